@@ -22,8 +22,8 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 
 FLOORS = (
-    "system", "keys", "video", "config", "simulation", "motion", "flow", "store", "cloud", "corpus", "schedule",
-    "broker", "worker", "supervise", "status", "offline", "prepare", "tradeoff", "page", "serve", "commands",
+    "system", "keys", "video", "config", "simulation", "motion", "flow", "store", "corpus", "schedule", "broker",
+    "worker", "supervise", "status", "offline", "prepare", "tradeoff", "page", "serve", "commands",
 )  # fmt: skip
 """The rooms of the server, from the ground up: each imports only from itself and from those before it."""
 
@@ -75,8 +75,19 @@ def test_the_packages_have_modules_to_check(package: str) -> None:
 
 @pytest.mark.parametrize("path", modules("v2v_protocol"), ids=lambda path: path.name)
 def test_the_protocol_needs_only_light_packages(path: Path) -> None:
-    may = PROTOCOL_MAY | {"yaml"} if path.name == "safe_yaml.py" else PROTOCOL_MAY
+    may = PROTOCOL_MAY | {"safe_yaml.py": {"yaml"}, "progress.py": {"rich"}}.get(path.name, set())
     assert imported(path.read_text(encoding="utf-8")) - may == set()
+
+
+def test_one_file_draws_progress() -> None:
+    """Every command shows its progress in the same way."""
+    users = [
+        path
+        for package in PACKAGES
+        for path in modules(package)
+        if "rich.progress" in imported_modules(path.read_text("utf-8"))
+    ]
+    assert users == [ROOT / "v2v_protocol" / "progress.py"]
 
 
 def test_yaml_is_read_in_one_place() -> None:
@@ -116,7 +127,12 @@ def test_server_folders_are_small() -> None:
 
 
 @pytest.mark.parametrize(
-    "room", ["corpus/index", *sorted(set(FLOORS) - {"config", "serve", "simulation", "motion", "flow", "offline"})]
+    "room",
+    [
+        "corpus/index",
+        "corpus/sources",
+        *sorted(set(FLOORS) - {"config", "serve", "simulation", "motion", "flow", "offline"}),
+    ],
 )
 def test_every_folder_documents_its_files(room: str) -> None:
     folder = ROOT / "v2v_server" / room

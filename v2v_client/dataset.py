@@ -5,57 +5,36 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-import logging
 import os
-import platform
 import warnings
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from typing import Any, Unpack
+from typing import Any, Self, Unpack
 
 import torch.distributed
 from torch.utils.data import IterableDataset, get_worker_info
 
 from v2v_client.batch import Batch
 from v2v_client.delivery import deliver
-from v2v_client.loaders import (
-    end_with_parent,
-    is_evaluated_by_lightning,
-    refuse_epoch_of_accelerate,
-    require_lightning_epoch,
-    send_before_exit,
-)
+from v2v_client.loaders import end_with_parent, send_before_exit
 from v2v_client.local_server import LocalServer, recipe_flags
 from v2v_client.memory.buffers import BatchBuffers
 from v2v_client.options import Options, require_arguments
 from v2v_client.position.plan import Consumer, EpochPlan
 from v2v_client.position.position import Iteration, Position
 from v2v_client.position.state import ResumeState, StreamIdentity
-from v2v_client.session.brokers import addresses, order
-from v2v_client.session.connection import Connection
-from v2v_client.session.link import Link
+from v2v_client.session.brokers import addresses
+from v2v_client.session.connector import Connector, ConsumerId
 from v2v_client.session.liveness import Patience
 from v2v_protocol.addresses import leaves_host
-from v2v_protocol.errors import RepeatedSamplesWarning, ServerLost, StateMismatch, UsageError
-from v2v_protocol.messages import Hello
+from v2v_protocol.errors import RepeatedSamplesWarning, StateMismatch, UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED
 from v2v_protocol.settings import require_whole
 from v2v_protocol.spec import SpecOptions, StreamSpec
 from v2v_protocol.tables import html_table
 
-_log = logging.getLogger(__name__)
-_REPEATED = (
-    "the last pass was left before the end of epoch {epoch}, and this pass delivers the same samples again. To resume "
-    "instead, call dataset.load_state_dict(batch.resume_state), with the last batch trained on, before each pass; for "
-    "other samples, call dataset.set_epoch(n) with another n for each pass. To repeat them on purpose, call "
-    "dataset.set_epoch({epoch}) before each pass"
-)
-_OF_A_LOADER_WORKER = (
-    ". A loader worker counts the batches that it has prefetched: ignore this if the loop took only one batch to "
-    "inspect it"
-)
 _NOT_SHARED = (
     "samples of one decode go to different ranks or loader workers here, so each is decoded separately: the stream was "
     "begun with another batch size, world size or number of loader workers. The samples do not change"
@@ -74,10 +53,12 @@ class V2VStreamDataset(IterableDataset[Batch]):
     wrong, because the state of a batch counts all earlier batches of the epoch as delivered.
 
     One iteration is one epoch from its beginning. Finishing it advances the epoch. Leaving it early and iterating again
-    repeats it, with a RepeatedSamplesWarning the first time (not after inspecting a single batch; loader workers count
-    the batches that they prefetched). After
+    repeats it. A RepeatedSamplesWarning says so once: at the second iteration, or at the third if a single batch was
+    taken to inspect it (with loader workers, also if they made no more batches than they prefetch). After
     :meth:`load_state_dict` an iteration begins where the state was taken. Ranks get disjoint samples and equally many
     batches. Samples that do not fill a global batch at the end of an epoch are dropped.
+
+    Without loader workers, an iteration begins with its first batch: an epoch set or a state loaded before that counts.
 
     With loader workers, an epoch counts as finished once every worker has delivered its share, which is a few
     prefetched batches before the training loop sees the last one. A loop that may leave an epoch during these batches
@@ -153,22 +134,27 @@ class V2VStreamDataset(IterableDataset[Batch]):
         require_arguments(V2VStreamDataset.__init__, options)
         if (rank is None) != (world_size is None):
             raise UsageError(f"rank = {rank}, world_size = {world_size}: give both or none")
-        self._brokers = addresses(address)
-        self._address = ",".join(self._brokers)
-        self._batch_size = require_whole("batch_size", batch_size, 1, 65_536)
-        self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
-        self._seed = require_whole("seed", seed, 0, LARGEST_SEED)
-        self._options = Options(self._arrays, recipe=recipe, **options)
-        self._patience = dataclasses.replace(patience or Patience(), timeout_seconds=timeout_seconds)
+        arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
+        brokers = addresses(address)
+        self._connector = Connector(
+            brokers,
+            Options(arrays, recipe=recipe, **options),
+            arrays,
+            require_whole("batch_size", batch_size, 1, 65_536),
+            require_whole("seed", seed, 0, LARGEST_SEED),
+            compress=any(map(leaves_host, brokers)) if compress is None else bool(compress),
+            keys=None if keys is None else os.fspath(keys),
+            patience=dataclasses.replace(patience or Patience(), timeout_seconds=timeout_seconds),
+        )
         self._shared_memory = shared_memory
-        self._compress = any(map(leaves_host, self._brokers)) if compress is None else bool(compress)
-        self._keys = None if keys is None else os.fspath(keys)
         self._explicit = None if rank is None or world_size is None else (rank, world_size)
         self._ambient = _distributed() or (0, 1)
-        self._position = Position(require_whole("epoch", epoch, 0, LARGEST_EPOCH))
+        self._position = Position(seed, require_whole("epoch", epoch, 0, LARGEST_EPOCH))
         self._buffers = BatchBuffers()
         self._offered: StreamIdentity | None = None  # the server's answer to len(), not pinned
-        EpochPlan(0, self.world_size, self.rank, self._batch_size)
+        self._stop_server: Callable[[], object] | None = None  # of a dataset that started its server
+        self._is_closed = False
+        EpochPlan(0, self.world_size, self.rank, batch_size)
 
     @classmethod
     def local(
@@ -185,7 +171,11 @@ class V2VStreamDataset(IterableDataset[Batch]):
     ) -> V2VStreamDataset:
         """Start a server on this host and return a dataset that streams from it.
 
-        The server stops with the dataset or with this process, even if the process is killed.
+            with V2VStreamDataset.local("my-videos/") as dataset:
+                for batch in dataset: ...
+
+        The server stops at the end of the with block (:meth:`close`), with the dataset, or with this process, even if
+        the process is killed.
 
         Args:
             videos: folder or list, as for ``v2v-serve --videos``.
@@ -208,24 +198,42 @@ class V2VStreamDataset(IterableDataset[Batch]):
         except BaseException:
             server.stop()
             raise
-        weakref.finalize(dataset, _stop_own, server, os.getpid())
+        dataset._stop_server = weakref.finalize(dataset, server.stop)
         return dataset
+
+    def close(self) -> None:
+        """Stop the server that :meth:`local` started, and free unused memory. Repeated calls do nothing.
+
+        A closed dataset delivers no more batches. :meth:`state_dict` and :meth:`describe` still work.
+        """
+        self._is_closed = True
+        self._buffers = BatchBuffers()
+        if self._stop_server is not None:
+            self._stop_server()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _require_open(self) -> None:
+        if self._is_closed:
+            raise UsageError("this dataset is closed: iterate inside its with block, or create another dataset")
 
     def __getstate__(self) -> dict[str, Any]:
         # A spawned loader worker has no process group. A copy, even a shallow one, gets its own position.
-        own = {"_position": copy.copy(self._position), "_buffers": BatchBuffers()}
+        own = {"_position": copy.copy(self._position), "_buffers": BatchBuffers(), "_stop_server": None}
         return self.__dict__ | {"_ambient": _distributed() or self._ambient} | own
 
     def __repr__(self) -> str:
-        own = f"seed {self._seed}, rank {self.rank} of {self.world_size}"
-        return f"V2VStreamDataset({self._address!r}, batch_size {self._batch_size}, {own})"
+        own = f"seed {self._connector.seed}, rank {self.rank} of {self.world_size}"
+        return f"V2VStreamDataset({self._address!r}, batch_size {self._connector.batch_size}, {own})"
 
     def _repr_html_(self) -> str:
-        rows = {"batch_size": self._batch_size, "arrays": ", ".join(self._arrays), "seed": self._seed}
-        rows |= {"epoch": self.epoch, "rank": f"{self.rank} of {self.world_size}"}
-        return html_table(f"V2VStreamDataset of {self._address}", rows)
-
-    # --- properties ---------------------------------------------------------------------------------------------------
+        ours = self._connector
+        rows = {"batch_size": ours.batch_size, "arrays": ", ".join(ours.arrays), "seed": ours.seed, "epoch": self.epoch}
+        return html_table(f"V2VStreamDataset of {self._address}", rows | {"rank": f"{self.rank} of {self.world_size}"})
 
     @property
     def rank(self) -> int:
@@ -240,12 +248,12 @@ class V2VStreamDataset(IterableDataset[Batch]):
     @property
     def epoch(self) -> int:
         """Return the epoch that the next iteration delivers."""
-        return self._position.agreed().epoch
+        return self._position.start(self._consumer).epoch
 
     @property
     def stream(self) -> StreamIdentity | None:
         """Return the stream's resolved spec, digests and sequences per epoch; None before the first connection."""
-        return self._position.agreed().stream
+        return self._position.stream
 
     def describe(self) -> dict[str, Any]:
         """Return the stream's identity and this consumer's settings as plain values, for a log.
@@ -258,9 +266,9 @@ class V2VStreamDataset(IterableDataset[Batch]):
             raise UsageError(f"the stream of {self._address} is not known yet: iterate first")
         return {field.name: getattr(stream, field.name) for field in dataclasses.fields(StreamIdentity)} | {
             "address": self._address,
-            "arrays": list(self._arrays),
-            "batch_size": self._batch_size,
-            "seed": self._seed,
+            "arrays": list(self._connector.arrays),
+            "batch_size": self._connector.batch_size,
+            "seed": self._connector.seed,
             "rank": self.rank,
             "world_size": self.world_size,
         }
@@ -272,22 +280,30 @@ class V2VStreamDataset(IterableDataset[Batch]):
         the epoch's beginning. Before the first iteration this connects to the server.
 
         Raises:
+            UsageError: the dataset is closed.
             V2VError: the server does not answer, or refuses: see the errors of iterating.
         """
-        agreed = self._position.agreed()
-        stream = agreed.stream or self._offered
+        self._require_open()
+        start = self._position.start(self._consumer)
+        stream = start.stream or self._offered
         if stream is None:
-            with closing(self._connection(agreed.epoch)) as connection:
+            with closing(self._connector.connection(self._consumer_id(), start)) as connection:
                 connection.open()
                 # Not pinned: the spacing of siblings depends on the number of loader workers that iterate.
                 stream = self._offered = connection.stream
-        return self._consumer.plan(stream, None).batches
+        return self._consumer.plan(stream, start.at_epoch(0)).batches
+
+    @property
+    def _address(self) -> str:
+        return ",".join(self._connector.brokers)
 
     @property
     def _consumer(self) -> Consumer:
-        return Consumer(self._seed, self._batch_size, self.rank, self.world_size)
+        return Consumer(self._connector.batch_size, self.rank, self.world_size)
 
-    # --- position -----------------------------------------------------------------------------------------------------
+    def _consumer_id(self, workers: int = 1) -> ConsumerId:
+        loader = get_worker_info()
+        return ConsumerId(self.rank, self.world_size, None if loader is None else loader.id, workers)
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the next iteration. It starts at the beginning, unless a state of that epoch was loaded.
@@ -296,9 +312,10 @@ class V2VStreamDataset(IterableDataset[Batch]):
         the next iteration delivers the epoch after it, or no batches if the state's own epoch is set here.
 
         Raises:
-            UsageError: the epoch is out of range, or accelerate sets it.
+            UsageError: the epoch is out of range, or a state of a later epoch was loaded and no pass has begun since:
+                its samples would be repeated.
         """
-        refuse_epoch_of_accelerate()
+        self._require_open()
         self._position.set_epoch(require_whole("epoch", epoch, 0, LARGEST_EPOCH))
 
     def state_dict(self) -> dict[str, Any]:
@@ -322,124 +339,56 @@ class V2VStreamDataset(IterableDataset[Batch]):
             StateMismatch: the state belongs to another seed or spec.
             UsageError: it is not a state, or a loader worker's state that this process cannot use.
         """
+        self._require_open()
         loaded = ResumeState.from_dict(state)
-        if loaded.seed != self._seed:
-            raise StateMismatch(
-                f"seed: the state has {loaded.seed}, this dataset {self._seed}; give seed={loaded.seed}"
-            )
+        seed = self._connector.seed
+        if loaded.seed != seed:
+            raise StateMismatch(f"seed: the state has {loaded.seed}, this dataset {seed}; give seed={loaded.seed}")
         if loaded.stream is not None:
-            self._options.spec(loaded.stream, "the state")
+            self._connector.options.spec(loaded.stream, "the state")
         self._position.load(loaded, self._consumer)
 
-    # --- iteration ----------------------------------------------------------------------------------------------------
-
     def __iter__(self) -> Iterator[Batch]:
-        if get_worker_info() is not None:
-            send_before_exit()
-            end_with_parent()
-        begun = self._position.begin(self._consumer)
-        if begun.repeats and not is_evaluated_by_lightning():
-            text = _REPEATED.format(epoch=begun.epoch) + ("" if get_worker_info() is None else _OF_A_LOADER_WORKER)
-            warnings.warn(text, RepeatedSamplesWarning, stacklevel=2)
-        return self._iterate(begun)
+        self._require_open()
+        if get_worker_info() is None:
+            return self._iterate()
+        send_before_exit()
+        end_with_parent()
+        return self._iterate(self._begin())  # stateful loaders ask for the state before the first batch
 
-    def _iterate(self, begun: Iteration) -> Iterator[Batch]:
-        consumer, epoch, state = self._consumer, begun.epoch, begun.state
-        if state is None:
-            require_lightning_epoch(epoch)
-        pinned = self.stream
-        with closing(self._connection(epoch, state, begun.workers)) as connection:
+    def _begin(self) -> Iteration:
+        begun = self._position.begin(self._consumer)
+        if begun.repeats:
+            warnings.warn(begun.warning, RepeatedSamplesWarning, stacklevel=3)
+        return begun
+
+    def _iterate(self, begun: Iteration | None = None) -> Iterator[Batch]:
+        begun = begun or self._begin()
+        consumer, member, pinned = self._consumer, self._consumer_id(begun.workers), begun.state.stream
+        with closing(self._connector.connection(member, begun.state)) as connection:
             connection.open()
             stream = connection.stream
             if pinned is None:
-                self._compare(connection, epoch)
-                self._position.pin(stream, connection.address)
-            plan = consumer.plan(stream, state)
-            if state is None:
+                self._connector.compare(connection, member, begun.state)
+                begun = self._position.pin(begun, stream, connection.address)
+            plan = consumer.plan(stream, begun.state)
+            if begun.state.is_beginning:
                 plan.require_batches()
             if stream.resolved.samples_per_decode > 1 and not plan.shares_decodes(
                 stream.resolved.sibling_spacing, begun.workers
             ):
                 warnings.warn(_NOT_SHARED, stacklevel=2)
-            batches, done = begun.batches(plan), begun.done
-
-            def after(batch: int, quarantine: int) -> dict[str, Any]:
-                return consumer.after(stream, epoch, plan, batch, quarantine).to_dict()
-
+            batches = begun.batches(plan)
+            after = functools.partial(consumer.after, begun.state, plan)
             delivered = deliver(
-                connection, plan, batches, epoch, after, self._buffers, shared_memory=self._shared_memory
+                connection, plan, batches, begun.state.epoch, after, self._buffers, shared_memory=self._shared_memory
             )
             for batch, number in zip(delivered, batches, strict=True):
-                done += 1
-                seen = batch.resume_state["quarantine"]
-                self._position.reached(
-                    begun,
-                    consumer.after(stream, epoch, plan, number, seen)
-                    if not begun.shared
-                    else begun.after(consumer, stream, done, seen),
-                    count=done - begun.done,
-                    last=number == batches[-1],
-                )
+                state = after(number, batch.resume_state["quarantine"])
+                self._position.reached(begun, consumer, state, last=number == batches[-1])
                 yield batch
-        self._position.finish(begun, consumer)
-
-    def _name(self, loader_workers: int) -> str:
-        """Return the name that status displays show for this consumer."""
-        loader = get_worker_info()
-        of_loader = "" if loader is None else f", loader worker {loader.id} of {loader_workers}"
-        return f"rank {self.rank} of {self.world_size}{of_loader}"
-
-    def _compare(self, connection: Connection, epoch: int) -> None:
-        """Compare this rank's broker with the first other broker that answers, which is the same for nearly all ranks.
-
-        Raises:
-            StateMismatch: the two brokers offer different streams.
-        """
-        patience = dataclasses.replace(self._patience, timeout_seconds=self._patience.takeover_seconds)
-        for broker in self._brokers if len(self._brokers) > 1 else ():
-            if broker == connection.address:
-                continue
-            try:
-                with closing(self._connection(epoch, brokers=(broker,), patience=patience)) as other:
-                    other.open()
-                    connection.stream.require_same(other.stream, ours=connection.address, theirs=broker)
-            except ServerLost as lost:
-                _log.warning("cannot compare %s with %s before it takes over: %s", connection.address, broker, lost)
-                continue
-            return
-
-    def _connection(
-        self,
-        epoch: int,
-        state: ResumeState | None = None,
-        loader_workers: int = 1,
-        *,
-        brokers: Sequence[str] | None = None,
-        patience: Patience | None = None,
-    ) -> Connection:
-        pinned = self.stream
-        loader = get_worker_info()
-        consumer = self.rank * loader_workers + (0 if loader is None else loader.id)
-        hello = Hello(
-            self._options.spec(pinned, "this dataset's stream"),
-            self._arrays,
-            self._batch_size,
-            self._seed,
-            quarantine=None if state is None else state.quarantine,
-            stride=self._batch_size * self.world_size * loader_workers,
-            name=self._name(loader_workers),
-            host=platform.node(),
-            packed=self._compress,
-        )
-        return Connection(
-            brokers or order(self._brokers, consumer, self.world_size * loader_workers),
-            hello,
-            epoch,
-            pinned=pinned,
-            pinned_by="the saved state" if state is not None else "this dataset",
-            patience=patience or self._patience,
-            transport=functools.partial(Link, keys=self._keys),
-        )
+                self._require_open()
+        self._position.finish(begun)
 
 
 def _distributed() -> tuple[int, int] | None:
@@ -447,8 +396,3 @@ def _distributed() -> tuple[int, int] | None:
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         return torch.distributed.get_rank(), torch.distributed.get_world_size()
     return None
-
-
-def _stop_own(server: LocalServer, owner: int) -> None:
-    if os.getpid() == owner:  # a forked loader worker holds a copy of the dataset, but must not stop the server
-        server.stop()

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 
@@ -13,6 +12,7 @@ from v2v_client.batch import Batch
 from v2v_client.memory.buffers import BatchBuffers, BatchMemory
 from v2v_client.ordering import ReorderWindow
 from v2v_client.position.plan import EpochPlan
+from v2v_client.position.state import ResumeState
 from v2v_client.session.connection import Connection
 from v2v_client.session.conversation import Arrival
 from v2v_protocol.messages import SampleHeader
@@ -31,7 +31,7 @@ def deliver(
     plan: EpochPlan,
     batches: Sequence[int],
     epoch: int,
-    resume_state: Callable[[int, int], Mapping[str, Any]],
+    resume_state: Callable[[int, int], ResumeState],
     buffers: BatchBuffers,
     *,
     shared_memory: bool = True,
@@ -102,7 +102,7 @@ def deliver(
             indices=plan.indices(number),
             epoch=epoch,
             provenance=provenance,
-            resume_state=resume_state(number, quarantine),
+            resume_state=resume_state(number, quarantine).to_dict(),
             wait_seconds=clock() - began,
             cpu_seconds=sum(header.cpu_seconds for header in headers),
             decodes=sum(header.decoded for header in headers),

@@ -61,6 +61,7 @@ class LocalServer:
         self._stop_seconds = stop_seconds
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: IO[bytes] | None = None
+        self._owner = os.getpid()
         self._cpu_seconds: dict[tuple[int, float], float] = {}
 
     def __enter__(self) -> LocalServer:
@@ -132,7 +133,12 @@ class LocalServer:
         return "\n".join(lines[-_LAST_LINES:]) or "(it wrote nothing)"
 
     def stop(self) -> None:
-        """Stop the server with SIGTERM, then kill its remaining processes. Repeated calls do nothing."""
+        """Stop the server with SIGTERM, then kill its remaining processes.
+
+        Repeated calls do nothing. Calls in a forked process do nothing either, because the server is not its own.
+        """
+        if os.getpid() != self._owner:
+            return
         process, self._process = self._process, None
         try:
             if process is not None:

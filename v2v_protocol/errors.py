@@ -101,6 +101,14 @@ class VideoUnreadable(VideoError):
     """
 
 
+class VideoGone(VideoUnreadable):
+    """There is no such file."""
+
+
+class VideoDenied(VideoUnreadable):
+    """This user may not read the file."""
+
+
 class ProtocolError(V2VError):
     """The peer sent something outside the protocol."""
 

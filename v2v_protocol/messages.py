@@ -203,7 +203,7 @@ class Status:
     """Answer to GetStatus.
 
     Attributes:
-        json: ``v2v_server.status.state.ServiceState.to_dict()`` as JSON, UTF-8.
+        json: a status as JSON, UTF-8; see :mod:`v2v_server.status.parts`.
     """
 
     json: bytes

@@ -20,6 +20,8 @@ from v2v_server.video.rows import Rows
 
 DEFAULT_BIND = "tcp://127.0.0.1:5555"
 MOST_WORKERS = 4096
+ENGINES = {"local": "v2v_server.supervise.local_host", "ray": "v2v_server.supervise.ray_host"}
+"""Where workers can run: the module of each :class:`v2v_server.supervise.host.Host`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +72,7 @@ class ServeConfig:
     )  # fmt: skip
     engine: str = word(
         "local",
-        ("local", "ray"),
+        ENGINES,
         "where workers run: local is this host, ray is a Ray cluster that this host belongs to",
     )
     ray_address: str = text("auto", "address of the Ray cluster; auto: the cluster of this host", metavar="HOST:PORT")
@@ -133,9 +135,9 @@ class ServeConfig:
                 "listen on 127.0.0.1 and reach it by `ssh -L`, or give --insecure if everyone on that network may "
                 "watch this service"
             )
-        if self.engine == "ray" and not self.worker_bind:
+        if self.engine != "local" and not self.worker_bind:
             raise UsageError(
-                "--engine ray: give the workers of other hosts an address of this one, --worker-bind tcp://HOST:5556"
+                f"--engine {self.engine}: give the workers of other hosts an address of this one, --worker-bind tcp://HOST:5556"
             )
         if self.ray_label and not all(self.ray_label.partition("=")):
             raise UsageError(f"--ray-label {self.ray_label!r}: write KEY=VALUE, as `ray start --labels KEY=VALUE` does")

@@ -19,8 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
-from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, V2VError, VideoChanged, VideoError
+from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, V2VError, VideoChanged, VideoError, VideoGone
+from v2v_protocol.progress import Progress
 from v2v_protocol.wire import encode
+from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,
@@ -40,21 +42,20 @@ from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets, TurnedAway
 from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
-from v2v_server.cloud.copies import Copies
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.keys.callers import AWAY_SECONDS
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.status.line import summary
-from v2v_server.status.progress import catalogue_progress
-from v2v_server.status.publisher import make_publisher
-from v2v_server.status.shutdown_summary import format_shutdown_summary
-from v2v_server.status.terminal import make_status
+from v2v_server.schedule.summary import corpus_summary
+from v2v_server.status.publisher import StatusPublisher
+from v2v_server.status.snapshot import Service
+from v2v_server.status.terminal import StatusView
+from v2v_server.status.text import format_shutdown_summary
 from v2v_server.store.cache import make_cache
-from v2v_server.supervise.engines import make_supervisor
-from v2v_server.supervise.protocol import Supervisor
+from v2v_server.supervise.engines import make_pool
+from v2v_server.supervise.pool import Pool
 from v2v_server.supervise.scaling import Scaling
 from v2v_server.system.clock import Clock
 from v2v_server.system.log import Level, Log
@@ -90,7 +91,8 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
         CorpusError: there are no videos, or no usable ones.
     """
     cores = usable_cores()
-    with catalogue_progress(log=Log(is_json=config.log_format == "json")) as progress:
+    log = Log(is_json=config.log_format == "json")
+    with Progress("probing videos", say=log.say if log.is_json else None) as progress:
         catalogue = open_catalogue(
             config.videos,
             list_file=config.list or None,
@@ -124,12 +126,12 @@ def serve(config: ServeConfig) -> None:
     for note in catalogue.notes:
         log.say(note)
     table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
-    for line in summary(catalogue, config.spec, table, list_refused=config.list_refused):
+    for line in corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused):
         log.say(line)
     catalogue.fail_fast()
     if not table.count:
         raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")
-    quarantine_file = quarantine_path(catalogue.root, config.cache_dir or None)
+    quarantine_file = quarantine_path(catalogue.source.name, config.cache_dir or None)
     quarantine = read_quarantine(quarantine_file)
     for entry in quarantine.entries(quarantine.latest):
         log.say(f"in quarantine: {entry}")
@@ -150,13 +152,12 @@ def serve(config: ServeConfig) -> None:
         folder = Path(config.cache).absolute()
         make_cache(folder)
         worker_flags += ["--cache", str(folder), "--cache-gib", str(config.cache_gib)]
-    if isinstance(catalogue.root, Copies):
-        worker_flags += ["--copies", str(catalogue.root.folder), "--copies-gib", str(config.copies_gib)]
+    worker_flags += catalogue.source.worker_flags()
     label = f"w{secrets.token_hex(4)}"
     keys = KeyFolder(Path(config.keys)) if config.keys else None
     stop = threading.Event()
     with _stop_on_signals(stop):
-        supervisor = make_supervisor(config, catalogue.root, label, worker_flags, keys)
+        pool = make_pool(config, catalogue.source, label, worker_flags, keys)
         sockets = Sockets(
             config.bind,
             config.worker_bind or _private_address(label),
@@ -166,12 +167,12 @@ def serve(config: ServeConfig) -> None:
             local_bind=_private_address(label),
         )
         page = PageProcess(config.page_host, config.page, config.page_names) if config.page else None
-        server = Server(config, catalogue, dispatcher, sockets, supervisor, quarantine, quarantine_file, page=page)
+        server = Server(config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file, page=page)
         try:
-            if config.engine == "local" and (question := question_workers(config.most_workers, usable_cores())):
+            if pool.is_local and (question := question_workers(config.most_workers, usable_cores())):
                 log.say(question, "warning")
-            supervisor.start(sockets.local_address if config.engine == "local" else sockets.worker_address)
-            supervisor.scale(config.least_workers)
+            pool.start(sockets.local_address if pool.is_local else sockets.worker_address)
+            pool.scale(config.least_workers)
             if page is not None:
                 page.start(sockets.local_address)
                 log.say(f"page: {page.url}")
@@ -188,7 +189,7 @@ class Server:
     Args:
         dispatcher: decides what to do.
         transport: sockets of consumers and workers.
-        supervisor: runs the workers' processes.
+        pool: runs the workers' processes.
         quarantine: the snapshots.
         quarantine_file: file that new entries are written to.
         clock: returns the time, seconds; None: a :class:`v2v_server.system.clock.Clock`.
@@ -201,7 +202,7 @@ class Server:
         catalogue: Catalogue,
         dispatcher: Dispatcher,
         transport: ServerTransport,
-        supervisor: Supervisor,
+        pool: Pool,
         quarantine: Quarantine,
         quarantine_file: Path,
         clock: Callable[[], float] | None = None,
@@ -213,17 +214,16 @@ class Server:
         self._catalogue = catalogue
         self._dispatcher = dispatcher
         self._transport = transport
-        self._supervisor = supervisor
+        self._pool = pool
         self._quarantine = quarantine
         self._quarantine_file = quarantine_file
         self._clock = clock or Clock()
         self._next_tick = self._clock()
         is_fixed = config.least_workers == config.most_workers
         self._scaling = None if is_fixed else Scaling(*config.workers, config.scale_seconds)
-        self._status = make_status(self._log, sys.stderr)
-        self._publisher = make_publisher(
-            config, catalogue, dispatcher, supervisor, quarantine, transport, self._clock(), _utc_now
-        )
+        self._view = StatusView(self._log, sys.stderr)
+        service = Service(config, catalogue, dispatcher, pool, quarantine, transport)
+        self._publisher = StatusPublisher(service, self._clock(), _utc_now)
         self._announced = False
         self._port_file: Path | None = None
         self._missing_told = -math.inf
@@ -253,13 +253,13 @@ class Server:
                     self._say(_turned_away(arrival), "warning")
         if now >= self._next_tick:
             self._next_tick = now + _TURN_SECONDS
-            for name, stalled in self._supervisor.stalled(now).items():
+            for name, stalled in self._pool.stalled(now).items():
                 self._dispatcher.worker_stalled(self._route(name), stalled)
             unrecorded, self._unrecorded = self._unrecorded, []
             for record, until in unrecorded:
                 self._carry_out(self._record(record, until))
             self._carry_out(self._dispatcher.tick(now))
-            for death in self._supervisor.watch(now, self._dispatcher.counters.samples):
+            for death in self._pool.watch(now, self._dispatcher.counters.samples):
                 self._say(
                     f"worker {death.identity.decode()} {death.loss.text}; its leases go to other workers", "warning"
                 )
@@ -267,7 +267,7 @@ class Server:
             if now >= self._give_back_at:
                 self._give_back_at = math.inf
                 give_back_freed_memory()
-            for line in [*self._supervisor.news(), *(self._page.watch(now) if self._page is not None else [])]:
+            for line in [*self._pool.news(), *(self._page.watch(now) if self._page is not None else [])]:
                 self._say(line)
             self._warn_if_blocked(now)
             self._scale(now)
@@ -276,16 +276,16 @@ class Server:
 
     def close(self) -> None:
         """Stop and end the workers, and close all connections."""
-        self._status.close()
+        self._view.close()
         if self._announced:
-            state = self._publisher.state(self._clock())
-            for line in format_shutdown_summary(state):
+            status = self._publisher.status(self._clock())
+            for line in format_shutdown_summary(status):
                 self._log.say(line)
             if self._log.is_json:
-                self._log.say("the end", totals=asdict(state.totals), uptime_seconds=state.uptime_seconds)
+                self._log.say("the end", totals=status["totals"], uptime_seconds=status["uptime_seconds"])
         for stop in self._dispatcher.stop_workers():
             self._transport.send(stop)
-        self._supervisor.stop()
+        self._pool.stop()
         if self._page is not None:
             self._page.stop()
         self._transport.close()
@@ -303,7 +303,7 @@ class Server:
                     if not self._transport.send(message):
                         dispatcher.consumer_lost(message.identity)
                 case ToWorker() as message:
-                    if not self._transport.send(message) and not self._supervisor.watches(self._name(message.identity)):
+                    if not self._transport.send(message) and not self._pool.watches(self._name(message.identity)):
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
                 case SendLease() as grant:
                     todo.extendleft(reversed(self._complete(grant, todo)))
@@ -318,8 +318,8 @@ class Server:
                     todo.extend(dispatcher.video_checked(missing, self._check_video(missing), now()))
                 case ReportRefusal(refusal, request):
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
-                case SendStatus() as show:
-                    todo.extend(self._publisher.ask(show))
+                case SendStatus() as request:
+                    todo.extend(self._publisher.ask(request))
 
     def _complete(self, grant: SendLease, todo: deque[Action]) -> list[Action]:
         """Return the message of a lease, complete; if it cannot be completed, what the dispatcher does about it.
@@ -343,19 +343,17 @@ class Server:
     def _give_up(self, hopeless: GiveUp) -> Loss:
         """End the process of a hung worker, if it is one of ours."""
         name = self._name(hopeless.identity)
-        loss = self._supervisor.give_up(name, hopeless.reason) or Loss(
-            Cause.UNEXPLAINED, hopeless.reason, for_all=False
-        )
+        loss = self._pool.give_up(name, hopeless.reason) or Loss(Cause.UNEXPLAINED, hopeless.reason, for_all=False)
         text = f"worker {clean_name(name.decode())} {hopeless.reason}: {loss.text}; its leases go to other workers"
         self._say(text, "warning")
         return loss
 
     def _name(self, identity: bytes) -> bytes:
-        """Return the name by which the supervisor knows a worker; empty if it has not said hello."""
+        """Return the name by which the pool knows a worker; empty if it has not said hello."""
         return self._dispatcher.registry.name_of(identity).encode()
 
     def _route(self, name: bytes) -> bytes:
-        """Return the routing id of a worker of the supervisor; empty if it has not said hello."""
+        """Return the routing id of a worker of the pool; empty if it has not said hello."""
         return self._dispatcher.registry.named(name.decode()) or b""
 
     def _record(self, record: AddToQuarantine, until: float) -> list[Action]:
@@ -393,7 +391,7 @@ class Server:
         """
         try:
             self._catalogue.check(missing.video, missing.fingerprint)
-        except VideoChanged:
+        except (VideoChanged, VideoGone):
             self._catalogue.mark_stale(missing.video)
             return False
         except (VideoError, CorpusError):
@@ -402,7 +400,7 @@ class Server:
         if now >= self._missing_told + REST_SECONDS:
             self._missing_told = now
             name = clean_name(self._name(missing.identity).decode())
-            is_local = not isinstance(self._catalogue.root, Copies)
+            is_local = self._catalogue.source.is_local
             self._say(
                 f"worker {name} failed on {missing.video}, which "
                 f"{'is on this host as catalogued' if is_local else 'is not known to be gone or changed'}: "
@@ -429,9 +427,9 @@ class Server:
         if self._scaling is None:
             return
         seen = self._dispatcher
-        decision = self._scaling.look(now, seen.waiting_share, seen.idle_share, seen.workers)
+        decision = self._scaling.decide(now, seen.waiting_share, seen.idle_share, seen.workers)
         if decision is not None:
-            self._supervisor.scale(decision.workers)
+            self._pool.scale(decision.workers)
             self._say(f"workers: {decision.workers} from now on, because {decision.reason}")
 
     def _show(self, now: float) -> None:
@@ -446,8 +444,8 @@ class Server:
                 _write_port_file(self._config.port_file, address)
                 self._port_file = Path(self._config.port_file)
             self._publisher.is_ready = True
-        if self._announced and self._status.is_due(now):
-            self._status.show(now, self._publisher.state(now))
+        if self._announced and self._view.is_due(now):
+            self._view.show(now, self._publisher.status(now))
 
     def _say(self, text: str, level: Level = "info", sample: Request | None = None, **about: Any) -> None:
         """Write a log line.
@@ -457,7 +455,7 @@ class Server:
             sample: the request that the line is about.
             about: additional fields for programs.
         """
-        self._status.interrupt()
+        self._view.interrupt()
         identity = None if sample is None or not self._log.is_json else self._dispatcher.identity_of(sample)
         if identity is not None:
             about["sample"] = asdict(identity)
@@ -484,14 +482,10 @@ def _private_address(label: str) -> str:
 
 def _write_port_file(file: str, address: str) -> None:
     """Write the address in one step, so that readers see the whole content or no file."""
-    path = Path(file)
-    partial = path.parent / f".{path.name}.{os.getpid()}"
     try:
-        partial.write_text(address + "\n", encoding="utf-8")
-        partial.replace(path)
+        with write_aside_and_rename(Path(file)) as partial:
+            partial.write_text(address + "\n", encoding="utf-8")
     except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
         raise UsageError(f"--port-file {file}: {error.strerror}") from error
 
 

@@ -18,7 +18,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -31,6 +30,7 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.flow.methods import one_thread
 from v2v_server.offline.leases import lease_for
@@ -69,17 +69,17 @@ def clips_of(catalogue: Catalogue, specs: Sequence[StreamSpec], most: int) -> It
             for spec in specs
         ]  # fmt: skip
         try:
-            yield _record_of(leases, catalogue.folder)
+            yield _record_of(leases, catalogue.source)
         except VideoError as error:
             progress(f"left out: {error}")
 
 
-def _record_of(leases: Sequence[Lease], root: Path) -> dict[str, Any]:
-    decode_for(leases[0], leases[0].indices, root)  # puts the file into memory, for both scenes alike
+def _record_of(leases: Sequence[Lease], source: VideoSource) -> dict[str, Any]:
+    decode_for(leases[0], leases[0].indices, source)  # puts the file into memory, for both scenes alike
     record: dict[str, Any] = {"measure": "clip", "video": leases[1].video, "start_frame": leases[1].start_frame}
     flows = []
     for scene, lease in zip(SCENES, leases, strict=True):
-        decoded, record[f"decode_{scene}_cpu_seconds"] = _timed(lambda: decode_for(lease, lease.indices, root)[0])  # noqa: B023
+        decoded, record[f"decode_{scene}_cpu_seconds"] = _timed(lambda: decode_for(lease, lease.indices, source)[0])  # noqa: B023
         flow, record[f"flow_{scene}_cpu_seconds"] = _timed(lambda: _flow(decoded))  # noqa: B023
         _, record[f"simulation_{scene}_cpu_seconds"] = _timed(lambda: _simulated(decoded))  # noqa: B023
         flows.append(flow)

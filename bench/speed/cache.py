@@ -31,6 +31,7 @@ from tests.oracles.leases import open_leases
 from v2v_protocol.command import Parser
 from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.simulation.view import apply_view
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.worker.produce import decode_for, make_sample
@@ -54,7 +55,7 @@ def epoch(leases: Sequence[Lease], root: Path, cache: Cache | None) -> list[floa
     spent = np.zeros(3)
     for lease in leases:
         clock = [time.process_time()]
-        decoded = decode_for(lease, lease.indices, root, cache)[0]
+        decoded = decode_for(lease, lease.indices, Folder(root), cache)[0]
         clock.append(time.process_time())
         make_sample(lease, decoded)
         clock.append(time.process_time())

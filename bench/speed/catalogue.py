@@ -42,6 +42,7 @@ from v2v_server.corpus.probe import probe_file
 from v2v_server.corpus.refresh import index_path
 from v2v_server.corpus.scenes.collect import SceneCollection, figures
 from v2v_server.corpus.scenes.scene import COLUMNS, MOST_FRAMES, SEGMENT_FRAMES, Scene
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.system.process import resident_bytes, usable_cores
 from v2v_server.video.rows import Rows
@@ -80,7 +81,7 @@ def make_up(clip: Path, folder: Path, cache: Path, videos: int, scene: bool = Fa
             (folder / id).parent.mkdir(parents=True)
         (folder / id).hardlink_to(copy)
         ids.append(id)
-    known = probe_file(folder, ids[0])
+    known = probe_file(Folder(folder), ids[0])
     if known.problem is not None:
         raise UsageError(f"--clip {clip}: {known.problem}")
     store = Store(index_path(folder.resolve(), cache))

@@ -38,6 +38,7 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import SPEED_PRESETS, StreamSpec
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.system.process import usable_cores
 from v2v_server.worker.produce import decode_for
 
@@ -190,7 +191,7 @@ def _decode_jobs(corpus: Corpus, workers: int, number: int, count: Any, stop: Ev
         for lease in itertools.islice(leases, number, None, workers):
             if stop.is_set():
                 return
-            decode_for(lease, lease.indices, root)
+            decode_for(lease, lease.indices, Folder(root))
             count.value += 1
 
 

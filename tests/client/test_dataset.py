@@ -826,3 +826,29 @@ def stream_of(stream):
 def test_a_mistyped_argument_is_named_with_the_nearest(make):
     with pytest.raises(UsageError, match=r"^no argument 'batchsize' \(did you mean 'batch_size'\?\); known: "):
         make("tcp://127.0.0.1:1", batchsize=4)
+
+
+# --- closing ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_closed_dataset_raises_on_use_and_still_has_its_state(server):
+    with dataset(server) as stream:
+        batches = iter(stream)
+        state = next(batches).resume_state
+    for _ in range(2):
+        with pytest.raises(UsageError, match=r"this dataset is closed: .* with block"):
+            next(iter(stream))
+    for use in (iter, len, lambda it: it.set_epoch(1), lambda it: it.load_state_dict(state), lambda it: next(batches)):
+        with pytest.raises(UsageError, match="this dataset is closed"):
+            use(stream)
+    assert stream.state_dict() == state
+    stream.close()
+    server.until_all_left()
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_loader_of_a_closed_dataset_raises(server, workers):
+    stream = dataset(server)
+    stream.close()
+    with pytest.raises(UsageError, match="this dataset is closed"):
+        next(iter(loader(stream, workers)))

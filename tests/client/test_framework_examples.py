@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 from torchdata.stateful_dataloader import StatefulDataLoader
 
 from tests.client.fake_server import FakeServer
-from v2v_client import Batch, UsageError, V2VStreamDataset
+from v2v_client import Batch, V2VStreamDataset
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "guides" / "frameworks.md"
@@ -118,18 +118,16 @@ def test_the_example_of_accelerate_resumes_where_it_was() -> None:
         exec(
             of_two_bins(dict(EXAMPLES)["accelerate"]), names | {"V2VStreamDataset": V2VStreamDataset} | vars(accelerate)
         )
-        loader = DataLoader(V2VStreamDataset(server.address, batch_size=4), batch_size=None)
-        prepared = iter(accelerate.Accelerator(cpu=True).prepare(loader))
-        with pytest.raises(UsageError, match=r"leave the loader out of prepare\(\)"):
-            next(prepared)
     assert taken == list(range(20))
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # theirs, of each other and of torch
-@pytest.mark.parametrize("workers", [None, 0, 2])
-def test_the_example_of_lightning_resumes_where_its_checkpoint_was(tmp_path: Path, workers: int | None) -> None:
-    """The checkpoint is written after two batches; the crash is in the fourth. The loader is a StatefulDataLoader."""
+@pytest.mark.parametrize(
+    ("kind", "workers"), [(None, 0), (DataLoader, 0), (DataLoader, 2), (StatefulDataLoader, 0), (StatefulDataLoader, 2)]
+)
+def test_the_example_of_lightning_resumes_where_its_checkpoint_was(tmp_path: Path, kind: Any, workers: int) -> None:
+    """The checkpoint is written after two batches; the crash is in the fourth."""
     lightning = importlib.import_module("lightning")
     callbacks = importlib.import_module("lightning.pytorch.callbacks")
     taken: list[int] = []
@@ -140,15 +138,15 @@ def test_the_example_of_lightning_resumes_where_its_checkpoint_was(tmp_path: Pat
             raise Crash
         taken.extend(batch.indices)
 
-    def given(address: str, batch_size: int) -> Any:
-        stream = V2VStreamDataset(address, batch_size=batch_size)
-        return stream if workers is None else StatefulDataLoader(stream, batch_size=None, num_workers=workers)
+    def loader(stream: V2VStreamDataset, *, batch_size: None, num_workers: int) -> Any:
+        return stream if kind is None else kind(stream, batch_size=batch_size, num_workers=workers)
 
     crashed: list[int] = []
     quiet = {"accelerator": "cpu", "logger": False, "enable_progress_bar": False, "enable_model_summary": False}
     first, second = of_two_bins(dict(EXAMPLES)["Lightning"]).split("  # a crash\n")
     with FakeServer(sequences=23, credit=8) as server:
-        names = {"ADDRESS": server.address, "train": train, "V2VStreamDataset": given, "FOLDER": str(tmp_path)}
+        names = {"ADDRESS": server.address, "train": train, "DataLoader": loader, "FOLDER": str(tmp_path)}
+        names |= {"V2VStreamDataset": V2VStreamDataset}
         names |= {"lightning": lightning, "torch": torch, "QUIET": quiet, "ModelCheckpoint": callbacks.ModelCheckpoint}
         with pytest.raises(Crash):
             exec(first, names)

@@ -7,7 +7,6 @@ import multiprocessing
 import os
 from collections.abc import Iterator
 from contextlib import nullcontext
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -55,43 +54,39 @@ def test_an_epoch_set_during_the_last_batch_is_the_next_one(server: FakeServer) 
     assert next(iter(stream)).epoch == 7
 
 
-def test_a_loader_prepared_by_accelerate_is_refused(server: FakeServer) -> None:
-    """All of accelerate's loaders set the epoch from their own count before they iterate."""
-    theirs: dict[str, object] = {"__name__": "accelerate.data_loader", "stream": dataset(server)}
-    with pytest.raises(UsageError, match=r"leave the loader out of prepare\(\)"):
-        exec("stream.set_epoch(0)", theirs)
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # accelerate's, and torch's because of accelerate
+def test_a_loader_prepared_by_accelerate_is_refused_where_it_would_repeat_samples(server: FakeServer) -> None:
+    """By default accelerate splits batches, which it cannot do with a Batch. Otherwise it counts epochs from 0."""
+    accelerate = importlib.import_module("accelerate")  # slow to import, and without types
+    utils = importlib.import_module("accelerate.utils")
+    splits = accelerate.Accelerator(cpu=True).prepare(DataLoader(dataset(server), batch_size=None))
+    with pytest.raises(TypeError, match=r"v2v_client\.batch\.Batch"):
+        next(iter(splits))
 
+    def prepare(stream: V2VStreamDataset) -> Any:
+        keeps_batches = utils.DataLoaderConfiguration(dispatch_batches=False)
+        accelerator = accelerate.Accelerator(cpu=True, dataloader_config=keeps_batches)
+        return accelerator.prepare(DataLoader(stream, batch_size=None))
 
-LIGHTNING = """
-class FitLoop:
-    def __init__(self, epoch, batch, restarting):
-        self.trainer = Namespace(current_epoch=epoch)
-        self.restarting = restarting
-        self.epoch_loop = Namespace(batch_progress=Namespace(current=Namespace(ready=batch)))
-
-    def advance(self, loader):
-        iter(loader)
-        return next(iter(loader))
-"""
-
-
-@pytest.mark.parametrize("workers", [0, 1])
-def test_lightning_cannot_resume_a_plain_loader(server: FakeServer, workers: int) -> None:
-    """Lightning's loop calls iter() itself, and knows its own position."""
-    theirs: dict[str, Any] = {"__name__": "lightning.pytorch.loops.fit_loop", "Namespace": SimpleNamespace}
-    exec(LIGHTNING, theirs)
     stream = dataset(server)
-    loader = DataLoader(
-        stream, batch_size=None, num_workers=workers, multiprocessing_context="fork" if workers else None
-    )
-    state = theirs["FitLoop"](0, 0, False).advance(loader).resume_state
-    for epoch, batch, restarting in ((0, 1, True), (1, 0, False)):
-        with pytest.raises(UsageError, match=r"Give fit\(\) the dataset itself"):
-            theirs["FitLoop"](epoch, batch, restarting).advance(loader)
-    stream.load_state_dict(state)
-    assert theirs["FitLoop"](0, 1, True).advance(loader).indices == (4, 5, 6, 7)
-    stream.set_epoch(3)
-    assert theirs["FitLoop"](3, 0, False).advance(loader).epoch == 3
+    prepared = prepare(stream)
+    epochs = [batch.epoch for _ in range(2) for batch in prepared]
+    assert epochs == [0] * 5 + [1] * 5
+    state = stream.state_dict()
+    resumed = dataset(server)
+    resumed.load_state_dict(state)
+    with pytest.raises(UsageError, match=r"leave the loader out of prepare\(\)"):
+        next(iter(prepare(resumed)))
+
+
+def test_an_iteration_begins_with_its_first_batch(server: FakeServer) -> None:
+    """Lightning creates an iterator before its hooks run, and another to inspect the loader."""
+    stream = dataset(server)
+    batches = iter(stream)
+    stream.set_epoch(4)
+    iter(stream)
+    assert next(batches).epoch == 4
 
 
 @pytest.mark.slow
@@ -131,6 +126,40 @@ def test_epochs_of_lightning_that_end_early_are_other_samples_or_are_not_silent(
         stream = dataset(server)
         trainer.fit(Module(), loader(stream, batch_size=None, num_workers=workers))
     assert taken == [(epoch, *range(4 * n, 4 * n + 4)) for epoch in range(1 + sets_epoch) for n in range(8)]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore", "error::v2v_client.RepeatedSamplesWarning")
+@pytest.mark.parametrize("workers", [0, 2])
+def test_validations_of_lightning_give_the_same_samples_each_time(server: FakeServer, workers: int) -> None:
+    lightning = importlib.import_module("lightning")
+    taken: list[tuple[int | None, ...]] = []
+    validation = dataset(server)
+
+    class Module(lightning.LightningModule):  # type: ignore[misc, name-defined]
+        def __init__(self) -> None:
+            super().__init__()
+            self.network = torch.nn.Linear(1, 1)
+
+        def training_step(self, batch: torch.Tensor, _number: int) -> torch.Tensor:
+            return self.network(batch).mean()
+
+        def validation_step(self, batch: Batch, _number: int) -> None:
+            taken.append((batch.epoch, *batch.indices))
+
+        def on_validation_end(self) -> None:
+            validation.set_epoch(0)
+
+        def configure_optimizers(self) -> torch.optim.Optimizer:
+            return torch.optim.SGD(self.parameters(), 1e-3)
+
+    trainer = lightning.Trainer(
+        max_epochs=3, limit_val_batches=3, num_sanity_val_steps=2, accelerator="cpu", logger=False,
+        enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
+    )  # fmt: skip
+    trainer.fit(Module(), DataLoader([torch.ones(1)]), DataLoader(validation, batch_size=None, num_workers=workers))
+    batches = [(0, *range(4 * n, 4 * n + 4)) for n in range(3)]
+    assert taken == batches[:2] + 3 * batches
 
 
 def test_a_forked_child_cannot_continue_an_iterator(server: FakeServer) -> None:

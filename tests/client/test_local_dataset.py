@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 import torch
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, get_worker_info
 
 from tests.clips import panned_luma, write_clip
 from tests.leftovers import abandoned_memory, shared_memory
@@ -77,9 +77,17 @@ def test_a_local_dataset_streams_and_stops_its_server(clips: Path, servers: set[
 @pytest.mark.slow
 def test_a_loader_worker_that_ends_does_not_end_the_server(clips: Path, servers: set[psutil.Process]) -> None:
     """A loader worker is a fork, with copies of all objects that would stop the server."""
+
+    def close(_worker: int) -> None:
+        worker = get_worker_info()
+        assert worker is not None
+        worker.dataset.close()
+        worker.dataset._is_closed = False
+
     dataset = V2VStreamDataset.local(clips, 2, recipe=RECIPE, workers=1)
-    for _ in range(2):
-        assert sum(1 for _ in DataLoader(dataset, batch_size=None, num_workers=1)) == len(dataset)
+    for init in (None, close):
+        loader = DataLoader(dataset, batch_size=None, num_workers=1, worker_init_fn=init)
+        assert sum(1 for _ in loader) == len(dataset)
     del dataset
     gc.collect()
 
@@ -91,11 +99,11 @@ def test_a_key_for_other_servers_is_not_used(
     folder.init()
     folder.new("gpu", "consumer", tmp_path / "gpu.key")
     monkeypatch.setenv("V2V_KEYS", str(tmp_path / "gpu.key"))
-    dataset = V2VStreamDataset.local(clips, 2, recipe=RECIPE, workers=1)
-    servers.update(psutil.Process().children(recursive=True))
-    assert next(iter(dataset)).voxels is not None
-    del dataset
-    gc.collect()
+    with V2VStreamDataset.local(clips, 2, recipe=RECIPE, workers=1) as dataset:
+        started = psutil.Process().children(recursive=True)
+        servers.update(started)
+        assert next(iter(dataset)).voxels is not None
+    assert not any(process.is_running() for process in started if "v2v_server" in " ".join(command(process)))
 
 
 def test_an_error_is_the_servers_own_message(tmp_path: Path, servers: set[psutil.Process]) -> None:

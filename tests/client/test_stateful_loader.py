@@ -14,7 +14,7 @@ import pytest
 import torch.utils.data._utils.worker as torch_worker
 
 from tests.client.fake_server import FakeServer
-from v2v_client import UsageError, V2VStreamDataset
+from v2v_client import RepeatedSamplesWarning, UsageError, V2VStreamDataset
 
 WORKERS = 2
 FORK = multiprocessing.get_context("fork")
@@ -47,7 +47,7 @@ def _worker(dataset, worker, workers, seed, state, most, connection):
                 outcome.ended = dataset.state_dict()
                 break
             outcome.batches.append((batch.epoch, batch.indices, dataset.state_dict()))
-    except UsageError as error:
+    except (UsageError, RepeatedSamplesWarning) as error:
         outcome.error = str(error)
     connection.send(outcome)
     connection.close()
@@ -169,3 +169,12 @@ def test_a_state_loaded_twice_starts_the_iteration_at_its_position(server):
     for _ in range(2):
         assert in_order(run(stream, 100, states)) == [whole(0)[4], whole(0)[3]]
         assert in_order(run(stream, 200)) == whole(1)
+
+
+def test_short_passes_that_are_left_early_warn_at_the_third(server):
+    """Each worker makes no more batches than it prefetches, so two passes could be a look at the data."""
+    stream = dataset(server)
+    errors = [[outcome.error for outcome in run(stream, 100 * turn, most=(1, 1))] for turn in range(3)]
+    assert errors[:2] == [["", ""], ["", ""]]
+    assert "set_epoch" in errors[2][0]
+    assert errors[2][1] == ""

@@ -13,6 +13,7 @@ from v2v_protocol.sample import DEFAULT_ARRAYS, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
@@ -55,5 +56,5 @@ def open_leases(videos: Path, rows: str, spec: StreamSpec) -> Iterator[tuple[Pat
 
 def whole_sample(lease: Lease, root: Path) -> Sample:
     """Make the sample of a lease as a server worker does: decode, view, simulate."""
-    (decoded,) = decode_for(lease, lease.indices, root)
+    (decoded,) = decode_for(lease, lease.indices, Folder(root))
     return make_sample(lease, decoded)

@@ -108,7 +108,7 @@ class StreamOracle:
             seed=self._asked.seed,
             arrays=("voxels", "frames"),
         )
-        made = make_sample(lease, decode_for(lease, lease.indices, self._catalogue.folder)[0])
+        made = make_sample(lease, decode_for(lease, lease.indices, self._catalogue.source)[0])
         return sighting(made.arrays, made.provenance)
 
 

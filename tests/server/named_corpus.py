@@ -13,6 +13,8 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.sources.folder import Folder
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.corpus.videos import CorpusFacts, VideoEntry
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
@@ -34,7 +36,7 @@ class NamedCorpus:
     videos: tuple[VideoEntry, ...]
     rows: Rows = field(default_factory=Rows)
     refusals: tuple[Refusal, ...] = ()
-    root: Path = Path("/corpus")
+    source: VideoSource = field(default_factory=lambda: Folder(Path("/corpus")))
     digest: str = "c" * 32
     unreadable: frozenset[str] = frozenset()
     held: set[str] = field(default_factory=set)

@@ -1,4 +1,4 @@
-"""A server without sockets and processes: peers talk over plain queues, and a toy supervisor keeps the workers."""
+"""A server without sockets and processes: peers talk over plain queues, and a toy pool keeps the workers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from v2v_server.broker.actions import ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.leases import Stall
 from v2v_server.broker.transport import Arrival, FromConsumer, FromWorker
-from v2v_server.supervise.protocol import Death
+from v2v_server.supervise.pool import Death
 
 
 @dataclass
@@ -65,7 +65,7 @@ class Queues:
         return taken
 
 
-class ToySupervisor:
+class ToyPool:
     """Keeps as many workers as it was told to, each of which is whatever ``begin`` makes of a name and an address.
 
     Args:

@@ -19,7 +19,7 @@ from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
 from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from tests.server.peers import DEADLINE, answer_to
-from tests.server.queues import Queues, ToySupervisor
+from tests.server.queues import Queues, ToyPool
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import VideoError
 from v2v_protocol.messages import (
@@ -173,7 +173,7 @@ class World:
             quarantine=quarantine,
             wall_clock=lambda: "2024-02-29T12:00:00+00:00",
         )
-        self.supervisor = ToySupervisor(lambda name, address: self._begin(name))
+        self.supervisor = ToyPool(lambda name, address: self._begin(name))
         self.supervisor.workers = list(self.workers)  # they find the new server at the same address
         self.server = Server(
             ServeConfig(videos="videos", workers=WORKERS),

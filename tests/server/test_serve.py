@@ -13,7 +13,7 @@ from typing import Any, cast
 import pytest
 
 from tests.server.peers import peers
-from tests.server.queues import Queues, ToySupervisor
+from tests.server.queues import Queues, ToyPool
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import VideoChanged
 from v2v_protocol.messages import Pong, Stop, WorkerHello
@@ -28,6 +28,7 @@ from v2v_server.broker.leases import Request
 from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, read_quarantine
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.serve import Server, question_workers
 from v2v_server.system import clock as clock_module
 
@@ -85,7 +86,7 @@ class Scripted:
 def served(
     dispatcher: Scripted,
     folder: Path,
-    supervisor: ToySupervisor | None = None,
+    supervisor: ToyPool | None = None,
     transport: Queues | None = None,
     clock: Callable[[], float] | None = None,
     check: Callable[[str, str], None] | None = None,
@@ -93,13 +94,15 @@ def served(
 ) -> Server:
     """A server that has made one turn."""
     stale: list[str] = []
-    catalogue = SimpleNamespace(check=check, stale=stale, mark_stale=stale.append, root=folder, videos=(), refusals=())
+    catalogue = SimpleNamespace(
+        check=check, stale=stale, mark_stale=stale.append, source=Folder(folder), videos=(), refusals=()
+    )
     server = Server(
         ServeConfig.load(None, {"videos": "videos", "workers": 0} | settings),
         cast(Catalogue, catalogue),
         cast(Dispatcher, dispatcher),
         transport or Queues(),
-        supervisor or ToySupervisor(lambda name, address: None),
+        supervisor or ToyPool(lambda name, address: None),
         Quarantine(),
         folder / "quarantine.jsonl",
         clock,
@@ -173,7 +176,7 @@ def test_what_holds_everybody_up_is_said_once(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_a_worker_given_up_is_reported_with_what_its_loss_means(tmp_path: Path) -> None:
-    supervisor = ToySupervisor(lambda name, address: None)
+    supervisor = ToyPool(lambda name, address: None)
     supervisor.scale(1)
     supervisor.watch(0.0, 0)
     dispatcher = Scripted([GiveUp(b"toy1", "slept"), GiveUp(b"elsewhere", "slept")], workers=[b"toy1", b"elsewhere"])
@@ -185,7 +188,7 @@ def test_a_worker_given_up_is_reported_with_what_its_loss_means(tmp_path: Path) 
 
 
 def test_a_death_is_reported_with_its_cause(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    supervisor = ToySupervisor(lambda name, address: None)
+    supervisor = ToyPool(lambda name, address: None)
     supervisor.scale(2)
     supervisor.watch(0.0, 0)
     supervisor.kill(b"toy1", Cause.CRASHED)
@@ -199,7 +202,7 @@ def test_a_death_is_reported_with_its_cause(tmp_path: Path, capsys: pytest.Captu
 @pytest.mark.parametrize("watched", [True, False])
 def test_who_cannot_be_reached_is_reported_unless_its_end_will_be(watched: bool, tmp_path: Path) -> None:
     """How a process of ours ended says whether the sample is to blame; that it is not there any more does not."""
-    supervisor = ToySupervisor(lambda name, address: None)
+    supervisor = ToyPool(lambda name, address: None)
     supervisor.scale(int(watched))
     supervisor.watch(0.0, 0)
     dispatcher = Scripted([ToWorker(b"toy1", encode(Stop()))], workers=[b"toy1"])
@@ -237,7 +240,7 @@ def test_more_workers_than_can_be_of_use_are_questioned() -> None:
 def test_more_workers_come_while_consumers_wait_and_leave_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    dispatcher, supervisor = Scripted(), ToySupervisor(lambda name, address: None)
+    dispatcher, supervisor = Scripted(), ToyPool(lambda name, address: None)
     now = [0.0]
     monkeypatch.setattr(serve_module, "Clock", lambda: lambda: now[0])
     dispatcher.workers, dispatcher.waiting_share, dispatcher.idle_share = 2, 1.0, 0.0  # type: ignore[attr-defined]
@@ -294,7 +297,7 @@ def test_with_json_every_line_is_an_object_and_one_on_a_sample_has_its_identity(
 def test_the_end_is_summed_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     served(Scripted(), tmp_path).close()
     said = capsys.readouterr().err
-    assert "in all 0 samples" in said
+    assert "in total 0 samples" in said
     assert "\nfaults 0\n" in said
 
 

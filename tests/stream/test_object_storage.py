@@ -170,7 +170,7 @@ def test_a_store_that_is_away_condemns_no_video(clips: Path, bucket: Bucket, tmp
         forget_copies(tmp_path)
         bucket.pause()
         epoch = thread.submit(digests, server.address, 0)
-        until(lambda: "which is not known to be gone or changed: cannot be fetched after 3 tries" in all_lines(server))
+        until(lambda: "which is not known to be gone or changed: the store gives no answer" in all_lines(server))
         bucket.go_on()
         assert epoch.result(120) == reference
         assert "passed over" not in all_lines(server)

@@ -6,15 +6,9 @@ Exit status: 0 everything was converted, 2 wrong usage or input (recordings conv
 from __future__ import annotations
 
 import argparse
-import contextlib
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TextIO
-
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from trainer.convert import items
 from trainer.convert.conversion import FORMS, Converted, convert, default_name
@@ -22,6 +16,7 @@ from trainer.convert.text_events import NS_PER_UNIT
 from trainer.evaluation import layout
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError
+from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
 
 
@@ -78,7 +73,7 @@ def _run(arguments: argparse.Namespace) -> int:
             )
     records = []
     for source, destination in zip(sources, destinations, strict=True):
-        with _progress(source.name) as progress:
+        with Progress(source.name, "%") as progress:
             done = convert(
                 source,
                 destination,
@@ -128,39 +123,6 @@ def _record(done: Converted) -> dict[str, str | int | float]:
         "width_px": written.size.width,
         "height_px": written.size.height,
     }
-
-
-@contextlib.contextmanager
-def _progress(name: str) -> Iterator[items.Progress]:
-    columns = (
-        TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(),
-        TextColumn("left"), TimeRemainingColumn(),
-    )  # fmt: skip
-    if not sys.stderr.isatty():
-        yield log_progress(name, sys.stderr)
-        return
-    with Progress(*columns, console=Console(file=sys.stderr), transient=True) as bar:
-        task = bar.add_task(name, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-def log_progress(
-    name: str, out: TextIO, *, clock: Callable[[], float] = time.monotonic, every_seconds: float = 30.0
-) -> items.Progress:
-    """Return a progress callback for logs, which prints the share done and the time left every ``every_seconds``.
-
-    It prints no lines if the total is unknown.
-    """
-    began = printed = clock()
-
-    def progress(done: int, total: int | None) -> None:
-        nonlocal printed
-        if total is not None and 0 < done < total and (now := clock()) - printed >= every_seconds:
-            printed = now
-            left = (now - began) * (total - done) / done
-            print(f"{name}: {done / total:.0%} converted, about {left:.0f} s left", file=out, flush=True)
-
-    return progress
 
 
 if __name__ == "__main__":

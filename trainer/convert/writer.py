@@ -11,7 +11,7 @@ The file has a temporary name until it is complete.
 
 from __future__ import annotations
 
-import os
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -24,6 +24,7 @@ import numpy.typing as npt
 from trainer.convert.items import EventChunk, FlowField, Item, Picture, SensorSize
 from trainer.evaluation import layout
 from v2v_protocol.errors import UsageError
+from v2v_protocol.write_aside import write_aside_and_rename
 
 FLUSH_EVENTS = 1 << 19
 REORDER_EVENTS = 1 << 17
@@ -70,8 +71,7 @@ class RecordingWriter:
     """
 
     def __init__(self, path: Path, *, source: str, size: SensorSize | None = None, published_shift: int = 0) -> None:
-        self._path = path
-        self._partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        self._files = contextlib.ExitStack()
         self._source, self._size, self._published_shift = source, size, published_shift
         self._pending: list[EventChunk] = []
         self._pending_events = 0
@@ -83,7 +83,8 @@ class RecordingWriter:
         self._events = self._reordered = self._flow_fields = 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = h5py.File(self._partial, "w")
+            partial = self._files.enter_context(write_aside_and_rename(path, durable=True))
+            self._file = self._files.enter_context(h5py.File(partial, "w"))
         except OSError as error:
             raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
         for name, dtype in COLUMNS.items():
@@ -100,18 +101,11 @@ class RecordingWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            if kind is None:
-                self.written = self._finish()
-                self._file.close()
-                with self._partial.open("rb") as file:
-                    os.fsync(file.fileno())
-                self._partial.replace(self._path)
-        finally:
-            try:
-                self._file.close()
-            finally:
-                self._partial.unlink(missing_ok=True)
+        if kind is not None:
+            self._files.__exit__(kind, error, trace)
+            return
+        with self._files:
+            self.written = self._finish()
 
     def add(self, item: Item) -> None:
         """Add the next item of the recording.

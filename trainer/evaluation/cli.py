@@ -6,25 +6,14 @@ Exit status: 0 all existing recordings were evaluated, 2 wrong usage or input, 1
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
 
 import torch
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.text import Text
 
 from trainer.convert.items import SensorSize
 from trainer.evaluation.config import EvaluationConfig, folder_config, read_config, shipped
@@ -39,6 +28,7 @@ from trainer.models import NETWORKS
 from trainer.weights import SHIPPED, load_network
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError
+from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
 
 LEAST_WIDTH = 110
@@ -143,9 +133,9 @@ def _run(arguments: argparse.Namespace) -> int:
         check_data_set(run, data, data_set)
     scores: dict[str, list[SequenceScore]] = {}
     try:
-        with _progress() as advance:
+        with Progress("evaluating", "windows") as progress:
             for data_set in config.data_sets:
-                for score in evaluate_data_set(run, data, data_set, advance):
+                for score in evaluate_data_set(run, data, data_set, _advance(progress)):
                     scores.setdefault(data_set.name, []).append(score)
     except KeyboardInterrupt:
         if scores:
@@ -184,10 +174,10 @@ def _run_flow(arguments: argparse.Namespace, config: EvaluationConfig, run: Run,
     console = Console() if Console().is_terminal else Console(width=LEAST_WIDTH)
     for data_set in config.data_sets:
         found = find_recordings(data, data_set)
-        with _progress() as advance:
+        with Progress("evaluating", "windows") as progress:
             scores = {
                 sequence: evaluate_flow(
-                    flow_run, path, data_set.time_ranges[sequence] if run.use_time_ranges else None, advance
+                    flow_run, path, data_set.time_ranges[sequence] if run.use_time_ranges else None, _advance(progress)
                 )
                 for sequence, path in found.items()
             }
@@ -279,22 +269,8 @@ def _print(config: EvaluationConfig, scores: dict[str, list[SequenceScore]]) -> 
                 )
 
 
-class _WindowRate(ProgressColumn):
-    def render(self, task: Task) -> Text:
-        """Return the rate in windows per second."""
-        return Text("" if task.speed is None else f"{task.speed:.1f}/s")
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[Advance]:
-    columns = (
-        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), _WindowRate(),
-        TextColumn("left"), TimeRemainingColumn(),
-    )  # fmt: skip
-    console = Console(file=sys.stderr)
-    with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda sequence, done, total: bar.update(task, description=sequence, completed=done, total=total)
+def _advance(progress: Progress) -> Advance:
+    return lambda sequence, done, total: progress(done, total, what=sequence)
 
 
 if __name__ == "__main__":

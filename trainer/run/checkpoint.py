@@ -10,14 +10,13 @@ module also checks that a checkpoint belongs to a run, and that a run may write 
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,6 +24,7 @@ from torch import Tensor
 from trainer.config import TrainConfig, differences
 from trainer.unpickle import read_torch_file
 from v2v_protocol.errors import UsageError
+from v2v_protocol.write_aside import write_aside_and_rename
 
 FORMAT = 2
 LAST = "last.pt"
@@ -100,7 +100,7 @@ def save_atomically(path: Path, content: Mapping[str, Any]) -> None:
         OSError: it cannot be written; an earlier file is intact.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
+    with write_aside_and_rename(path, durable=True) as partial, partial.open("wb") as file:
         try:
             torch.save(content, file)
         except RuntimeError as error:
@@ -134,31 +134,6 @@ def prune_epochs(out: Path, keep: int) -> None:
     """Remove the oldest checkpoints of epochs in the folder of a run, except the last ``keep``."""
     for path in sorted(out.glob("epoch-*.pt"))[:-keep]:
         path.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Yield a file that replaces ``path`` at the end of the block, when all of it is on the disk.
-
-    Raises:
-        OSError: it cannot be written. ``path`` is then unchanged, as after an error in the block.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with temporary.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    # The rename is an entry of the folder: without this it can be lost although the file is not.
-    with contextlib.suppress(PermissionError):  # Windows opens no folders
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
 
 
 def require_same_run(checkpoint: Checkpoint, config: TrainConfig) -> list[str]:

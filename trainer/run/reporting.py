@@ -13,18 +13,19 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from torch import Tensor
 
 from trainer.config import TrainConfig
 from trainer.config_file import show_config
 from trainer.pictures import Image, Video, add_header, contact_sheet
 from trainer.run.board import Board
-from trainer.run.checkpoint import replacing, unwritable
+from trainer.run.checkpoint import unwritable
 from trainer.run.distributed import Ranks
 from v2v_client import V2VStreamDataset
 from v2v_pictures.files import png_bytes
 from v2v_protocol.errors import UsageError
+from v2v_protocol.progress import Progress
+from v2v_protocol.write_aside import write_aside_and_rename
 
 METRICS = "metrics.jsonl"
 CONFIGURATION = "config.yaml"
@@ -100,15 +101,10 @@ class Reporter:
         self._held_out: float | None = None
         self._seconds = 0.0
         self._began = time.perf_counter()
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=None),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[note]}"),
-            console=self._console,
-            disable=not speaks or not self._console.is_terminal,
-        )
-        self._task = self._bar.add_task("training", total=None, note="", completed=step)
+        # Without a terminal, each reading is a line.
+        has_bar = speaks and self._console.is_terminal
+        self._progress = Progress("training", "steps", console=self._console, shows_rate=False) if has_bar else None
+        self._last_note = ""
         if speaks:
             with self._writing(METRICS):
                 out.mkdir(parents=True, exist_ok=True)
@@ -117,13 +113,13 @@ class Reporter:
                 self._board = Board(out / "tensorboard", step + 1 if step else 0)
 
     def __enter__(self) -> Reporter:
-        self._bar.start()
         return self
 
     def __exit__(
         self, _kind: type[BaseException] | None, error: BaseException | None, _trace: TracebackType | None
     ) -> None:
-        self._bar.stop()
+        if self._progress is not None:
+            self._progress.close()
         if self._board is None:
             return
         try:
@@ -145,7 +141,8 @@ class Reporter:
         self._step = step
         if not self._planned:
             self._planned, self._seconds, self._total = True, config.run.seconds, _planned_steps(dataset, config)
-        self._bar.update(self._task, completed=step, total=self._total)
+        if self._progress is not None:
+            self._progress(step, self._total, self._last_note)
 
     def metrics(self, step: int, epoch: int, learning_rate: float, values: Mapping[str, float]) -> None:
         """Record a reading of the meter."""
@@ -153,8 +150,8 @@ class Reporter:
             return
         self._write({"step": step, "epoch": epoch, "learning_rate": learning_rate, **values})
         note = self._note(values)
-        self._bar.update(self._task, note=note)
-        if self._bar.disable:
+        self._last_note = note
+        if self._progress is None:
             self._console.print(
                 f"step {step}{f'/{self._total}' if self._total else ''}  {note}", markup=False, soft_wrap=True
             )
@@ -279,8 +276,8 @@ def _drop_after(path: Path, step: int) -> None:
     if path.exists():
         records = read_metrics(path) if step else []
         kept = [json.dumps(record) + "\n" for record in records if record["step"] <= step]
-        with replacing(path) as file:
-            file.write("".join(kept).encode())
+        with write_aside_and_rename(path, durable=True) as partial:
+            partial.write_text("".join(kept), encoding="utf-8")
 
 
 def _clock(seconds: float) -> str:

@@ -1,8 +1,15 @@
-"""Where one copy of a dataset stands, and where its next iteration begins.
+"""Keep where a dataset stands. One mechanism serves every loader and training loop:
 
-What all copies agree on is in :mod:`v2v_client.position.shared`. Here is what one of them knows beyond it: which of its
-iterations is the newest, the state after the last batch that came out of it, and how far a loader worker had come that
-a stateful loader restores.
+1. The next pass (an iteration of the dataset) begins at the *start*: an epoch, and a position in it.
+2. ``set_epoch`` and ``load_state_dict`` set the start.
+3. A pass that has delivered all its batches sets it to the next epoch, unless it was set since the pass began.
+4. A pass that is left early does not set it, so the next pass repeats the same samples.
+5. W loader workers share a pass: worker w delivers batches w, w + W, w + 2 W ... of it. The last one finishes it.
+6. All copies of a dataset (one in each loader worker) share one record of the start; each rank has its own.
+7. Each batch carries the rank's state after it (``Batch.resume_state``), which is a start for any loader.
+8. A loader that saves each worker (torchdata's) gets the start of the pass and the batches that the worker delivered.
+
+The record is :mod:`v2v_client.position.record`, and :mod:`v2v_client.position.shared` shares it between processes.
 """
 
 from __future__ import annotations
@@ -14,208 +21,219 @@ from typing import Any
 from torch.utils.data import get_worker_info
 
 from v2v_client.position.plan import Consumer, EpochPlan
-from v2v_client.position.shared import Agreed, Shared
-from v2v_client.position.state import ResumeState, StreamIdentity
+from v2v_client.position.record import Record, Start
+from v2v_client.position.shared import Shared
+from v2v_client.position.state import LoaderShare, ResumeState, StreamIdentity
 from v2v_protocol.errors import UsageError
 
-_NO_BATCH_YET = 0
-_USED = 2
-"""Batches of an iteration from which on it counts as training, not as a look at the data."""
-_USED_BY_LOADER_WORKER = 4
-"""The same for a loader worker, which prefetches two batches by default."""
+_REPEATED = (
+    "the last pass was left before the end of epoch {epoch}, and this pass delivers the same samples again. To resume "
+    "instead, call dataset.load_state_dict(batch.resume_state), with the last batch trained on, before each pass; for "
+    "other samples, call dataset.set_epoch(n) with another n for each pass. To repeat them on purpose, call "
+    "dataset.set_epoch({epoch}) before each pass"
+)
+_OF_A_LOADER_WORKER = (
+    ". Loader workers count the batches that they have prefetched: ignore this if the loop took only one batch to "
+    "inspect it"
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Iteration:
-    """One iteration of a dataset, as it began.
+    """Hold one process's part of a pass, as it began.
 
     Attributes:
-        number: which of this copy's.
-        epoch: that it delivers.
-        state: where in it; None at its beginning.
-        beginnings: how often an epoch had been set or begun until then.
-        shared: its number among those of loader workers; 0 where none of them iterates.
-        worker, workers: which of how many loader workers; 0 of 1 where none iterates.
-        done: batches of the loader worker's share that were delivered before.
-        repeats: it is the first that repeats an iteration which was left early.
+        number: of the pass.
+        state: where the pass begins.
+        worker, workers: which loader worker of how many; 0 of 1 without loader workers.
+        in_loader: whether this process is a loader worker.
+        done: batches of this worker's share that were delivered before.
+        counts: batches of this process to count; more cannot change whether the pass is more than a look.
+        repeats: whether to warn that this pass repeats samples.
     """
 
     number: int
-    epoch: int
-    state: ResumeState | None
-    beginnings: int = 0
-    shared: int = 0
+    state: ResumeState
     worker: int = 0
     workers: int = 1
-    done: int = _NO_BATCH_YET
+    in_loader: bool = False
+    done: int = 0
+    counts: int = 2
     repeats: bool = False
 
+    @property
+    def warning(self) -> str:
+        """Return the text of the warning that samples are repeated."""
+        return _REPEATED.format(epoch=self.state.epoch) + (_OF_A_LOADER_WORKER if self.in_loader else "")
+
     def batches(self, plan: EpochPlan) -> range:
-        """Numbers of the batches that are still to be delivered here."""
+        """Return the numbers of the batches that this process still has to deliver."""
         return plan.batches_of_worker(self.worker, self.workers)[self.done :]
 
-    def after(
-        self, consumer: Consumer, stream: StreamIdentity | None, done: int, quarantine: int | None = None
-    ) -> ResumeState:
-        """The state of its loader worker, which has delivered ``done`` batches of its share."""
-        return consumer.in_share(
-            stream,
-            self.epoch,
-            self.state,
-            worker=self.worker,
-            workers=self.workers,
-            done=done,
-            quarantine=quarantine,
-        )
+    def after(self, consumer: Consumer, delivered: int, quarantine: int | None) -> ResumeState:
+        """Return the state of this loader worker after ``delivered`` batches of this iteration."""
+        share = LoaderShare(self.worker, self.workers, consumer.batch_size, self.done + delivered)
+        return dataclasses.replace(self.state, share=share, quarantine=quarantine)
 
 
 class Position:
-    """Where this copy stands. A shallow copy shares the record, and moves on by itself."""
+    """Hold where this copy of a dataset stands. A shallow copy shares the record, and iterates on its own.
 
-    def __init__(self, epoch: int) -> None:
-        self._shared = Shared(epoch)
+    Args:
+        seed: of the stream.
+        epoch: the first epoch.
+    """
+
+    def __init__(self, seed: int, epoch: int) -> None:
+        self._shared = Shared(Record(Start(ResumeState(None, seed, epoch, 0, 0, 1))))
         self._iterations = 0
-        self._here: ResumeState | None = None  # after the last batch of this process; None where the record says
-        self._loaded: ResumeState | None = None  # of this loader worker, from a stateful loader
-        self._to_start_from: ResumeState | None = None  # the same, until it iterates
-        self._empty_rest: ResumeState | None = None  # what was loaded, where the next epoch was taken up instead
+        self._newest = 0  # number of the newest pass that this copy began
+        self._delivered = 0  # batches of that pass that left this process
+        self._here: ResumeState | None = None  # after the last batch of this process; None: the start
+        self._loaded: ResumeState | None = None  # what a stateful loader gave this loader worker for its next pass
 
-    def agreed(self) -> Agreed:
-        """What the copies agree on now."""
-        return self._shared.agreed()
+    @property
+    def stream(self) -> StreamIdentity | None:
+        """Return what the samples are made of; None before a server or a state told."""
+        return self._shared.read().stream
+
+    def start(self, consumer: Consumer) -> ResumeState:
+        """Return where the next pass begins."""
+        return _next_start(self._shared.read(), consumer)
 
     def set_epoch(self, epoch: int) -> None:
-        """The next iteration delivers ``epoch``; from its beginning, unless a state of that epoch was loaded."""
-        with self._shared.change() as agreed:
-            state, rest = agreed.state if agreed.epoch == epoch else None, self._empty_rest
-            if rest is not None and rest.epoch == epoch and self._is_at_the_beginning_of(epoch + 1, agreed):
-                # Whoever loads a state and then names its epoch has had these samples: all of them, but for a rest.
-                state = rest
-            agreed.begin(epoch, state)
-            agreed.stale = False
-        self._here = None
-
-    def _is_at_the_beginning_of(self, epoch: int, agreed: Agreed) -> bool:
-        """Whether a state was loaded that begins there, and no batch has come out since."""
-        return not agreed.stale and all(
-            state is not None and (state.epoch, state.origin, state.position) == (epoch, 0, 0)
-            for state in (self._here, agreed.state)
-        )
-
-    def state(self, consumer: Consumer) -> ResumeState:
-        """After the last batch that this process took.
+        """Set the epoch of the next pass; see :meth:`v2v_client.position.record.Record.set_epoch`.
 
         Raises:
-            UsageError: loader workers took the batches, so that this process does not know.
+            UsageError: a state of a later epoch was loaded, and nothing has been delivered from it.
+        """
+        with self._shared.change() as record:
+            record.set_epoch(epoch)
+        self._here = None
+
+    def state(self, consumer: Consumer) -> ResumeState:
+        """Return the state after the last batch that this process took.
+
+        Raises:
+            UsageError: loader workers took the batches, so this process does not know.
         """
         if self._here is not None and get_worker_info() is not None:
             return self._here
-        agreed = self.agreed()
-        if agreed.stale:
+        record = self._shared.read()
+        if record.stale:
             raise UsageError(
                 "state_dict: the batches went through DataLoader workers, and this process does not know which of them "
                 "were used; save Batch.resume_state of the last batch you trained on instead"
             )
-        return self._here or agreed.state or consumer.beginning(agreed.stream, agreed.epoch)
+        return self._here or _next_start(record, consumer)
 
     def load(self, saved: ResumeState, consumer: Consumer) -> None:
-        """The next iteration begins where ``saved`` was taken.
+        """Start the next pass where ``saved`` was taken.
 
         Raises:
-            UsageError: it is the state of a loader worker somewhere else.
+            UsageError: it is the state of another loader worker.
         """
-        loader = get_worker_info()
-        consumer.require_share(saved, loader)
-        state = consumer.taken_up(saved)
-        self._here = state
-        if loader is not None:
-            self._loaded = self._to_start_from = state
+        worker = get_worker_info()
+        _require_share(saved, worker, consumer)
+        state = consumer.adopt(saved)
+        if worker is not None:
+            self._here = self._loaded = state if state.share else _skip_rest(state, consumer)
             return
-        self._empty_rest = consumer.rest(saved) if state.epoch > saved.epoch else None
-        with self._shared.change() as agreed:
-            agreed.begin(state.epoch, dataclasses.replace(state, share=None))
-            agreed.stale = False
+        with self._shared.change() as record:
+            record.load(state)
+            record.stale = False
+        self._here = None
 
     def begin(self, consumer: Consumer) -> Iteration:
-        """A new iteration; older ones say nothing about where we are from now on."""
+        """Begin a pass, or this loader worker's part of one. Older iterations no longer affect the position."""
         self._iterations += 1
         worker = get_worker_info()
-        if worker is None:
-            with self._shared.change() as agreed:
-                agreed.stale = False
-                repeats = agreed.repeats()
-            self._here = agreed.state or consumer.beginning(agreed.stream, agreed.epoch)
-            return Iteration(self._iterations, agreed.epoch, agreed.state, agreed.beginnings, repeats=repeats)
-        with self._shared.change() as agreed:
-            shared = agreed.start(self._name(worker), worker.id, self._to_start_from)
-        self._to_start_from = None
-        begun = Iteration(
-            self._iterations,
-            shared.epoch,
-            shared.state,
-            shared.beginnings,
-            shared.number,
-            worker.id,
-            worker.num_workers,
-            self._already_done(shared.epoch, shared.state),
-            shared.repeats,
-        )
-        known = None if shared.state is None else shared.state.stream
-        if known is not None and not begun.batches(consumer.plan(known, shared.state)) and begun.done > 0:
-            # A stateful loader may discard this iterator unused; the epoch is over all the same.
-            self.finish(begun, consumer)
-        else:
-            self._here = begun.after(consumer, agreed.stream, begun.done)
-        return begun
+        with self._shared.change() as record:
+            start = _next_start(record, consumer)
+            if start.place != record.start.state.place:
+                record.start = Start(start, loaded=record.start.loaded)
+            if worker is None:
+                name, number, workers = None, 0, 1
+            else:
+                # PyTorch seeds the workers of a loader alike, and they iterate equally often.
+                name, number, workers = f"{worker.seed - worker.id}:{self._iterations}", worker.id, worker.num_workers
+            begun, repeats = record.begin(name, number, workers, self._loaded)
+            state = consumer.adopt(dataclasses.replace(begun.start.state, stream=record.stream))
+        self._loaded, self._newest, self._delivered = None, begun.number, 0
+        done = begun.start.shares.get((number, workers), 0)
+        iteration = Iteration(begun.number, state, number, workers, worker is not None, done, begun.looked + 1, repeats)
+        self._here = state if worker is None else iteration.after(consumer, 0, state.quarantine)
+        if done and state.stream is not None and not iteration.batches(consumer.plan(state.stream, state)):
+            # A stateful loader may drop this iterator unused, but the epoch is over.
+            self.finish(iteration)
+        return iteration
 
-    def _name(self, worker: Any) -> str:
-        """A name that the loader workers of one iteration share: PyTorch seeds them alike, and they iterate alike."""
-        return f"{worker.seed - worker.id}:{self._iterations}"
-
-    def _already_done(self, epoch: int, state: ResumeState | None) -> int:
-        """Batches of this loader worker's share that a loaded state says it delivered."""
-        loaded = self._loaded
-        if loaded is None or loaded.share is None or state is None:
-            return _NO_BATCH_YET
-        here, there = (loaded.epoch, loaded.origin, loaded.position), (epoch, state.origin, state.position)
-        return loaded.share.batches if here == there else _NO_BATCH_YET
-
-    def pin(self, stream: StreamIdentity, address: str) -> None:
-        """A server offered ``stream`` where none was known.
+    def pin(self, begun: Iteration, stream: StreamIdentity, address: str) -> Iteration:
+        """Record the stream that a server offered to an iteration, and return the iteration with it.
 
         Raises:
-            StateMismatch: a loader worker beside us was offered another one first.
+            StateMismatch: a loader worker was offered another one before.
         """
-        with self._shared.change() as agreed:
-            first = agreed.stream = agreed.stream or stream
+        with self._shared.change() as record:
+            first = record.stream = record.stream or stream
         first.require_same(stream, ours="another loader worker", theirs=address)
+        return dataclasses.replace(begun, state=dataclasses.replace(begun.state, stream=stream))
 
-    def reached(self, begun: Iteration, state: ResumeState, *, count: int, last: bool) -> None:
-        """A batch comes out of an iteration now.
+    def reached(self, begun: Iteration, consumer: Consumer, state: ResumeState, *, last: bool) -> None:
+        """Record that a batch leaves an iteration now.
 
         Args:
-            state: the one after it.
-            count: batches that came out of this iteration so far, this one included.
-            last: whether it is the last one: who counts batches may never ask whether there is another.
+            state: the rank's state after it.
+            last: whether it is the last one. A loop that counts batches may never ask for another.
         """
-        if begun.number == self._iterations:  # an older iterator that is still read says nothing about where we are
-            self._here = state
-            if count == (_USED_BY_LOADER_WORKER if begun.shared else _USED):
-                with self._shared.change() as agreed:
-                    agreed.used = begun.beginnings
-            if last:
-                self._finish(begun)
-
-    def finish(self, begun: Iteration, consumer: Consumer) -> None:
-        """An iteration has delivered all its batches, and was asked for one more."""
-        if begun.number != self._iterations:
+        if begun.number != self._newest:  # an older iterator that is still read
             return
-        self._finish(begun)
-        self._here = consumer.beginning(self.agreed().stream, begun.epoch + 1) if begun.shared else None
+        self._delivered += 1
+        self._here = begun.after(consumer, self._delivered, state.quarantine) if begun.in_loader else state
+        if self._delivered <= begun.counts or last:
+            with self._shared.change() as record:
+                record.deliver(begun.number)
+                if last:
+                    record.finish(begun.number, begun.worker)
 
-    def _finish(self, begun: Iteration) -> None:
-        with self._shared.change() as agreed:
-            if begun.shared:
-                agreed.finish(begun.shared, begun.worker, begun.workers)
-            elif agreed.beginnings == begun.beginnings:  # otherwise an epoch was set since: that is the next
-                agreed.begin(begun.epoch + 1, None)
+    def finish(self, begun: Iteration) -> None:
+        """Record that an iteration has delivered all its batches, and was asked for one more."""
+        if begun.number != self._newest:
+            return
+        with self._shared.change() as record:
+            record.finish(begun.number, begun.worker)
+        self._here = begun.state.at_epoch(begun.state.epoch + 1) if begun.in_loader else None
+
+
+def _next_start(record: Record, consumer: Consumer) -> ResumeState:
+    """Return where the next pass begins, in this world size."""
+    state = consumer.adopt(dataclasses.replace(record.start.state, stream=record.stream))
+    # set_epoch may name a loaded epoch of which less than a global batch is left: the next pass then has no batches.
+    return state if record.start.named else _skip_rest(state, consumer)
+
+
+def _skip_rest(state: ResumeState, consumer: Consumer) -> ResumeState:
+    """Return the next epoch if less than a global batch is left of a resumed one; otherwise ``state``."""
+    if state.is_beginning or consumer.has_batches(state):
+        return state
+    return state.at_epoch(state.epoch + 1)
+
+
+def _require_share(state: ResumeState, loader: Any, consumer: Consumer) -> None:
+    """Check that a loader worker's state is loaded by the same worker of an equal loader.
+
+    Args:
+        loader: PyTorch's description of the loader worker that this process is; None if it is none.
+
+    Raises:
+        UsageError: another process loads it.
+    """
+    share = state.share
+    here = None if loader is None else (loader.id, loader.num_workers, consumer.batch_size, consumer.world_size)
+    if share is None or here == (share.worker, share.workers, share.batch_size, state.world_size):
+        return
+    raise UsageError(
+        f"this is the state of loader worker {share.worker} of {share.workers} (batch_size {share.batch_size}, world "
+        f"size {state.world_size}); only the same worker of an equal loader can continue from it. Batch.resume_state "
+        "is valid for any number of loader workers"
+    )

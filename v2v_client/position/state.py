@@ -1,7 +1,7 @@
-"""What a consumer saves: which stream, and how far it came. Pure.
+"""Define what a consumer saves: which stream, and where it stands in it. Pure.
 
-A state is a plain dict, so that a trainer's checkpoint can hold it. It pins everything that makes a sample's bytes;
-a server that would give others is refused before the first batch.
+A state is a plain dict, so a trainer's checkpoint can hold it. It pins everything that determines a sample's bytes; a
+server of another stream is refused before the first batch.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ STATE_VERSION = 1
 
 @dataclass(frozen=True, slots=True)
 class StreamIdentity:
-    """The server's half of every sample's identity.
+    """Hold the server's half of every sample's identity.
 
     Attributes:
         spec: the resolved spec as plain values.
@@ -38,14 +38,15 @@ class StreamIdentity:
 
     @classmethod
     def of(cls, welcome: Welcome) -> StreamIdentity:
-        """
+        """Return the stream that a server offers.
+
         Raises:
-            ProtocolError: the spec is none, or the digest is not its own.
+            ProtocolError: the spec is not valid, or the digest is not that of the spec.
         """
         try:
             digest = StreamSpec.from_dict(welcome.spec).digest
         except (UsageError, TypeError, ValueError) as error:
-            raise ProtocolError(f"the server's resolved spec is not one: {error}") from error
+            raise ProtocolError(f"the server's resolved spec is not valid: {error}") from error
         if digest != welcome.spec_digest:
             raise ProtocolError(
                 f"the server names its resolved spec {welcome.spec_digest}, but it is {digest}: client and server are "
@@ -61,24 +62,25 @@ class StreamIdentity:
 
     @property
     def resolved(self) -> StreamSpec:
-        """The spec."""
+        """Return the spec as an object."""
         return StreamSpec.from_dict(self.spec)
 
     def require_same(self, other: StreamIdentity, *, ours: str, theirs: str) -> None:
-        """
+        """Check that another stream has the same samples.
+
         Args:
             other: the stream that is offered.
-            ours, theirs: words for the two sides.
+            ours, theirs: names of the two sides for the message.
 
         Raises:
-            StateMismatch: they would give other samples; the message names what differs, on both sides.
+            StateMismatch: it has not; the message names what differs, on both sides.
         """
-        # First what explains the others: another version may name the same spec and videos differently.
+        # The cause comes first: another version may give the same spec and videos other digests.
         remedies = {
             "numerics_version": "serve with the release that the state was saved with",
             "spec_digest": "ask for the recipe and options that were saved",
-            "catalogue_digest": "serve the folder of videos as it was (added, removed or changed files alter it)",
-            "sequences": "serve the folder of videos as it was",
+            "catalogue_digest": "serve the same folder of videos (added, removed or changed files alter it)",
+            "sequences": "serve the same folder of videos",
         }
         for name, remedy in remedies.items():
             mine, offered = getattr(self, name), getattr(other, name)
@@ -88,7 +90,7 @@ class StreamIdentity:
 
 
 def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
-    """The fields in which two resolved specs differ, as text: `` (recipe.gamma: 2.2 / 1.8)``."""
+    """Return the fields in which two resolved specs differ, as text: `` (recipe.gamma: 2.2 / 1.8)``."""
 
     def flat(spec: Mapping[str, Any]) -> dict[str, Any]:
         recipe = spec.get("recipe", {})
@@ -106,12 +108,12 @@ def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class LoaderShare:
-    """How far one loader worker came, when a stateful loader saves each of them.
+    """Hold how far one loader worker came, for a loader that saves each of its workers.
 
     Attributes:
-        worker, workers: which of how many.
-        batch_size: of its batches.
-        batches: batches it delivered since the position in the state.
+        worker, workers: number of the worker, and how many there are.
+        batch_size: samples of its batches.
+        batches: batches that it has delivered since the position in the state.
     """
 
     worker: int
@@ -122,14 +124,15 @@ class LoaderShare:
 
 @dataclass(frozen=True, slots=True)
 class ResumeState:
-    """Where a rank stands.
+    """Hold where a rank, or one of its loader workers, stands.
 
     Attributes:
         stream: what the samples are made of; None before the first connection.
         seed, epoch: of the samples to come.
         origin, position, world_size: see :mod:`v2v_client.position.plan`.
-        share: None for the state of a rank, which any number of loader workers can take up.
-        quarantine: number of the quarantine snapshot to go on under; None for the server's newest.
+        share: progress of a loader worker since ``position``; None for the state of a rank, which is valid for any
+            number of loader workers.
+        quarantine: number of the quarantine snapshot to continue with; None for the server's newest.
     """
 
     stream: StreamIdentity | None
@@ -141,8 +144,22 @@ class ResumeState:
     share: LoaderShare | None = None
     quarantine: int | None = None
 
+    @property
+    def place(self) -> tuple[int, int, int]:
+        """Return the epoch, and the origin and position in it."""
+        return self.epoch, self.origin, self.position
+
+    @property
+    def is_beginning(self) -> bool:
+        """Return whether nothing of the epoch is consumed."""
+        return self.origin == self.position == 0
+
+    def at_epoch(self, epoch: int) -> ResumeState:
+        """Return the state at the beginning of ``epoch``, with the server's newest quarantine snapshot."""
+        return dataclasses.replace(self, epoch=epoch, origin=0, position=0, share=None, quarantine=None)
+
     def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values."""
         pinned = {field.name: getattr(self.stream, field.name, None) for field in dataclasses.fields(StreamIdentity)}
         return {
             "version": STATE_VERSION,
@@ -158,9 +175,10 @@ class ResumeState:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> ResumeState:
-        """
+        """Return the state that :meth:`to_dict` wrote.
+
         Raises:
-            UsageError: not a state of this release.
+            UsageError: the values are not a state of this release.
         """
         if not isinstance(values, Mapping) or values.get("version") != STATE_VERSION:
             version = values.get("version") if isinstance(values, Mapping) else type(values).__name__
@@ -188,10 +206,10 @@ def _stream(values: Mapping[str, Any]) -> StreamIdentity | None:
     if values["spec"] is None:
         return None
     if not isinstance(values["spec"], Mapping):
-        raise UsageError("state: spec is no mapping")
+        raise UsageError("state: spec is not a mapping")
     for name in ("spec_digest", "catalogue_digest"):
         if not isinstance(values[name], str):
-            raise UsageError(f"state: {name} = {values[name]!r} is no text")
+            raise UsageError(f"state: {name} = {values[name]!r} is not text")
     return StreamIdentity(
         spec=values["spec"],
         spec_digest=values["spec_digest"],

@@ -18,9 +18,10 @@ from contextlib import suppress
 from dataclasses import replace
 
 from v2v_client.position.state import StreamIdentity
-from v2v_client.session.conversation import WAIT_REPORT_SECONDS, Arrival, Conversation, Event, State
+from v2v_client.session.conversation import WAIT_REPORT_SECONDS, Arrival, Conversation
 from v2v_client.session.link import Link, Transport
 from v2v_client.session.liveness import ListeningClock, Patience
+from v2v_client.session.states import Event, State
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.messages import Hello, SampleHeader

@@ -8,10 +8,10 @@ Entering a state, even from itself, sends messages:
     GREETING    sends Hello, and repeats it at growing intervals until Welcome arrives, because either may be lost
     WELCOMED    sends all unanswered requests again, and may send more
 
-:data:`TRANSITIONS` defines which event leads from one state to another. Events without an entry change nothing. After a
-restart, the server does not know the consumer and denies its requests. The consumer then sends Hello with the resolved
-spec, and the server must offer the same stream as before. Repeated requests can make a sample arrive twice; the reorder
-window drops the second one.
+:data:`v2v_client.session.states.TRANSITIONS` defines which event leads from one state to another. After a restart, the
+server does not know the consumer and denies its requests. The consumer then sends Hello with the resolved spec, and the
+server must offer the same stream as before. Repeated requests can make a sample arrive twice; the reorder window drops
+the second one.
 
 Three conditions raise errors: nothing received for ``timeout_seconds`` (ServerLost); for the same time, a server that
 answers but has no worker to make a sample (NoWorkers); and messages that break the protocol (ProtocolError).
@@ -19,21 +19,20 @@ answers but has no worker to make a sample (NoWorkers); and messages that break 
 
 from __future__ import annotations
 
-import logging
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from enum import Enum, auto
 from typing import Any
 
 import numpy.typing as npt
 
 from v2v_client.memory.slots import Answer, Slots
 from v2v_client.position.state import StreamIdentity
-from v2v_client.session.liveness import Patience
+from v2v_client.session.liveness import Patience, WorkerShortage
 from v2v_client.session.packing import unpack
+from v2v_client.session.states import TRANSITIONS, Event, State
 from v2v_protocol.arena import NO_SLOT, Slot
-from v2v_protocol.errors import NoWorkers, ProtocolError, RemoteError, SampleUnavailable, ServerLost
+from v2v_protocol.errors import ProtocolError, RemoteError, SampleUnavailable, ServerLost
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import (
     Denied,
@@ -51,55 +50,10 @@ from v2v_protocol.messages import (
 from v2v_protocol.sample import Form, Layout, Provenance, SampleId, array_layout
 from v2v_protocol.wire import Buffer, decode_map, decode_sample, layout_of
 
-
-class State(Enum):
-    """List the states of a conversation."""
-
-    CLOSED = auto()  # before Hello, or after Goodbye
-    GREETING = auto()  # Hello was sent
-    WELCOMED = auto()  # the server has answered Hello
-
-
-class Event(Enum):
-    """List the events that change the state."""
-
-    OPENED = auto()  # a link is open
-    WELCOME = auto()  # the server answered Hello
-    FORGOTTEN = auto()  # the server does not know the session: it was restarted, or the consumer was silent too long
-    DISCONNECTED = auto()  # the network was interrupted and is back: messages under way in either direction may be lost
-    UNANSWERED = auto()  # the server is alive, but no request was answered for a while: messages may be lost
-    SILENCE = auto()  # nothing was received for the same time: the link may be broken and is opened again
-    LEFT = auto()  # the consumer leaves: Goodbye
-
-
-TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
-    State.CLOSED: {
-        Event.OPENED: State.GREETING,
-    },
-    State.GREETING: {
-        Event.WELCOME: State.WELCOMED,
-        Event.DISCONNECTED: State.GREETING,
-        Event.SILENCE: State.GREETING,
-        Event.LEFT: State.CLOSED,
-    },
-    State.WELCOMED: {
-        Event.WELCOME: State.WELCOMED,
-        Event.FORGOTTEN: State.GREETING,
-        Event.DISCONNECTED: State.WELCOMED,
-        Event.UNANSWERED: State.WELCOMED,
-        Event.SILENCE: State.GREETING,
-        Event.LEFT: State.CLOSED,
-    },
-}
-
 WAIT_REPORT_SECONDS = 1.0
 """Interval at which the server is told how long this consumer has waited for samples."""
 _MOST_CREDIT_DENIALS = 3
-_WARN_SECONDS = 5.0
-"""A server without workers is logged after this time."""
 _NO_SLOTS: Mapping[int, Slot] = {}
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,8 +123,7 @@ class Conversation:
         )
         self._rewant_seconds = min(patience.rewant_seconds, patience.timeout_seconds)
         self._answered = now  # last time that a request was answered, or all were repeated
-        self._available_at = now  # last time that the server had no obstacle to making samples
-        self._warned = False
+        self._shortage = WorkerShortage(now, patience.timeout_seconds)
         self._moved = False  # whether the stream was offered by an earlier broker
         self._asked: dict[int, None] = {}  # sent and not answered, in the order sent
         self._queued: deque[int] = deque()  # to send when the credit allows
@@ -197,7 +150,8 @@ class Conversation:
             self._moved = True
         self._address = address
         self._server.mark_heard(now)
-        self._answered = self._available_at = now
+        self._answered = now
+        self._shortage.end(now)
         self.outbox.clear()
         self.handle_event(Event.SILENCE, now)
 
@@ -336,9 +290,10 @@ class Conversation:
         """
         self._server.mark_heard(now)
         if isinstance(message, Pong):
-            self._check_for_workers(message.trouble, now)
+            self._shortage.check(self._address, message.trouble if self._asked else "", now)
         else:
-            self._answered = self._available_at = now
+            self._answered = now
+            self._shortage.end(now)
         if isinstance(message, SampleHeader):
             return self._sample(message, arrays)
         if arrays:
@@ -371,19 +326,6 @@ class Conversation:
                     f"{self._address} sent {type(message).__name__}, which servers do not send to consumers"
                 )
         return None
-
-    def _check_for_workers(self, trouble: str, now: float) -> None:
-        if not trouble or not self._asked:
-            self._available_at, self._warned = now, False
-            return
-        waited = now - self._available_at
-        limit = self._patience.timeout_seconds
-        text = f"{self._address}: no sample for {waited:.0f} s, because {trouble}"
-        if waited >= limit:
-            raise NoWorkers(f"{text}; or wait longer with timeout_seconds (now {limit:g})")
-        if waited >= _WARN_SECONDS and not self._warned:
-            self._warned = True
-            _log.warning("%s; giving up after %g s (timeout_seconds)", text, limit)
 
     def _may_exceed_credit(self) -> bool:
         return self._asked_again and self._credit_denials < _MOST_CREDIT_DENIALS

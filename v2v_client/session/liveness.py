@@ -5,12 +5,17 @@ Time in which the trainer validates, or in which its process is stopped, does no
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import NoWorkers, UsageError
 
 _STOPPED_SECONDS = 1.0
 """If a wait exceeds its deadline by this much, the process was stopped."""
+_WARN_SECONDS = 5.0
+"""A server without workers is logged after this time."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,3 +76,42 @@ class ListeningClock:
         """
         if now - due > _STOPPED_SECONDS:
             self._away += now - due
+
+
+class WorkerShortage:
+    """Measure how long a server that answers has had no worker to make a requested sample.
+
+    Args:
+        now: seconds of listening.
+        limit_seconds: time after which the consumer gives up.
+    """
+
+    def __init__(self, now: float, limit_seconds: float) -> None:
+        self._since = now
+        self._limit_seconds = limit_seconds
+        self._warned = False
+
+    def end(self, now: float) -> None:
+        """Record that the server answered a request, or was replaced."""
+        self._since = now
+
+    def check(self, address: str, trouble: str, now: float) -> None:
+        """Take note of what a server says about its workers; log it after 5 s.
+
+        Args:
+            address: of the server.
+            trouble: why no sample can be made; empty if there is no trouble, or no request.
+
+        Raises:
+            NoWorkers: there has been trouble for ``limit_seconds``.
+        """
+        if not trouble:
+            self._since, self._warned = now, False
+            return
+        waited = now - self._since
+        text = f"{address}: no sample for {waited:.0f} s, because {trouble}"
+        if waited >= self._limit_seconds:
+            raise NoWorkers(f"{text}; or wait longer with timeout_seconds (now {self._limit_seconds:g})")
+        if waited >= _WARN_SECONDS and not self._warned:
+            self._warned = True
+            _log.warning("%s; giving up after %g s (timeout_seconds)", text, self._limit_seconds)

@@ -21,10 +21,10 @@ from rich.table import Table
 from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_client.tools.progress import ReportProgress, show_progress
 from v2v_client.tools.schedule_check import ScheduleCheck
 from v2v_protocol.command import INTERRUPTED, Parser, run_command
 from v2v_protocol.errors import UsageError
+from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
 from v2v_protocol.safe_yaml import YamlError, parse_yaml
 from v2v_protocol.sample import DEFAULT_ARRAYS
@@ -99,6 +99,11 @@ def percentile(values: Sequence[float], share: float) -> float:
     return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
 
 
+def _show(progress: Progress, measured: float, seconds: float, batches: int) -> None:
+    rate = f"{batches / measured:.1f} batches/s" if measured > 0 and batches else "warm-up"
+    progress(min(measured, seconds), seconds, rate)
+
+
 def measure(
     dataset: V2VStreamDataset,
     *,
@@ -109,7 +114,7 @@ def measure(
     seconds: float,
     warmup_batches: int,
     trainer_seconds: float,
-    report: ReportProgress = lambda _measured, _batches: None,
+    progress: Progress | None = None,
 ) -> tuple[dict[str, Any], ScheduleCheck]:
     """Consume the dataset for ``seconds`` after warm-up, over as many epochs as needed.
 
@@ -154,7 +159,8 @@ def measure(
             continue
         usage.sample(ended)
         measured.add(batch, wait, trainer_seconds)
-        report(ended - began, len(measured.waits))
+        if progress is not None:
+            _show(progress, ended - began, seconds, len(measured.waits))
     cpu = usage.cpu_seconds() - cpu_began + (measured.worker_cpu_seconds if server is None else 0.0)
     elapsed = ended - began
     count = len(measured.waits)
@@ -330,20 +336,22 @@ def run(arguments: argparse.Namespace) -> int:
     results = []
     if arguments.connect:
         dataset = _dataset(arguments, arguments.connect)
-        with show_progress(arguments.connect, arguments.seconds) as report:
+        with Progress(arguments.connect, "%") as progress:
             results.append(
-                measure(dataset, address=arguments.connect, workers=None, server=None, report=report, **options)
+                measure(dataset, address=arguments.connect, workers=None, server=None, progress=progress, **options)
             )
     else:
         _dataset(arguments, "tcp://127.0.0.1:0")  # report wrong options before a server is started
         for workers in arguments.workers or (1, 2):
             with (
                 LocalServer(arguments.videos, workers=workers, flags=_server_flags(arguments)) as server,
-                show_progress(f"{workers} workers", arguments.seconds) as report,
+                Progress(f"{workers} workers", "%") as progress,
             ):
                 dataset = _dataset(arguments, server.address)
                 results.append(
-                    measure(dataset, address=server.address, workers=workers, server=server, report=report, **options)
+                    measure(
+                        dataset, address=server.address, workers=workers, server=server, progress=progress, **options
+                    )
                 )
             if results[-1][0]["interrupted"]:
                 break

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from v2v_protocol.messages import Result
+from v2v_server.system.status_fields import counter, meanings
 
 _LONGEST_TROUBLE = 120
 _MOST_SECONDS = 86_400.0
@@ -47,49 +48,49 @@ def bounded_seconds(said: float) -> float:
 
 
 @dataclass(slots=True)
-class Counters:
-    """Totals since the start.
+class Counters(WorkDone):
+    """Totals since the start. Fields without a meaning are no status by themselves."""
 
-    Attributes:
-        samples: samples sent to consumers.
-        batches: the same in batches of each consumer's own size (a fraction while one is filling).
-        decodes: clips decoded for those samples; fewer than samples if siblings share one.
-        cache_hits, cache_misses: of those clips, if workers have a cache.
-        cache_trouble: why a worker's cache stores nothing more, as last reported; empty if it does.
-        bytes: size of the arrays of those samples.
-        in_slots: samples written to memory shared with their consumer; the others travelled in messages.
-        work: time that the workers took for them.
-        queued_seconds: total time that the server's own workers waited for a core.
-        waited_seconds: total time that consumers have waited for samples, as they report.
-        refused_candidates: videos passed over because they could not be used.
-        unavailable: samples without a usable candidate.
-        returned_leases: leases taken back from workers that died, hung or left.
-        second_leases: samples given to a second worker because the first was slow.
-        late_results: results of leases that had been taken back.
-        workers_lost: workers that died or were given up.
-        missing_videos: leases whose worker could not read a video that the server's host has.
-        malformed: malformed messages received.
-    """
-
-    samples: int = 0
-    batches: float = 0.0
-    decodes: int = 0
+    samples: int = counter("Samples sent to consumers.", is_routine=True)
+    batches: float = counter("Batches sent to consumers, in each consumer's own batch size.", is_routine=True)
+    decodes: int = counter("Clips decoded for the samples sent; siblings share one.", is_routine=True)
+    bytes: int = counter("Bytes of the arrays of the samples sent.", "sample_bytes", unit="bytes", is_routine=True)
+    in_slots: int = counter(
+        "Samples written to memory shared with their consumer.", "shared_memory_samples", is_routine=True
+    )
+    cpu_seconds: float = counter(
+        "Processor time that samples took in workers.", "worker_cpu_seconds", unit="s", is_routine=True
+    )
+    decode_seconds: float = counter(
+        "Wall-clock time of workers, decoding.", "worker_seconds", unit="s", part="decode", is_routine=True
+    )
+    simulate_seconds: float = counter(
+        "Wall-clock time of workers, simulating.", "worker_seconds", unit="s", part="simulate", is_routine=True
+    )
+    handover_seconds: float = counter(
+        "Wall-clock time of workers, delivering.", "worker_seconds", unit="s", part="handover", is_routine=True
+    )
+    queued_seconds: float = counter(
+        "Time that the server's own workers waited for a core.", "worker_queued_seconds", unit="s", is_routine=True
+    )
+    waited_seconds: float = counter(
+        "Time that consumers waited for samples, as they report.", "consumer_waiting_seconds", unit="s", is_routine=True
+    )
+    refused_candidates: int = counter("Candidates skipped because their video could not be used.", is_fault=True)
+    unavailable: int = counter("Samples without a usable candidate.", "unavailable_samples", is_fault=True)
+    returned_leases: int = counter("Leases taken back from workers that died, hung or left.")
+    second_leases: int = counter("Samples given to a second worker because the first was slow.", is_routine=True)
+    late_results: int = counter(
+        "Results of leases that had been taken back, or whose consumer had left.", is_routine=True
+    )
+    workers_lost: int = counter("Workers that died or were given up.", "lost_workers", is_fault=True)
+    missing_videos: int = counter(
+        "Leases whose worker could not read a video that the server's host has.", is_fault=True
+    )
+    malformed: int = counter("Malformed messages received.", "malformed_messages", is_fault=True)
     cache_hits: int = 0
     cache_misses: int = 0
     cache_trouble: str = ""
-    bytes: int = 0
-    in_slots: int = 0
-    work: WorkDone = field(default_factory=WorkDone)
-    queued_seconds: float = 0.0
-    waited_seconds: float = 0.0
-    refused_candidates: int = 0
-    unavailable: int = 0
-    returned_leases: int = 0
-    second_leases: int = 0
-    late_results: int = 0
-    workers_lost: int = 0
-    missing_videos: int = 0
-    malformed: int = 0
 
     def count_cache(self, said: str) -> None:
         """Count the cache field of a sample's header."""
@@ -102,4 +103,11 @@ class Counters:
     @property
     def faults(self) -> int:
         """Number of faults that the service survived."""
-        return self.refused_candidates + self.unavailable + self.workers_lost + self.missing_videos + self.malformed
+        return sum(getattr(self, name) for name, meaning in meanings(Counters).items() if meaning.is_fault)
+
+
+@dataclass(frozen=True, slots=True)
+class FaultTotal:
+    """Sum of the counters that are faults."""
+
+    faults: int = counter("Faults that the service survived, in total.", is_routine=True)

@@ -463,7 +463,7 @@ class Dispatcher:
                 return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
             decoded = header.decoded
             if self._count(session, request, header, in_slot=len(payload) == 1):
-                self.counters.work.add(result, header.cpu_seconds)
+                self.counters.add(result, header.cpu_seconds)
                 self.registry.worked(identity, result, header.cpu_seconds)
                 actions.append(ToConsumer(request.session, payload))
         self.registry.can_work(identity)
@@ -491,11 +491,10 @@ class Dispatcher:
             self.sessions.charge(*debt)
 
     def _count(self, session: Session, request: Request, header: SampleHeader, *, in_slot: bool) -> bool:
-        """Count a sample; return False if no session waits for it."""
+        """Count what was sent of a sample; return False if no session waits for it."""
         if not self.sessions.mark_answered(request, bounded_seconds(header.cpu_seconds)):
             self.counters.late_results += 1
             return False
-        self.counters.samples += 1
         self.counters.decodes += header.decoded
         self.counters.count_cache(header.cache)
         self.counters.batches += 1 / session.batch_size

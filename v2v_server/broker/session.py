@@ -39,6 +39,31 @@ _MOST_STALE = 64
 GONE_SECONDS = 10.0
 """Time that a consumer has to return to its session after its connection ended."""
 SILENT_SECONDS = 60.0
+AWAY_SECONDS = 2.0
+"""Between two epochs a consumer is away for a shorter time."""
+RETURN_SECONDS = 60.0
+"""A consumer that says Hello within this time of the last message of one with the same name continues its totals."""
+_MOST_DEPARTED = 1024
+"""Number of departed consumers whose totals are remembered; the oldest is dropped first."""
+
+
+@dataclass(slots=True)
+class ConsumerTotals:
+    """What a consumer got in all of its sessions: a trainer opens one for each epoch, and after each reconnect.
+
+    Attributes:
+        number: of the consumer, from 0; no other one has it.
+        since: when it came, or returned after :data:`AWAY_SECONDS` or more.
+        served: samples sent.
+        waited_seconds: time that it waited for samples, as it reports.
+        passed: by how many indices its position advanced, over all epochs.
+    """
+
+    number: int
+    since: float
+    served: int = 0
+    waited_seconds: float = 0.0
+    passed: int = 0
 
 
 @dataclass(slots=True)
@@ -53,14 +78,14 @@ class Session:
         liveness: when it was last heard.
         waiting: requests without a worker, in the order of the request.
         unanswered: every requested (epoch, index) that is not yet answered.
-        served: samples sent.
+        totals: what it got, this session and earlier ones.
         quarantine: number of the quarantine snapshot that its samples are made under.
         left_at: when its connection ended; None while it is connected, as far as is known.
         since: when it was opened.
         packed: whether it asks for compressed arrays.
         name, host: names that the consumer gives for itself.
         epoch: the epoch that it last requested samples of.
-        position: index after the highest answered index of that epoch.
+        position: index after the highest answered index of that epoch; before the first answer, the lowest requested.
         waited_seconds: time that it has waited for samples since its Hello, as it reports.
         user: name of its connection's key; empty without keys.
         owner: digest of that key and of the secret of its Hello; empty without a secret.
@@ -77,7 +102,6 @@ class Session:
     liveness: Liveness
     waiting: deque[Request] = field(default_factory=deque)
     unanswered: set[tuple[int, int]] = field(default_factory=set)
-    served: int = 0
     quarantine: int = 0
     left_at: float | None = None
     since: float = 0.0
@@ -90,9 +114,11 @@ class Session:
     user: str = ""
     owner: bytes = b""
 
+    totals: ConsumerTotals = field(init=False)
     form: Form = field(init=False)
 
     def __post_init__(self) -> None:
+        self.totals = ConsumerTotals(0, self.since)
         self.form = Form.of(array_layout(self.spec.recipe, self.spec.voxel_dtype, self.arrays))
 
     def mark_heard(self, now: float) -> None:
@@ -110,9 +136,15 @@ class Session:
         Returns:
             the increase, bounded by the age of the session.
         """
-        more = min(seconds, now - self.since) - self.waited_seconds
-        self.waited_seconds += max(0.0, more)
-        return max(0.0, more)
+        more = max(0.0, min(seconds, now - self.since) - self.waited_seconds)
+        self.waited_seconds += more
+        self.totals.waited_seconds += more
+        return more
+
+    @property
+    def display(self) -> tuple[object, ...]:
+        """What consumers are told apart by if their secrets differ: a trainer has a new one in each epoch."""
+        return self.user, self.name, self.host, self.spec.digest, self.seed
 
 
 class Sessions:
@@ -126,6 +158,8 @@ class Sessions:
     def __init__(self, leases: LeaseBook) -> None:
         self._leases = leases
         self._sessions: dict[bytes, Session] = {}
+        self._departed: deque[tuple[tuple[object, ...], Liveness, ConsumerTotals]] = deque(maxlen=_MOST_DEPARTED)
+        self._numbers = count()
         self._queue = FairQueue()
 
     def __len__(self) -> int:
@@ -145,8 +179,25 @@ class Sessions:
         replaced = {session.identity, *self.owned_by(session.owner)}
         for before in replaced:
             self.forget(before)
+        session.totals = self._totals_of(session)
         self._sessions[session.identity] = session
         self._queue.add(session.identity, replaced)
+
+    def totals(self) -> Iterator[ConsumerTotals]:
+        """Yield the totals of all consumers, and of those that left and may return."""
+        yield from (session.totals for session in self)
+        yield from (totals for _, _, totals in self._departed)
+
+    def _totals_of(self, session: Session) -> ConsumerTotals:
+        """Return the totals of the consumer that opens a session: those of its last one, if it left a moment ago."""
+        for place in range(len(self._departed) - 1, -1, -1):
+            display, liveness, totals = self._departed[place]
+            if display == session.display and liveness.silence(session.since) < RETURN_SECONDS:
+                del self._departed[place]
+                if liveness.silence(session.since) >= AWAY_SECONDS:
+                    totals.since = session.since
+                return totals
+        return ConsumerTotals(next(self._numbers), session.since)
 
     def owned_by(self, owner: bytes) -> list[bytes]:
         """Return the routing ids of an owner's sessions; an empty list for an empty owner."""
@@ -154,7 +205,9 @@ class Sessions:
 
     def forget(self, identity: bytes) -> None:
         """Drop a session, if there is one; its debt is remembered."""
-        if self._sessions.pop(identity, None) is not None:
+        session = self._sessions.pop(identity, None)
+        if session is not None:
+            self._departed.append((session.display, session.liveness, session.totals))
             self._queue.remove(identity)
 
     def charge(self, identity: bytes, seconds: float) -> None:
@@ -187,8 +240,9 @@ class Sessions:
                 f"{len(new)} more samples asked while {len(session.unanswered)} are unanswered; "
                 f"the credit is {session.credit}"
             )
-        if new and epoch != session.epoch:
-            session.epoch, session.position = epoch, 0
+        is_first = not (session.unanswered or session.position)
+        if new and (is_first or epoch != session.epoch):
+            session.epoch, session.position = epoch, min(new)
         for index in new:
             session.unanswered.add((epoch, index))
             place = session.schedule.place(index)
@@ -241,12 +295,13 @@ class Sessions:
             return False
         session.unanswered.remove((request.epoch, request.index))
         if request.epoch == session.epoch:
-            session.position = max(session.position, request.index + 1)
+            before, session.position = session.position, max(session.position, request.index + 1)
+            session.totals.passed += session.position - before
         self._queue.charge(request.session, worker_seconds)
         self._requeue(session)
         if not session.unanswered:
             self._queue.drop_savings(request.session)
-        session.served += 1
+        session.totals.served += 1
         return True
 
     def idle(self, now: float) -> list[bytes]:

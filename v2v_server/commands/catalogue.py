@@ -11,13 +11,12 @@ from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.progress import Progress, format_duration
 from v2v_protocol.spec import SCENES
-from v2v_server.cloud.copies import COPIES_GIB
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.index.parts import Shard
+from v2v_server.corpus.sources.source import COPIES_GIB
 from v2v_server.offline.ahead import Ahead, Part, catalogue_ahead, catalogue_shard
-from v2v_server.status.progress import CatalogueProgress, catalogue_progress
-from v2v_server.status.shutdown_summary import format_duration
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 
@@ -88,7 +87,7 @@ def _run(arguments: argparse.Namespace) -> None:
     )
     begun = time.monotonic()
     shard = None if arguments.shard is None else Shard.parse(arguments.shard)
-    with catalogue_progress() as shown:
+    with Progress("probing videos") as shown:
         probed = _Probed(shown)
         if shard is not None:
             part = catalogue_shard(asked, shard, Path(arguments.out), probed, shown.notice)
@@ -103,7 +102,7 @@ def _run(arguments: argparse.Namespace) -> None:
 class _Probed:
     """Count the files that are probed, and show the progress."""
 
-    def __init__(self, shown: CatalogueProgress) -> None:
+    def __init__(self, shown: Progress) -> None:
         self._shown, self.files = shown, 0
 
     def __call__(self, done: int, total: int) -> None:
@@ -120,7 +119,7 @@ def _of_part(part: Part, shard: Shard) -> list[str]:
 
 def _of_all(catalogue: Catalogue) -> list[str]:
     with closing(catalogue):
-        lines = [*catalogue.notes, f"{catalogue.root}: {len(catalogue.videos)} videos can be used"]
+        lines = [*catalogue.notes, f"{catalogue.source}: {len(catalogue.videos)} videos can be used"]
         if catalogue.refusals:
             lines.append(f"{len(catalogue.refusals)} files cannot be used:")
             lines += [f"  {refusal}" for refusal in catalogue.refusals[:_SHOWN]]

@@ -11,31 +11,19 @@ import contextlib
 import statistics
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TaskProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.text import Text
-
 from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
 from v2v_protocol.spec import SCENES
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.listfile import LIST_SUFFIXES
+from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
 from v2v_server.prepare.report import Report
-from v2v_server.status.progress import catalogue_progress
 from v2v_server.store.encoding import DEFAULT_GOP, DEFAULT_QUALITY, DEFAULT_SIZE, H264, LOSSLESS, Encoding
 from v2v_server.store.packing import SIZES
 from v2v_server.system.process import usable_cores
@@ -107,7 +95,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.workers < 1:
         raise UsageError(f"--workers {arguments.workers}: give at least 1")
     started = time.monotonic()
-    with catalogue_progress() as probing:
+    with Progress("probing videos") as probing:
         catalogue = open_catalogue(
             arguments.source,
             list_file=arguments.list,
@@ -117,7 +105,7 @@ def _run(arguments: argparse.Namespace) -> int:
             progress=probing,
             notice=probing.notice,
         )
-    with contextlib.closing(catalogue), _progress() as progress:
+    with contextlib.closing(catalogue), Progress("preparing", "frames") as shown:
         report = prepare.prepare(
             catalogue,
             arguments.destination,
@@ -127,7 +115,7 @@ def _run(arguments: argparse.Namespace) -> int:
             frame_floor_db=arguments.frame_floor,
             scene=arguments.scene != "off",
             single=_is_video(Path(arguments.source)),
-            progress=progress,
+            progress=lambda done, total, made, expected: shown(done, total, _size(made, expected)),
         )
     for line in summary(report, encoding, time.monotonic() - started):
         print(line)
@@ -206,27 +194,8 @@ def _listed(title: str, items: list[tuple[str, str]]) -> list[str]:
     return lines
 
 
-class _FrameRate(ProgressColumn):
-    def render(self, task: Task) -> Text:
-        """Format frames per second."""
-        return Text("" if task.speed is None else f"{task.speed:.0f} frames/s")
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[prepare.Progress]:
-    columns = (
-        TextColumn("preparing"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[size]}"),
-        _FrameRate(), TextColumn("left"), TimeRemainingColumn(),
-    )  # fmt: skip
-    console = Console(file=sys.stderr)
-    with Progress(*columns, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task("prepare", total=None, size="")
-
-        def tell(done: int, total: int, made: int, expected: int) -> None:
-            size = f"{made / 1e9:.1f} of about {expected / 1e9:.1f} GB" if expected else ""
-            bar.update(task, completed=done, total=total, size=size)
-
-        yield tell
+def _size(made: int, expected: int) -> str:
+    return f"{made / 1e9:.1f} of about {expected / 1e9:.1f} GB" if expected else ""
 
 
 if __name__ == "__main__":

@@ -17,8 +17,7 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.records import write_json
 from v2v_server.broker.quarantine import Quarantine, clearing, quarantine_path, read_quarantine, write_entry
-from v2v_server.cloud.bucket import is_url
-from v2v_server.corpus.files import corpus_root
+from v2v_server.corpus.sources.source import SourceOptions, open_source
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -37,8 +36,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    source: str = arguments.videos
-    file = quarantine_path(corpus_root(Path(source)) if not is_url(source) else source.rstrip("/"), arguments.cache_dir)
+    source = open_source(arguments.videos, SourceOptions(cache_dir=arguments.cache_dir))
+    file = quarantine_path(source.name, arguments.cache_dir)
     quarantine = read_quarantine(file)
     if arguments.clear and quarantine.entries(quarantine.latest):
         _clear(file, quarantine)

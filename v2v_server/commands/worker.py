@@ -9,8 +9,7 @@ from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_server.cloud.copies import COPIES_GIB, copies_of
-from v2v_server.corpus.files import corpus_root
+from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_source
 from v2v_server.store.cache import GIB, Cache, make_cache
 from v2v_server.system.log import LOG_FORMATS, Log, report_errors
 from v2v_server.worker.process import run_worker, unshared_name
@@ -62,8 +61,7 @@ def _run(arguments: argparse.Namespace) -> None:
 def _work(arguments: argparse.Namespace) -> None:
     # A server names its own workers, and recognises them by these names.
     name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
-    copies = copies_of(arguments.videos, arguments.copies, arguments.copies_gib)
-    root = copies or corpus_root(Path(arguments.videos))
+    source = open_source(arguments.videos, SourceOptions(copies=arguments.copies, copies_gib=arguments.copies_gib))
     cache = None
     if arguments.cache is not None:
         if not arguments.cache_gib >= 0:
@@ -73,7 +71,7 @@ def _work(arguments: argparse.Namespace) -> None:
             make_cache(folder)
         cache = Cache(folder, int(arguments.cache_gib * GIB))
     log = Log(is_json=arguments.log_format == "json")
-    run_worker(arguments.connect, root, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log)
+    run_worker(arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log)
 
 
 if __name__ == "__main__":

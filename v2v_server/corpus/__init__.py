@@ -2,9 +2,8 @@
 
 catalogue        the snapshot that everything else works from
 videos           its videos in columns
-corpus           which files a corpus has
-files            finding files, and asking about many at a time
-listfile         list files like the paper's
+sources          where the videos come from
+corpus           the files of a corpus, before one of them is opened
 probe            probing many files in processes of their own
 index            what probing found, on disk and in memory
 refresh          bring the index up to date

@@ -15,19 +15,19 @@ from v2v_protocol.errors import CorpusError, IndexUnreadable, VideoChanged
 from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
-from v2v_server.cloud.copies import COPIES_GIB, Copies, copies_of
-from v2v_server.corpus.corpus import Corpus, find_corpus, told
-from v2v_server.corpus.files import Notice
+from v2v_server.corpus.corpus import Corpus, format_problems, list_corpus
 from v2v_server.corpus.index.columns import VideoTable
 from v2v_server.corpus.index.file import Store
-from v2v_server.corpus.listfile import ListEntry
 from v2v_server.corpus.manifest import Header, PreparedVideo
 from v2v_server.corpus.probe import Progress
 from v2v_server.corpus.refresh import index_path, refresh_index
 from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.corpus.sources.asking import Notice
+from v2v_server.corpus.sources.listfile import ListEntry
+from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
 from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos
-from v2v_server.store.clips import STORE_FORMAT, check_file
+from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.system.process import without_collections
 from v2v_server.video.frame_index import FrameIndex, unseekable
@@ -46,7 +46,7 @@ class Catalogue:
     """A snapshot of a corpus. Make one with :func:`open_catalogue`; close it when done.
 
     Attributes:
-        root: the folder that ids are relative to, resolved; or their copies, of videos in object storage.
+        source: where the videos come from.
         rows: which rows of the pictures may be used.
         videos: the videos that can be used, by id.
         refusals: files, folders and lines of the list that give no video, by id.
@@ -58,7 +58,7 @@ class Catalogue:
         scene_digest: names this snapshot together with the statistics of its videos; None without them.
     """
 
-    root: Path | Copies
+    source: VideoSource
     rows: Rows
     videos: Videos
     refusals: tuple[Refusal, ...]
@@ -76,41 +76,30 @@ class Catalogue:
 
     @property
     def folder(self) -> Path:
-        """The root, for what works on folders only.
-
-        Raises:
-            CorpusError: the videos lie in object storage.
-        """
-        if isinstance(self.root, Copies):
-            raise CorpusError(f"{self.root}: is no folder of this host, which this needs: copy the videos to one first")
-        return self.root
+        """The folder that ids are relative to, see :attr:`VideoSource.folder`."""
+        return self.source.folder
 
     def path(self, id: str) -> Path:
-        """Where the video lies.
+        """Return where the video lies.
 
         Raises:
-            CorpusError: no such id in this catalogue, or the videos lie in object storage.
+            CorpusError: there is no such id in this catalogue, or no such folder on this host.
         """
         self._fingerprint(id)
         return self.folder / id
 
     def check(self, id: str, fingerprint: str) -> None:
-        """Make sure that the video is here as it was catalogued. In object storage it is if nothing else can be told,
-        and it is asked for only once.
+        """Check that the video is as catalogued, see :meth:`VideoSource.verify`.
 
         Raises:
-            CorpusError: no such id in this catalogue.
-            VideoError: it is another one, is gone, or (on a disk) cannot be read.
+            CorpusError: there is no such id in this catalogue.
+            VideoError: the video is gone, another one by now, or (on a disk) cannot be read.
         """
-        if not isinstance(self.root, Copies):
-            return check_file(self.path(id), fingerprint)
         self._fingerprint(id)
+        state = None
         with suppress(sqlite3.Error):
-            known = self._store.state(id)
-            # A row in doubt (size -1) was found wanting before.
-            if known is None or known[0] < 0 or not self.root.is_there(id, *known):
-                raise VideoChanged(id, None, f"is gone from {self.root}, or changed there")
-        return None
+            state = self._store.state(id)
+        self.source.verify(id, fingerprint, state)
 
     def frame_index(self, id: str) -> FrameIndex:
         """The frames of a video, read from the index on disk.
@@ -213,13 +202,12 @@ class Catalogue:
     def close(self) -> None:
         """Close the index; ``frame_index`` works no more."""
         self._store.close()
-        if isinstance(self.root, Copies):
-            self.root.release()
+        self.source.release()
 
     def _fingerprint(self, id: str) -> str:
         number = self.videos.find(id)
         if number is None:
-            raise CorpusError(f"{id!r} is no video of this catalogue ({len(self.videos)} videos below {self.root})")
+            raise CorpusError(f"{id!r} is no video of this catalogue ({len(self.videos)} videos below {self.source})")
         return self.videos.fingerprints[number]
 
 
@@ -256,8 +244,8 @@ def open_catalogue(
     """Take in a corpus: probe what is new or changed, forget what is gone.
 
     Args:
-        source: a folder (searched to all depths), one video, or a list file whose paths are relative to its folder; or
-            an address in object storage, ``s3://bucket/prefix``, see :mod:`v2v_server.cloud`.
+        source: a folder (searched to all depths), one video, a list file whose paths are relative to its folder, or an
+            address in object storage (``s3://bucket/prefix``).
         list_file: a list that restricts the folder ``source`` to the videos it names.
         rows: which rows may be used; all when None.
         cache_dir: where the index lies; None takes ``$V2V_CACHE_DIR``, else ``$XDG_CACHE_HOME/v2v``, else
@@ -265,7 +253,7 @@ def open_catalogue(
         copies: folder for copies of videos from object storage; None takes one where the index lies.
         copies_gib: at most so much lies there.
         scene: also take in what the videos show, which decodes what was not looked at yet; see
-            :mod:`v2v_server.corpus.scene`.
+            :mod:`v2v_server.corpus.scenes`.
         processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
         progress: told after each file that had to be probed; starts again where the index turns out to be unusable.
         notice: told what is looked at before that, file by file, and how far it is.
@@ -274,10 +262,11 @@ def open_catalogue(
         CorpusError: there is no such folder or list, it cannot be read, it makes no sense, or not one video of it can
             be used.
     """
-    corpus = find_corpus(source, list_file, rows, copies_of(os.fspath(source), copies, copies_gib, cache_dir), notice)
-    scenes = SceneCollection(corpus.rows, corpus.manifest) if scene else None
-    path = index_path(corpus.root, cache_dir)
-    store, table, notes = refresh_index(corpus.root, corpus.ids, path, scenes, processes, progress, notice)
+    opened = open_source(source, SourceOptions(list_file, copies, copies_gib, cache_dir))
+    corpus = list_corpus(opened, rows, notice)
+    scenes = SceneCollection(corpus.rows, opened.manifest) if scene else None
+    path = index_path(opened.name, cache_dir)
+    store, table, notes = refresh_index(opened, corpus.ids, path, scenes, processes, progress, notice)
     try:
         with without_collections():
             return _snapshot(corpus, table, notes, store, scenes)
@@ -289,28 +278,31 @@ def open_catalogue(
 def _snapshot(
     corpus: Corpus, on_disk: VideoTable, notes: list[str], store: Store, scenes: SceneCollection | None
 ) -> Catalogue:
-    root, manifest, table = corpus.root, corpus.manifest, on_disk
+    source, manifest, table = corpus.source, corpus.source.manifest, on_disk
     problems, files = dict(corpus.refused), dict[str, str]()
     absent: dict[str, PreparedVideo] = {}
     if manifest is not None:
         records = [on_disk.row(at) for at in range(len(on_disk))]
         files = {record.id: record.fingerprint for record in records}
         absent = {record.id: manifest.videos[record.id] for record in records if not manifest.describes(record)}
-        table = VideoTable.of(manifest.as_source(record).columns for record in records)
+        table, _ = VideoTable.read((manifest.as_source(record).columns for record in records), len(records))
     else:
         table.problem[table.codec == STORE_FORMAT] = "is a file of a lossless corpus by itself: serve the whole folder"
     usable = table.problem == np.array(None)
     problems.update((table.ids[at], table.problem[at]) for at in np.flatnonzero(~usable).tolist())
     table = table.where(usable)
-    thresholds, shorter = _listed(corpus.listed, Videos(table, {}))
+    thresholds, shorter = _listed(source.listed or (), Videos(table, {}))
     videos = Videos(table, thresholds)
     if not videos:
-        raise CorpusError(f"{root}: none of {len(problems)} videos can be used{told(problems)}")
+        raise CorpusError(f"{source}: none of {len(problems)} videos can be used{format_problems(problems)}")
     if absent:
         if len(absent) == len(videos):
-            raise CorpusError(f"{root}: none of {len(absent)} prepared files is there as its manifest says")
+            raise CorpusError(f"{source}: none of {len(absent)} prepared files is there as its manifest says")
         reasons = {id: video.problem or "its file is missing or changed" for id, video in absent.items()}
-        notes = [*notes, f"{len(absent)} videos have no prepared file, so others stand in for them{told(reasons)}"]
+        notes = [
+            *notes,
+            f"{len(absent)} videos have no prepared file, so others stand in for them{format_problems(reasons)}",
+        ]
     if manifest is not None and manifest.aside:
         notes = [
             *notes,
@@ -337,7 +329,7 @@ def _snapshot(
         if died := sorted(unknown - absent.keys()):
             notes = [*notes, f"{len(died)} videos crash the decoder that analyses their scenes: {died[0]}"]
     return Catalogue(
-        root=root,
+        source=source,
         rows=corpus.rows,
         videos=videos,
         refusals=tuple(Refusal(id, None, problems[id], RefusalKind.UNUSABLE) for id in sorted(problems)),

@@ -20,10 +20,9 @@ from typing import Any, TypeVar
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_protocol.safe_json import parse_json
-from v2v_server.cloud.copies import Copies
-from v2v_server.corpus.files import UNPRINTABLE, answers, printable
 from v2v_server.corpus.index.file import IndexRow
 from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.corpus.sources.names import UNPRINTABLE, printable
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.encoding import Encoding
 from v2v_server.video.fingerprint import is_same_file
@@ -197,50 +196,6 @@ class Manifest:
             frames_per_second=video.frames_per_second,
             problem=None,
         )
-
-
-def find_manifest(root: Path) -> Manifest | None:
-    """The manifest of a resolved folder; None if it is no prepared one.
-
-    Raises:
-        CorpusError: the manifest makes no sense, or the folder is a part of a prepared one.
-        OSError: the folder cannot be looked into.
-    """
-    for folder in root.parents:
-        if (folder / MANIFEST_NAME).exists():
-            raise CorpusError(
-                f"{root} lies in the prepared folder {folder}, where its manifest is: name that folder, and restrict "
-                "it by a list file"
-            )
-    return read_manifest(root) if (root / MANIFEST_NAME).exists() else None
-
-
-def refuse_prepared_below(root: Path | Copies, ids: Iterable[str]) -> None:
-    """Make sure that no video of an ordinary corpus comes from a prepared folder, whose rows are cut already.
-
-    Raises:
-        CorpusError: one does.
-    """
-    if isinstance(root, Copies):
-        found = [name for name in root.listed if name.rpartition("/")[2] == MANIFEST_NAME]
-        if found:
-            raise CorpusError(f"{root}: {found[0]} makes it a prepared corpus: copy that to a disk")
-        return
-
-    def is_prepared(folder: PurePosixPath) -> bool:
-        try:
-            return (root / folder / MANIFEST_NAME).exists()
-        except OSError:  # where nobody may look, no video can be read either: each says so itself
-            return False
-
-    folders = {PurePosixPath(folder) for folder in {id.rpartition("/")[0] for id in ids}}
-    folders.update({parent for folder in folders for parent in folder.parents})
-    for folder, refused in answers(is_prepared, sorted(folders)):
-        if refused:
-            raise CorpusError(
-                f"{root / folder} is a prepared folder and cannot be a part of another corpus: name it itself, or move "
-                "it out"
-            )
 
 
 def read_manifest(root: Path) -> Manifest:

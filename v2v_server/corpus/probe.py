@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from v2v_protocol.errors import VideoError, VideoUnreadable
-from v2v_server.cloud.copies import Copies, open_local
 from v2v_server.corpus.index.file import IndexRow
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.clips import facts_of
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.fingerprint import fingerprint
@@ -28,22 +28,22 @@ _MOST_TOGETHER = 1024
 _MOST_SECONDS = 10.0
 Progress = Callable[[int, int], None]
 """(files done so far, files to do)."""
-ProbeFile = Callable[[Path | Copies, str], IndexRow]
-"""(root, id) -> what is known of that file; see :func:`probe_file`."""
+ProbeFile = Callable[[VideoSource, str], IndexRow]
+"""(source, id) -> what is known of that file; see :func:`probe_file`."""
 T = TypeVar("T")
 
 
-def probe_file(root: Path | Copies, id: str) -> IndexRow:
+def probe_file(source: VideoSource, id: str) -> IndexRow:
     """Probe one file; an error becomes the record's ``problem``.
 
     A file that cannot be read gets the size -1, which no file has: it is probed again at the next start.
     """
     try:
-        before = _state(root, id)
-        with open_local(root, id, "") as path:
+        before = source.state(id)
+        with source.open_local(id, "") as path:
             mark = fingerprint(path)
             facts = _facts(path)
-        if _state(root, id) != before:
+        if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
     except OSError as error:
         return IndexRow(id, -1, problem=f"cannot be read: {error.strerror or error}")
@@ -68,14 +68,6 @@ def probe_file(root: Path | Copies, id: str) -> IndexRow:
     )
 
 
-def _state(root: Path | Copies, id: str) -> tuple[int, int, int]:
-    """Return size in bytes, mtime and ctime in ns, or what replaces them in object storage."""
-    if isinstance(root, Copies):
-        return root.state(id)
-    status = (root / id).stat()
-    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
-
-
 def _facts(path: Path) -> VideoFacts:
     """Return what is known of the video; retry once after an error of the system rather than of the decoder.
 
@@ -97,7 +89,7 @@ def _facts(path: Path) -> VideoFacts:
 
 
 def probe_files(
-    root: Path | Copies,
+    source: VideoSource,
     ids: Iterable[str],
     processes: int,
     probe: ProbeFile = probe_file,
@@ -109,7 +101,7 @@ def probe_files(
     outside, or memory was too short for it and its neighbours.
 
     Args:
-        root: the folder, or what lies in object storage, that ids are relative to.
+        source: where the videos come from.
         ids: relative paths.
         processes: number of processes to probe in; 0 probes in this one, which a file that crashes the decoder ends.
         probe: probes one file; must be picklable.
@@ -117,10 +109,10 @@ def probe_files(
     """
     isolated = partial(
         run_isolated,
-        partial(probe, root),
+        partial(probe, source),
         deadline_seconds=lambda id: longest_seconds,
         memory_bytes=LARGEST_MEMORY_BYTES,
-        writable=None if isinstance(root, Copies) else (),  # copies are fetched: from a network, into a folder
+        writable=() if source.is_local else None,  # copies are fetched: from a network, into a folder
     )
     suspects: list[str] = []
     for id, found in isolated(ids, processes):
@@ -131,17 +123,17 @@ def probe_files(
         else:
             yield found
     for id, found in isolated(suspects, 1):
-        yield _culprit(root, id, found) if isinstance(found, Died) else found
+        yield _culprit(source, id, found) if isinstance(found, Died) else found
 
 
-def _culprit(root: Path | Copies, id: str, death: Died) -> IndexRow:
+def _culprit(source: VideoSource, id: str, death: Died) -> IndexRow:
     if not death.is_crash:
         why = f"could not be probed: the process ended over it twice ({death.how}), which says nothing of the file"
         return IndexRow(id, -1, problem=f"{why}; the next start tries again")
     why = f"crashes the decoder: the process that probed it died ({death.how})"
     try:
-        return IndexRow(id, *_state(root, id), problem=why)
-    except (OSError, VideoUnreadable):
+        return IndexRow(id, *source.state(id), problem=why)
+    except VideoUnreadable:
         return IndexRow(id, -1, problem=why)  # gone meanwhile; if it comes back, it is probed again
 
 

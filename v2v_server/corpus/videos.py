@@ -76,14 +76,16 @@ class Videos(Sequence[VideoEntry]):
         """
         sha = hashlib.sha256(f"v2v catalogue 2\n{rows}\n".encode())
         table = self._table
-        columns = table.ids, table.fingerprints, table.frames, table.width_px, table.height_px, table.frames_per_second
         for start in range(0, len(self), CHUNK):
-            parts = [column[start : start + CHUNK] for column in columns]
-            lists = [part if isinstance(part, list) else part.tolist() for part in parts]
+            those = slice(start, start + CHUNK)
+            columns = (table.frames, table.width_px, table.height_px, table.frames_per_second)
+            values = zip(
+                table.ids[those], table.fingerprints[those], *(c[those].tolist() for c in columns), strict=True
+            )
             lines = []
-            for number, values in enumerate(zip(*lists, strict=True), start):
-                limits = self._thresholds.get(number, NO_THRESHOLDS)
-                lines.append("\0".join(map(str, (*values, *limits))) + "\n")
+            for number, (id, fingerprint, frames, width, height, rate) in enumerate(values, start):
+                pos, neg = self._thresholds.get(number, NO_THRESHOLDS)
+                lines.append(f"{id}\0{fingerprint}\0{frames}\0{width}\0{height}\0{rate}\0{pos}\0{neg}\n")
             sha.update("".join(lines).encode())
         return sha.hexdigest()[:32]
 

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.cloud.copies import COPIES_GIB, copies_of
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.corpus import find_corpus
-from v2v_server.corpus.files import Notice, corpus_root
+from v2v_server.corpus.corpus import list_corpus
 from v2v_server.corpus.index.parts import Shard, make_folder, parts_in, take_in_parts, write_part
 from v2v_server.corpus.probe import Progress
 from v2v_server.corpus.refresh import index_path, refresh_index
 from v2v_server.corpus.scenes.collect import SceneCollection
+from v2v_server.corpus.sources.asking import Notice
+from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
 from v2v_server.video.rows import Rows
 
 
@@ -63,8 +62,7 @@ def catalogue_ahead(asked: Ahead, parts: Path | None, progress: Progress | None,
     """
     if parts is not None:
         complete = parts_in(parts)
-        bucket = copies_of(asked.videos, asked.copies, asked.copies_gib, asked.cache_dir)
-        take_in_parts(index_path(bucket or corpus_root(Path(asked.videos)), asked.cache_dir), complete)
+        take_in_parts(index_path(_source(asked).name, asked.cache_dir), complete)
     return open_catalogue(
         asked.videos,
         list_file=asked.list_file,
@@ -93,12 +91,12 @@ def catalogue_shard(asked: Ahead, shard: Shard, out: Path, progress: Progress | 
         CorpusError: there is no such corpus, or a folder cannot be written to.
     """
     make_folder(out)
-    bucket = copies_of(os.fspath(asked.videos), asked.copies, asked.copies_gib, asked.cache_dir)
-    corpus = find_corpus(asked.videos, asked.list_file, asked.rows, bucket, notice)
+    source = _source(asked)
+    corpus = list_corpus(source, asked.rows, notice)
     ids = [id for id in corpus.ids if shard.holds(id)]
-    scenes = SceneCollection(corpus.rows, corpus.manifest) if asked.scene else None
-    index = index_path(corpus.root, asked.cache_dir, shard)
-    store, table, notes = refresh_index(corpus.root, ids, index, scenes, asked.processes, progress, notice)
+    scenes = SceneCollection(corpus.rows, source.manifest) if asked.scene else None
+    index = index_path(source.name, asked.cache_dir, shard)
+    store, table, notes = refresh_index(source, ids, index, scenes, asked.processes, progress, notice)
     store.close()
     if notes:
         raise CorpusError(notes[0])
@@ -108,3 +106,7 @@ def catalogue_shard(asked: Ahead, shard: Shard, out: Path, progress: Progress | 
         len(ids),
         Counter(problem for problem in table.problem if problem is not None),
     )
+
+
+def _source(asked: Ahead) -> VideoSource:
+    return open_source(asked.videos, SourceOptions(asked.list_file, asked.copies, asked.copies_gib, asked.cache_dir))

@@ -12,7 +12,6 @@ from itertools import islice
 from v2v_protocol.errors import CorpusError, V2VError
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
-from v2v_server.cloud.copies import Copies
 from v2v_server.config import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.offline.aperture import clean_aperture
@@ -101,7 +100,7 @@ def _how_videos_are_stored(catalogue: Catalogue) -> Iterator[Line]:
             "decoded from the beginning of its file"
         )
         yield "note", "corpus", text, "run v2v-prepare once: all frames of a prepared corpus are quick to read"
-    if isinstance(catalogue.root, Copies):
+    if not catalogue.source.is_local:
         return
     cropped = [(id, shown) for id in ids if (shown := clean_aperture(catalogue.path(id))) is not None]
     if cropped:

@@ -17,7 +17,6 @@ from v2v_protocol.recipe import Recipe, effect_settings
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
-from v2v_server.cloud.copies import open_local
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.offline.leases import lease_for
 from v2v_server.offline.remake import RemadeSample, Remaker
@@ -136,7 +135,7 @@ class WholePictures:
         lease = replace(lease, rows="full", height_px=height, width_px=width, thresholds=())
         frames = np.empty((recipe.steps + 1, height, width), np.uint8)
         index, stride = catalogue.frame_index(video.id), recipe.frame_stride
-        with open_local(catalogue.root, video.id, video.fingerprint) as path:
+        with catalogue.source.open_local(video.id, video.fingerprint) as path:
             window = (top, 0, bottom - top, video.width_px)
             taken = _pictures(path, index, sequence.start_frame, recipe.frames_needed, window)
             for frame, picture in zip(frames, islice(taken, 0, None, stride), strict=True):

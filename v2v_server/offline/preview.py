@@ -8,7 +8,6 @@ with shorter clips or smaller crops, and the output says so.
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +21,10 @@ from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write
 from v2v_pictures.film import FRAMES_PER_SECOND, draw_film
 from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, UsageError
+from v2v_protocol.progress import Progress
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
-from v2v_server.cloud.copies import open_local
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.offline.motion import WholePictures, moving_seeds, quiet_voxels
 from v2v_server.offline.remake import Remaker, open_shown
@@ -34,7 +33,6 @@ from v2v_server.store.clips import clips_of
 from v2v_server.video.collect import Cut
 
 KINDS = (".png", ".mp4", ".gif", ".html")
-_REPORT_SECONDS = 2.0
 _SMALLEST_CROP_PX = 16
 _GIF_EVERY = 2  # every other bin: half the size
 
@@ -95,25 +93,22 @@ def preview(
     catalogue = open_shown(source, list_file=list_file, rows=rows, cache_dir=cache_dir)
     cameras: list[Camera] = []
     notes: dict[str, list[str]] = {}
-    progress: _Progress | None = None
     try:
         first = _fitted_stream(catalogue, spec, shots[0].recipe)
         wholes = WholePictures(catalogue, first)
         if find_motion:
             shots, note = _moving(shots, Remaker(catalogue, first), wholes)
             say(note)
-        for shot in shots:
-            cameras.append(_camera(catalogue, shot, spec, with_flow, notes))
-            if progress is None:  # the first may include compiling, so it is no estimate for the others
-                progress = _Progress(say, "cameras", len(shots), done=1)
-            else:
-                progress.step()
+        with Progress("simulating", "cameras") as progress:
+            for shot in shots:
+                cameras.append(_camera(catalogue, shot, spec, with_flow, notes))
+                progress(len(cameras), len(shots))  # the first may include compiling; the estimate begins after it
         whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
     finally:
         catalogue.close()
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
-    write(out, _content(out.suffix, whole, cameras, title, moments, say))
+    write(out, _content(out.suffix, whole, cameras, title, moments))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
 
 
@@ -135,33 +130,15 @@ def _sequence_of(catalogue: Catalogue, provenance: Provenance) -> VideoSequence:
     return VideoSequence(video, provenance.start_frame)
 
 
-class _Progress:
-    """Report from time to time how many of the things are done, how fast, and the time left."""
-
-    def __init__(self, say: Callable[[str], None], things: str, total: int, done: int = 0) -> None:
-        self._say, self._things, self._total = say, things, total
-        self._done = self._first = done
-        self._began = self._told = time.monotonic()
-
-    def step(self) -> None:
-        self._done += 1
-        now, left = time.monotonic(), self._total - self._done
-        if left and now - self._told > _REPORT_SECONDS:
-            self._told, each = now, (now - self._began) / (self._done - self._first)
-            rate = f"{1 / each:.1f} a second" if each < 1 else f"{each:.1f} s each"
-            self._say(f"{self._done} of {self._total} {self._things}, {rate}, {left * each:.0f} s left")
-
-
-def _content(
-    kind: str, whole: Camera, cameras: Sequence[Camera], title: str, moments: int, say: Callable[[str], None]
-) -> bytes | str:
+def _content(kind: str, whole: Camera, cameras: Sequence[Camera], title: str, moments: int) -> bytes | str:
     if kind == ".png":
         return png_bytes(draw_sheet(cameras, title, moments=moments, whole=whole))
     grids, bins = cameras[0].voxels.shape[:2]
-    progress, film = _Progress(say, "pictures of the film", grids * bins), []
-    for picture in draw_film(cameras, title, whole=whole):
-        film.append(picture)
-        progress.step()
+    film = []
+    with Progress("drawing the film", "pictures") as progress:
+        for picture in draw_film(cameras, title, whole=whole):
+            film.append(picture)
+            progress(len(film), grids * bins)
     if kind == ".mp4":
         return mp4_bytes(film, FRAMES_PER_SECOND)
     if kind == ".gif":
@@ -197,7 +174,7 @@ def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[
     index = catalogue.frame_index(provenance.video)
     top, bottom = catalogue.rows.bounds(index.height_px)
     cut = Cut(1, (top, 0, bottom - top, index.width_px))
-    with open_local(catalogue.root, provenance.video, provenance.fingerprint) as path:
+    with catalogue.source.open_local(provenance.video, provenance.fingerprint) as path:
         (clip,) = clips_of(path, provenance.fingerprint, index, provenance.start_frame, [cut], 1)
     picture: npt.NDArray[np.uint8] = clip.frames[0]
     return picture

@@ -15,6 +15,7 @@ from v2v_pictures.files import write_png
 from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError, VideoUnreadable
 from v2v_protocol.messages import Lease
+from v2v_protocol.progress import Progress
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.sample import DEFAULT_ARRAYS, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
@@ -26,7 +27,6 @@ from v2v_server.offline.event_files import check_event_file, write_events
 from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
-from v2v_server.status.progress import catalogue_progress
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample
@@ -113,7 +113,7 @@ class Remaker:
                 request, sequence=sequence, catalogue=catalogue, spec=spec, seed=seed, arrays=self._arrays
             )
             try:
-                decoded = decode_for(lease, lease.indices, catalogue.root)[0]
+                decoded = decode_for(lease, lease.indices, catalogue.source)[0]
                 return RemadeSample(lease, decoded, make_sample(lease, decoded))
             except VideoError as error:
                 if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
@@ -127,7 +127,7 @@ def open_shown(
     source: str, *, list_file: str | None, rows: str, cache_dir: str | None, scene: bool = False
 ) -> Catalogue:
     """Call :func:`open_catalogue` on all cores, with progress on stderr."""
-    with catalogue_progress() as progress:
+    with Progress("probing videos") as progress:
         return open_catalogue(
             source, list_file=list_file, rows=Rows.parse(rows), scene=scene, cache_dir=cache_dir,
             processes=usable_cores(), progress=progress, notice=progress.notice,
@@ -208,7 +208,7 @@ def simulate_to_file(
         check_event_file(events)
     scene = stream.scene != "off"
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
-    quarantine = read_quarantine(quarantine_path(catalogue.root, cache_dir)) if snapshot else Quarantine()
+    quarantine = read_quarantine(quarantine_path(catalogue.source.name, cache_dir)) if snapshot else Quarantine()
     quarantine.entries(snapshot)  # before any work: whether there is such a snapshot
     for refusal in catalogue.refusals:
         print(f"cannot be used: {refusal}")

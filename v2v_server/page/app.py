@@ -4,8 +4,9 @@
 /healthz   200 if the server answers; for a liveness probe, which restarts it
 /readyz    200 if a worker can make samples; for a readiness probe, which sends consumers to it
 /metrics   for Prometheus
-/state     the newest state, JSON
-/events    every new state, as server-sent events
+/state     the newest status, JSON
+/events    every new status, as server-sent events
+/fields    what each number of the status means, JSON
 """
 
 from __future__ import annotations
@@ -24,18 +25,19 @@ from starlette.staticfiles import StaticFiles
 from v2v_server.page.guard import App, Guard
 from v2v_server.page.metrics import exposition
 from v2v_server.page.source import Source
+from v2v_server.status.parts import PARTS, meanings_at
 
 STATIC = Path(__file__).parent / "static"
 EVENT_SECONDS = 0.5
 MOST_STREAMS = 64
-"""Browsers that receive every state. One that stops reading occupies its connection and the memory of one state."""
+"""Browsers that receive every status. One that stops reading occupies its connection and the memory of one status."""
 
 
 class Pages:
     """Handlers of the paths.
 
     Args:
-        source: source of states.
+        source: where statuses come from.
     """
 
     def __init__(self, source: Source) -> None:
@@ -48,31 +50,41 @@ class Pages:
 
     async def healthz(self, request: Request) -> Response:
         """Report whether the server answers."""
-        sight = await self._source.known()
-        return _said(sight.trouble)
+        latest = await self._source.known()
+        return _said(latest.trouble)
 
     async def readyz(self, request: Request) -> Response:
         """Report whether a worker can make samples."""
-        sight = await self._source.known()
-        if sight.state is None:
-            return _said(sight.trouble)
-        return _said("" if sight.state["is_ready"] and sight.state["worker_count"] else "no worker is connected")
+        latest = await self._source.known()
+        if latest.status is None:
+            return _said(latest.trouble)
+        return _said("" if latest.status["is_ready"] and latest.status["worker_count"] else "no worker is connected")
 
     async def metrics(self, request: Request) -> Response:
         """Return the metrics; if the server does not answer, ``v2v_up`` is 0."""
-        sight = await self._source.latest()
-        content, content_type = exposition(sight.state, request.headers.get("accept", ""))
+        latest = await self._source.latest()
+        content, content_type = exposition(latest.status, request.headers.get("accept", ""))
         return Response(content, headers={"content-type": content_type})
 
     async def state(self, request: Request) -> Response:
-        """Return the newest state."""
-        sight = await self._source.latest()
-        if sight.state is None:
-            return JSONResponse({"trouble": sight.trouble}, 503)
-        return JSONResponse(sight.state)
+        """Return the newest status."""
+        latest = await self._source.latest()
+        if latest.status is None:
+            return JSONResponse({"trouble": latest.trouble}, 503)
+        return JSONResponse(latest.status)
+
+    async def fields(self, request: Request) -> Response:
+        """Return the place, name, help and unit of each field."""
+        return JSONResponse(
+            [
+                {"place": place, "name": name, "help": meaning.help, "unit": meaning.unit, "kind": meaning.kind}
+                for place in PARTS
+                for name, meaning in meanings_at(place).items()
+            ]
+        )
 
     async def events(self, request: Request) -> Response:
-        """Stream states: ``event: state``, or ``event: trouble`` if the server does not answer."""
+        """Stream every status: ``event: state``, or ``event: trouble`` if the server does not answer."""
         if self._streams >= MOST_STREAMS:
             return PlainTextResponse(
                 f"too many viewers: {MOST_STREAMS} are connected, the limit; close one and reload\n", 503
@@ -83,9 +95,9 @@ class Pages:
         self._streams += 1
         try:
             while True:
-                sight = await self._source.latest()
-                kind = "state" if sight.state is not None else "trouble"
-                data = json.dumps(sight.state if sight.state is not None else {"trouble": sight.trouble})
+                latest = await self._source.latest()
+                kind = "state" if latest.status is not None else "trouble"
+                data = json.dumps(latest.status if latest.status is not None else {"trouble": latest.trouble})
                 yield f"event: {kind}\ndata: {data}\n\n".encode()
                 await asyncio.sleep(EVENT_SECONDS)
         finally:
@@ -96,7 +108,7 @@ def make_app(source: Source, names: Iterable[str] = ()) -> App:
     """Build the application.
 
     Args:
-        source: source of states.
+        source: where statuses come from.
         names: host names that it accepts, in addition to IP addresses and this host's own name.
     """
     pages = Pages(source)
@@ -108,6 +120,7 @@ def make_app(source: Source, names: Iterable[str] = ()) -> App:
         Route("/metrics", pages.metrics),
         Route("/state", pages.state),
         Route("/events", pages.events),
+        Route("/fields", pages.fields),
     ]
     return Guard(Starlette(routes=routes), names)
 

@@ -1,4 +1,4 @@
-"""Get the newest state of the service on demand: a page without viewers costs nothing."""
+"""Get the newest status of the service on demand: a page without viewers costs nothing."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from v2v_protocol.errors import RemoteError, V2VError
 from v2v_protocol.messages import ErrorCode
 
 FRESH_SECONDS = 0.4
-"""A state of at most this age is reused."""
+"""A status of at most this age is reused."""
 _ANSWER_SECONDS = 3.0
 KNOWN_SECONDS = 15.0
-"""A health check accepts a state of this age."""
+"""A health check accepts a status of this age."""
 
 
 class GetsStatus(Protocol):
-    """Where states come from: a :class:`v2v_server.status.client.StatusClient`."""
+    """Where statuses come from: a :class:`v2v_server.status.client.StatusClient`."""
 
     def get_status(self, timeout_seconds: float) -> dict[str, Any]:
         """See :meth:`v2v_server.status.client.StatusClient.get_status`."""
@@ -30,18 +30,18 @@ class LatestStatus:
     """The last answer of the server.
 
     Attributes:
-        state: ``v2v_server.status.state.ServiceState.to_dict()``; None if the server did not answer.
+        status: see :mod:`v2v_server.status.parts`; None if the server did not answer.
         trouble: why it did not answer; empty if it did.
         at: time of the answer, seconds.
     """
 
-    state: dict[str, Any] | None
+    status: dict[str, Any] | None
     trouble: str
     at: float
 
 
 class Source:
-    """Request the state from a server, one request at a time and at most a few per second.
+    """Request the status from a server, one request at a time and at most a few per second.
 
     Args:
         client: sends the requests; used by one thread at a time.
@@ -57,16 +57,16 @@ class Source:
         self._asking: asyncio.Future[LatestStatus] | None = None
 
     async def latest(self) -> LatestStatus:
-        """Return the newest state, which is at most :data:`FRESH_SECONDS` old."""
+        """Return the newest status, which is at most :data:`FRESH_SECONDS` old."""
         async with self._lock:
             if self._latest is None or self._clock() - self._latest.at >= FRESH_SECONDS:
-                self._latest = await asyncio.to_thread(self._look)
+                self._latest = await asyncio.to_thread(self._request)
             return self._latest
 
     async def known(self) -> LatestStatus:
         """Return what is known without waiting for the server, unless nothing recent is known.
 
-        A state up to :data:`KNOWN_SECONDS` old counts; the next one is asked for in the background.
+        A status up to :data:`KNOWN_SECONDS` old counts; the next one is asked for in the background.
         """
         if self._asking is None or self._asking.done():
             self._asking = asyncio.ensure_future(self.latest())
@@ -76,14 +76,14 @@ class Source:
             return self._latest
         return await asyncio.shield(self._asking)
 
-    def _look(self) -> LatestStatus:
+    def _request(self) -> LatestStatus:
         try:
-            state = self._client.get_status(_ANSWER_SECONDS)
+            status = self._client.get_status(_ANSWER_SECONDS)
         except RemoteError as error:
             if error.code == ErrorCode.BUSY and self._answered is not None:  # the server is alive
                 self._answered = replace(self._answered, at=self._clock())
             return LatestStatus(None, str(error), self._clock())
         except V2VError as error:
             return LatestStatus(None, str(error), self._clock())
-        answered = self._answered = LatestStatus(state, "", self._clock())
+        answered = self._answered = LatestStatus(status, "", self._clock())
         return answered

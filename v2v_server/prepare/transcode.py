@@ -21,6 +21,7 @@ import numpy.typing as npt
 import xxhash
 
 from v2v_protocol.errors import VideoError
+from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.scenes.analysis import SceneAnalysis
 from v2v_server.corpus.scenes.scene import MOST_FRAMES, Scene
 from v2v_server.prepare.encode import encode_luma
@@ -107,8 +108,8 @@ def transcode(job: Transcoding) -> Made:
     job.target.parent.mkdir(parents=True, exist_ok=True)
     # Hidden, so that no catalogue includes it; hashed, so that the suffix fits even with the longest names.
     name = hashlib.sha256(os.fsencode(job.target.name)).hexdigest()[:16]
-    partial = job.target.with_name(f".{name}{PARTIAL_SUFFIX}")
-    try:
+    hidden = job.target.with_name(f".{name}{PARTIAL_SUFFIX}")
+    with write_aside_and_rename(job.target, partial=hidden) as partial:
         frames = _frames(job, index)
         analysis = SceneAnalysis()
         if job.scene:
@@ -116,9 +117,6 @@ def transcode(job: Transcoding) -> Made:
         made = (
             _stored(job, index, partial, frames) if job.encoding.is_lossless else _encoded(job, index, partial, frames)
         )
-        partial.replace(job.target)
-    finally:
-        partial.unlink(missing_ok=True)
     return replace(made, scene=analysis.scene()) if job.scene else made
 
 

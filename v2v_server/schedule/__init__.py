@@ -3,4 +3,5 @@
 sequences     which sequences of which videos a spec may draw from
 permutation   a keyed permutation that is computed, never stored
 epoch         which sequence each index of an epoch is made from, and its candidates
+summary       what a corpus gives under a spec, for the operator
 """

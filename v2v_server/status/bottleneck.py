@@ -1,96 +1,98 @@
-"""Who waits for whom, in one sentence, and what to do about it. Pure: computed from shares of time, nothing guessed.
+"""Find the bottleneck of the service, in one sentence, and what to do about it. Pure: it follows from shares of time.
 
-    consumers wait     they say so themselves: time in which they stood still for want of a batch
-    workers wait       time in which they held nothing to make
+    consumers wait     as they report: time in which they needed a batch and had none
+    workers wait       time in which they held no lease
     workers queue      time in which they could have worked and got no core
-    workers work       decoding, simulating, handing over: each result says how long
+    workers work       decoding, simulating, delivering: each result says how long
     the broker works   time in which its loop did not wait for a message
 
-Where consumers hardly wait, they are the slow part themselves. Where they do, it is for workers that have no time left,
-and then for what takes most of it; or for the broker, if that has no time left; or else for what is on its way.
+If consumers hardly wait, they are the bottleneck themselves. If they do, it is the broker if that has no time left;
+the network if workers have time left; else what takes most of the workers' time.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-from v2v_server.status.history import Moment
+from v2v_server.status.history import TimeWindow
+from v2v_server.system.status_fields import gauge, states, text
 
 NOTICEABLE_SHARE = 0.1
-"""Of its time that a consumer may wait without a word about it."""
+"""Share of its time that a consumer may wait without being called stalled."""
 _IDLE_SHARE = 0.3
-"""Of the workers' time: with more to spare they are not what consumers wait for."""
+"""Workers that are idle for a larger share of their time are not the bottleneck."""
 _FULL_SHARE = 0.85
-"""Of the broker's time: with so little to spare it is."""
+"""A broker that is busy for a larger share of its time is the bottleneck."""
 _LEAST_SECONDS = 2.0
-"""Of a window that says anything."""
+"""Shortest window that allows a conclusion."""
 _QUEUED_SHARE = 0.4
-"""Of the workers' time, in which they wait for a core: with more, the host has more to do than cores for it."""
+"""If workers wait for a core for a larger share of their time, their host has too few cores."""
 _SPARE_SHARE = 0.5
-"""Of the workers' time, in which they are idle, for fewer of them to do."""
+"""If workers are idle for a larger share of their time, fewer of them would do."""
+
+
+def _share(help: str, part: str) -> Any:
+    return gauge(help, "time_ratio", unit="0 to 1", part=part, default=0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Shares:
-    """Shares of the time in which there was a consumer, each 0 to 1.
+    """Shares of the last ten seconds in which there was a consumer."""
 
-    Attributes:
-        seconds: of that time, within the last ten.
-        consumers: of all consumers' time, in which they waited for batches.
-        idle: of all workers' time, in which they held nothing to make.
-        broker: of the server's loop, in which it did not wait for a message.
-        decode, simulate, handover: of all workers' time.
-        queued: of all workers' time, in which those of this server waited for a core.
-        cores: processor time of all workers by their time, which is cores for each.
-    """
-
-    seconds: float = 0.0
-    consumers: float = 0.0
-    idle: float = 0.0
-    broker: float = 0.0
-    decode: float = 0.0
-    simulate: float = 0.0
-    handover: float = 0.0
-    queued: float = 0.0
-    cores: float = 0.0
+    seconds: float = gauge("Seconds of the last ten in which there was a consumer.", unit="s", default=0.0)
+    consumers: float = _share("Share of the consumers' time in which they waited for batches.", "consumers")
+    idle: float = _share("Share of the workers' time in which they held no lease.", "idle")
+    broker: float = _share("Share of the time in which the server's loop did not wait for a message.", "broker")
+    decode: float = _share("Share of the workers' time that decoding took.", "decode")
+    simulate: float = _share("Share of the workers' time that simulating took.", "simulate")
+    handover: float = _share("Share of the workers' time that delivering took.", "handover")
+    queued: float = _share("Share of all workers' time in which those of this server waited for a core.", "queued")
+    cores: float = gauge("Processor time of the workers by their time.", unit="cores", default=0.0)
 
     @classmethod
-    def of(cls, before: Moment, last: Moment) -> Shares:
-        """Those of the time between two moments."""
-        attended = last.attended_seconds - before.attended_seconds
-        workers = last.worker_seconds - before.worker_seconds
+    def of(cls, window: TimeWindow) -> Shares:
+        """Compute the shares of a window."""
+        parts = {
+            name: window.share(f"{total}_seconds", "worker")
+            for name, total in (
+                ("decode", "decode"),
+                ("simulate", "simulate"),
+                ("handover", "handover"),
+                ("queued", "queued"),
+                ("cores", "cpu"),
+            )
+        }
         return cls(
-            seconds=attended,
-            consumers=_share(
-                last.waited_seconds - before.waited_seconds, last.consumer_seconds - before.consumer_seconds
-            ),
-            idle=_share(last.idle_seconds - before.idle_seconds, workers),
-            broker=_share(last.broker_seconds - before.broker_seconds, attended),
-            decode=_share(last.decode_seconds - before.decode_seconds, workers),
-            simulate=_share(last.simulate_seconds - before.simulate_seconds, workers),
-            handover=_share(last.handover_seconds - before.handover_seconds, workers),
-            queued=_share(last.queued_seconds - before.queued_seconds, workers),
-            cores=_share(last.cpu_seconds - before.cpu_seconds, workers),
+            seconds=window.change("attended"),
+            consumers=window.share("waited_seconds", "consumer"),
+            idle=window.share("idle", "worker"),
+            broker=window.share("broker", "attended"),
+            **parts,
         )
 
 
 @dataclass(frozen=True, slots=True)
-class Waiting:
-    """The verdict.
+class Bottleneck:
+    """The bottleneck of the service."""
 
-    Attributes:
-        part: the slow one: "nobody" (no consumer is connected), "start" (too early to say), "workers" (none can
-            work), "consumers", "cores" (the workers' host has too few of them), "decode", "simulate", "handover",
-            "broker", "way" (requests and samples are on their way for long), "even" (no wait to speak of).
-        sentence: who waits for whom.
-        remedy: what to do about it; empty where nothing need be done.
-        shares: that it follows from.
-    """
-
-    part: str
-    sentence: str
-    remedy: str
-    shares: Shares
+    part: str = states(
+        "1 for the part that is the bottleneck.",
+        "slow_part",
+        "no_consumers",  # none is connected
+        "start",  # too early to say
+        "workers",  # none can make a sample
+        "consumers",
+        "cores",  # the workers' host has too few
+        "decode",
+        "simulate",
+        "handover",
+        "broker",
+        "transit",  # requests and samples take long to arrive
+        "even",  # no notable waiting
+    )
+    sentence: str = text("What waits for what.")
+    remedy: str = text("What to do about it; empty if nothing is needed.", default="")
 
 
 def find_bottleneck(
@@ -101,71 +103,67 @@ def find_bottleneck(
     starting: int = 0,
     trouble: str = "",
     has_cache: bool = False,
-) -> Waiting:
-    """The slow part of the service.
+) -> Bottleneck:
+    """Find the bottleneck.
 
     Args:
-        shares: of the last seconds.
+        shares: shares of the last seconds.
         is_attended: whether there are consumers.
-        workers: that have said hello.
-        starting: processes of the server's own that have not said hello yet.
-        trouble: why no worker can make a sample; empty where one can.
-        has_cache: whether the server's workers keep what was decoded.
+        workers: number of connected workers.
+        starting: number of the server's own worker processes that are not connected yet.
+        trouble: why no worker can make a sample; empty if one can.
+        has_cache: whether the server's workers cache decoded clips.
     """
-    part, sentence, remedy = _verdict(shares, is_attended, workers, starting, trouble, has_cache)
-    return Waiting(part, sentence, remedy, shares)
-
-
-def _verdict(
-    shares: Shares, is_attended: bool, workers: int, starting: int, trouble: str, has_cache: bool
-) -> tuple[str, str, str]:
     if not is_attended:
-        return "nobody", "Nobody is connected: the service waits for consumers.", ""
+        return Bottleneck("no_consumers", "No consumer is connected.")
     if trouble:
         if starting and not workers:
-            return "workers", f"Consumers wait for workers: {starting} are starting.", ""
-        return "workers", f"Consumers wait for workers: {trouble}.", ""
+            return Bottleneck("workers", f"Consumers wait for workers: {starting} are starting.")
+        return Bottleneck("workers", f"Consumers wait for workers: {trouble}.")
     if shares.seconds < _LEAST_SECONDS:
-        return "start", "It is too early to say who waits: samples have just begun to flow.", ""
+        return Bottleneck("start", "It is too early to say what is slow: samples have just begun to flow.")
     wait = f"{shares.consumers:.0%}"
     if shares.consumers < NOTICEABLE_SHARE:
         if shares.idle < _IDLE_SHARE:
-            return "even", f"Nobody waits to speak of: consumers {wait} of their time, workers {shares.idle:.0%}.", ""
+            return Bottleneck(
+                "even", f"Hardly any waiting: consumers {wait} of their time, workers {shares.idle:.0%}.", ""
+            )
         spare = "fewer workers would do" if shares.idle >= _SPARE_SHARE else ""
-        return (
+        return Bottleneck(
             "consumers",
-            f"Workers wait for consumers: these take samples as fast as they can use them (they wait {wait} of their "
-            f"time), and workers are idle {shares.idle:.0%} of theirs.",
+            f"Workers wait for consumers, which use samples as fast as they can (they wait {wait} of their time); "
+            f"workers are idle {shares.idle:.0%} of theirs.",
             spare,
         )
     if shares.broker >= _FULL_SHARE:
-        return (
+        return Bottleneck(
             "broker",
-            f"Consumers wait {wait} of their time for the server's own loop, which is busy {shares.broker:.0%} of its.",
+            f"Consumers wait {wait} of their time for the server's own loop, which is busy {shares.broker:.0%} of its "
+            "time.",
             "give its host a free core, let consumers on this host use shared memory, or split the consumers between "
             "two servers",
         )
     if shares.idle >= _IDLE_SHARE:
-        return (
-            "way",
-            f"Consumers wait {wait} of their time although workers are idle {shares.idle:.0%} of theirs: samples are "
-            "on their way for long, or too few are asked ahead.",
-            "look at the network between them, and raise --max-credit-bytes or --expect-workers so that more is asked "
-            "ahead",
+        return Bottleneck(
+            "transit",
+            f"Consumers wait {wait} of their time although workers are idle {shares.idle:.0%} of theirs: samples take "
+            "long to arrive, or too few are requested ahead.",
+            "check the network between them; raise --max-credit-bytes or --expect-workers so that more samples are "
+            "requested ahead",
         )
     if shares.queued >= _QUEUED_SHARE:
-        return (
+        return Bottleneck(
             "cores",
             f"The workers' host is overloaded: consumers wait {wait} of their time for workers, which wait "
             f"{shares.queued:.0%} of theirs for a core and get {shares.cores:.2f} of a core each.",
             "more workers on this host would not help: stop other programs there, or start v2v-worker on other hosts",
         )
     part = max(("decode", "simulate", "handover"), key=lambda name: getattr(shares, name))
-    doing, remedy = {
+    activity, remedy = {
         "decode": (
             "decode",
             "start more workers (--workers, v2v-worker on other hosts)"
-            + ("" if has_cache else ", keep what is decoded (--cache)")
+            + ("" if has_cache else ", cache decoded clips (--cache)")
             + ", prepare the videos once (v2v-prepare), or take more samples of each clip (samples_per_decode)",
         ),
         "simulate": (
@@ -174,13 +172,11 @@ def _verdict(
             "voxels_per_clip, fewer effects, no flow",
         ),
         "handover": (
-            "hand over",
-            "run consumers on the workers' host, where samples lie in shared memory, or give the network more room",
+            "deliver samples",
+            "run consumers on the workers' host, where samples are in shared memory, or use a faster network",
         ),
     }[part]
-    share = {"decode": shares.decode, "simulate": shares.simulate, "handover": shares.handover}[part]
-    return part, f"Consumers wait {wait} of their time for workers, which {doing} {share:.0%} of theirs.", remedy
-
-
-def _share(part: float, whole: float) -> float:
-    return min(1.0, max(0.0, part / whole)) if whole > 0.0 else 0.0
+    sentence = (
+        f"Consumers wait {wait} of their time for workers, which {activity} {getattr(shares, part):.0%} of theirs."
+    )
+    return Bottleneck(part, sentence, remedy)

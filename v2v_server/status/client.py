@@ -1,4 +1,4 @@
-"""Asks a server for its state, over a socket of its own. Blocking; for one thread."""
+"""Request a server's status over a separate socket. Blocking; for one thread."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from v2v_protocol.safe_json import parse_json
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode
 
 _AGAIN_SECONDS = 2.0
-"""Without an answer the question is asked again: it may be lost with a connection."""
+"""An unanswered request is repeated after this time: it may be lost with a connection."""
 
 
 class StatusClient:
-    """One connection to look through.
+    """One connection to a server.
 
     Args:
-        address: of the server's consumers' or workers' side, ``tcp://host:port``.
-        keys: file of a consumer's key; None takes what ``V2V_KEYS`` names, "" none.
+        address: where consumers or workers connect, ``tcp://host:port``.
+        keys: file of a consumer's key; None: the one that ``V2V_KEYS`` names, "": no key.
 
     Raises:
-        UsageError: the address is not understood.
+        UsageError: the address is malformed.
         KeyRefused: the key file cannot be used.
     """
 
@@ -38,7 +38,7 @@ class StatusClient:
         self._handshakes = Handshakes(address, key, "consumer")
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
-        # A name of its own: a first byte of 0 is ZeroMQ's.
+        # ZeroMQ reserves a first byte of 0.
         self._socket.setsockopt(zmq.ROUTING_ID, b"\x02" + os.urandom(15))
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_HEADER_BYTES)
@@ -64,32 +64,32 @@ class StatusClient:
         self.close()
 
     def get_status(self, timeout_seconds: float = 10.0) -> dict[str, Any]:
-        """The state of now: ``v2v_server.status.state.ServiceState.to_dict()``.
+        """Return the current status, see :mod:`v2v_server.status.parts`.
 
         Raises:
-            ServerLost: no answer in that time.
-            RemoteError: the server is too busy for us.
-            KeyRefused: it takes no such key.
-            ProtocolError, VersionMismatch: it is no server of ours, or of another version.
+            ServerLost: there is no answer in this time.
+            RemoteError: the server is too busy.
+            KeyRefused: the server does not accept the key.
+            ProtocolError, VersionMismatch: the peer is no such server, or has another version.
         """
         end = time.monotonic() + timeout_seconds
         ask_at = time.monotonic()
         while (now := time.monotonic()) < end:
             if now >= ask_at:
                 ask_at = now + _AGAIN_SECONDS
-                with suppress(zmq.Again):  # the handshake has failed, and is heard of below
+                with suppress(zmq.Again):  # the handshake failed, which the monitor reports
                     self._socket.send_multipart(encode(GetStatus()), flags=zmq.NOBLOCK)
             ready = dict(self._poller.poll(int(1000 * max(0.0, min(end, ask_at) - now)) + 1))
             if self._monitor in ready:
                 self._handshakes.take(
                     lambda: self._monitor.poll(0), lambda: self._monitor.recv_multipart(flags=zmq.NOBLOCK)
                 )
-            if self._socket in ready and (seen := self._latest()) is not None:
-                return seen
+            if self._socket in ready and (latest := self._latest()) is not None:
+                return latest
         raise ServerLost(f"{self._address}: no answer for {timeout_seconds:g} s; is v2v-serve running there?")
 
     def _latest(self) -> dict[str, Any] | None:
-        """The newest of the answers that are here: one that came too late for its question is old."""
+        """Return the newest answer that has arrived: one that came too late for its request is old."""
         newest = None
         while self._socket.poll(0):
             message = decode(self._socket.recv_multipart()[0])
@@ -100,13 +100,13 @@ class StatusClient:
         if newest is None:
             return None
         try:
-            state = parse_json(newest.json)
+            status = parse_json(newest.json)
         except ValueError as error:
-            raise ProtocolError(f"{self._address} sent a state that is no JSON") from error
-        if not isinstance(state, dict) or not isinstance(state.get("version"), int):
-            raise ProtocolError(f"{self._address} sent a state without a version")
-        return state
+            raise ProtocolError(f"{self._address} sent a status that is not JSON") from error
+        if not isinstance(status, dict) or not isinstance(status.get("version"), int):
+            raise ProtocolError(f"{self._address} sent a status without a version")
+        return status
 
     def close(self) -> None:
-        """Ends the connection."""
+        """End the connection."""
         self._context.destroy(linger=0)

@@ -1,138 +1,131 @@
-"""What went on over the last seconds: running totals, noted once a second, from which rates and shares follow. Pure."""
+"""Totals of the last seconds, noted once a second: rates and shares are their differences. Pure."""
 
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from v2v_server.broker.dispatcher import Dispatcher
+from v2v_server.broker.session import AWAY_SECONDS
+from v2v_server.system.status_fields import values
 
 WINDOW_SECONDS = 10.0
 NOTE_SECONDS = 1.0
-_AWAY_SECONDS = 2.0
+_LEAST_SECONDS = 1.0
+"""Shortest time that the rate of a new peer is of."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """The totals at one time, seconds by the clock unless said otherwise.
+    """The totals at one time.
 
     Attributes:
-        now: the time.
-        samples, batches, array_bytes, decodes: handed over; see :class:`v2v_server.broker.counters.Counters`.
-        decode_seconds, simulate_seconds, handover_seconds: of all workers together.
-        queued_seconds: of the server's own workers, in which they waited for a core.
-        cpu_seconds: processor time of all workers together.
-        attended_seconds: in which there was a consumer; only in these the next three are counted: that nobody has work
-            while nobody wants any says nothing.
-        broker_seconds: that the server's loop did not wait for a message.
-        worker_seconds: that there were workers, times how many.
-        idle_seconds: of these, in which they held no lease.
-        consumer_seconds: that there were consumers, times how many.
-        waited_seconds: of these, in which they waited for samples.
-        cpu: processor time, by worker.
-        busy: time by the clock that samples took, by worker.
-        waited: time that a consumer waited for samples, by consumer.
-        served: samples, by consumer.
-        positions: (epoch, position in it), by consumer.
+        now: monotonic time, seconds.
+        totals: the counters; and, of the time in which there was a consumer, ``attended``, ``broker`` (the loop did not
+            wait for a message), ``worker`` and ``consumer`` (times their number), ``idle`` (of ``worker``, without a
+            lease), in seconds.
+        peers: busy and processor seconds of each worker, by routing id; samples, seconds waited and indices passed of
+            each consumer, by number.
     """
 
     now: float
-    samples: int = 0
-    batches: float = 0.0
-    array_bytes: int = 0
-    decodes: int = 0
-    decode_seconds: float = 0.0
-    simulate_seconds: float = 0.0
-    handover_seconds: float = 0.0
-    queued_seconds: float = 0.0
-    cpu_seconds: float = 0.0
-    attended_seconds: float = 0.0
-    broker_seconds: float = 0.0
-    worker_seconds: float = 0.0
-    idle_seconds: float = 0.0
-    consumer_seconds: float = 0.0
-    waited_seconds: float = 0.0
-    cpu: Mapping[bytes, float] = field(default_factory=dict)
-    busy: Mapping[bytes, float] = field(default_factory=dict)
-    waited: Mapping[bytes, float] = field(default_factory=dict)
-    served: Mapping[bytes, int] = field(default_factory=dict)
-    positions: Mapping[bytes, tuple[int, int]] = field(default_factory=dict)
+    totals: Mapping[str, float]
+    peers: Mapping[bytes | int, tuple[float, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class TimeWindow:
+    """The time between two moments."""
+
+    before: Moment
+    last: Moment
+
+    @property
+    def seconds(self) -> float:
+        """Its length."""
+        return self.last.now - self.before.now
+
+    def change(self, name: str) -> float:
+        """Return by how much a total grew."""
+        return self.last.totals.get(name, 0.0) - self.before.totals.get(name, 0.0)
+
+    def rate(self, name: str) -> float:
+        """Return the same per second; 0 for an empty window."""
+        return self.change(name) / self.seconds if self.seconds > 0.0 else 0.0
+
+    def share(self, part: str, whole: str) -> float:
+        """Return the growth of one total as a share of another's, 0 to 1."""
+        return min(1.0, max(0.0, self.change(part) / self.change(whole))) if self.change(whole) > 0.0 else 0.0
+
+    def rates_of(self, peer: bytes | int, since: float = -math.inf) -> list[float]:
+        """Return the rates of a peer's totals; of one that came at ``since``, within the window, over its own time."""
+        seconds = min(self.seconds, max(_LEAST_SECONDS, self.last.now - since))
+        totals = self.last.peers[peer]
+        before = self.before.peers.get(peer, (0.0,) * len(totals))
+        return [(now - then) / seconds if seconds > 0.0 else 0.0 for now, then in zip(totals, before, strict=True)]
 
 
 class History:
-    """The last ten seconds.
+    """The last ten seconds of a dispatcher.
 
     Args:
-        now: the time.
+        dispatcher: whose totals are noted.
+        now: monotonic time, seconds.
     """
 
-    def __init__(self, now: float) -> None:
+    def __init__(self, dispatcher: Dispatcher, now: float) -> None:
+        self._dispatcher = dispatcher
         self._moments: deque[Moment] = deque()
-        self._looked = now
-        self._note_at = now
-        self._attended_seconds = self._broker_seconds = 0.0
-        self._worker_seconds = self._idle_seconds = self._consumer_seconds = 0.0
-        self._broker_before = 0.0
+        self._noted = self._note_at = now
+        self._clocks: defaultdict[str, float] = defaultdict(float)
+        self._broker_seconds = 0.0
         self._attended_at = -math.inf
 
-    def look(self, now: float, dispatcher: Dispatcher, broker_seconds: float) -> None:
-        """To be called a few times a second.
+    def note(self, now: float, broker_seconds: float) -> None:
+        """Note the time that passed. Call a few times a second.
 
         Args:
-            now: the time.
-            dispatcher: whose totals are noted.
-            broker_seconds: since the start, in which the loop did not wait for a message.
+            now: monotonic time, seconds.
+            broker_seconds: time since the start in which the loop did not wait for a message.
         """
-        since, self._looked = max(0.0, now - self._looked), now
-        busy, self._broker_before = broker_seconds - self._broker_before, broker_seconds
-        if consumers := dispatcher.consumers:
+        passed, self._noted = max(0.0, now - self._noted), now
+        busy, self._broker_seconds = broker_seconds - self._broker_seconds, broker_seconds
+        if consumers := self._dispatcher.consumers:
+            # Idle workers matter only while there is a consumer.
             self._attended_at = now
-            self._attended_seconds += since
-            self._broker_seconds += busy
-            self._worker_seconds += since * dispatcher.workers
-            self._idle_seconds += since * dispatcher.workers * dispatcher.idle_share
-            self._consumer_seconds += since * consumers
-        if now < self._note_at:
-            return
-        self._note_at = now + NOTE_SECONDS
-        self._moments.append(self._moment(now, dispatcher))
-        while len(self._moments) > 2 and now - self._moments[1].now >= WINDOW_SECONDS:
-            self._moments.popleft()
+            worker = passed * self._dispatcher.workers
+            idle = worker * self._dispatcher.idle_share
+            clocks = {
+                "attended": passed,
+                "broker": busy,
+                "worker": worker,
+                "idle": idle,
+                "consumer": passed * consumers,
+            }
+            for name, seconds in clocks.items():
+                self._clocks[name] += seconds
+        if now >= self._note_at:
+            self._note_at = now + NOTE_SECONDS
+            self._moments.append(self._moment(now))
+            while len(self._moments) > 2 and now - self._moments[1].now >= WINDOW_SECONDS:
+                self._moments.popleft()
 
     def is_attended(self, now: float) -> bool:
-        """Whether there is a consumer, or was a moment ago: from one epoch to the next they leave and come again."""
-        return now - self._attended_at < _AWAY_SECONDS
+        """Return whether there is a consumer, or was a moment ago: between epochs they leave and return."""
+        return now - self._attended_at < AWAY_SECONDS or self._dispatcher.consumers > 0
 
-    def window(self, now: float, dispatcher: Dispatcher) -> tuple[Moment, Moment]:
-        """The totals some ten seconds ago, or at the start, and those of now. For the arguments see :meth:`look`."""
-        last = self._moment(now, dispatcher)
-        return (self._moments[0] if self._moments else last), last
+    def window(self, now: float) -> TimeWindow:
+        """Return the last ten seconds, or the time since the start."""
+        last = self._moment(now)
+        return TimeWindow(self._moments[0] if self._moments else last, last)
 
-    def _moment(self, now: float, dispatcher: Dispatcher) -> Moment:
-        counters, members = dispatcher.counters, dispatcher.registry.members()
-        work = counters.work
-        return Moment(
-            now,
-            counters.samples,
-            counters.batches,
-            counters.bytes,
-            counters.decodes,
-            work.decode_seconds,
-            work.simulate_seconds,
-            work.handover_seconds,
-            counters.queued_seconds,
-            work.cpu_seconds,
-            self._attended_seconds,
-            self._broker_seconds,
-            self._worker_seconds,
-            self._idle_seconds,
-            self._consumer_seconds,
-            counters.waited_seconds,
-            {identity: member.work.cpu_seconds for identity, member in members.items()},
-            {identity: member.work.busy_seconds for identity, member in members.items()},
-            {session.identity: session.waited_seconds for session in dispatcher.sessions},
-            {session.identity: session.served for session in dispatcher.sessions},
-            {session.identity: (session.epoch, session.position) for session in dispatcher.sessions},
-        )
+    def _moment(self, now: float) -> Moment:
+        peers: dict[bytes | int, tuple[float, ...]] = {
+            identity: (member.work.busy_seconds, member.work.cpu_seconds)
+            for identity, member in self._dispatcher.registry.members().items()
+        }
+        for each in self._dispatcher.sessions.totals():
+            peers[each.number] = each.served, each.waited_seconds, each.passed
+        return Moment(now, values(self._dispatcher.counters) | self._clocks, peers)

@@ -1,6 +1,6 @@
-"""Whoever looks at the service: keeps the history, makes the state when somebody wants it, and answers those who asked.
+"""Keep the history of a service, build its status on request, and answer the requests.
 
-A state is made at most a few times a second, however many look and however often they ask.
+A status is built at most a few times a second, whatever the number of clients and requests.
 """
 
 from __future__ import annotations
@@ -8,96 +8,81 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from v2v_protocol.messages import ErrorCode, Status
+from v2v_protocol.messages import ErrorCode
+from v2v_protocol.messages import Status as StatusMessage
 from v2v_protocol.wire import Frames, encode
 from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker, denial
-from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.quarantine import Quarantine
-from v2v_server.broker.transport import ServerTransport
-from v2v_server.config import ServeConfig
-from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.status.history import History
-from v2v_server.status.snapshot import Service, service_state
-from v2v_server.status.state import ServiceState
-from v2v_server.supervise.protocol import Supervisor
+from v2v_server.status.parts import Status
+from v2v_server.status.snapshot import Service, to_json
 
 ANSWER_SECONDS = 0.4
 LARGEST_SHARE = 0.02
-"""Of the loop's time that states may take: with thousands of workers and consumers they come less often."""
-MOST_LOOKERS = 64
-"""Peers that are answered with one state."""
+"""Share of the loop's time that building may take; with thousands of workers and consumers it happens less often."""
+MOST_WAITING = 64
+"""Clients that are answered with one status."""
 
 
 class StatusPublisher:
-    """One service, looked at.
+    """Answer requests for the status of one service.
 
     Args:
-        service: where the state is read from.
-        waited_seconds: for how long the loop has waited for messages in all.
-        wall_clock: gives the time of day, ISO 8601.
-        processor_clock: seconds that this thread has worked.
+        service: what the status is read from.
+        now: monotonic time of the server's start, seconds.
+        wall_clock: returns the time of day, ISO 8601.
+        processor_clock: returns the processor seconds of this thread.
 
     Attributes:
-        is_ready: whether the server has said so.
+        is_ready: whether the server has announced that it is ready.
     """
 
     def __init__(
         self,
         service: Service,
-        waited_seconds: Callable[[], float],
+        now: float,
         wall_clock: Callable[[], str],
         processor_clock: Callable[[], float] = time.thread_time,
     ) -> None:
         self._service = service
-        self._waited_seconds = waited_seconds
+        self._started = now
+        self._waited_before = service.transport.waited_seconds
+        self._history = History(service.dispatcher, now)
         self._wall_clock = wall_clock
         self._processor_clock = processor_clock
-        self._lookers: dict[SendStatus, None] = {}
-        self._answer_at = service.started
+        self._waiting: dict[SendStatus, None] = {}
+        self._answer_at = now
         self.is_ready = False
 
-    def state(self, now: float) -> ServiceState:
-        """The state of now."""
-        return service_state(self._service, now, self._wall_clock(), is_ready=self.is_ready)
+    def status(self, now: float) -> Status:
+        """Return the current status."""
+        return self._service.status(
+            self._history.window(now),
+            self._wall_clock(),
+            uptime_seconds=now - self._started,
+            is_ready=self.is_ready,
+            is_attended=self._history.is_attended(now),
+        )
 
-    def ask(self, show: SendStatus) -> list[ToConsumer | ToWorker]:
-        """Somebody looks; returns what is to be sent at once, which is nothing as a rule."""
-        if show in self._lookers or len(self._lookers) < MOST_LOOKERS:
-            self._lookers[show] = None
+    def ask(self, request: SendStatus) -> list[ToConsumer | ToWorker]:
+        """Take a request; return what to send at once: nothing, or a denial if too many wait."""
+        if request in self._waiting or len(self._waiting) < MOST_WAITING:
+            self._waiting[request] = None
             return []
-        return [_to(show, denial(ErrorCode.BUSY, f"{MOST_LOOKERS} others look at this server at this moment"))]
+        text = f"{MOST_WAITING} clients wait for the status of this server, its limit: try again"
+        return [_to(request, denial(ErrorCode.BUSY, text))]
 
     def tick(self, now: float) -> list[ToConsumer | ToWorker]:
-        """To be called a few times a second; returns the answers that are due."""
-        self._service.history.look(now, self._service.dispatcher, self._broker_seconds(now))
-        if not self._lookers or now < self._answer_at:
+        """Return the answers that are due. Call a few times a second."""
+        waited_seconds = self._service.transport.waited_seconds - self._waited_before
+        self._history.note(now, max(0.0, now - self._started - waited_seconds))
+        if not self._waiting or now < self._answer_at:
             return []
         began = self._processor_clock()
-        lookers, self._lookers = self._lookers, {}
-        frames = encode(Status(self.state(now).to_json()))
+        waiting, self._waiting = self._waiting, {}
+        frames = encode(StatusMessage(to_json(self.status(now))))
         self._answer_at = now + max(ANSWER_SECONDS, (self._processor_clock() - began) / LARGEST_SHARE)
-        return [_to(show, frames) for show in lookers]
-
-    def _broker_seconds(self, now: float) -> float:
-        return max(0.0, now - self._service.started - self._waited_seconds())
+        return [_to(request, frames) for request in waiting]
 
 
-def make_publisher(
-    config: ServeConfig,
-    catalogue: Catalogue,
-    dispatcher: Dispatcher,
-    supervisor: Supervisor,
-    quarantine: Quarantine,
-    transport: ServerTransport,
-    now: float,
-    wall_clock: Callable[[], str],
-) -> StatusPublisher:
-    """The watch over a server that starts at ``now``."""
-    addresses = transport.address, transport.worker_address
-    service = Service(config, catalogue, dispatcher, supervisor, quarantine, History(now), *addresses, started=now)
-    before = transport.waited_seconds
-    return StatusPublisher(service, lambda: transport.waited_seconds - before, wall_clock)
-
-
-def _to(show: SendStatus, frames: Frames) -> ToConsumer | ToWorker:
-    return ToWorker(show.identity, frames) if show.is_worker_side else ToConsumer(show.identity, frames)
+def _to(request: SendStatus, frames: Frames) -> ToConsumer | ToWorker:
+    return ToWorker(request.identity, frames) if request.is_worker_side else ToConsumer(request.identity, frames)

@@ -1,76 +1,87 @@
-"""What a terminal shows of a running server: a few lines that are kept up to date in place."""
+"""Show the status of a running server on standard error: on a terminal, in a log, or for programs."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import asdict
-from typing import TextIO
+from typing import Any, TextIO
 
-from rich.console import Console, Group
+from rich.console import Console
 from rich.text import Text
 
-from v2v_server.corpus.files import printable
-from v2v_server.status.line import StatusLine, figures
-from v2v_server.status.log import StatusLog
-from v2v_server.status.state import ServiceState
+from v2v_server.corpus.sources.names import printable
+from v2v_server.status.parts import Status
+from v2v_server.status.text import figures
 from v2v_server.status.top import consumers_table
 from v2v_server.system.log import Log, write
 
-_SECONDS = 0.5
+_TERMINAL_SECONDS, _LOG_SECONDS = 0.5, 10.0
 _MOST_CONSUMERS = 8
+_LOGGED = ("samples_per_second", "batches_per_second", "queue")
 
 
-def make_status(log: Log, stream: TextIO) -> StatusBlock | StatusLine | StatusLog:
-    """How a server shows its state: for programs, on a terminal, or in a file."""
-    if log.is_json:
-        return StatusLog(log)
-    is_terminal = stream.isatty() and os.environ.get("TERM") != "dumb"
-    return StatusBlock(stream) if is_terminal else StatusLine(stream)
-
-
-class StatusBlock:
-    """Who waits for whom, the figures, and how far each consumer is in its epoch.
+class StatusView:
+    """Show the status when it is due. On a terminal a few lines are replaced in place.
 
     Args:
-        stream: a terminal.
+        log: for programs, if it is JSON.
+        stream: for people.
     """
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-        self._console = Console(file=stream, highlight=False)
+    def __init__(self, log: Log, stream: TextIO) -> None:
+        self._log, self._stream = log, stream
+        is_terminal = stream.isatty() and os.environ.get("TERM") != "dumb" and not log.is_json
+        self._console = Console(file=stream, highlight=False) if is_terminal else None
         self._next = 0.0
         self._lines = 0
 
     def is_due(self, now: float) -> bool:
-        """Whether it is time to show the state again."""
+        """Return whether it is time to show the status again."""
         return now >= self._next
 
-    def show(self, now: float, state: ServiceState) -> None:
-        """Shows the state in the place of the one before."""
-        self._next = now + _SECONDS
-        cores = sum(worker.cpu_share for worker in state.workers)
-        parts = [
-            Text(printable(state.waiting.sentence), style="bold"),
-            Text(printable(f"{figures(state)}  {cores:.1f} cores"), style="dim"),
-        ]
-        with self._console.capture() as drawn:
-            self._console.print(Group(*parts))
-            if state.consumers:
-                shown = [asdict(each) for each in state.consumers[:_MOST_CONSUMERS]]
-                self._console.print(consumers_table(state.consumer_count, shown))
-        text = drawn.get()
-        write(self._stream, self._clearing() + text)
-        self._lines = text.count("\n")
+    def show(self, now: float, status: Status) -> None:
+        """Show the status."""
+        self._next = now + (_LOG_SECONDS if self._console is None else _TERMINAL_SECONDS)
+        if self._log.is_json:
+            self._log.say(status["waiting"]["sentence"], **_for_programs(status))
+        elif self._console is None:
+            write(self._stream, figures(status) + "\n")
+        else:
+            text = _drawn(self._console, status)
+            write(self._stream, self._clearing() + text)
+            self._lines = text.count("\n")
 
     def interrupt(self) -> None:
-        """Clears the lines, because something else is about to be printed."""
+        """Clear the lines, because another line follows."""
         if self._lines:
             write(self._stream, self._clearing())
             self._lines = 0
 
     def close(self) -> None:
-        """Leaves what was shown last."""
+        """Leave what was shown last."""
         self._lines = 0
 
     def _clearing(self) -> str:
         return f"\x1b[{self._lines}F\x1b[J" if self._lines else ""
+
+
+def _for_programs(status: Status) -> dict[str, Any]:
+    totals = status["totals"]
+    return {
+        "slow_part": status["waiting"]["part"],
+        "workers": status["worker_count"],
+        "consumers": status["consumer_count"],
+        "samples": totals["samples"],
+        "faults": totals["faults"],
+        **{name: round(status[name], 3) for name in _LOGGED},
+        "totals": totals,
+    }
+
+
+def _drawn(console: Console, status: Status) -> str:
+    cores = sum(worker["cpu_share"] for worker in status["workers"])
+    with console.capture() as drawn:
+        console.print(Text(printable(status["waiting"]["sentence"]), style="bold"))
+        console.print(Text(printable(f"{figures(status)}  {cores:.1f} cores"), style="dim"))
+        if status["consumers"]:
+            console.print(consumers_table(status["consumer_count"], status["consumers"][:_MOST_CONSUMERS]))
+    return drawn.get()

@@ -1,20 +1,21 @@
-"""The state of a service on a terminal, for `v2v-top`. Pure: from a state as JSON has it to what rich draws.
+"""Draw the status on a terminal, for `v2v-top`. Pure: from a status as JSON has it to what rich draws.
 
-Names come from strangers: they are put into cells as text, never as markup.
+Names are untrusted: cells hold them as text, never as markup.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from rich.console import Group, RenderableType
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from v2v_server.corpus.files import printable
-from v2v_server.status.shutdown_summary import format_duration
+from v2v_protocol.progress import format_duration
+from v2v_server.corpus.sources.names import printable
+from v2v_server.status.parts import Status
+from v2v_server.status.text import figures
 
 _MOST_ROWS = 30
 _COLOURS = {
@@ -30,30 +31,26 @@ _SHARES = (
     ("workers idle", "idle"),
     ("decode", "decode"),
     ("simulate", "simulate"),
-    ("hand over", "handover"),
+    ("deliver", "handover"),
     ("no core", "queued"),
     ("server busy", "broker"),
 )
 
 
-def line(state: Mapping[str, Any]) -> str:
-    """The state in one line, for what is no terminal."""
-    return printable(
-        f"{state['time']}  {state['batches_per_second']:.2f} batches/s  {state['samples_per_second']:.1f} samples/s  "
-        f"workers {state['worker_count']}  consumers {state['consumer_count']}  queue {state['queue']}  "
-        f"faults {state['totals']['faults']}  {state['waiting']['sentence']}"
-    )
+def line(status: Status) -> str:
+    """Return the status in one line, where there is no terminal."""
+    return printable(f"{status['time']}  {figures(status)}  {status['waiting']['sentence']}")
 
 
-def draw(state: Mapping[str, Any], note: str = "") -> RenderableType:
-    """The state as tables.
+def draw(status: Status, note: str = "") -> RenderableType:
+    """Draw the status as tables.
 
     Args:
-        state: ``ServiceState.to_dict()``.
-        note: that it is old, and why; empty where it is of now.
+        status: the status.
+        note: why it is old; empty if it is current.
     """
-    waiting, totals, cache = state["waiting"], state["totals"], state["cache"]
-    head = _text(f"v2v-serve {state['program']} on {state['host']}  {state['address']}  {state['videos']}", "dim")
+    waiting = status["waiting"]
+    head = _text(f"v2v-serve {status['program']} on {status['host']}  {status['address']}  {status['videos']}", "dim")
     parts: list[RenderableType] = [head]
     if note:
         parts.append(_text(note, "bold red"))
@@ -63,55 +60,47 @@ def draw(state: Mapping[str, Any], note: str = "") -> RenderableType:
     shares = Table.grid(padding=(0, 2))
     shares.add_row(*(f"{name} {waiting['shares'][key]:.0%}" for name, key in _SHARES))
     shares.add_row(*(ProgressBar(total=1.0, completed=waiting["shares"][key], width=16) for _, key in _SHARES))
-    said = (
-        f"{state['batches_per_second']:.2f} batches/s   {state['samples_per_second']:.1f} samples/s   "
-        f"{state['bytes_per_second'] / 1e6:.1f} MB/s   queue {state['queue']}   total {totals['samples']} samples   "
-        f"faults {totals['faults']}"
-    )
-    if cache is not None and (read := cache["hits"] + cache["misses"]):
-        said += f"   cache {cache['hits'] / read:.0%} hits, {cache['held_gib']:.2f} of {cache['most_gib']:g} GiB"
-        said += f" ({cache['trouble']})" if cache["trouble"] else ""
-    parts += [shares, _text(said), consumers_table(state["consumer_count"], state["consumers"]), _workers(state)]
-    if state["refusals"]:
-        passed = _table(f"passed over {totals['refused_candidates']} times, the last", "video", "frame", "why")
-        for each in state["refusals"][:5]:
-            passed.add_row(_text(each["video"]), _plain(each["frame"]), _text(each["reason"]))
-        parts.append(passed)
+    said = f"{figures(status)}  {status['bytes_per_second'] / 1e6:.1f} MB/s"
+    parts += [shares, _text(said), consumers_table(status["consumer_count"], status["consumers"]), _workers(status)]
+    if status["refusals"]:
+        skipped = _table(f"skipped {status['totals']['refused_candidates']} times, the last", "video", "frame", "why")
+        for each in status["refusals"][:5]:
+            skipped.add_row(_text(each["video"]), _plain(each["frame"]), _text(each["reason"]))
+        parts.append(skipped)
     return Group(*parts)
 
 
-def consumers_table(count: int, consumers: Sequence[Mapping[str, Any]]) -> Table:
-    """How far each consumer is.
+def consumers_table(count: int, consumers: Sequence[Status]) -> Table:
+    """Draw how far each consumer is.
 
     Args:
-        count: of those that are connected.
-        consumers: some of them, as ``ServiceState`` has them.
+        count: number of connected consumers.
+        consumers: the rows to draw.
     """
     table = _table(
         f"{count} consumers",
-        *("who", "state", "epoch", "", "position", "left", "batches/s", "waits", "on its way"),
+        *("name", "state", "epoch", "", "position", "left", "batches/s", "waits", "in work + queued"),
     )
     for each in _shown(table, consumers):
-        share = each["position"] / each["sequences"] if each["sequences"] else 0.0
         table.add_row(
             _text(f"{each['name'] or each['id'][:8]} on {each['host']}"),
             Text(each["state"], style=_COLOURS.get(each["state"], "")),
             str(each["epoch"]),
-            ProgressBar(total=1.0, completed=share, width=20),
+            ProgressBar(total=1.0, completed=each["epoch_share"], width=20),
             f"{each['position']}/{each['sequences']}",
             "" if each["eta_seconds"] is None else format_duration(each["eta_seconds"]),
             f"{each['batches_per_second']:.2f}",
             f"{each['waiting_share']:.0%}",
-            f"{each['in_flight']}+{each['waiting']}",
+            f"{each['in_flight']} + {each['waiting']}",
         )
     return table
 
 
-def _workers(state: Mapping[str, Any]) -> Table:
+def _workers(status: Status) -> Table:
     table = _table(
-        f"{state['worker_count']} workers", *("name", "host", "state", "clip", "busy", "cores", "GiB", "restarts")
+        f"{status['worker_count']} workers", *("name", "host", "state", "clip", "busy", "cores", "GiB", "restarts")
     )
-    for each in _shown(table, state["workers"]):
+    for each in _shown(table, status["workers"]):
         table.add_row(
             _text(each["name"]),
             _text(each["host"]),
@@ -125,7 +114,7 @@ def _workers(state: Mapping[str, Any]) -> Table:
     return table
 
 
-def _shown(table: Table, rows: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
+def _shown(table: Table, rows: Sequence[Status]) -> Sequence[Status]:
     if len(rows) > _MOST_ROWS:
         table.caption = f"and {len(rows) - _MOST_ROWS} more"
     return rows[:_MOST_ROWS]
@@ -139,7 +128,7 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _text(value: str, style: str = "") -> Text:
-    """As text, and without what would move the terminal's cursor."""
+    """Return text without control characters, which could move the terminal's cursor."""
     return Text(printable(value), style=style)
 
 

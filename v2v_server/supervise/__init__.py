@@ -1,11 +1,12 @@
-"""Who starts workers, and starts those again that die.
+"""Start workers, and start those again that die.
 
-protocol     what the loop asks of a supervisor
-child        one worker's process: its start, what it is at, what its end means
-restarts     how long to wait after a death, and when there is no use in another start
-scaling      how many workers there should be, by who waits and who is idle
-local_pool   the processes of this host
-ray_workers  those of a Ray cluster
-ray_actor    what ray_workers has on each node; nothing but these two imports Ray
-engines      which of the two a server has
+pool         the workers of a server: slots, restarts, surplus workers, hung and stalled ones
+restarts     the delay after a death, and when another start does not help
+scaling      how many workers there should be, from waiting consumers and idle workers
+host         the seam between the pool and what runs the processes
+local_host   runs them on this host
+ray_host     runs them on a Ray cluster
+ray_actor    the part of ray_host on each node; only these two import Ray
+child        one worker's process: its start, its state, what its end means
+engines      makes the pool that a configuration names
 """

@@ -1,5 +1,4 @@
-"""One worker's process: how it is started, what it is at, and what its end means. Whoever has processes uses it: the
-local pool, and an engine's actor on another host."""
+"""Start one worker's process, read its state, and interpret its end: on this host, or by an actor on another one."""
 
 from __future__ import annotations
 
@@ -26,15 +25,15 @@ _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 def start_child(
     address: str, root: str, name: str, flags: Sequence[str], logbook: Logbook, key: PeerKey | None = None
 ) -> subprocess.Popen[bytes]:
-    """A worker in a process of its own, which dies with this one.
+    """Start a worker in a process of its own, which dies with this one.
 
     Args:
         address: where the server listens for workers.
         root: the corpus, a folder or an address.
-        name: of the worker, which no other has.
-        flags: more of them.
-        logbook: for the lease it is at.
-        key: its key, which it gets in a nameless file: neither command line, environment nor disk shows it.
+        name: unique name of the worker.
+        flags: further flags.
+        logbook: records the lease in work.
+        key: its key, passed in an unnamed file: neither command line, environment nor disk shows it.
 
     Raises:
         OSError: it cannot be started.
@@ -54,7 +53,7 @@ def start_child(
 
 
 def command(address: str, root: str, name: str) -> list[str]:
-    """The program of one worker."""
+    """Return the command line of one worker."""
     return [
         *(sys.executable, "-m", "v2v_server.commands.worker"),
         *("--connect", address, "--videos", root, "--name", name),
@@ -63,9 +62,9 @@ def command(address: str, root: str, name: str) -> list[str]:
 
 
 def post_mortem(returncode: int, *, short_of_memory: bool) -> Loss:
-    """What the end of a worker means that was not asked for."""
+    """Return what the unexpected end of a worker means."""
     if returncode >= 0:
-        # An exception nobody foresaw, a broken installation: the trace is on stderr, whose fault it is is not.
+        # An unhandled exception or a broken installation. The trace is on stderr; the cause is not known.
         return Loss(Cause.UNEXPLAINED, f"exited with status {returncode}")
     number = -returncode
     name = signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
@@ -79,34 +78,26 @@ def post_mortem(returncode: int, *, short_of_memory: bool) -> Loss:
 
 
 def hung(status: str, reason: str, at: int | None, *, decodes: bool) -> Loss:
-    """What it means that a worker is given up.
+    """Return what it means that a worker is given up.
 
     Args:
-        status: of its process, in psutil's words.
+        status: status of its process, in psutil's words.
         reason: what it did, in words.
-        at: the lease it is at by its logbook.
+        at: the lease in work by its logbook.
         decodes: whether it decodes a video, by its logbook.
     """
     if status in STOPPED:
         return Loss(Cause.KILLED, "was stopped from outside and killed")
     if status == psutil.STATUS_DISK_SLEEP:
-        # A network file system whose server is away holds every worker at whatever clip it has.
+        # If the server of a network file system is away, every worker waits, each at a sound clip.
         return Loss(Cause.UNEXPLAINED, f"waited for its storage and {reason}", at, decodes)
     return Loss(Cause.HUNG, reason, at, decodes)
 
 
-def is_stopped(pid: int) -> bool:
-    """By its own words, which are cheap to ask a thousand workers for."""
-    try:
-        state = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b") ")[2][:1]
-    except OSError:
-        return sys.platform != "linux" and status_of(pid) in STOPPED
-    return state in (b"T", b"t")
-
-
 def queued_seconds(pid: int) -> float:
-    """How long a process has waited for a core since it began, its first thread alone: that which works. 0 where the
-    system does not say."""
+    """Return how long the first thread of a process, which does the work, has waited for a core since it started; 0 if
+    the system does not say.
+    """
     try:
         return int(Path(f"/proc/{pid}/schedstat").read_bytes().split()[1]) / 1e9
     except (OSError, IndexError, ValueError):
@@ -114,7 +105,7 @@ def queued_seconds(pid: int) -> float:
 
 
 def status_of(pid: int) -> str:
-    """What a process is at, in psutil's words: stopped, also by a debugger, or in the kernel, waiting for a disk ..."""
+    """Return the status of a process in psutil's words: stopped, stopped by a debugger, waiting for a disk ..."""
     try:
         return str(psutil.Process(pid).status())
     except psutil.NoSuchProcess:
@@ -122,7 +113,7 @@ def status_of(pid: int) -> str:
 
 
 def out_of_memory_kills() -> int:
-    """How many processes the kernel of this host has killed for want of memory; 0 where it does not say."""
+    """Return how many processes the kernel of this host has killed for lack of memory; 0 if it does not say."""
     try:
         for line in Path("/proc/vmstat").read_text(encoding="ascii").splitlines():
             if line.startswith("oom_kill "):

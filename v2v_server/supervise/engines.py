@@ -1,44 +1,41 @@
-"""Which supervisor a server has: by the name of its engine."""
+"""Make the pool of workers on the host that the configuration names."""
 
 from __future__ import annotations
 
 from importlib import import_module
-from pathlib import Path
 
 from v2v_protocol.errors import UsageError
-from v2v_server.cloud.copies import Copies
-from v2v_server.config import ServeConfig
+from v2v_server.config import ENGINES, ServeConfig
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.keys.folder import KeyFolder
-from v2v_server.supervise.local_pool import Pool
-from v2v_server.supervise.protocol import Supervisor
+from v2v_server.supervise.pool import Pool
 
 
-def make_supervisor(
-    config: ServeConfig, root: Path | Copies, label: str, flags: list[str], keys: KeyFolder | None = None
-) -> Supervisor:
-    """The supervisor that the configuration asks for.
+def make_pool(
+    config: ServeConfig, source: VideoSource, label: str, flags: list[str], keys: KeyFolder | None = None
+) -> Pool:
+    """Return the pool that the configuration asks for.
 
     Args:
         config: of the server.
-        root: the corpus folder, or the copies of what is in object storage.
+        source: where the videos come from; workers open it by its name.
         label: prefix of the workers' names, unique to this server.
-        flags: more of them for each worker.
-        keys: of the server, which lends one to workers on other hosts.
+        flags: further flags of each worker.
+        keys: keys of the server, which lends one to workers on other hosts.
 
     Raises:
-        UsageError: its engine is not installed, or there is no cluster.
+        UsageError: the engine is not installed, or there is no cluster.
     """
-    if config.engine == "local":
-        return Pool(str(root), label, flags)
+    name = config.engine
     try:
-        engine = import_module("v2v_server.supervise.ray_workers")
+        engine = import_module(ENGINES[name])
     except ModuleNotFoundError as error:
-        if error.name != "ray":
+        if error.name != name:
             raise
         raise UsageError(
-            "--engine ray needs the Python package ray, which is not installed; the extra 'ray' brings it: "
-            "pip install '.[server,ray]' in a checkout of v2v-stream, here and on every node of the cluster"
+            f"--engine {name} needs the Python package {name}, which is not installed; the extra '{name}' brings it: "
+            f"pip install '.[server,{name}]' in a checkout of v2v-stream, here and on every node of the cluster"
         ) from error
-    key = None if keys is None else keys.lend(f"ray-{label}", "worker")
-    supervisor: Supervisor = engine.RayWorkers(str(root), label, flags, config.ray_address, config.ray_labels, key)
-    return supervisor
+    is_remote = keys is not None and name != "local"
+    key = keys.lend(f"{name}-{label}", "worker") if keys is not None and is_remote else None
+    return Pool(engine.make_host(config, source.name, label, flags, key), label)

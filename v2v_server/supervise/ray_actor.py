@@ -1,4 +1,4 @@
-"""The actor of a worker on a Ray cluster: starts the worker's process on its node, looks at it, and says how it ended.
+"""The actor of a worker on a Ray cluster: it starts the worker's process on its node, observes it, and reports its end.
 
 A decoder that crashes ends the process, never the actor.
 """
@@ -10,35 +10,30 @@ import socket
 import subprocess
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import ray
 
 from v2v_protocol.keys import PeerKey
 from v2v_server.broker.blame import Loss
 from v2v_server.supervise.child import out_of_memory_kills, post_mortem, queued_seconds, start_child, status_of
+from v2v_server.supervise.host import ProcessStatus
 from v2v_server.worker.logbook import Logbook
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
-    """What an actor sees.
+class ActorStatus:
+    """What an actor observes.
 
     Attributes:
-        node: where it is.
-        name: of its worker; empty where none runs.
-        status: of the worker's process, in psutil's words.
-        queued_seconds: how long that process has waited for a core since it began.
-        lease: that the worker is at, 0 for none; None when it never said.
-        decodes: whether it decodes a video.
+        node: its node.
+        name: name of its worker; empty if none runs.
+        process: the worker's process.
     """
 
     node: str
     name: str = ""
-    status: str = ""
-    queued_seconds: float = 0.0
-    lease: int | None = None
-    decodes: bool = False
+    process: ProcessStatus = field(default_factory=ProcessStatus)
 
 
 class RayWorker:
@@ -46,8 +41,8 @@ class RayWorker:
 
     Args:
         root: the corpus, a folder of its node or an address.
-        flags: more of them for the worker.
-        key: of the worker; None: what ``V2V_KEYS`` names on its node.
+        flags: further flags of the worker.
+        key: key of the worker; None: the key that ``V2V_KEYS`` names on its node.
     """
 
     def __init__(self, root: str, flags: Sequence[str], key: PeerKey | None = None) -> None:
@@ -58,7 +53,7 @@ class RayWorker:
         self._memory_kills = out_of_memory_kills()
 
     def run(self, name: str, address: str) -> tuple[int, Loss]:
-        """One worker, from its start to its end.
+        """Run one worker from its start to its end.
 
         Returns:
             its exit status, and what that means.
@@ -68,7 +63,7 @@ class RayWorker:
         """
         with self._lock:
             if self._child is not None:
-                self._child[1].kill()  # the call that it was started by was lost on the way back
+                self._child[1].kill()  # the result of the call that started it was lost on its way
             logbook = Logbook()
             with contextlib.ExitStack() as undo:
                 undo.callback(logbook.close)
@@ -78,31 +73,33 @@ class RayWorker:
         returncode = process.wait()
         with self._lock:
             short = out_of_memory_kills() > self._memory_kills
-            said = post_mortem(returncode, short_of_memory=short)
-            loss = Loss(said.cause, f"{said.text} on {node()}", logbook.lease())
+            loss = post_mortem(returncode, short_of_memory=short)
+            loss = Loss(loss.cause, f"{loss.text} on {node()}", logbook.lease())
             logbook.close()
             if self._child is not None and self._child[1] is process:
                 self._child = None
         return returncode, loss
 
-    def look(self) -> Sight:
-        """What it is at."""
+    def status(self) -> ActorStatus:
+        """Observe the worker's process."""
         with self._lock:
             self._memory_kills = out_of_memory_kills()
             if self._child is None:
-                return Sight(node())
+                return ActorStatus(node())
             name, process, logbook = self._child
-            waited = queued_seconds(process.pid)
-            return Sight(node(), name, status_of(process.pid), waited, logbook.lease(), logbook.decodes())
+            seen = ProcessStatus(
+                status_of(process.pid), queued_seconds(process.pid), logbook.lease(), logbook.decodes()
+            )
+            return ActorStatus(node(), name, seen)
 
     def signal(self, name: str, number: int) -> None:
-        """Sends the worker of that name a signal, if it still runs."""
+        """Send a worker a signal, if it still runs."""
         with self._lock:
             if self._child is not None and self._child[0] == name:
                 self._child[1].send_signal(number)
 
 
 def node() -> str:
-    """This node, as logs name it."""
+    """Return the name of this node for logs."""
     context = ray.get_runtime_context()
     return f"{socket.gethostname()} ({context.get_node_id()[:6]})"

@@ -1,7 +1,7 @@
-"""When a dead worker's successor is started, and when there is no use in another. Pure.
+"""Choose the delay before a dead worker is replaced, and decide when another start does not help. Pure.
 
-The wait doubles with every death in a row. When the workers die again and again without a single sample being finished,
-something is wrong that restarting does not mend.
+The delay doubles with every death in a row. If the workers die repeatedly and not one sample is finished, something is
+wrong that restarting does not repair.
 """
 
 from __future__ import annotations
@@ -14,29 +14,29 @@ _LONGEST_BACKOFF_SECONDS = 10.0
 
 
 def crash_budget(workers: int) -> int:
-    """Deaths in a row, without any finished sample between them, that so many workers may have."""
+    """Return how many deaths in a row, without any finished sample between them, this number of workers may have."""
     return 3 * workers + 4
 
 
 class Restarts:
-    """Counts deaths in a row."""
+    """Count deaths in a row."""
 
     def __init__(self) -> None:
         self._deaths_in_a_row = 0
         self._samples_seen = 0
 
     def progress(self, samples: int) -> None:
-        """So many samples were finished so far; any more than last time forgives earlier deaths."""
+        """Update the number of samples finished so far; any increase resets the count of deaths."""
         if samples > self._samples_seen:
             self._samples_seen = samples
             self._deaths_in_a_row = 0
 
     def delay(self, workers: int, loss: Loss) -> float:
-        """A worker died.
+        """Count a death.
 
         Args:
-            workers: how many there should be.
-            loss: what became of it.
+            workers: number of workers that there should be.
+            loss: what happened to the worker.
 
         Returns:
             seconds until its successor may be started.
@@ -51,6 +51,6 @@ class Restarts:
                 f"{crash_budget(workers)}); the last one {loss.text}. What they printed is above; "
                 f"`v2v-simulate` on one of the videos shows the same in one process"
             )
-        # Capped before the power: hundreds of deaths in a row, as many workers allow, would overflow a float.
+        # Bounded before the power: a large pool may have hundreds of deaths in a row, which would overflow a float.
         doublings = min(self._deaths_in_a_row - 1, 16)
         return float(min(_FIRST_BACKOFF_SECONDS * 2**doublings, _LONGEST_BACKOFF_SECONDS))

@@ -1,17 +1,17 @@
-"""How many workers there should be, within bounds, by what is seen: who waits, and who has nothing to do. Pure.
+"""Choose the number of workers within bounds, from waiting consumers and idle workers. Pure.
 
-    waiting share   consumers that have asked for something nobody works on yet, of all consumers
+    waiting share   consumers that have requests without a worker, of all consumers
     idle share      workers without any lease, of all workers
 
-Not by the load of processors: a decoder keeps its core busy whether anybody waits or not.
+The load of the processors says nothing: a decoder keeps its core busy whether a consumer waits or not.
 
-    more     half of the consumers wait, or more, and at most a tenth of the workers are idle: half as many again
-    fewer    more than a third of the workers are idle: as many as would be busy four fifths of the time, but no fewer
-             than half of those there are
+    more     at least half of the consumers wait, and at most a tenth of the workers are idle: half as many again
+    fewer    more than a third of the workers are idle: as many as would be busy four fifths of the time, but at least
+             half of the present number
 
-Between the two nothing happens, and that is why it does not swing: those that leave stop at a fifth of idle workers,
-far from the tenth at which more come. Each change starts the watch anew, and more are asked for only once those before
-came.
+Between the two the number stays, so it does not oscillate: after a reduction a fifth of the workers are idle, well
+above the tenth that allows an increase. Each change restarts the measurement, and more workers are requested only once
+those requested before are present.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class Decision:
     """A change.
 
     Attributes:
-        workers: that there shall be.
-        reason: in words.
+        workers: the new number.
+        reason: why, in words.
     """
 
     workers: int
@@ -42,40 +42,40 @@ class Decision:
 
 
 class Scaling:
-    """Watches, and decides.
+    """Measure the shares, and decide.
 
     Args:
-        least, most: workers.
-        seconds: for how long workers must have been idle until some leave; a sixth of that is enough for more to come.
+        least, most: bounds of the number of workers.
+        seconds: time that workers must have been idle before some leave; a sixth of it is enough for an increase.
     """
 
     def __init__(self, least: int, most: int, seconds: float) -> None:
         self._least, self._most = least, most
         self._part_seconds = seconds / _PARTS
         self._target = least
-        self._parts: deque[tuple[float, float]] = deque(maxlen=_PARTS)  # the shares in each part of the time
+        self._parts: deque[tuple[float, float]] = deque(maxlen=_PARTS)  # shares in each sixth of the time
         self._since: float | None = None
-        self._looks = 0
+        self._calls = 0
         self._waiting = self._idle = 0.0
         self._lacking = False
 
-    def look(self, now: float, waiting: float, idle: float, present: int) -> Decision | None:
-        """What to do. To be called a few times a second.
+    def decide(self, now: float, waiting: float, idle: float, present: int) -> Decision | None:
+        """Return the change to make, if there is one. Call it a few times a second.
 
         Args:
-            now: the time, seconds.
+            now: monotonic time, seconds.
             waiting, idle: the shares, 0 to 1.
-            present: workers that can work.
+            present: number of workers that are connected.
         """
         if self._since is None:
             self._since = now
-        self._looks += 1
+        self._calls += 1
         self._waiting += waiting
-        self._idle += idle if present else 0.0  # nobody is idle where nobody is
+        self._idle += idle if present else 0.0
         self._lacking = self._lacking or present < self._target
         if now - self._since < self._part_seconds:
             return None
-        shares, lacking = (self._waiting / self._looks, self._idle / self._looks), self._lacking
+        shares, lacking = (self._waiting / self._calls, self._idle / self._calls), self._lacking
         self._parts.append(shares)
         self._begin(now)
         decision = (None if lacking else self._more(*shares)) or self._fewer()
@@ -85,9 +85,9 @@ class Scaling:
         return decision
 
     def _begin(self, now: float) -> None:
-        """The next part of the time."""
+        """Begin the next sixth of the time."""
         self._since = now
-        self._looks = 0
+        self._calls = 0
         self._waiting = self._idle = 0.0
         self._lacking = False
 
@@ -98,13 +98,13 @@ class Scaling:
         return Decision(target, _reason(waiting, idle, self._part_seconds))
 
     def _fewer(self) -> Decision | None:
-        # By the busiest part: what was a pause, or its end, sends nobody away who is needed.
+        # The busiest part counts: a pause, or its end, must not stop workers that are needed.
         waiting, idle = max(share for share, _ in self._parts), min(share for _, share in self._parts)
         if len(self._parts) < _PARTS or idle <= _IDLE:
             return None
-        # A hair less, lest a sum of shares that is a hair too large keeps one worker more.
+        # Slightly less: a rounding error in the sum of shares must not keep one worker more.
         needed = math.ceil(self._target * (1.0 - idle) / _LEFT_BUSY - 1e-9)
-        needed = max(needed, 1) if idle < 1.0 else 0  # the last one stays while anybody asks for anything
+        needed = max(needed, 1) if idle < 1.0 else 0  # the last one stays while there are requests
         target = max(self._least, self._target // 2, needed)
         if target >= self._target:
             return None

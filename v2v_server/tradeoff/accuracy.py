@@ -19,6 +19,7 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.simulation.clip import simulate, simulate_clip
 from v2v_server.simulation.view import apply_view
 from v2v_server.store.clips import clips_of
@@ -55,7 +56,7 @@ class CameraView:
 
 def seen(root: Path, lease: Lease) -> CameraView:
     """Return a lease's first sample before simulation, without hot pixels."""
-    (decoded,) = decode_for(lease, lease.indices[:1], root)
+    (decoded,) = decode_for(lease, lease.indices[:1], Folder(root))
     recipe = decoded.plan.spec.recipe
     params = dataclasses.replace(decoded.plan.params, hot_pixel_count=0)
     return CameraView(

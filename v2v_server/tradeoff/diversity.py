@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import SampleParams
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.view import apply_view
 from v2v_server.tradeoff.errors import correlation
@@ -73,7 +74,7 @@ def diversity(root: Path, leases: Sequence[Lease], *, until: float = math.inf) -
 
 def _activities(root: Path, lease: Lease) -> list[tuple[SampleParams, _Activity]]:
     made = []
-    for decoded in decode_for(lease, lease.indices, root):
+    for decoded in decode_for(lease, lease.indices, Folder(root)):
         recipe = decoded.plan.spec.recipe
         params = dataclasses.replace(decoded.plan.params, hot_pixel_count=0)
         voxels, _ = simulate_clip(apply_view(decoded.clip.frames, params, recipe), params, recipe, "float32")

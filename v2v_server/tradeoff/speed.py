@@ -20,6 +20,7 @@ from v2v_protocol.sample import DEFAULT_ARRAYS, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
@@ -97,7 +98,7 @@ def leases_of(catalogue: Catalogue, spec: StreamSpec, places: int) -> tuple[Leas
 
 def make(lease: Lease, indices: Sequence[int], root: Path) -> list[Sample]:
     """Make the samples of some of a lease's indices, from one decode."""
-    decoded = decode_for(lease, indices, root)
+    decoded = decode_for(lease, indices, Folder(root))
     return [
         make_sample(dataclasses.replace(lease, indices=(index,)), one)
         for index, one in zip(indices, decoded, strict=True)

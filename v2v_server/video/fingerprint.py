@@ -12,7 +12,7 @@ import hashlib
 import os
 import stat
 
-from v2v_protocol.errors import VideoChanged, VideoUnreadable
+from v2v_protocol.errors import VideoChanged, VideoDenied, VideoGone, VideoUnreadable
 
 _BLOCK_BYTES = 64 * 1024
 
@@ -33,8 +33,18 @@ def fingerprint(path: str | os.PathLike[str]) -> str:
             file.seek(max(0, status.st_size - _BLOCK_BYTES))
             digest.update(file.read(_BLOCK_BYTES))
     except OSError as error:
-        raise VideoUnreadable(os.fspath(path), None, f"cannot be read: {error.strerror or error}") from error
+        raise unreadable(os.fspath(path), error) from error
     return f"{status.st_size}-{digest.hexdigest()[:32]}"
+
+
+def unreadable(video: str, error: OSError) -> VideoUnreadable:
+    """Return the error of a video whose file the system does not open."""
+    kind = VideoUnreadable
+    if isinstance(error, FileNotFoundError | NotADirectoryError):
+        kind = VideoGone
+    elif isinstance(error, PermissionError):
+        kind = VideoDenied
+    return kind(video, None, f"cannot be read: {error.strerror or error}")
 
 
 def is_same_file(one: str, other: str) -> bool:

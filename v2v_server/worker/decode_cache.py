@@ -6,11 +6,9 @@ Memory: what the samples to come of one lease's siblings need, each cropped to i
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from v2v_protocol.errors import VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import Lease
-from v2v_server.cloud.copies import Copies
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.cache import Cache
 from v2v_server.worker.produce import Decoded, decode_for
 
@@ -19,12 +17,12 @@ class Clips:
     """Decode clips for leases, together with those of their siblings.
 
     Args:
-        root: folder that the catalogue's ids are relative to on this host, or local copies of object storage.
+        source: where the videos come from.
         cache: cache of decoded pieces for later epochs; None stores nothing.
     """
 
-    def __init__(self, root: Path | Copies, cache: Cache | None = None) -> None:
-        self._root = root
+    def __init__(self, source: VideoSource, cache: Cache | None = None) -> None:
+        self._source = source
         self._cache = cache
         self._kept: dict[tuple[object, ...], Decoded] = {}
 
@@ -40,19 +38,19 @@ class Clips:
         self._kept = {}  # siblings that never came
         if len(lease.indices) > 1:
             try:
-                first, *others = decode_for(lease, lease.indices, self._root, self._cache)
+                first, *others = decode_for(lease, lease.indices, self._source, self._cache)
             except VideoError:
                 pass  # a sibling may need more of the clip than this sample; try without siblings
             else:
                 self._kept = {_key(lease, index): one for index, one in zip(lease.indices[1:], others, strict=True)}
                 return first, True
         try:
-            return decode_for(lease, lease.indices[:1], self._root, self._cache)[0], True
+            return decode_for(lease, lease.indices[:1], self._source, self._cache)[0], True
         except (VideoChanged, VideoUnreadable):
             raise
         except VideoError:
             # A decoder may hide a temporary storage error, so try once more. An error of the file repeats.
-            return decode_for(lease, lease.indices[:1], self._root, self._cache)[0], True
+            return decode_for(lease, lease.indices[:1], self._source, self._cache)[0], True
 
     def said_of_cache(self, decoded: Decoded) -> str:
         """Return the cache field of a sample's header, see :class:`v2v_protocol.messages.SampleHeader`."""

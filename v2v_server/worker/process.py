@@ -23,7 +23,7 @@ from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.keys import HANDSHAKE_EVENTS, Handshakes, key_for
 from v2v_protocol.messages import Lease, WorkerHello
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames
-from v2v_server.cloud.copies import Copies
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.simulation.variants import USUAL
 from v2v_server.store.cache import Cache
 from v2v_server.system.compile_cache import compile_cache
@@ -79,7 +79,7 @@ class Worker:
 
     Args:
         name: unique name, see :func:`unshared_name`.
-        root: the corpus folder on this host, or local copies of a corpus in object storage.
+        source: where the videos come from.
         address: where the server listens for workers.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
         cache: cache of decoded clips for later epochs; None stores nothing.
@@ -94,7 +94,7 @@ class Worker:
     def __init__(
         self,
         name: str,
-        root: Path | Copies,
+        source: VideoSource,
         address: str,
         logbook: int | None = None,
         cache: Cache | None = None,
@@ -105,11 +105,11 @@ class Worker:
         self._name = name
         self._log = log or Log()
         self._logbook = logbook
-        self._clips = Clips(root, cache)
+        self._clips = Clips(source, cache)
         self._at = IDLE  # the lease in work
         if cache is not None:
             cache.on_wait = self._note_wait
-        self._copies = root if isinstance(root, Copies) else None
+        self._source = source
         self._unfetched: tuple[tuple[str, str], VideoError] | None = None  # the last video that could not be fetched
         self._is_remote = leaves_host(address)
         self._kernels = set(USUAL)  # loaded kernels
@@ -237,17 +237,17 @@ class Worker:
         """Return whether work on the lease can begin: its video is on this host, or fetching it has failed, which is
         reported.
         """
-        if self._copies is None or self._clips.has(lease):
+        if self._clips.has(lease):
             return True
         video = lease.video, lease.fingerprint
-        return (self._unfetched is not None and self._unfetched[0] == video) or self._copies.has(*video)
+        return (self._unfetched is not None and self._unfetched[0] == video) or self._source.has(*video)
 
     def _fetch(self, lease: Lease) -> None:
         """Fetch the lease's video before the lease is begun, so that network time does not count against the sample."""
-        if self._copies is None or self._has_video(lease):
+        if self._has_video(lease):
             return
         try:
-            self._copies.fetch(lease.video, lease.fingerprint)
+            self._source.fetch(lease.video, lease.fingerprint)
         except VideoError as error:
             self._unfetched = (lease.video, lease.fingerprint), error
 
@@ -335,18 +335,18 @@ def _size_bytes(lease: Lease) -> int:
     return int(size) if size.isdecimal() else 0
 
 
-def _written(root: Path | Copies, address: str, cache: Cache | None) -> list[Path] | None:
+def _written(source: VideoSource, address: str, cache: Cache | None) -> list[Path] | None:
     """Return the folders that a worker writes to; None if they cannot be listed, because its samples may go to a
     consumer's memory or the tools for object storage write elsewhere.
     """
-    if isinstance(root, Copies) or not leaves_host(address):
+    if not source.is_local or not leaves_host(address):
         return None
     return [*compile_cache(), *([] if cache is None else [cache.folder])]
 
 
 def run_worker(
     address: str,
-    root: Path | Copies,
+    source: VideoSource,
     name: str | None,
     parent_pid: int | None,
     logbook: int | None = None,
@@ -358,7 +358,7 @@ def run_worker(
 
     Args:
         address: where the server listens for workers.
-        root: the corpus folder on this host, or local copies of a corpus in object storage.
+        source: where the videos come from.
         name: unique name; by default host, process id and a random suffix.
         parent_pid: process id of the server if it started this worker, which then ends with it.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
@@ -382,8 +382,8 @@ def run_worker(
     # Exclude objects that exist by now from collections, which then take a fraction of a millisecond.
     gc.collect()
     gc.freeze()
-    confine(_written(root, address, cache), network=not address.startswith("ipc:") or isinstance(root, Copies))
-    worker = Worker(name or unshared_name(None), root, address, logbook, cache, keys, log)
+    confine(_written(source, address, cache), network=not address.startswith("ipc:") or not source.is_local)
+    worker = Worker(name or unshared_name(None), source, address, logbook, cache, keys, log)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # After ZeroMQ's threads have started, which should run without delay.
     take_long_turns()

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -22,8 +22,8 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.safe_json import parse_json
 from v2v_protocol.sample import Layout, Provenance, Sample, SampleId, SampleParams, array_layout, new_arrays
 from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
-from v2v_server.cloud.copies import Copies, open_local
 from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.motion import MARGIN_PX, levels_of
 from v2v_server.simulation.draw import draw
@@ -105,14 +105,14 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
 
 
 def decode_for(
-    lease: Lease, indices: Sequence[int], root: Path | Copies, cache: Cache | None = None
+    lease: Lease, indices: Sequence[int], source: VideoSource, cache: Cache | None = None
 ) -> tuple[Decoded, ...]:
     """Decode, in one pass, exactly the frames that some of a lease's indices need.
 
     Args:
         lease: the work.
         indices: a subset of ``lease.indices``.
-        root: folder that the catalogue's ids are relative to on this host, or local copies of object storage.
+        source: where the videos come from.
         cache: cache of decoded pieces for later epochs; None stores nothing.
 
     Raises:
@@ -126,7 +126,7 @@ def decode_for(
         index, cuts = _frame_index(lease, spec.recipe.frames_needed), [plan.cut for plan in plans]
         what = index, lease.start_frame, cuts, spec.recipe.frame_stride
         clips = None
-        with open_local(root, lease.video, lease.fingerprint) as path:
+        with source.open_local(lease.video, lease.fingerprint) as path:
             if cache is not None and not is_store_file(path):
                 rows = Rows.parse(lease.rows).bounds(lease.height_px)
                 clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what)

@@ -1,8 +1,11 @@
+"""Test the arithmetic of ranks, batches and loader workers."""
+
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from v2v_client.position.plan import EpochPlan, resumed
+from v2v_client.position.plan import Consumer, EpochPlan
+from v2v_client.position.state import ResumeState
 from v2v_protocol.errors import UsageError
 
 SEQUENCES = st.integers(0, 300)
@@ -51,8 +54,9 @@ def test_another_world_size_goes_on_at_a_global_batch_boundary(sequences, world,
     plans = ranks(sequences, world, batch)
     taken = min(taken, plans[0].batches)
     before = [index for plan in plans for number in range(taken) for index in plan.indices(number)]
-    origin, position = resumed(origin=0, position=taken * batch, saved_world_size=world, world_size=other_world)
-    after = consumed(ranks(sequences, other_world, other, origin, position))
+    saved = ResumeState(None, 0, 0, 0, taken * batch, world)
+    state = Consumer(other, 0, other_world).adopt(saved)
+    after = consumed(ranks(sequences, other_world, other, state.origin, state.position))
     both = sorted(before + after)
     assert both == list(range(len(both)))
     assert sequences - len(both) < other_world * other

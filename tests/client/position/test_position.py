@@ -1,11 +1,12 @@
-"""States of one rank and of its loader workers, without a server."""
+"""Test the states of one rank and of its loader workers, without a server."""
 
 from __future__ import annotations
 
 import copy
-from types import SimpleNamespace
+from collections.abc import Iterator
 
 import pytest
+import torch.utils.data._utils.worker as torch_worker
 
 from v2v_client.position.plan import Consumer
 from v2v_client.position.position import Iteration, Position
@@ -13,62 +14,159 @@ from v2v_client.position.state import ResumeState, StreamIdentity
 from v2v_protocol.errors import UsageError
 
 STREAM = StreamIdentity({}, "spec", "catalogue", 1, sequences=24)
-ALONE = Consumer(seed=3, batch_size=4, rank=0, world_size=1)
-HALF = Consumer(seed=3, batch_size=4, rank=1, world_size=2)
+ALONE = Consumer(batch_size=4, rank=0, world_size=1)
+HALF = Consumer(batch_size=4, rank=1, world_size=2)
+BEGINNING = ResumeState(STREAM, 3, 7, 0, 0, 1)
+
+
+@pytest.fixture(autouse=True)
+def no_worker() -> Iterator[None]:
+    yield
+    torch_worker._worker_info = None
+
+
+def become_worker(worker: int, workers: int) -> None:
+    torch_worker._worker_info = torch_worker.WorkerInfo(id=worker, num_workers=workers, seed=50 + worker, dataset=None)
+
+
+def after(batch: int) -> ResumeState:
+    return ALONE.after(BEGINNING, ALONE.plan(STREAM, BEGINNING), batch, None)
 
 
 def test_the_state_after_a_batch_is_where_the_rest_begins() -> None:
-    plan = ALONE.plan(STREAM, None)
+    plan = ALONE.plan(STREAM, BEGINNING)
     every = [plan.indices(batch) for batch in range(plan.batches)]
     for batch in range(plan.batches - 1):
-        state = ALONE.after(STREAM, 7, plan, batch, quarantine=2)
+        state = ALONE.after(BEGINNING, plan, batch, quarantine=2)
         rest = ALONE.plan(STREAM, state)
         assert [rest.indices(number) for number in range(rest.batches)] == every[batch + 1 :]
         assert (state.seed, state.epoch, state.quarantine) == (3, 7, 2)
-    assert ALONE.after(STREAM, 7, plan, plan.batches - 1, quarantine=2) == ALONE.beginning(STREAM, 8)
+    assert after(plan.batches - 1) == BEGINNING.at_epoch(8)
 
 
-def test_another_world_size_takes_up_what_nobody_consumed() -> None:
-    saved = ALONE.after(STREAM, 0, ALONE.plan(STREAM, None), 0, None)
-    taken = HALF.taken_up(saved)
+def test_another_world_size_takes_up_what_no_rank_consumed() -> None:
+    taken = HALF.adopt(after(0))
     assert (taken.origin, taken.position, taken.world_size) == (4, 0, 2)
     assert HALF.plan(STREAM, taken).indices(0) == (5, 7, 9, 11)
 
 
-def test_a_rest_without_a_global_batch_is_the_next_epoch() -> None:
-    saved = ALONE.after(STREAM, 0, ALONE.plan(STREAM, None), 4, None)
-    assert HALF.taken_up(saved) == HALF.beginning(STREAM, 1)
+@pytest.mark.parametrize("named", [False, True])
+def test_a_rest_without_a_global_batch_is_skipped_unless_its_epoch_is_named(named: bool) -> None:
+    position = Position(3, 0)
+    position.load(after(4), HALF)
+    if named:
+        position.set_epoch(7)
+    begun = position.begin(HALF)
+    assert begun.state.epoch == (7 if named else 8)
+    assert len(begun.batches(HALF.plan(STREAM, begun.state))) == (0 if named else 3)
+    position.finish(begun)
+    assert position.start(HALF).place == (8 if named else 9, 0, 0)
 
 
-@pytest.mark.parametrize(
-    "here", [None, SimpleNamespace(id=0, num_workers=2), SimpleNamespace(id=1, num_workers=3)], ids=str
-)
-def test_a_share_belongs_to_one_loader_worker(here: object) -> None:
-    state = Iteration(1, 0, None, shared=1, worker=1, workers=2).after(ALONE, STREAM, done=2)
-    ALONE.require_share(state, SimpleNamespace(id=1, num_workers=2))
-    ALONE.require_share(ALONE.beginning(STREAM, 0), here)
+@pytest.mark.parametrize("here", [None, (0, 2), (1, 3)], ids=str)
+def test_a_share_belongs_to_one_loader_worker(here: tuple[int, int] | None) -> None:
+    state = Iteration(1, BEGINNING, worker=1, workers=2, in_loader=True).after(ALONE, 2, None)
+    become_worker(1, 2)
+    Position(3, 0).load(state, ALONE)
+    torch_worker._worker_info = None
+    if here is not None:
+        become_worker(*here)
+    Position(3, 0).load(BEGINNING, ALONE)
     with pytest.raises(UsageError, match="loader worker 1 of 2"):
-        ALONE.require_share(state, here)
+        Position(3, 0).load(state, ALONE)
 
 
-def test_only_the_newest_iteration_says_where_we_are() -> None:
-    position = Position(0)
+def test_only_the_newest_iteration_affects_the_position() -> None:
+    position = Position(3, 0)
     older, newer = position.begin(ALONE), position.begin(ALONE)
-    first, second = (ALONE.after(STREAM, 0, ALONE.plan(STREAM, None), batch, None) for batch in (0, 1))
-    position.reached(newer, first, count=1, last=False)
-    position.reached(older, second, count=1, last=True)
-    position.finish(older, ALONE)
+    first, second = after(0), after(1)
+    position.reached(newer, ALONE, first, last=False)
+    position.reached(older, ALONE, second, last=True)
+    position.finish(older)
     assert position.state(ALONE) == first
-    position.finish(newer, ALONE)
-    assert position.state(ALONE) == ALONE.beginning(None, 1)
+    position.finish(newer)
+    assert position.state(ALONE) == ResumeState(None, 3, 1, 0, 0, 1)
 
 
 def test_a_shallow_copy_moves_on_by_itself() -> None:
-    position = Position(0)
+    position = Position(3, 0)
     begun = position.begin(ALONE)
-    here: ResumeState = ALONE.after(STREAM, 0, ALONE.plan(STREAM, None), 2, None)
-    position.reached(begun, here, count=1, last=False)
+    position.reached(begun, ALONE, after(2), last=False)
     other = copy.copy(position)
     other.begin(ALONE)
-    assert position.state(ALONE) == here
-    assert other.state(ALONE) == ALONE.beginning(None, 0)
+    assert position.state(ALONE) == after(2)
+    assert other.state(ALONE) == ResumeState(None, 3, 0, 0, 0, 1)
+
+
+def test_the_world_size_is_that_of_the_consumer() -> None:
+    """The process group may be set up after the dataset was created."""
+    position = Position(3, 0)
+    begun = position.begin(HALF)
+    assert begun.state.world_size == position.state(HALF).world_size == 2
+    saved = HALF.after(begun.state, HALF.plan(STREAM, begun.state), 0, None)
+    assert (saved.position, saved.world_size) == (4, 2)
+
+
+def test_an_earlier_epoch_than_the_loaded_one_is_refused_until_a_pass_begins() -> None:
+    """Loops that count epochs from 0 after a resume would train on the same samples again."""
+    position = Position(3, 0)
+    position.load(after(0), ALONE)
+    with pytest.raises(UsageError, match=r"set_epoch\(0\): the loaded state is in epoch 7.*dataset\.epoch"):
+        position.set_epoch(0)
+    assert position.state(ALONE) == after(0)
+    position.set_epoch(7)
+    assert position.state(ALONE) == after(0)
+    position.load(after(0), ALONE)
+    position.begin(ALONE)
+    position.set_epoch(0)
+    assert position.start(ALONE).place == (0, 0, 0)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("batches", [1, 2])
+def test_passes_that_are_left_early_again_and_again_are_repeated_with_one_warning(workers: int, batches: int) -> None:
+    """A loop may take few batches: fewer than its loader workers prefetch, so that they look like one that inspects."""
+    position, warned = Position(3, 0), []
+    copies = [copy.copy(position) for _ in range(workers)] or [position]
+    for _ in range(4):
+        repeats = []
+        for worker, own in enumerate(copies):
+            if workers:
+                become_worker(worker, workers)
+            begun = own.begin(ALONE)
+            repeats.append(begun.repeats)
+            for count in range(1, batches + 1):
+                own.reached(begun, ALONE, after(count), last=False)
+        warned.append(sum(repeats))
+    assert warned == ([0, 1, 0, 0] if batches == 2 and not workers else [0, 0, 1, 0])
+
+
+def test_loader_workers_together_count_the_batches_of_a_pass() -> None:
+    """Two workers prefetch two batches each, and make one for each batch that the loop takes."""
+    position = Position(3, 0)
+    copies = [copy.copy(position) for _ in range(2)]
+    for taken, repeats in ((5, False), (6, True)):
+        position.set_epoch(taken)
+        for delivered, expected in ((taken, False), (0, repeats)):
+            for worker, own in enumerate(copies):
+                become_worker(worker, 2)
+                begun = own.begin(ALONE)
+                assert begun.repeats == (expected and worker == 0)
+                for count in range(1, (delivered + 1 - worker) // 2 + 1):
+                    own.reached(begun, ALONE, after(count), last=False)
+
+
+def test_a_restored_loader_that_is_left_early_continues_where_it_was_restored() -> None:
+    position = Position(3, 0)
+    states = [Iteration(1, BEGINNING, worker, 2, True).after(ALONE, 2 - worker, None) for worker in range(2)]
+    for restored in (True, False):  # the second pass is made by new loader workers, which load nothing
+        for worker, state in enumerate(states):
+            own = copy.copy(position)
+            become_worker(worker, 2)
+            if restored:
+                own.load(state, ALONE)
+            else:
+                own._iterations = 1
+            begun = own.begin(ALONE)
+            assert list(begun.batches(ALONE.plan(STREAM, begun.state))) == ([4] if worker == 0 else [3, 5])
+            assert own.state(ALONE).place == (7, 0, 0)

@@ -19,8 +19,8 @@ from tests.client.fake_server import SPEC, FakeServer
 from tests.waiting import until
 from v2v_client.session import link
 from v2v_client.session.connection import Connection
-from v2v_client.session.conversation import Event
 from v2v_client.session.liveness import Patience
+from v2v_client.session.states import Event
 from v2v_protocol.messages import Hello
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.wire import Frames

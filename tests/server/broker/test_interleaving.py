@@ -77,7 +77,7 @@ class Interleaving(RuleBasedStateMachine):
         for identity, heard in self.at.heard.items():
             for number, message in enumerate(heard[self.read.get(identity, 0) :], self.read.get(identity, 0)):
                 if isinstance(message, SampleHeader):
-                    self.take_in(identity, message, in_message=len(self.at.frames[identity][number]) > 1)
+                    self.receive_sample(identity, message, in_message=len(self.at.frames[identity][number]) > 1)
                 if isinstance(message, SampleHeader | Unavailable):
                     # The heart of the promise: nothing comes that is not waited for.
                     self.owed[identity].remove((message.epoch, message.index))
@@ -102,7 +102,7 @@ class Interleaving(RuleBasedStateMachine):
     def want(self, identity: bytes, epoch: int, indices: list[int]) -> None:
         self.at.want(*indices, identity=identity, epoch=epoch)
 
-    def take_in(self, identity: bytes, header: SampleHeader, *, in_message: bool) -> None:
+    def receive_sample(self, identity: bytes, header: SampleHeader, *, in_message: bool) -> None:
         assert in_message
         assert header.slot == NO_SLOT
 
@@ -366,7 +366,7 @@ class WithSlots(Interleaving):
             slots.want(epoch, list(fresh))
             self.at.want(*fresh.values(), identity=identity, epoch=epoch, arena=arena, slots=numbers)
 
-    def take_in(self, identity: bytes, header: SampleHeader, *, in_message: bool) -> None:
+    def receive_sample(self, identity: bytes, header: SampleHeader, *, in_message: bool) -> None:
         slots = self.slots[identity]
         key = header.epoch * 1000 + header.index
         slot = slots._named.get(key)

@@ -12,7 +12,9 @@ from v2v_server.commands.worker import main as worker
 
 def test_it_takes_as_videos_what_the_server_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     roots: list[Any] = []
-    monkeypatch.setattr("v2v_server.commands.worker.run_worker", lambda address, root, *more: roots.append(root))
+    monkeypatch.setattr(
+        "v2v_server.commands.worker.run_worker", lambda address, source, *more: roots.append(source.folder)
+    )
     (tmp_path / "clip.mp4").touch()
     (tmp_path / "list.txt").touch()
     for source in (tmp_path, tmp_path / "clip.mp4", tmp_path / "list.txt"):

@@ -26,6 +26,7 @@ from v2v_server.corpus.index.file import SCHEMA_VERSION
 from v2v_server.corpus.manifest import MANIFEST_NAME
 from v2v_server.corpus.probe import ProbeFile, probe_files
 from v2v_server.corpus.refresh import index_path
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint, is_same_file
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
@@ -287,7 +288,7 @@ def test_a_start_says_what_it_looks_at(corpus: Path, opener: Opener, tmp_path: P
     write_clip(corpus / "a.mp4", panned_luma(12))
     opener(corpus, notice=notices.append)
     assert notices == [
-        *(f"looking for videos: {done} so far" for done in (1, 2, 3)),
+        *(f"looking for videos in {corpus}: {done} so far" for done in (1, 2, 3)),
         "looking at files: 3 of 3, 1 of them new or changed",
     ]
     notices.clear()
@@ -295,7 +296,7 @@ def test_a_start_says_what_it_looks_at(corpus: Path, opener: Opener, tmp_path: P
     listed.write_text("a.mp4\n")
     opener(corpus, list_file=listed, notice=notices.append)
     assert notices == [
-        "looking at the list's files: 1 of 1",
+        f"looking for videos in {corpus}: 1 so far",
         "looking at files: 1 of 1, 0 of them new or changed",
         "looking for files that are gone: 2 of 2 that this corpus does not name",
     ]
@@ -355,7 +356,7 @@ def test_interlaced_videos_are_said_at_each_start(corpus: Path, opener: Opener) 
 
 def test_a_single_video(corpus: Path, opener: Opener) -> None:
     catalogue = opener(corpus / "a.mp4")
-    assert (ids(catalogue), catalogue.root) == (["a.mp4"], corpus.resolve())
+    assert (ids(catalogue), catalogue.folder) == (["a.mp4"], corpus.resolve())
 
 
 def test_files_that_do_not_open(corpus: Path, opener: Opener, sample: Path) -> None:
@@ -456,7 +457,7 @@ def test_a_user_without_a_home_is_told_where_to_say(tmp_path: Path, monkeypatch:
 def test_a_file_that_kills_its_reader_costs_only_itself(corpus: Path) -> None:
     shutil.copy(corpus / "a.mp4", corpus / "lethal.mp4")
     names = ["a.mp4", "lethal.mp4", "sub/b.mp4"]
-    records = {record.id: record for record in probe_files(corpus, names, 2, lethal)}
+    records = {record.id: record for record in probe_files(Folder(corpus), names, 2, lethal)}
     assert set(records) == set(names)
     assert records["lethal.mp4"].problem == "crashes the decoder: the process that probed it died (signal SIGSEGV)"
     assert records["lethal.mp4"].size_bytes == (corpus / "lethal.mp4").stat().st_size  # not to be tried again
@@ -465,12 +466,14 @@ def test_a_file_that_kills_its_reader_costs_only_itself(corpus: Path) -> None:
 
 def test_a_file_is_not_blamed_for_a_process_killed_from_outside(corpus: Path) -> None:
     names = ["a.mp4", "sub/b.mp4"]
-    assert {record.id: record.problem for record in probe_files(corpus, names, 2, killed_once)} == dict.fromkeys(names)
+    assert {
+        record.id: record.problem for record in probe_files(Folder(corpus), names, 2, killed_once)
+    } == dict.fromkeys(names)
 
 
 @pytest.mark.parametrize(("ended", "how"), [(always_killed, "signal SIGKILL"), (always_exits, "exit status 3")])
 def test_a_file_is_not_condemned_for_what_an_installation_did(corpus: Path, ended: ProbeFile, how: str) -> None:
-    (record,) = probe_files(corpus, ["a.mp4"], 2, ended)
+    (record,) = probe_files(Folder(corpus), ["a.mp4"], 2, ended)
     assert f"twice ({how}), which says nothing of the file" in (record.problem or "")
     assert record.size_bytes == -1  # which no file has: the next start tries again
 
@@ -489,7 +492,7 @@ def test_a_script_without_a_guard_poisons_no_index(corpus: Path, opener: Opener,
 @pytest.mark.slow
 def test_a_file_that_is_waited_for_in_vain_costs_only_itself(corpus: Path) -> None:
     names = ["a.mp4", "waiting.mp4", "sub/b.mp4"]
-    records = {record.id: record for record in probe_files(corpus, names, 2, waiting, longest_seconds=10.0)}
+    records = {record.id: record for record in probe_files(Folder(corpus), names, 2, waiting, longest_seconds=10.0)}
     assert [id for id, record in records.items() if record.problem is not None] == ["waiting.mp4"]
     assert records["waiting.mp4"].size_bytes == -1  # to be tried again
     assert "ended after 10 s without a result; the next start" in str(records["waiting.mp4"].problem)

@@ -6,11 +6,13 @@ import os
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 
 from v2v_server.corpus import refresh
-from v2v_server.corpus.index.columns import VideoTable
 from v2v_server.corpus.index.file import IndexRow, Store
+from v2v_server.corpus.sources.folder import Folder
 
 COUNT = 700
 
@@ -24,23 +26,23 @@ def ids(tmp_path: Path) -> list[str]:
 
 
 def test_a_changed_a_missing_and_an_unknown_file_are_found(tmp_path: Path, ids: list[str]) -> None:
-    def table(*unknown: int) -> VideoTable:
+    def states(*unknown: int) -> npt.NDArray[np.int64]:
         rows = []
         for number, id in enumerate(ids):
             status = (tmp_path / id).stat()
             size = -1 if number in unknown else status.st_size
-            rows.append(IndexRow(id, size, status.st_mtime_ns, status.st_ctime_ns, problem="is no video").columns)
-        return VideoTable.of(rows)
+            rows.append((size, status.st_mtime_ns, status.st_ctime_ns))
+        return np.array(rows)
 
     notices: list[str] = []
-    assert refresh._changed(tmp_path, ids, table(), notices.append) == []
+    assert refresh._changed(Folder(tmp_path), ids, states(), notices.append) == []
     assert notices[-1] == f"looking at files: {COUNT} of {COUNT}, 0 of them new or changed"
-    known = table(300, 301)
+    known = states(300, 301)
     (tmp_path / ids[5]).write_bytes(b"x")
     (tmp_path / ids[130]).chmod(0o600)  # changes only the ctime
     (tmp_path / ids[301]).unlink()
     (tmp_path / ids[699]).unlink()
-    assert refresh._changed(tmp_path, ids, known, notices.append) == [5, 130, 300, 301, 699]
+    assert refresh._changed(Folder(tmp_path), ids, known, notices.append) == [5, 130, 300, 301, 699]
     assert notices[-1] == f"looking at files: {COUNT} of {COUNT}, 5 of them new or changed"
 
 
@@ -55,7 +57,7 @@ def test_a_record_that_another_process_removes_meanwhile_is_no_video(
             other.forget([ids[0]])
 
     monkeypatch.setattr(Store, "put", put_and_lose)
-    store, table, notes = refresh.refresh_index(tmp_path, ids[:3], index, None, 0, None, None)
+    store, table, notes = refresh.refresh_index(Folder(tmp_path), ids[:3], index, None, 0, None, None)
     store.close()
     assert notes == []
     assert table.problem[0] == "the index lost its record; start again to probe it"
@@ -75,7 +77,7 @@ def test_the_index_is_read_once_if_nothing_changed(tmp_path: Path, ids: list[str
     index = tmp_path / "index"
     for expected in (2, 1):
         reads.clear()
-        store, table, _ = refresh.refresh_index(tmp_path, ids[:3], index, None, 0, None, None)
+        store, table, _ = refresh.refresh_index(Folder(tmp_path), ids[:3], index, None, 0, None, None)
         store.close()
         assert len(table) == 3
         assert len(reads) == expected

@@ -124,22 +124,17 @@ def test_the_error_of_the_library_is_typed(clip: Path, tmp_path: Path) -> None:
         preview(str(clip), tmp_path / "p.tiff", [Shot("", "paper", 0)], {}, title="t")
 
 
-def test_many_cameras_say_how_far_they_are(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("v2v_server.offline.preview._REPORT_SECONDS", 0.0)
-    said: list[str] = []
+def test_many_cameras_and_a_film_show_their_progress(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("v2v_protocol.progress.LOG_SECONDS", 0.0)
     shots = [Shot(str(seed), TINY, seed) for seed in range(4)]
-    preview(
-        str(clip), tmp_path / "p.png", shots, {}, title="t", cache_dir=str(tmp_path), with_flow=False, say=said.append
-    )
-    assert [line.split(" cameras")[0] for line in said] == ["2 of 4", "3 of 4", f"{tmp_path / 'p.png'}: 4"]
-    assert all("a second" in line and "s left" in line for line in said[:2])
-    said.clear()
-    preview(
-        str(clip), tmp_path / "p.gif", shots[:1], {}, title="t", cache_dir=str(tmp_path), with_flow=False,
-        say=said.append,
-    )  # fmt: skip
-    assert said[0].startswith("1 of 15 pictures of the film, ")
-    assert len(said) == 15
+    preview(str(clip), tmp_path / "p.gif", shots, {}, title="t", cache_dir=str(tmp_path), with_flow=False)
+    said = capsys.readouterr().err.splitlines()
+    cameras = [line for line in said if line.startswith("simulating: ")]
+    assert [line.split(" cameras")[0] for line in cameras] == [f"simulating: {number} of 4" for number in range(1, 5)]
+    assert all("a second" in line and "left" in line for line in cameras[1:3])
+    assert sum(line.startswith("drawing the film: ") for line in said) == 15
 
 
 def _shares(

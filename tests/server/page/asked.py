@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from tests.server.status.services import Watched
+from tests.server.status.services import Published
 from v2v_protocol.errors import ServerLost
 from v2v_server.page.guard import App
 
@@ -63,15 +62,14 @@ async def asked(
 
 
 class FakeClient:
-    """Looks at a watched service without a wire; counts how often. Without one, nobody answers."""
+    """Looks at a published service without a wire; counts how often. Without one, nobody answers."""
 
-    def __init__(self, watched: Watched | None) -> None:
-        self.watched = watched
+    def __init__(self, service: Published | None) -> None:
+        self.service = service
         self.looks = 0
 
     def get_status(self, timeout_seconds: float) -> dict[str, Any]:
         self.looks += 1
-        if self.watched is None:
+        if self.service is None:
             raise ServerLost("tcp://127.0.0.1:5555: no answer for 3 s; is v2v-serve running there?")
-        values: dict[str, Any] = json.loads(self.watched.state().to_json())
-        return values
+        return self.service.plain()

@@ -10,40 +10,40 @@ import pytest
 
 from tests.server.page.asked import Answer, FakeClient, ask, asked
 from tests.server.peers import peers
-from tests.server.status.services import Watched, service
+from tests.server.status.services import Published, published
 from v2v_server.page.app import MOST_STREAMS, make_app
 from v2v_server.page.guard import App
 from v2v_server.page.source import FRESH_SECONDS, Source
 
 
-def app_of(watched: Watched | None) -> App:
-    return make_app(Source(FakeClient(watched)), ["watch.example"])
+def app_of(service: Published | None) -> App:
+    return make_app(Source(FakeClient(service)), ["watch.example"])
 
 
 @pytest.fixture
-def watched() -> Watched:
+def service() -> Published:
     at = peers()
     at.join()
     at.hello()
     at.want(0, 1, 2)
     at.work_off()
-    seen = service(at)
-    seen.watch.is_ready = True
+    seen = published(at)
+    seen.publisher.is_ready = True
     return seen
 
 
 # --- paths ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_service_that_answers_is_healthy_and_with_workers_it_is_ready(watched: Watched) -> None:
-    assert (ask(app_of(watched), "/healthz").status, ask(app_of(watched), "/readyz").status) == (200, 200)
+def test_a_service_that_answers_is_healthy_and_with_workers_it_is_ready(service: Published) -> None:
+    assert (ask(app_of(service), "/healthz").status, ask(app_of(service), "/readyz").status) == (200, 200)
 
 
 def test_a_service_without_workers_is_healthy_and_not_ready() -> None:
-    watched = service(peers())
-    watched.watch.is_ready = True
-    assert ask(app_of(watched), "/healthz").status == 200
-    answer = ask(app_of(watched), "/readyz")
+    service = published(peers())
+    service.publisher.is_ready = True
+    assert ask(app_of(service), "/healthz").status == 200
+    answer = ask(app_of(service), "/readyz")
     assert (answer.status, answer.text) == (503, "no worker is connected\n")
 
 
@@ -54,10 +54,10 @@ def test_a_server_that_does_not_answer_is_said(path: str) -> None:
     assert "is v2v-serve running there?" in answer.text
 
 
-def test_the_state_is_the_servers(watched: Watched) -> None:
-    answer = ask(app_of(watched), "/state")
+def test_the_state_is_the_servers(service: Published) -> None:
+    answer = ask(app_of(service), "/state")
     assert answer.headers["content-type"] == "application/json"
-    assert json.loads(answer.body) == json.loads(watched.state().to_json())
+    assert json.loads(answer.body) == service.plain()
 
 
 def events(answer: Answer) -> list[tuple[str, object]]:
@@ -68,13 +68,13 @@ def events(answer: Answer) -> list[tuple[str, object]]:
     return found
 
 
-def test_events_are_states_as_they_come(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_events_are_states_as_they_come(service: Published, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("v2v_server.page.app.EVENT_SECONDS", 0.0)
-    answer = ask(app_of(watched), "/events", most_parts=3)
+    answer = ask(app_of(service), "/events", most_parts=3)
     assert answer.headers["content-type"].startswith("text/event-stream")
     (first, state), *_ = events(answer)
     assert first == "state"
-    assert state == json.loads(watched.state().to_json())
+    assert state == service.plain()
 
 
 def test_events_say_that_the_server_is_gone() -> None:
@@ -83,9 +83,9 @@ def test_events_say_that_the_server_is_gone() -> None:
     assert "no answer" in str(said)
 
 
-def test_a_crowd_of_browsers_is_sent_away_and_those_that_leave_make_room(watched: Watched) -> None:
+def test_a_crowd_of_browsers_is_sent_away_and_those_that_leave_make_room(service: Published) -> None:
     async def crowd() -> tuple[int, int]:
-        app = app_of(watched)
+        app = app_of(service)
         many = [asyncio.create_task(asked(app, "/events", most_parts=10**6)) for _ in range(MOST_STREAMS)]
         while (refused := (await asked(app, "/events", most_parts=1)).status) == 200:
             await asyncio.sleep(0)  # they are still coming in
@@ -97,9 +97,9 @@ def test_a_crowd_of_browsers_is_sent_away_and_those_that_leave_make_room(watched
     assert asyncio.run(crowd()) == (503, 200)
 
 
-def test_nothing_else_is_there_and_nothing_can_be_changed(watched: Watched) -> None:
-    assert ask(app_of(watched), "/../etc/passwd").status == 404
-    assert ask(app_of(watched), "/state", method="POST").status == 405
+def test_nothing_else_is_there_and_nothing_can_be_changed(service: Published) -> None:
+    assert ask(app_of(service), "/../etc/passwd").status == 404
+    assert ask(app_of(service), "/state", method="POST").status == 405
 
 
 # --- who may ask ------------------------------------------------------------------------------------------------------
@@ -109,22 +109,22 @@ def test_nothing_else_is_there_and_nothing_can_be_changed(watched: Watched) -> N
     "host",
     ["127.0.0.1:5580", "localhost:5580", "LOCALHOST", "[::1]:5580", "10.1.2.3", platform.node(), "watch.example:80"],
 )
-def test_addresses_and_names_of_this_host_may_be_asked_by(watched: Watched, host: str) -> None:
-    assert ask(app_of(watched), "/healthz", {"host": host}).status == 200
+def test_addresses_and_names_of_this_host_may_be_asked_by(service: Published, host: str) -> None:
+    assert ask(app_of(service), "/healthz", {"host": host}).status == 200
 
 
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:5580", "127.0.0.1.evil.example", "", "[::1", "[]", "localhost.evil"]
 )
-def test_a_name_that_others_can_have_is_not_answered(watched: Watched, host: str) -> None:
-    answer = ask(app_of(watched), "/state", {"host": host})
+def test_a_name_that_others_can_have_is_not_answered(service: Published, host: str) -> None:
+    answer = ask(app_of(service), "/state", {"host": host})
     assert answer.status == 421
     assert "--page-names" in answer.text
 
 
-def test_a_browser_runs_nothing_of_strangers_and_sends_nothing_elsewhere(watched: Watched) -> None:
+def test_a_browser_runs_nothing_of_strangers_and_sends_nothing_elsewhere(service: Published) -> None:
     for path in ("/state", "/metrics", "/nowhere"):
-        headers = ask(app_of(watched), path).headers
+        headers = ask(app_of(service), path).headers
         policy = headers["content-security-policy"]
         assert "default-src 'none'" in policy
         assert "unsafe" not in policy
@@ -135,8 +135,8 @@ def test_a_browser_runs_nothing_of_strangers_and_sends_nothing_elsewhere(watched
 # --- how often --------------------------------------------------------------------------------------------------------
 
 
-def test_the_server_is_asked_only_for_somebody_and_a_few_times_a_second_for_all(watched: Watched) -> None:
-    client, now = FakeClient(watched), [0.0]
+def test_the_server_is_asked_only_for_somebody_and_a_few_times_a_second_for_all(service: Published) -> None:
+    client, now = FakeClient(service), [0.0]
     source = Source(client, lambda: now[0])
     app = make_app(source)
     assert client.looks == 0
@@ -151,9 +151,9 @@ def test_the_server_is_asked_only_for_somebody_and_a_few_times_a_second_for_all(
     assert client.looks == 2
 
 
-def test_health_does_not_wait_for_a_server_that_is_asked_again(watched: Watched) -> None:
+def test_health_does_not_wait_for_a_server_that_is_asked_again(service: Published) -> None:
     now = [0.0]
-    source = Source(FakeClient(watched), lambda: now[0])
+    source = Source(FakeClient(service), lambda: now[0])
 
     async def known_while_another_question_is_under_way() -> bool:
         before = await source.latest()

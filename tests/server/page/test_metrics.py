@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from typing import Any
 
@@ -10,9 +9,10 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from tests.server.peers import peers
-from tests.server.status.services import service
+from tests.server.status.services import published
 from v2v_protocol.messages import Hello
-from v2v_server.page.metrics import PARTS, exposition
+from v2v_server.page.metrics import exposition
+from v2v_server.status.parts import meanings_at
 
 
 def values(state: dict[str, Any] | None) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
@@ -29,7 +29,7 @@ def values(state: dict[str, Any] | None) -> dict[tuple[str, tuple[tuple[str, str
 @pytest.fixture
 def state() -> dict[str, Any]:
     at = peers()
-    watched = service(at, cache="/nowhere", cache_gib=2.0)
+    service = published(at, cache="/nowhere", cache_gib=2.0)
     for name in (b"a", b"b"):
         at.consumer_says(name, Hello({}, ("voxels",), 2, 0, name='rank "0" of 1', host="gpu\\1"))
     at.join()
@@ -37,7 +37,7 @@ def state() -> dict[str, Any]:
     at.want(9, identity=b"b")
     at.finish()
     at.finish()
-    loaded: dict[str, Any] = json.loads(watched.state().to_json())
+    loaded: dict[str, Any] = service.plain()
     return loaded
 
 
@@ -82,7 +82,7 @@ def test_names_and_units_keep_to_the_convention(state: dict[str, Any]) -> None:
 def test_every_verdict_of_the_sentence_has_its_sample() -> None:
     from tests.server.status.test_bottleneck import CASES
 
-    assert {case[1] for case in CASES} == set(PARTS)
+    assert {case[1] for case in CASES} == set(meanings_at("waiting")["part"].states)
 
 
 def test_the_form_that_is_asked_for_is_given(state: dict[str, Any]) -> None:

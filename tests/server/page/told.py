@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
-
 from prometheus_client.parser import text_string_to_metric_families
 
 from tests.server.peers import peers
-from tests.server.status.services import service
+from tests.server.status.services import published
 from v2v_server.page.metrics import exposition
 
 
@@ -18,6 +16,6 @@ def told() -> set[str]:
     at.hello()
     at.want(0)
     at.work_off()
-    content, _ = exposition(json.loads(service(at, cache="/nowhere").state().to_json()))
+    content, _ = exposition(published(at, cache="/nowhere").plain())
     families = text_string_to_metric_families(content.decode())
     return {sample.name for family in families for sample in family.samples}

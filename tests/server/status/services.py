@@ -1,72 +1,96 @@
-"""The watch over fake peers."""
+"""A status publisher over fake peers."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from typing import Any, cast
 
 from tests.server.named_corpus import corpus, video
 from tests.server.peers import Peers
-from tests.server.queues import Queues, ToySupervisor
-from v2v_protocol.messages import Status
+from tests.server.queues import Queues, ToyPool
+from v2v_protocol.messages import Status as StatusMessage
 from v2v_protocol.wire import decode
 from v2v_server.broker.actions import Action, SendStatus, ToConsumer, ToWorker
 from v2v_server.config import ServeConfig
-from v2v_server.status.publisher import StatusPublisher, make_publisher
-from v2v_server.status.state import ServiceState
+from v2v_server.status.parts import Status
+from v2v_server.status.publisher import StatusPublisher
+from v2v_server.status.snapshot import Service, to_json
 
 WALL = "2024-02-29T12:00:00+00:00"
 
 
+class View(dict[str, Any]):
+    """A status with its values as attributes too."""
+
+    def __getattr__(self, name: str) -> Any:
+        return _viewed(self[name])
+
+
+def _viewed(value: Any) -> Any:
+    if isinstance(value, dict):
+        return View(value)
+    return [_viewed(each) for each in value] if isinstance(value, list) else value
+
+
 @dataclass
-class Watched:
-    """A watch.
+class Published:
+    """A publisher.
 
     Attributes:
-        at: whom it watches; their clock is its.
-        watch: over them.
-        transport: which waited for messages all the time, unless a test says otherwise.
-        supervisor: of the server's own workers.
+        at: the peers whose service it publishes; their clock is its.
+        publisher: the publisher.
+        transport: it waited for messages all the time, unless a test says otherwise.
+        pool: of the server's own workers.
     """
 
     at: Peers
-    watch: StatusPublisher
+    publisher: StatusPublisher
     transport: Queues
-    supervisor: ToySupervisor
+    pool: ToyPool
 
-    def state(self) -> ServiceState:
-        return self.watch.state(self.at.now)
+    def status(self) -> Status:
+        return self.publisher.status(self.at.now)
+
+    def plain(self) -> dict[str, Any]:
+        """Return what a client receives."""
+        values: dict[str, Any] = json.loads(to_json(self.status()))
+        return values
+
+    def view(self) -> View:
+        return View(self.status())
 
     def answers(self) -> list[ToConsumer | ToWorker]:
-        """Of one tick."""
-        return self.watch.tick(self.at.now)
+        """Return the answers of one tick."""
+        return self.publisher.tick(self.at.now)
 
     def pass_seconds(self, seconds: float, busy_share: float = 0.0) -> None:
-        """Time passes, in ticks of a tenth of a second; for some of it the loop waits for no message."""
+        """Let time pass, in ticks of a tenth of a second; for some of it the loop waits for no message."""
         for _ in range(round(seconds * 10)):
             self.at.now += 0.1
             self.transport.waited_seconds += 0.1 * (1.0 - busy_share)
-            self.watch.tick(self.at.now)
+            self.publisher.tick(self.at.now)
 
     def ask(self, actions: list[Action]) -> list[ToConsumer | ToWorker]:
-        (show,) = actions
-        return self.watch.ask(cast(SendStatus, show))
+        (request,) = actions
+        return self.publisher.ask(cast(SendStatus, request))
 
 
-def service(at: Peers, **settings: Any) -> Watched:
-    """A watch that begins now."""
+def published(at: Peers, **settings: Any) -> Published:
+    """Return a publisher that begins now."""
     config = ServeConfig.load(None, {"videos": "videos"} | settings)
-    transport, supervisor = Queues(), ToySupervisor(lambda name, address: None)
+    transport, pool = Queues(), ToyPool(lambda name, address: None)
     catalogue = corpus(*(video(f"v{number}.mp4") for number in range(5)))
-    watch = make_publisher(config, catalogue, at.dispatcher, supervisor, at.quarantine, transport, at.now, lambda: WALL)
-    watch._processor_clock = lambda: 0.0  # a slow host makes states less often
-    watch.tick(at.now)
-    return Watched(at, watch, transport, supervisor)
+    service = Service(config, catalogue, at.dispatcher, pool, at.quarantine, transport)
+    publisher = StatusPublisher(service, at.now, lambda: WALL)
+    publisher._processor_clock = lambda: 0.0  # a slow host builds a status less often
+    publisher.tick(at.now)
+    return Published(at, publisher, transport, pool)
 
 
-def seen(action: ToConsumer | ToWorker) -> bytes:
-    """The JSON of an answer."""
+def json_of(action: ToConsumer | ToWorker) -> bytes:
+    """Return the JSON of an answer."""
     message = decode(action.frames[0])
-    if not isinstance(message, Status):
+    if not isinstance(message, StatusMessage):
         raise AssertionError(message)
     return message.json

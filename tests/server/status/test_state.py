@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import time
 
 import pytest
 
-from tests.server.corpus import SMALL_SPEC
+from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import Peers, answer_to, peers
-from tests.server.status.services import WALL, seen, service
+from tests.server.status.services import WALL, Published, View, json_of, published
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
 from v2v_protocol.messages import Denied, ErrorCode, GetStatus, Goodbye, Hello, Result, Want, WorkerHello
 from v2v_protocol.refusal import Refusal
@@ -18,9 +17,10 @@ from v2v_protocol.wire import decode, encode
 from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause
 from v2v_server.broker.quarantine import QuarantineEntry
-from v2v_server.status.publisher import ANSWER_SECONDS, MOST_LOOKERS
-from v2v_server.status.snapshot import MOST_SHOWN
-from v2v_server.status.state import STATE_VERSION
+from v2v_server.broker.session import RETURN_SECONDS
+from v2v_server.status.parts import STATUS_VERSION
+from v2v_server.status.publisher import ANSWER_SECONDS, MOST_WAITING
+from v2v_server.status.snapshot import MOST_SHOWN, to_json
 
 
 def finish(at: Peers, worker: bytes = b"w", **took: float) -> None:
@@ -37,32 +37,32 @@ def hello(at: Peers, identity: bytes = b"c", name: str = "rank 1 of 2", host: st
 
 
 def test_a_service_without_anybody_says_what_it_serves() -> None:
-    state = service(peers(), workers="1:3").state()
-    assert (state.version, state.protocol, state.time) == (STATE_VERSION, PROTOCOL_VERSION, WALL)
+    state = published(peers(), workers="1:3").view()
+    assert (state.version, state.protocol, state.time) == (STATUS_VERSION, PROTOCOL_VERSION, WALL)
     assert (state.video_count, state.unusable_count, state.videos) == (5, 0, "/corpus")
     assert (state.worker_count, state.consumer_count, state.workers_wanted) == (0, 0, (1, 3))
-    assert (state.workers, state.consumers, state.refusals, state.verdicts, state.cache) == ((), (), (), (), None)
-    assert state.waiting.part == "nobody"
+    assert (state.workers, state.consumers, state.refusals, state.verdicts, state.cache) == ([], [], [], [], None)
+    assert state.waiting.part == "no_consumers"
     assert not state.is_ready
     assert state.spec["recipe"]["bins"] == 5
 
 
 def test_a_worker_is_told_with_what_it_is_at_and_what_it_took() -> None:
     at = peers()
-    watched = service(at)
+    service = published(at)
     at.worker_says(b"w", WorkerHello("w", NUMERICS_VERSION, 2, "node-7"))
     hello(at)
     at.want(0, 1, 2, 3)
     at.now = 5.0
     lease = at.begin()
     at.now = 8.0
-    (worker,) = watched.state().workers
+    (worker,) = service.view().workers
     assert (worker.name, worker.host, worker.state) == ("w", "node-7", "working")
     assert (worker.clip, worker.frame, worker.clip_seconds) == (lease.video, lease.start_frame, 3.0)
     assert (worker.leases, worker.samples, worker.restarts, worker.silent_seconds) == (2, 0, None, 3.0)
     finish(at, decode_seconds=2.0, simulate_seconds=1.0, handover_seconds=0.5)
     at.now = 10.0
-    state = watched.state()
+    state = service.view()
     (worker,) = state.workers
     assert (worker.samples, worker.busy_share, worker.cpu_share, worker.memory_gib) == (1, 0.35, 0.15, 0.5)
     assert (state.totals.decode_seconds, state.totals.simulate_seconds, state.totals.handover_seconds) == (
@@ -75,7 +75,7 @@ def test_a_worker_is_told_with_what_it_is_at_and_what_it_took() -> None:
 
 def test_a_worker_rests_is_idle_or_lost() -> None:
     at = peers()
-    watched = service(at)
+    service = published(at)
     for name in (b"idle", b"resting", b"lost"):
         at.join(name)
     at.dispatcher.registry.rest(b"resting", at.now, "v0.mp4: no such file")
@@ -83,7 +83,7 @@ def test_a_worker_rests_is_idle_or_lost() -> None:
     for name in (b"idle", b"resting"):
         at.dispatcher.registry.mark_heard(name, at.now)
     at.dispatcher.registry.vanished(at.now)
-    states = {worker.name: worker for worker in watched.state().workers}
+    states = {worker.name: worker for worker in service.view().workers}
     assert {name: worker.state for name, worker in states.items()} == {
         "idle": "idle", "resting": "resting", "lost": "lost",
     }  # fmt: skip
@@ -93,71 +93,139 @@ def test_a_worker_rests_is_idle_or_lost() -> None:
 
 def test_the_servers_own_workers_have_a_number_of_restarts() -> None:
     at = peers()
-    watched = service(at)
-    watched.supervisor.scale(2)
-    watched.supervisor.watch(0.0, 0)
+    service = published(at)
+    service.pool.scale(2)
+    service.pool.watch(0.0, 0)
     at.join(b"toy1")
     at.join(b"elsewhere")
-    state = watched.state()
+    state = service.view()
     assert {worker.name: worker.restarts for worker in state.workers} == {"toy1": 0, "elsewhere": None}
     assert (state.worker_processes, state.worker_count) == (2, 2)
 
 
 def test_a_consumer_is_told_with_its_place_in_the_epoch() -> None:
     at = peers()
-    watched = service(at)
+    service = published(at)
     hello(at)
     at.consumer_says(b"c", Want(3, (10, 11, 12, 13), waited_seconds=0.0))
     at.join()
     at.work_off()
-    watched.pass_seconds(5.0)
+    service.pass_seconds(5.0)
     at.consumer_says(b"c", Want(3, (20, 21, 22), waited_seconds=2.0))
     at.finish()
-    watched.pass_seconds(5.0)
-    (consumer,) = watched.state().consumers
+    service.pass_seconds(5.0)
+    (consumer,) = service.view().consumers
     assert (consumer.name, consumer.host) == ("rank 1 of 2", "gpu-1")
     assert b"c".hex() != consumer.id
     assert (consumer.epoch, consumer.position, consumer.sequences) == (3, 21, 50)
     assert (consumer.in_flight, consumer.waiting, consumer.served, consumer.batch_size) == (2, 0, 5, 2)
     assert consumer.waiting_share == pytest.approx(0.2)
     assert (consumer.state, consumer.waited_seconds, consumer.seed) == ("stalled", 2.0, 7)
-    assert consumer.eta_seconds == pytest.approx((50 - 21) / 2.1, rel=0.01)
-    assert watched.state().specs[consumer.spec] == at.dispatcher.sessions.get(b"c").spec.to_dict()  # type: ignore[union-attr]
+    assert consumer.eta_seconds == pytest.approx((50 - 21) / 1.1, rel=0.01)  # it began at 10
+    assert service.view().specs[consumer.spec] == at.dispatcher.sessions.get(b"c").spec.to_dict()  # type: ignore[union-attr]
 
 
 def test_a_new_epoch_begins_at_its_beginning() -> None:
     at = peers()
-    watched = service(at)
+    service = published(at)
     hello(at)
     at.join()
     at.want(40, 41)
     at.work_off()
-    assert watched.state().consumers[0].position == 42
+    assert service.view().consumers[0].position == 42
     at.want(0, epoch=1)
     at.work_off()
-    consumer = watched.state().consumers[0]
+    consumer = service.view().consumers[0]
     assert (consumer.epoch, consumer.position) == (1, 1)
+
+
+def run_epochs(at: Peers, service: Published, epochs: int) -> list[View]:
+    """Let a trainer take epochs of 1.2 s: each in a new session, ten samples of five batches, a fifth of it waiting."""
+    rows = []
+    for epoch in range(epochs):
+        identity = b"c%d" % epoch
+        hello(at, identity)
+        for batch in range(5):
+            at.consumer_says(identity, Want(epoch, (2 * batch, 2 * batch + 1), waited_seconds=0.048 * batch))
+            at.work_off()
+            service.pass_seconds(0.2)
+        rows.append(service.view().consumers[0])
+        at.consumer_says(identity, Goodbye(0.24))
+        service.pass_seconds(0.2)
+    return rows
+
+
+def test_a_row_counts_over_short_epochs() -> None:
+    at = peers()
+    service = published(at)
+    at.join()
+    *_, before, last = run_epochs(at, service, 20)
+    assert (last.id, last.epoch, last.served) == (before.id, 19, 200)
+    assert last.samples_per_second == pytest.approx(10 / 1.2, rel=0.1)
+    assert last.batches_per_second == pytest.approx(5 / 1.2, rel=0.1)
+    assert last.waiting_share == pytest.approx(0.2, abs=0.02)
+    assert last.waited_seconds == pytest.approx(20 * 0.24, abs=0.1)
+    assert last.eta_seconds == pytest.approx((50 - 10) / (10 / 1.2), rel=0.1)
+
+
+def test_a_reconnect_continues_the_row_and_a_later_run_begins_one() -> None:
+    at = peers()
+    service = published(at)
+    at.join()
+    (first,) = run_epochs(at, service, 1)
+    service.pass_seconds(RETURN_SECONDS - 1.0)
+    hello(at, b"again")
+    at.consumer_says(b"again", Want(1, (0, 1), waited_seconds=0.0))
+    at.work_off()
+    service.pass_seconds(2.0)
+    again = service.view().consumers[0]
+    assert (again.id, again.served) == (first.id, 12)
+    assert again.samples_per_second == pytest.approx(1.0)  # over the time since it returned
+    at.consumer_says(b"again", Goodbye(0.0))
+    at.now += RETURN_SECONDS
+    hello(at, b"later")
+    (later,) = service.view().consumers
+    assert later.id != first.id
+    assert later.served == 0
+
+
+def test_consumers_of_one_name_keep_rows_of_their_own() -> None:
+    at = peers()
+    service = published(at)
+    at.join()
+    for identity in (b"a", b"b"):
+        hello(at, identity)
+    at.want(0, 1, identity=b"a")
+    at.work_off()
+    before = {consumer.id for consumer in service.view().consumers}
+    for identity in (b"a", b"b"):
+        at.consumer_says(identity, Goodbye(0.0))
+    for identity in (b"d", b"e", b"f"):
+        hello(at, identity)
+    rows = {consumer.id: consumer.served for consumer in service.view().consumers}
+    assert before < set(rows)
+    assert sorted(rows.values()) == [0, 0, 2]
 
 
 def test_a_consumer_whose_connection_has_ended_is_not_counted() -> None:
     at = peers()
-    watched = service(at)
+    service = published(at)
     hello(at, b"stays")
     hello(at, b"goes")
     at.want(0, identity=b"goes")
-    assert watched.state().queued_share == 0.5
+    assert service.view().queued_share == 0.5
     at.dispatcher.consumer_gone(b"goes", at.now)
-    state = watched.state()
+    state = service.view()
     assert (state.consumer_count, state.queued_share) == (1, 0.0)
     assert [consumer.state for consumer in state.consumers] == ["idle", "gone"]
     at.now = 11.0
     at.tick(0.0)
-    assert [consumer.id for consumer in watched.state().consumers] == [state.consumers[0].id]
+    assert [consumer.id for consumer in service.view().consumers] == [state.consumers[0].id]
 
 
 def test_refusals_and_verdicts_are_told_newest_first() -> None:
     at = peers()
-    watched = service(at)
+    service = published(at)
     hello(at)
     at.join()
     at.want(0)
@@ -166,7 +234,7 @@ def test_refusals_and_verdicts_are_told_newest_first() -> None:
     at.begin()
     at.fail(reason="<b>gone</b>", frame=None)
     at.quarantine.extend([QuarantineEntry(1, "v3.mp4", "f", 12, "crash", WALL)])
-    state = watched.state()
+    state = service.view()
     assert [(each.reason, each.frame, each.kind, each.time) for each in state.refusals] == [
         ("<b>gone</b>", None, "failed", WALL), ("cut short", 7, "failed", WALL),
     ]  # fmt: skip
@@ -179,7 +247,7 @@ def test_of_many_refusals_the_last_few_are_told() -> None:
     at = peers()
     for number in range(100):
         at.dispatcher.candidates.latest.append((str(number), Refusal("v.mp4", None, "x" * 500)))
-    state = service(at).state()
+    state = published(at).view()
     assert len(state.refusals) == 20
     assert state.refusals[0].time == "99"
     assert len(state.refusals[0].reason) == 200
@@ -187,17 +255,17 @@ def test_of_many_refusals_the_last_few_are_told() -> None:
 
 def test_a_lost_worker_is_a_fault_and_gone() -> None:
     at = peers()
-    watched = service(at)
+    service = published(at)
     at.join()
     at.die(cause=Cause.KILLED)
-    state = watched.state()
-    assert (state.totals.workers_lost, state.totals.faults, state.workers) == (1, 1, ())
+    state = service.view()
+    assert (state.totals.workers_lost, state.totals.faults, state.workers) == (1, 1, [])
 
 
 def test_what_peers_call_themselves_is_short_and_printable() -> None:
     at = peers()
     hello(at, name="\x1b[2J" + "n" * 1000, host="\n<script>")
-    (consumer,) = service(at).state().consumers
+    (consumer,) = published(at).view().consumers
     assert len(consumer.name) <= 100
     assert consumer.name.startswith("[2Jnnn")
     assert consumer.host == "<script>"
@@ -208,19 +276,18 @@ def test_what_peers_call_themselves_is_short_and_printable() -> None:
 
 def test_the_state_is_plain_json() -> None:
     at = peers()
-    watched = service(at, cache="/nowhere")
+    service = published(at, cache="/nowhere")
     hello(at)
     at.join()
     at.want(0, 1)
     at.begin()
-    state = watched.state()
-    assert json.loads(state.to_json()) == json.loads(json.dumps(dataclasses.asdict(state)))
-    assert json.loads(state.to_json())["workers"][0]["name"] == "w"
+    assert service.plain() == json.loads(json.dumps(service.status()))
+    assert service.plain()["workers"][0]["name"] == "w"
 
 
 def test_thousands_of_peers_fit_into_one_message_and_take_milliseconds() -> None:
     at = peers()
-    watched = service(at)
+    service = published(at)
     for number in range(MOST_SHOWN + 50):
         at.join(b"w%04d" % number)
     for number in range(MOST_SHOWN + 50):
@@ -228,11 +295,11 @@ def test_thousands_of_peers_fit_into_one_message_and_take_milliseconds() -> None
         at.want(0, 1, identity=b"c%04d" % number)
     for worker in range(0, MOST_SHOWN, 2):
         at.begin(b"w%04d" % worker)
-    watched.pass_seconds(1.0)
+    service.pass_seconds(1.0)
     began = time.process_time()
-    state = watched.state()
-    encoded = state.to_json()
+    encoded = to_json(service.status())
     took = time.process_time() - began
+    state = service.view()
     assert (state.worker_count, state.consumer_count) == (MOST_SHOWN + 50, MOST_SHOWN + 50)
     assert len(encoded) < 1 << 20
     values = json.loads(encoded)
@@ -247,8 +314,8 @@ def test_names_that_are_no_text_and_very_long_ones_do_no_harm() -> None:
     at.quarantine.extend(
         [QuarantineEntry(number + 1, "\x03" * 4000, "f", 0, "\x04" * 4000, WALL) for number in range(100)]
     )
-    state = service(at, cache="/not-utf8-\udcff").state()
-    encoded = state.to_json()
+    service = published(at, cache="/not-utf8-\udcff")
+    encoded, state = to_json(service.status()), service.view()
     assert len(encoded) < 1 << 18
     assert json.loads(encoded)["cache"]["folder"] == "/not-utf8-?"
     assert (len(state.verdicts), state.quarantined, state.verdicts[0].snapshot) == (20, 100, 100)
@@ -259,32 +326,32 @@ def test_names_that_are_no_text_and_very_long_ones_do_no_harm() -> None:
 
 def test_whoever_looks_gets_the_next_state_without_a_session() -> None:
     at = peers()
-    watched = service(at)
-    assert watched.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now)) == []
-    (answer,) = watched.answers()
+    service = published(at)
+    assert service.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now)) == []
+    (answer,) = service.answers()
     assert isinstance(answer, ToConsumer)
     assert answer.identity == b"page"
-    assert json.loads(seen(answer))["version"] == STATE_VERSION
-    assert watched.state().consumer_count == 0
+    assert json.loads(json_of(answer))["version"] == STATUS_VERSION
+    assert service.view().consumer_count == 0
 
 
 def test_the_workers_side_may_look_too_and_is_no_worker_for_it() -> None:
     at = peers()
-    watched = service(at)
-    watched.ask(at.dispatcher.from_worker(b"page", encode(GetStatus()), at.now))
-    (answer,) = watched.answers()
+    service = published(at)
+    service.ask(at.dispatcher.from_worker(b"page", encode(GetStatus()), at.now))
+    (answer,) = service.answers()
     assert isinstance(answer, ToWorker)
-    assert json.loads(seen(answer))["worker_count"] == 0
+    assert json.loads(json_of(answer))["worker_count"] == 0
 
 
 def test_a_state_is_made_a_few_times_a_second_however_often_they_ask() -> None:
     at = peers()
-    watched = service(at)
+    service = published(at)
     made = 0
     for _ in range(20):
         for _ in range(50):
-            assert watched.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now)) == []
-        answers = watched.answers()
+            assert service.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now)) == []
+        answers = service.answers()
         assert len(answers) <= 1
         made += len(answers)
         at.now += 0.1
@@ -293,13 +360,13 @@ def test_a_state_is_made_a_few_times_a_second_however_often_they_ask() -> None:
 
 def test_a_state_that_takes_long_to_make_is_made_less_often() -> None:
     at = peers()
-    watched = service(at)
+    service = published(at)
     worked = iter(range(1000))
-    watched.watch._processor_clock = lambda: float(next(worked)) / 10.0
+    service.publisher._processor_clock = lambda: float(next(worked)) / 10.0
     made = []
     for _ in range(200):
-        watched.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now))
-        made += [at.now] * len(watched.answers())
+        service.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now))
+        made += [at.now] * len(service.answers())
         at.now += 0.1
     # A tenth of a second of work each.
     assert made == pytest.approx([0.0, 5.0, 10.0, 15.0], abs=0.5)
@@ -307,32 +374,32 @@ def test_a_state_that_takes_long_to_make_is_made_less_often() -> None:
 
 def test_all_who_look_at_once_get_the_same_state_and_a_crowd_is_sent_away() -> None:
     at = peers()
-    watched = service(at)
-    for number in range(MOST_LOOKERS):
-        assert watched.watch.ask(SendStatus(b"%d" % number)) == []
-    (denied,) = watched.watch.ask(SendStatus(b"one too many"))
+    service = published(at)
+    for number in range(MOST_WAITING):
+        assert service.publisher.ask(SendStatus(b"%d" % number)) == []
+    (denied,) = service.publisher.ask(SendStatus(b"one too many"))
     answer = decode(denied.frames[0])
     assert isinstance(answer, Denied)
     assert answer.code == ErrorCode.BUSY
-    answers = watched.answers()
-    assert len(answers) == MOST_LOOKERS
+    answers = service.answers()
+    assert len(answers) == MOST_WAITING
     assert len({id(each.frames) for each in answers}) == 1
 
 
 def test_the_spec_of_the_server_is_told_resolved() -> None:
-    state = service(peers()).state()
+    state = published(peers()).view()
     assert set(state.spec) == set(SMALL_SPEC.to_dict())
 
 
 def test_a_consumer_cannot_have_waited_longer_than_it_was_there() -> None:
     at = peers()
-    watched = service(at)
+    service = published(at)
     at.now = 10.0
     hello(at)
     at.now = 14.0
     at.consumer_says(b"c", Want(0, (), waited_seconds=1e300))
     at.consumer_says(b"c", Want(0, (), waited_seconds=3.0))
-    assert watched.state().consumers[0].waited_seconds == 4.0
+    assert service.view().consumers[0].waited_seconds == 4.0
     at.consumer_says(b"c", Goodbye(4.0))
-    assert watched.state().totals.waited_seconds == 4.0
-    assert watched.state().consumers == ()
+    assert service.view().totals.waited_seconds == 4.0
+    assert service.view().consumers == []

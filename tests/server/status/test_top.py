@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pty
 import signal
@@ -17,7 +16,7 @@ from rich.console import Console
 
 from tests.clips import panned_luma, write_clip
 from tests.server.peers import peers
-from tests.server.status.services import service
+from tests.server.status.services import published
 from tests.waiting import until
 from v2v_client.local_server import LocalServer
 from v2v_server.commands.top import main
@@ -36,12 +35,12 @@ def drawn(state: dict[str, Any], note: str = "") -> str:
 def busy() -> dict[str, Any]:
     """A state with a worker, a consumer, and hostile names."""
     at = peers()
-    watched = service(at)
+    service = published(at)
     at.join(b"w", credit=2)
     at.hello()
     at.want(0, 1, 2)
-    watched.pass_seconds(3.0)
-    state: dict[str, Any] = json.loads(watched.state().to_json())
+    service.pass_seconds(3.0)
+    state: dict[str, Any] = service.plain()
     state["workers"][0]["clip"] = HOSTILE
     state["refusals"] = [{"time": "t", "video": HOSTILE, "frame": None, "reason": "[bold]cut", "kind": "failed"}]
     return state
@@ -84,7 +83,7 @@ def test_beside_a_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     small = ("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=40")
     with LocalServer(tmp_path, workers=1, flags=small) as server:
         assert main(["--connect", server.address, "--once"]) == 0
-        assert "Nobody is connected" in capsys.readouterr().out
+        assert "No consumer is connected" in capsys.readouterr().out
 
         # On a terminal: again and again, until Ctrl-C.
         ours, theirs = pty.openpty()
@@ -105,7 +104,7 @@ def test_beside_a_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
             nonlocal said
             with suppress(BlockingIOError):
                 said += os.read(ours, 1 << 16)
-            return said.count(b"Nobody is connected") >= times
+            return said.count(b"No consumer is connected") >= times
 
         try:
             until(lambda: seen(2))

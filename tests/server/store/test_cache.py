@@ -24,6 +24,7 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.store.cache import Cache, make_cache, piece_frames
 from v2v_server.store.used import used_bytes
 from v2v_server.worker.decode_cache import Clips
@@ -71,7 +72,7 @@ def epoch(source: Path, cache: Cache, count: int = 8, spec: StreamSpec = SPEC) -
     """What was said of the cache; every sample is compared with that of the source."""
     said = []
     for root, lease in leases_of(source, count, spec):
-        sample, of_cache = made(lease, Clips(root, cache))
+        sample, of_cache = made(lease, Clips(Folder(root), cache))
         exact = whole_sample(replace(lease, indices=lease.indices[:1]), root)
         if of_cache == "hit":
             require_equal(sample, exact, "cache")
@@ -186,7 +187,7 @@ def test_a_changed_source(source: Path, folder: Path, tmp_path: Path) -> None:
         shutil.rmtree(folder)
         make_cache(folder)
         with pytest.raises(VideoChanged):
-            made(old, Clips(tmp_path / "source", Cache(folder, 1 << 30, 0)))
+            made(old, Clips(Folder(tmp_path / "source"), Cache(folder, 1 << 30, 0)))
     assert epoch(tmp_path / "source", Cache(folder, 1 << 30, 0))[0] == "miss"
     assert kept
 
@@ -205,11 +206,11 @@ def test_damage_beyond_a_sample_does_not_spoil_it(tmp_path: Path, folder: Path) 
             refusal = str(error)
         if exact is None:
             with pytest.raises(VideoError) as cached:
-                made(lease, Clips(root, Cache(folder, 1 << 30, 0)))
+                made(lease, Clips(Folder(root), Cache(folder, 1 << 30, 0)))
             assert str(cached.value) == refusal
             outcomes.add("refused")
         else:
-            sample, said = made(lease, Clips(root, Cache(folder, 1 << 30, 0)))
+            sample, said = made(lease, Clips(Folder(root), Cache(folder, 1 << 30, 0)))
             assert said == "miss"
             np.testing.assert_array_equal(sample.arrays["voxels"], exact.arrays["voxels"])
             outcomes.add("made")
@@ -220,11 +221,11 @@ def test_what_a_killed_worker_leaves_is_not_used_and_removed(source: Path, folde
     """Killed in the middle of a piece: the file is there, under a name that nobody reads."""
     program = (
         "import os, signal, sys\nfrom pathlib import Path\nimport v2v_server.store.cache as cache\n"
-        "from tests.server.store.test_cache import leases_of, Clips\n"
+        "from tests.server.store.test_cache import leases_of, Clips, Folder\n"
         "cache.piece_frames = lambda rows, width: 16\n"
         "cache.StoreWriter.close = lambda self: os.kill(os.getpid(), signal.SIGKILL)\n"
         "(root, lease), = leases_of(Path(sys.argv[1]), 1)\n"
-        "Clips(root, cache.Cache(Path(sys.argv[2]), 1 << 30, 0)).take(lease)\n"
+        "Clips(Folder(root), cache.Cache(Path(sys.argv[2]), 1 << 30, 0)).take(lease)\n"
     )
     done = subprocess.run([sys.executable, "-c", program, str(source), str(folder)], check=False)
     assert done.returncode == -9
@@ -278,7 +279,7 @@ def test_samples_of_real_footage(tmp_path: Path, folder: Path, monkeypatch: pyte
         for turn in range(2):
             for root, plain in leases_of(source, len(SOUND) - 4, spec):
                 lease = replace(plain, arrays=arrays)
-                sample, said = made(lease, Clips(root, Cache(folder, 1 << 40, 0)))
+                sample, said = made(lease, Clips(Folder(root), Cache(folder, 1 << 40, 0)))
                 if turn:
                     assert said == "hit"
                     require_equal(sample, whole_sample(lease, root), "cache")

@@ -10,21 +10,21 @@ import pytest
 
 from v2v_protocol.errors import UsageError
 from v2v_server.config import ServeConfig
-from v2v_server.supervise.engines import make_supervisor
-from v2v_server.supervise.local_pool import Pool
+from v2v_server.corpus.sources.folder import Folder
+from v2v_server.supervise.engines import make_pool
 
 RAY = {"videos": "videos", "engine": "ray", "worker_bind": "tcp://127.0.0.1:5556"}
 
 
 def test_the_usual_one_is_this_hosts_pool() -> None:
-    assert isinstance(make_supervisor(ServeConfig(videos="videos"), Path("videos"), "w", []), Pool)
+    assert make_pool(ServeConfig(videos="videos"), Folder(Path("videos")), "w", []).is_local
 
 
 def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "v2v_server.supervise.ray_workers", raising=False)
+    monkeypatch.delitem(sys.modules, "v2v_server.supervise.ray_host", raising=False)
     with pytest.raises(UsageError, match=r"needs the Python package ray.*pip install '\.\[server,ray\]'"):
-        make_supervisor(ServeConfig(**RAY), Path("videos"), "w", [])
+        make_pool(ServeConfig(**RAY), Folder(Path("videos")), "w", [])
 
 
 def test_workers_elsewhere_need_an_address_they_can_reach() -> None:
@@ -47,10 +47,7 @@ def test_a_server_whose_workers_are_here_loads_no_ray() -> None:
 def test_where_no_cluster_is_it_says_what_to_start() -> None:
     pytest.importorskip("ray", reason="the extra 'ray' is not installed")
     # In a process of its own: Ray changes warnings, signal handlers and more of whoever imports it.
-    program = (
-        "from pathlib import Path\nfrom v2v_server.supervise.ray_workers import RayWorkers\n"
-        "RayWorkers(Path('videos'), 'w', address='127.0.0.1:1')"
-    )
+    program = "from v2v_server.supervise.ray_host import RayHost\nRayHost('videos', 'w', address='127.0.0.1:1')"
     done = subprocess.run([sys.executable, "-c", program], check=False, timeout=120, capture_output=True, text=True)
     assert "UsageError: --ray-address 127.0.0.1:1: " in done.stderr
     assert "ray start --head" in done.stderr

@@ -27,7 +27,7 @@ def run(
             present = target
         wanted = demand * (1 + noise * chance.uniform(-1, 1))
         busy = min(1.0, wanted / present) if present else 1.0
-        decision = scaling.look(now, float(wanted >= present and wanted > 0), 1.0 - busy, present)
+        decision = scaling.decide(now, float(wanted >= present and wanted > 0), 1.0 - busy, present)
         if decision is not None:
             decisions.append(decision)
             due = now + delay if decision.workers > target else now

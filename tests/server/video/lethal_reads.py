@@ -5,41 +5,41 @@ from __future__ import annotations
 import os
 import signal
 import stat
-from pathlib import Path
 
 from v2v_server.corpus.index.file import IndexRow
 from v2v_server.corpus.probe import probe_file
+from v2v_server.corpus.sources.source import VideoSource
 
 
-def lethal(root: str, id: str) -> IndexRow:
+def lethal(source: VideoSource, id: str) -> IndexRow:
     """Dies over files of that name, as over a bug of the decoder."""
     if "lethal" in id:
         os.kill(os.getpid(), signal.SIGSEGV)
-    return probe_file(root, id)
+    return probe_file(source, id)
 
 
-def killed_once(root: str, id: str) -> IndexRow:
+def killed_once(source: VideoSource, id: str) -> IndexRow:
     """Is killed from outside over each file, the first time."""
-    file = Path(root, id)
+    file = source.folder / id
     if not file.stat().st_mode & stat.S_ISVTX:  # such a process may write no file, but change a mode
         file.chmod(file.stat().st_mode | stat.S_ISVTX)
         os.kill(os.getpid(), signal.SIGKILL)
-    return probe_file(root, id)
+    return probe_file(source, id)
 
 
-def always_killed(root: str, id: str) -> IndexRow:
+def always_killed(source: VideoSource, id: str) -> IndexRow:
     """Is killed from outside over every file."""
     os.kill(os.getpid(), signal.SIGKILL)
-    return probe_file(root, id)
+    return probe_file(source, id)
 
 
-def always_exits(root: str, id: str) -> IndexRow:
+def always_exits(source: VideoSource, id: str) -> IndexRow:
     """Ends with a status over every file, as over a module that is not installed."""
     os._exit(3)
 
 
-def waiting(root: str, id: str) -> IndexRow:
+def waiting(source: VideoSource, id: str) -> IndexRow:
     """Waits for ever over files of that name, as over storage that does not answer."""
     if "waiting" in id:
         signal.pause()
-    return probe_file(root, id)
+    return probe_file(source, id)

@@ -14,6 +14,7 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import VideoError
 from v2v_server.corpus.probe import probe_files
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.video import probe as probing
 from v2v_server.video import source
 from v2v_server.video.probe import probe
@@ -105,7 +106,7 @@ def test_a_file_that_claims_a_thousand_million_frames_is_given_no_room_for_them(
         start = content.index(atom.encode()) + at
         content[start : start + 4 * len(fields)] = struct.pack(f">{len(fields)}I", *fields)
     whole.write_bytes(content)
-    records = {record.id: record for record in probe_files(tmp_path, ["claim.mov", "good.mov"], 1)}
+    records = {record.id: record for record in probe_files(Folder(tmp_path), ["claim.mov", "good.mov"], 1)}
     assert records["good.mov"].frames == 5
     assert records["claim.mov"].problem is not None
     assert records["claim.mov"].size_bytes > 0  # it is not read again at each start
@@ -123,7 +124,7 @@ def test_metadata_that_grow_when_they_are_unpacked_are_refused(tmp_path: Path, c
     moov = _atom(b"cmov", _atom(b"dcom", b"zlib") + _atom(b"cmvd", struct.pack(">I", claimed) + packed))
     content = _atom(b"ftyp", b"qt  \0\0\0\0qt  ") + _atom(b"moov", moov) + _atom(b"mdat", bytes(100))
     (tmp_path / "bomb.mov").write_bytes(content)
-    (record,) = probe_files(tmp_path, ["bomb.mov"], 1)
+    (record,) = probe_files(Folder(tmp_path), ["bomb.mov"], 1)
     assert record.problem in (
         "has no video track",
         "cannot be opened: Invalid data found when processing input",

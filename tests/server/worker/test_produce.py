@@ -56,7 +56,7 @@ def test_a_whole_index_and_its_slice_make_the_same_sample(catalogue: Catalogue, 
     assert lease.frame_index == index.to_bytes()
     needed = SMALL_SPEC.recipe.frames_needed
     cut = dataclasses.replace(lease, frame_index=index.slice(lease.start_frame, needed).to_bytes())
-    whole, part = (make_sample(each, decode_for(each, each.indices, catalogue.root)[0]) for each in (lease, cut))
+    whole, part = (make_sample(each, decode_for(each, each.indices, catalogue.source)[0]) for each in (lease, cut))
     assert whole.provenance == part.provenance
     assert all(np.array_equal(array, part.arrays[name]) for name, array in whole.arrays.items())
 
@@ -64,10 +64,9 @@ def test_a_whole_index_and_its_slice_make_the_same_sample(catalogue: Catalogue, 
 @pytest.mark.parametrize("video", ["../a.mp4", "sub/../../a.mp4", "/etc/passwd", "..", "//a.mp4"])
 def test_a_lease_that_leads_out_of_the_corpus_opens_nothing(catalogue: Catalogue, lease: Lease, video: str) -> None:
     """Its worker may be on another host than the server that sent it."""
-    assert isinstance(catalogue.root, Path)
-    write_clip(catalogue.root.parent / "a.mp4", panned_luma(30, 16, 24), gop=12)
+    write_clip(catalogue.folder.parent / "a.mp4", panned_luma(30, 16, 24), gop=12)
     with pytest.raises(ProtocolError, match="leads out of the corpus folder"):
-        decode_for(dataclasses.replace(lease, video=video), lease.indices, catalogue.root)
+        decode_for(dataclasses.replace(lease, video=video), lease.indices, catalogue.source)
 
 
 class TestASecondAttempt:
@@ -88,22 +87,22 @@ class TestASecondAttempt:
 
     def test_makes_the_sample(self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]) -> None:
         failures.append(VideoError("a.mp4", 3, "does not decode"))
-        decoded, _ = clips.Clips(catalogue.root).take(lease)
-        expected = make_sample(lease, decode_for(lease, lease.indices, catalogue.root)[0])
+        decoded, _ = clips.Clips(catalogue.source).take(lease)
+        expected = make_sample(lease, decode_for(lease, lease.indices, catalogue.source)[0])
         assert np.array_equal(make_sample(lease, decoded).arrays["voxels"], expected.arrays["voxels"])
 
     def test_has_the_last_word(self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]) -> None:
         failures += [VideoError("a.mp4", 3, "first"), VideoError("a.mp4", 3, "second")]
         with pytest.raises(VideoError, match="second"):
-            clips.Clips(catalogue.root).take(lease)
+            clips.Clips(catalogue.source).take(lease)
 
     def test_finds_a_file_that_was_replaced_meanwhile(
         self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]
     ) -> None:
-        (catalogue.root / "a.mp4").write_bytes(b"another")
+        (catalogue.folder / "a.mp4").write_bytes(b"another")
         failures.append(VideoError("a.mp4", 3, "does not decode"))
         with pytest.raises(VideoChanged):
-            clips.Clips(catalogue.root).take(lease)
+            clips.Clips(catalogue.source).take(lease)
 
     def test_is_not_made_where_the_file_is_missing(
         self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]
@@ -111,13 +110,13 @@ class TestASecondAttempt:
         """The server looks whether it is there."""
         failures += [VideoUnreadable("a.mp4", None, "cannot be read"), VideoError("a.mp4", 3, "asked again")]
         with pytest.raises(VideoUnreadable):
-            clips.Clips(catalogue.root).take(lease)
+            clips.Clips(catalogue.source).take(lease)
 
 
 def test_what_this_host_cannot_read_is_not_made_from_another_video(catalogue: Catalogue, lease: Lease) -> None:
-    write_clip(catalogue.root / "b.mp4", panned_luma(30, 16, 24), gop=12)
-    with closing(open_catalogue(catalogue.root, processes=0)) as both:
-        (catalogue.root / "a.mp4").unlink()
+    write_clip(catalogue.folder / "b.mp4", panned_luma(30, 16, 24), gop=12)
+    with closing(open_catalogue(catalogue.folder, processes=0)) as both:
+        (catalogue.folder / "a.mp4").unlink()
         ended = set()
         for index in range(4):
             try:
@@ -128,14 +127,14 @@ def test_what_this_host_cannot_read_is_not_made_from_another_video(catalogue: Ca
 
 
 def test_a_sample_is_made_again_under_its_quarantine_snapshot(catalogue: Catalogue, tmp_path: Path) -> None:
-    write_clip(catalogue.root / "b.mp4", panned_luma(30, 16, 24), gop=12)
+    write_clip(catalogue.folder / "b.mp4", panned_luma(30, 16, 24), gop=12)
     cache = str(tmp_path / "cache")
 
     def made(*flags: str) -> str:
         recipe = [f"--set={name}={value}" for name, value in SMALL_SPEC.recipe.to_dict().items() if name in CHANGED]
         out = tmp_path / "sample.npz"
         assert (
-            simulate([str(catalogue.root), f"--out={out}", f"--cache-dir={cache}", "--index=2", *recipe, *flags]) == 0
+            simulate([str(catalogue.folder), f"--out={out}", f"--cache-dir={cache}", "--index=2", *recipe, *flags]) == 0
         )
         with np.load(out) as content:
             video: str = json.loads(str(content["provenance"]))["video"]
@@ -143,7 +142,7 @@ def test_a_sample_is_made_again_under_its_quarantine_snapshot(catalogue: Catalog
 
     first = made()
     mark = next(video.fingerprint for video in catalogue.videos if video.id == first)
-    file = quarantine_path(catalogue.root, cache)
+    file = quarantine_path(catalogue.folder, cache)
     for frame in (0, 10):  # two verdicts refuse the file
         write_entry(file, QuarantineEntry(0, first, mark, frame, "crash", "t"), read_quarantine(file))
     assert (made(), made("--quarantine=2")) == (first, {"a.mp4": "b.mp4", "b.mp4": "a.mp4"}[first])
@@ -161,7 +160,7 @@ def test_a_damaged_index_costs_its_video_only(catalogue: Catalogue, lease: Lease
         "too few frames": index.slice(0, lease.start_frame + 1).to_bytes(),
     }[damage]
     with pytest.raises(VideoError, match=r"^a\.mp4.*: its index from the server is damaged: "):
-        decode_for(dataclasses.replace(lease, frame_index=damaged), lease.indices, catalogue.root)
+        decode_for(dataclasses.replace(lease, frame_index=damaged), lease.indices, catalogue.source)
 
 
 @pytest.mark.parametrize("file", ["sample", "sample.npz", "sample.mp4"])
@@ -169,6 +168,6 @@ def test_a_sample_lies_where_it_is_said_to(
     file: str, catalogue: Catalogue, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recipe = [f"--set={name}={value}" for name, value in SMALL_SPEC.recipe.to_dict().items() if name in CHANGED]
-    simulate([str(catalogue.root / "a.mp4"), f"--out={tmp_path / file}", f"--cache-dir={tmp_path}", *recipe])
+    simulate([str(catalogue.folder / "a.mp4"), f"--out={tmp_path / file}", f"--cache-dir={tmp_path}", *recipe])
     with np.load(capsys.readouterr().out.split("written to ")[1].strip()) as content:
         assert sorted(content) == ["frames", "provenance", "voxels"]

@@ -20,6 +20,7 @@ from v2v_protocol.messages import Begun, Goodbye, Lease, LeaseFailed, Message, P
 from v2v_protocol.sample import Layout, new_arrays
 from v2v_protocol.wire import decode, encode
 from v2v_server.commands.worker import main as worker_command
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.simulation.variants import Variant
 from v2v_server.worker import process as worker_module
 from v2v_server.worker.conversation import Reconnect, Send
@@ -66,7 +67,7 @@ def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
         router.setsockopt(zmq.LINGER, 0)
         at = Server(router)
         port = router.bind_to_random_port("tcp://127.0.0.1")
-        worker = Worker("w", tmp_path, f"tcp://127.0.0.1:{port}", logbook.fileno())
+        worker = Worker("w", Folder(tmp_path), f"tcp://127.0.0.1:{port}", logbook.fileno())
         monkeypatch.setattr(worker_module, "make_sample", make)
         monkeypatch.setattr(worker_module, "sample_layout", lambda lease: LAYOUT)
         monkeypatch.setattr(
@@ -116,7 +117,7 @@ def test_a_new_connection_has_a_new_routing_id(tmp_path: Path) -> None:
     with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
         router.setsockopt(zmq.LINGER, 0)
         at = Server(router)
-        worker = Worker("w", tmp_path, f"tcp://127.0.0.1:{router.bind_to_random_port('tcp://127.0.0.1')}")
+        worker = Worker("w", Folder(tmp_path), f"tcp://127.0.0.1:{router.bind_to_random_port('tcp://127.0.0.1')}")
         found = []
         try:
             for _ in range(2):
@@ -135,7 +136,7 @@ def test_a_new_connection_has_a_new_routing_id(tmp_path: Path) -> None:
 
 def test_a_malformed_address_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"--connect nowhere: .*; write tcp://HOST:PORT"):
-        Worker("w", tmp_path, "nowhere")
+        Worker("w", Folder(tmp_path), "nowhere")
 
 
 def test_a_corpus_that_cannot_be_looked_at_is_said(capsys: pytest.CaptureFixture[str]) -> None:
@@ -161,7 +162,7 @@ def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pyte
     monkeypatch.setattr(worker_module, "signal", SimpleNamespace(SIGTERM=15, signal=lambda number, handler: None))
     monkeypatch.setenv("OPENCV_FOR_THREADS_NUM", "1")
     for name in (None, None, "mine"):
-        run_worker("tcp://127.0.0.1:5556", tmp_path, name, None)
+        run_worker("tcp://127.0.0.1:5556", Folder(tmp_path), name, None)
     assert len(set(names)) == 3
     assert names[0].startswith(f"{socket.gethostname()}-{os.getpid()}-")
     assert names[2] == "mine"

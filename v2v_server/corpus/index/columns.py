@@ -23,6 +23,8 @@ from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 CHUNK = 4096
 """Rows that are converted at a time."""
 _LARGEST_RATE = 1e9
+_NUMBER_TYPES = "qqqqiidb"
+"""Types of size, mtime, ctime, frames, width, height, rate and interlaced, in the letters of :mod:`array` and NumPy."""
 _UNREADABLE = (-1, 0, 0, "", 0, 0, 0, None, "", 0, "the index lost its record; start again to probe it")
 """The columns after the id where the index has no sound row. No file has a size of -1, so it is probed."""
 
@@ -67,8 +69,11 @@ class StringColumn(Sequence[str]):
             if step != 1:
                 return [self[each] for each in range(start, end, step)]
             ends = self._ends[start : max(start, end) + 1].tolist()
-            utf8 = self._utf8[ends[0] : ends[-1]].tobytes()
-            return [utf8[low - ends[0] : high - ends[0]].decode() for low, high in pairwise(ends)]
+            utf8, offset = self._utf8[ends[0] : ends[-1]].tobytes(), ends[0]
+            if utf8.isascii():
+                text = utf8.decode()
+                return [text[low - offset : high - offset] for low, high in pairwise(ends)]
+            return [utf8[low - offset : high - offset].decode() for low, high in pairwise(ends)]
         if not 0 <= at < len(self):
             raise IndexError(f"string {at} of {len(self)}")
         return self._utf8[self._ends[at] : self._ends[at + 1]].tobytes().decode()
@@ -84,64 +89,53 @@ class VideoTable:
 
     Attributes:
         ids, fingerprints: strings [N].
-        states: int64 [N, 3], size in bytes, mtime and ctime in ns of each file when it was probed.
         frames, width_px, height_px: integers [N].
         frames_per_second: float64 [N], NaN where unknown.
-        codec, problem: objects [N], strings; no problem is None.
         interlaced: bool [N].
+        codec, problem: objects [N], strings; no problem is None.
     """
 
     ids: StringColumn
-    states: npt.NDArray[np.int64]
     fingerprints: StringColumn
     frames: npt.NDArray[np.int64]
     width_px: npt.NDArray[np.int32]
     height_px: npt.NDArray[np.int32]
     frames_per_second: npt.NDArray[np.float64]
-    codec: npt.NDArray[np.object_]
     interlaced: npt.NDArray[np.bool_]
+    codec: npt.NDArray[np.object_]
     problem: npt.NDArray[np.object_]
 
     @classmethod
-    def of(cls, rows: Iterable[tuple[Any, ...]]) -> VideoTable:
+    def read(cls, rows: Iterable[tuple[Any, ...]], count: int) -> tuple[VideoTable, npt.NDArray[np.int64]]:
         """Make a table of rows of :meth:`v2v_server.corpus.index.file.Store.rows`.
 
         A damaged row becomes one that has to be probed, because SQLite accepts any type in any column.
+
+        Args:
+            rows: sorted by id.
+            count: N, the number of rows.
+
+        Returns:
+            the table, and [N, 3] the size in bytes, mtime and ctime in ns of each file when it was probed.
         """
-        ids, id_lengths, fingerprints, lengths = bytearray(), array("q"), bytearray(), array("q")
-        states, frames, width, height, rate = array("q"), array("q"), array("i"), array("i"), array("d")
-        codec, interlaced, problem = list[str](), array("b"), list[str | None]()
-        columns: list[Any] = [
-            ids,
-            id_lengths,
-            states,
-            fingerprints,
-            lengths,
-            frames,
-            width,
-            height,
-            rate,
-            codec,
-            interlaced,
-            problem,
-        ]
-        left = iter(rows)
+        ids, fingerprints, start, left = bytearray(), bytearray(), 0, iter(rows)
+        # Allocated once: arrays that grow leave holes in the heap, a third of their size.
+        columns = [np.empty(count, dtype) for dtype in ("i", "i", *_NUMBER_TYPES, "O", "O")]
         while chunk := list(islice(left, CHUNK)):
-            for part in _converted(chunk):
+            for some_ids, some_fingerprints, *part in _converted(chunk):
+                ids += some_ids
+                fingerprints += some_fingerprints
+                end = start + len(part[0])
                 for column, values in zip(columns, part, strict=True):
-                    column.extend(values)
-        return cls(
-            StringColumn(np.frombuffer(ids, np.uint8), _ends(np.asarray(id_lengths))),
-            np.asarray(states).reshape(-1, 3),
-            StringColumn(np.frombuffer(fingerprints, np.uint8), _ends(np.asarray(lengths))),
-            np.asarray(frames),
-            np.asarray(width),
-            np.asarray(height),
-            np.asarray(rate),
-            np.array(codec, object),
-            np.frombuffer(interlaced, np.bool_),
-            np.array(problem, object),
+                    column[start:end] = values
+                start = end
+        id_lengths, lengths, size, mtime, ctime, frames, width, height, rate, interlaced, codec, problem = columns
+        table = cls(
+            StringColumn(np.asarray(ids), _ends(id_lengths)),
+            StringColumn(np.asarray(fingerprints), _ends(lengths)),
+            *(frames, width, height, rate, interlaced.view(np.bool_), codec, problem),
         )
+        return table, np.stack((size, mtime, ctime), 1)
 
     def where(self, mask: npt.NDArray[np.bool_]) -> VideoTable:
         """Return the rows at which the mask is set."""
@@ -155,14 +149,11 @@ class VideoTable:
         return len(self.frames)
 
     def row(self, at: int) -> IndexRow:
-        """Return one row, without its frame index."""
-        size, mtime, ctime = self.states[at].tolist()
+        """Return one row, without the state of its file and its frame index."""
         rate = float(self.frames_per_second[at])
         return IndexRow(
             id=self.ids[at],
-            size_bytes=size,
-            mtime_ns=mtime,
-            ctime_ns=ctime,
+            size_bytes=-1,
             fingerprint=self.fingerprints[at],
             frames=int(self.frames[at]),
             width_px=int(self.width_px[at]),
@@ -174,11 +165,11 @@ class VideoTable:
         )
 
 
-def _converted(rows: list[tuple[Any, ...]]) -> Iterator[tuple[Sequence[Any], ...]]:
-    """Yield rows as columns in the order of the fields of :class:`VideoTable`, in as few parts as damage allows."""
+def _converted(rows: list[tuple[Any, ...]]) -> Iterator[tuple[Any, ...]]:
+    """Yield rows as columns, in as few parts as damage allows."""
     try:
         yield _columns(rows)
-    except (TypeError, AttributeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError):
         if len(rows) == 1:
             yield _columns([(rows[0][0], *_UNREADABLE)])
         else:
@@ -186,39 +177,38 @@ def _converted(rows: list[tuple[Any, ...]]) -> Iterator[tuple[Sequence[Any], ...
                 yield from _converted([row])
 
 
-def _columns(rows: list[tuple[Any, ...]]) -> tuple[Sequence[Any], ...]:
-    """Convert rows to columns.
+def _columns(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
+    """Convert rows to columns: UTF-8 of ids and of fingerprints, the lengths of both, numbers, formats, problems.
 
     Raises:
-        TypeError, AttributeError, ValueError, OverflowError: no probe writes such a row.
+        TypeError, ValueError, OverflowError: no probe writes such a row.
     """
     ids, sizes, mtimes, ctimes, fingerprints, frames, widths, heights, rates, codecs, interlaced, problems = zip(
         *rows, strict=True
     )
-    usable = np.array([problem is None for problem in problems])
-    numbers = array("q", frames), array("i", widths), array("i", heights)
-    for column, most in zip(numbers, (LARGEST_FRAMES, LARGEST_SIDE_PX, LARGEST_SIDE_PX), strict=True):
-        values = np.asarray(column)
-        if (values < usable).any() or (values > most).any():
+    if None in rates:
+        rates = tuple(math.nan if rate is None else rate for rate in rates)
+    values = sizes, mtimes, ctimes, frames, widths, heights, rates, interlaced
+    numbers = tuple(array(code, column) for code, column in zip(_NUMBER_TYPES, values, strict=True))
+    # Only a row with a problem may have no frames.
+    least = np.array([problem is None for problem in problems]) if any(problems) else 1
+    limits = (least, LARGEST_FRAMES), (least, LARGEST_SIDE_PX), (least, LARGEST_SIDE_PX), (0, _LARGEST_RATE), (0, 1)
+    for column, (low, high) in zip(map(np.asarray, numbers[3:]), limits, strict=True):
+        if (column < low).any() or (column > high).any():
             raise ValueError
-    rate = array("d", [math.nan if rate is None else rate for rate in rates])
-    if (np.asarray(rate) < 0).any() or (np.asarray(rate) > _LARGEST_RATE).any():
-        raise ValueError
-    if not {0, 1}.issuperset(interlaced) or not {str, type(None)}.issuperset(map(type, problems)):
-        raise ValueError
-    utf8 = [[string.encode() for string in strings] for strings in (ids, fingerprints)]
-    return (
-        b"".join(utf8[0]),
-        array("q", map(len, utf8[0])),
-        array("q", chain.from_iterable(zip(sizes, mtimes, ctimes, strict=True))),
-        b"".join(utf8[1]),
-        array("q", map(len, utf8[1])),
-        *numbers,
-        rate,
-        list(map(sys.intern, codecs)),
-        array("b", interlaced),
-        list(problems),
-    )
+    if not {str, type(None)}.issuperset(map(type, problems)):
+        raise TypeError
+    (id_utf8, id_lengths), (utf8, lengths) = _utf8(ids), _utf8(fingerprints)
+    return id_utf8, utf8, id_lengths, lengths, *numbers, list(map(sys.intern, codecs)), problems
+
+
+def _utf8(strings: Sequence[str]) -> tuple[bytes, array[int]]:
+    """Return strings as UTF-8 in one piece, and the bytes of each."""
+    text = "".join(strings)
+    if text.isascii():
+        return text.encode(), array("i", map(len, strings))
+    encoded = [string.encode() for string in strings]
+    return b"".join(encoded), array("i", map(len, encoded))
 
 
 def joined(

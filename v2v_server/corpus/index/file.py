@@ -190,14 +190,14 @@ class Store:
         query = "SELECT frame_index FROM video WHERE id = ? AND fingerprint = ?"
         return _blob(self._database.execute(query, (id, fingerprint)).fetchone())
 
-    def state(self, id: str) -> tuple[int, int] | None:
-        """Size and time of the last modification of a file when it was probed; None if it is not known.
+    def state(self, id: str) -> tuple[int, int, int] | None:
+        """Return the state of a file when it was probed; None if it is not known.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
-        row = self._database.execute("SELECT size_bytes, mtime_ns FROM video WHERE id = ?", (id,)).fetchone()
-        return None if row is None else (row[0], row[1])
+        row = self._database.execute("SELECT size_bytes, mtime_ns, ctime_ns FROM video WHERE id = ?", (id,)).fetchone()
+        return None if row is None else (row[0], row[1], row[2])
 
     def make_figures(self) -> bool:
         """Make the table of figures if it is missing; return whether there is also a table of an earlier release.

@@ -14,19 +14,18 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
-from v2v_server.cloud.copies import Copies, open_local
 from v2v_server.corpus.index.columns import VideoTable, joined
 from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.manifest import Manifest
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES, LONGEST_SECONDS, Progress, batches
 from v2v_server.corpus.scenes.runs import SplitVideos
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_FRAMES, Scene
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.clips import pictures_of
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
@@ -55,7 +54,7 @@ class SceneCollection:
         return FigureKind("scene", f"{made}{self.rows}, look {ANALYSIS_VERSION}")
 
     def collect(
-        self, store: Store, root: Path | Copies, table: VideoTable, processes: int, progress: Progress | None
+        self, store: Store, source: VideoSource, table: VideoTable, processes: int, progress: Progress | None
     ) -> None:
         """Make sure that the index has the scene of each usable video, if it can be had.
 
@@ -65,7 +64,7 @@ class SceneCollection:
         has_earlier = store.make_figures()
         known = joined(table.ids, store.summaries(self.kind), [], (None,))
         missing = [table.row(at) for at, (_, runs) in enumerate(known) if runs is None and table.problem[at] is None]
-        with closing(self._found(store, root, missing, has_earlier, processes)) as found:
+        with closing(self._found(store, source, missing, has_earlier, processes)) as found:
             for batch in batches(found, len(missing), progress):
                 store.put_figures(self.kind, (figures(record, scene) for record, scene in batch))
 
@@ -96,7 +95,7 @@ class SceneCollection:
         return SplitVideos.decode(frames, bytes(encoded), np.asarray(lengths)), sha.hexdigest()[:32]
 
     def _found(
-        self, store: Store, root: Path | Copies, missing: list[IndexRow], has_earlier: bool, processes: int
+        self, store: Store, source: VideoSource, missing: list[IndexRow], has_earlier: bool, processes: int
     ) -> Generator[tuple[IndexRow, Scene], None, None]:
         by_id: dict[str, IndexRow] = {}
         for record in missing:
@@ -115,10 +114,10 @@ class SceneCollection:
 
         isolated = partial(
             run_isolated,
-            partial(_analyse, root),
+            partial(_analyse, source),
             deadline_seconds=lambda job: LONGEST_SECONDS,
             memory_bytes=2 * LARGEST_MEMORY_BYTES,
-            writable=None if isinstance(root, Copies) else compile_cache(),
+            writable=compile_cache() if source.is_local else None,
         )
         suspects = []
         for job, found in isolated(jobs(), processes):
@@ -162,7 +161,7 @@ class _Job:
     window: Window | None
 
 
-def _analyse(root: Path | Copies, job: _Job) -> bytes:
+def _analyse(source: VideoSource, job: _Job) -> bytes:
     """Return the encoded scene of one video, from what decodes before the first error.
 
     It is empty where the system, not the decoder, reports an error.
@@ -173,7 +172,7 @@ def _analyse(root: Path | Copies, job: _Job) -> bytes:
     analysis = SceneAnalysis()
     if job.index and job.window is not None:
         try:
-            with open_local(root, job.id, job.fingerprint) as path:
+            with source.open_local(job.id, job.fingerprint) as path:
                 pictures = pictures_of(path, FrameIndex.from_bytes(job.index), job.window)
                 for picture in islice(pictures, MOST_FRAMES):
                     analysis.add(picture)

@@ -187,6 +187,7 @@ function show(state) {
   fill("refusals", state.refusals.map(refusal), "no sequence was skipped");
   fill("verdicts", state.verdicts.map(refusal), "nothing");
   fill("recipe", settings(state.spec), "");
+  fill("figures", figures(state), "");
   say(at("consumers-count"), `${state.consumer_count} connected`);
   say(at("workers-count"), workersCount(state));
   say(at("refusals-count"), `${state.totals.refused_candidates} times, the last few`);
@@ -226,7 +227,7 @@ function consumer(each) {
     each.host ? `${each.name || each.id.slice(0, 8)} on ${each.host}` : each.name || each.id.slice(0, 8),
     { text: each.state, kind: `state ${each.state}` },
     each.epoch,
-    { part: each.sequences ? each.position / each.sequences : 0, text: `${each.position} of ${each.sequences}` },
+    { part: each.epoch_share, text: `${each.position} of ${each.sequences}` },
     seconds(each.eta_seconds),
     number(each.batches_per_second),
     share(each.waiting_share),
@@ -255,6 +256,18 @@ function refusal(each) {
   return [each.time.replace("T", " ").replace("+00:00", " UTC"), each.video, each.frame === null ? "" : each.frame, each.reason];
 }
 
+/** Every number that is not of one peer, with its meaning. */
+function figures(state) {
+  return fields.flatMap(({ place, name, help, unit, kind }) => {
+    const part = place.split(".").reduce((found, key) => (key ? found && found[key] : found), state);
+    if (kind === "text" || kind === "states" || Array.isArray(part) || !part || part[name] === null) return [];
+    const known = part[name];
+    if (unit === "0 to 1") return [[name.replaceAll("_", " "), share(known), help]];
+    const value = Number.isInteger(known) || typeof known !== "number" ? known.toLocaleString("en") : number(known);
+    return [[name.replaceAll("_", " "), unit ? `${value} ${unit}` : value, help]];
+  });
+}
+
 function settings(spec, within = "") {
   return Object.entries(spec).flatMap(([key, value]) =>
     value !== null && typeof value === "object" && !Array.isArray(value)
@@ -266,6 +279,7 @@ function settings(spec, within = "") {
 // --- listening ---
 
 let heard = 0;
+let fields = []; // what each number means
 
 function trouble(text) {
   at("lost").hidden = !text;
@@ -293,6 +307,7 @@ function listen() {
 
 drawCharts();
 listen();
+fetch("/fields").then((answer) => answer.json()).then((known) => (fields = known));
 setInterval(() => {
   if (Date.now() - heard > SILENT_MS) trouble("The server does not answer. The state shown is old; this page retries.");
 }, 1000);

@@ -134,8 +134,10 @@ def _simulate(
     count, pixels = len(segments.step), frames.shape[1]
     noisy = len(segments.noise_scale) > 0
     timed = out.is_listing or len(out.bilinear) > 0
-    residual, change, signed, positive, negative, rises, falls, waited, blind = state[:9]
-    on, off, old, levels, own = state[9], state[10], state[11], state[12:16], state[16:]
+    # One by one: rows that are unpacked from an array have unknown strides, and their loops are not vectorised.
+    residual, change, signed, positive, negative, rises = state[0], state[1], state[2], state[3], state[4], state[5]
+    falls, waited, blind, on, off, old = state[6], state[7], state[8], state[9], state[10], state[11]
+    levels, own = state[12:16], state[16:]
     radius_words, angle_words, normal = words[4], words[5], floats[4:]
     block = Block(
         residual, change, signed, rises, falls, waited, blind, timed, positive, negative, levels, words[:4],
@@ -209,12 +211,13 @@ def _simulate(
             drifting = residual if drifts_first else change
             for spot in range(hot, next_hot):
                 drifting[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
-            if not _cross(tables, own, block, at):
+            if _cross(tables, own, block, at):
                 for i in range(BLOCK_PX):
-                    signed[i], residual[i] = crossed(residual[i] + change[i], positive[i], negative[i], tolerance)
-            for i in range(BLOCK_PX):
-                rises[i] = signed[i] if signed[i] > zero else zero
-                falls[i] = zero if signed[i] > zero else zero - signed[i]
+                    rises[i], falls[i] = max(signed[i], zero), max(zero - signed[i], zero)
+            else:
+                for i in range(BLOCK_PX):
+                    events, residual[i] = crossed(residual[i] + change[i], positive[i], negative[i], tolerance)
+                    signed[i], rises[i], falls[i] = events, max(events, zero), max(zero - events, zero)
             _after(tables, own, block, at)
             of_bin = segments.bin[each]
             if each == 0 or segments.bin[each - 1] != of_bin:

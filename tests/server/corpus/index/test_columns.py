@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,13 +28,29 @@ def row(name: str, number: int) -> IndexRow:
     problem = "is damaged" if number % 7 == 3 else None
     rate = None if number % 5 == 0 else 20.0 + number
     codec = ("h264", "vp9", "av1")[number % 3]
-    times = number, 10**18 + number, -number
     return IndexRow(
-        name, *times, f"{number}-{number:032x}", 9 + number, 64, 48 + number % 2, rate, codec, number % 4 == 0, problem
+        name,
+        -1,
+        0,
+        0,
+        f"{number}-{number:032x}",
+        9 + number,
+        64,
+        48 + number % 2,
+        rate,
+        codec,
+        number % 4 == 0,
+        problem,
     )
 
 
 ROWS = [row(name, number) for number, name in enumerate(NAMES)]
+
+
+def read(rows: Iterable[tuple[Any, ...]]) -> VideoTable:
+    rows = list(rows)
+    table, _ = VideoTable.read(rows, len(rows))
+    return table
 
 
 def rows_of(table: VideoTable) -> list[IndexRow]:
@@ -42,7 +60,7 @@ def rows_of(table: VideoTable) -> list[IndexRow]:
 @pytest.fixture
 def table(monkeypatch: pytest.MonkeyPatch) -> VideoTable:
     monkeypatch.setattr(columns, "CHUNK", 16)
-    return VideoTable.of(record.columns for record in ROWS)
+    return read(record.columns for record in ROWS)
 
 
 def test_a_table_holds_its_rows(table: VideoTable) -> None:
@@ -57,15 +75,15 @@ def test_a_table_holds_its_rows(table: VideoTable) -> None:
 
 
 def test_an_empty_table() -> None:
-    table = VideoTable.of([])
-    assert len(table) == len(table.ids) == len(table.states) == 0
+    table = read([])
+    assert len(table) == len(table.ids) == 0
     assert list(table.ids) == table.ids[0:5] == []
     assert table.ids.find("a") is None
 
 
 @given(st.lists(st.booleans(), min_size=len(NAMES), max_size=len(NAMES)))
 def test_a_mask_selects_rows(mask: list[bool]) -> None:
-    table = VideoTable.of(record.columns for record in ROWS)
+    table = read(record.columns for record in ROWS)
     expected = [record for record, is_in in zip(ROWS, mask, strict=True) if is_in]
     assert rows_of(table.where(np.array(mask))) == expected
 
@@ -79,9 +97,9 @@ def test_rows_are_joined_with_the_ids_that_are_asked(asked: set[str], known: set
 
 
 def test_an_id_without_a_row_has_to_be_probed() -> None:
-    (record,) = rows_of(VideoTable.of(joined(["a"], [], [])))
-    assert record.size_bytes == -1
-    assert record.problem is not None
+    table, states = VideoTable.read(joined(["a"], [], []), 1)
+    assert states.tolist() == [[-1, 0, 0]]
+    assert table.problem[0] is not None
 
 
 _INTEGERS = ["size_bytes", "mtime_ns", "ctime_ns", "frames", "width_px", "height_px", "interlaced"]
@@ -98,19 +116,28 @@ _INTEGERS = ["size_bytes", "mtime_ns", "ctime_ns", "frames", "width_px", "height
         ("interlaced", 2),
     ],
 )
-def test_a_damaged_row_has_to_be_probed_and_harms_no_other(table: VideoTable, column: str, value: object) -> None:
+def test_a_damaged_row_has_to_be_probed_and_harms_no_other(
+    monkeypatch: pytest.MonkeyPatch, column: str, value: object
+) -> None:
     """SQLite accepts any type in any column."""
-    rows = [record.columns for record in ROWS]
-    rows[20] = replace(ROWS[20], **{column: value}).columns  # type: ignore[arg-type]
-    found = rows_of(VideoTable.of(rows))
-    assert (found[20].id, found[20].size_bytes) == (NAMES[20], -1)
+    monkeypatch.setattr(columns, "CHUNK", 16)
+    states = [[number, 10**18 + number, -number] for number in range(len(ROWS))]
+    records = [
+        replace(record, size_bytes=a, mtime_ns=b, ctime_ns=c) for record, (a, b, c) in zip(ROWS, states, strict=True)
+    ]
+    records[20] = replace(records[20], **{column: value})  # type: ignore[arg-type]
+    states[20] = [-1, 0, 0]
+    table, known = VideoTable.read((record.columns for record in records), len(records))
+    assert known.tolist() == states
+    found = rows_of(table)
+    assert found[20].id == NAMES[20]
     assert found[20].problem is not None
     assert found[:20] + found[21:] == ROWS[:20] + ROWS[21:]
 
 
 def test_a_row_with_a_problem_needs_no_frames() -> None:
-    unusable = IndexRow("a", 1, problem="is no video")
-    assert rows_of(VideoTable.of([unusable.columns, ROWS[0].columns])) == [unusable, ROWS[0]]
+    unusable = IndexRow("a", -1, problem="is no video")
+    assert rows_of(read([unusable.columns, ROWS[0].columns])) == [unusable, ROWS[0]]
 
 
 def test_strings_are_one_piece_of_utf_8() -> None:

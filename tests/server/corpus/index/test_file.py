@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.index.columns import VideoTable
+from v2v_server.corpus.index.columns import VideoTable, joined
 from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.refresh import index_path
 from v2v_server.corpus.scenes.collect import SceneCollection, figures
@@ -89,7 +89,7 @@ def test_damage_is_an_error_of_sqlite_or_costs_a_probe(tmp_path: Path, damage: l
         content[int(place * len(content))] = byte
     path.write_bytes(content)
     with suppress(sqlite3.Error, UnicodeDecodeError), closing(Store(path)) as store:
-        VideoTable.of(store.rows())
+        VideoTable.read(joined(list("abcd"), store.rows(), []), 4)
         for name in "abcd":
             store.frame_index(name, name * 40)
         list(store.all_figures(KIND))

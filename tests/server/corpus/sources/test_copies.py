@@ -1,0 +1,273 @@
+"""Copies of objects on this host; the store is a folder, asked through fsspec, that may fail on purpose."""
+
+from __future__ import annotations
+
+import fcntl
+import multiprocessing
+import pickle
+import stat
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from v2v_protocol.errors import (
+    CorpusError,
+    ProtocolError,
+    UsageError,
+    VideoChanged,
+    VideoDenied,
+    VideoGone,
+    VideoUnreadable,
+)
+from v2v_server.corpus.sources import bucket as bucket_module
+from v2v_server.corpus.sources import copies as copies_module
+from v2v_server.corpus.sources.bucket import Bucket, is_url
+from v2v_server.corpus.sources.copies import Copies
+from v2v_server.corpus.sources.source import GONE, SourceOptions, open_source
+from v2v_server.store.used import PARTIAL, count_bytes, used_bytes
+from v2v_server.video.fingerprint import fingerprint
+
+pytest.importorskip("fsspec", reason="the extra 'cloud' is not installed")
+
+SIZE = 1000
+
+
+@pytest.fixture(autouse=True)
+def _no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bucket_module, "_FIRST_WAIT_SECONDS", 0.001)
+    monkeypatch.setattr("v2v_server.corpus.sources.copies._ROOM_SECONDS", 0.01)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    folder = tmp_path / "store"
+    (folder / "deep").mkdir(parents=True)
+    for number, name in enumerate(("a.mp4", "b.mp4", "deep/c.mp4")):
+        (folder / name).write_bytes(bytes([number]) * SIZE)
+    return folder
+
+
+_MADE: list[Copies] = []
+
+
+@pytest.fixture(autouse=True)
+def _nothing_held() -> Iterator[None]:
+    yield
+    while _MADE:
+        _MADE.pop().release()
+
+
+def copies(store: Path, most: int = 10 * SIZE) -> Copies:
+    made = Copies(Bucket(f"file://{store}"), store.parent / "copies", most)
+    made.make()
+    _MADE.append(made)
+    return made
+
+
+def files(made: Copies) -> set[bytes]:
+    """The first byte of each copy."""
+    found = list(made.copies.glob("??/*"))
+    assert sum(path.stat().st_size for path in found) == used_bytes(made.copies) == count_bytes(made.copies)
+    return {path.read_bytes()[:1] for path in found}
+
+
+def test_what_an_address_holds(store: Path) -> None:
+    made, names = copies(store), ("a.mp4", "b.mp4", "deep/c.mp4")
+    assert set(made.videos({}, Counter())) == set(names)
+    states = made.states([*names, "none.mp4"])
+    assert list(states[::3]) == [SIZE, SIZE, SIZE, GONE[0]]
+    (store / "a.mp4").write_bytes(b"x" * SIZE)
+    assert made.states(["a.mp4"]) == states[:3], "the states are those of one listing"
+    assert copies(store).states(["a.mp4"]) != states[:3]
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [("s3://bucket/videos", True), ("memory://x", True), ("/data", False), ("C:/data", False)],
+)
+def test_an_address_is_told_from_a_path(source: str, expected: bool) -> None:
+    assert is_url(source) is expected
+    if not expected:
+        assert copies_module.open_source(source, SourceOptions()) is None
+
+
+def test_a_video_is_fetched_once(store: Path) -> None:
+    made, mark = copies(store), fingerprint(store / "a.mp4")
+    assert not made.has("a.mp4", mark)
+    with made.open_local("a.mp4", f"{mark}-content") as path:
+        assert path.read_bytes() == (store / "a.mp4").read_bytes()
+        assert path.suffix == ".mp4"
+    (store / "a.mp4").unlink()
+    assert made.has("a.mp4", mark)
+    with made.open_local("a.mp4", mark) as path:
+        assert path.stat().st_size == SIZE
+    assert [each.name for each in (made.copies / PARTIAL).iterdir() if each.suffix != ".lock"] == []
+
+
+def test_a_slot_that_another_process_keeps_is_not_waited_for(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(copies_module, "_SLOT_SECONDS", 0.0)
+    made, mark = copies(store), fingerprint(store / "a.mp4")
+    with ExitStack() as held:
+        for number in range(63):
+            lock = held.enter_context((made.copies / PARTIAL / f"{number:02}.lock").open("wb"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        made.fetch("a.mp4", mark)
+        assert made.has("a.mp4", mark)
+        last = held.enter_context((made.copies / PARTIAL / "63.lock").open("wb"))
+        fcntl.flock(last, fcntl.LOCK_EX)
+        with pytest.raises(VideoUnreadable, match="other processes keep all 64 of its slots"):
+            made.fetch("b.mp4", fingerprint(store / "b.mp4"))
+    made.fetch("b.mp4", fingerprint(store / "b.mp4"))
+
+
+def test_other_users_cannot_lock_a_copy(store: Path) -> None:
+    made = copies(store)
+    made.fetch("a.mp4", fingerprint(store / "a.mp4"))
+    found = [path for path in made.copies.rglob("*") if path.is_file()]
+    assert {path.suffix for path in found} >= {".mp4", ".lock"}
+    assert {stat.S_IMODE(path.stat().st_mode) for path in found} == {0o600}
+
+
+def test_an_object_that_is_gone_or_changed(store: Path) -> None:
+    made, mark = copies(store), fingerprint(store / "a.mp4")
+    state = made.state("a.mp4")
+    made.verify("a.mp4", mark, state)
+    (store / "a.mp4").write_bytes(b"y" * SIZE)
+    with pytest.raises(VideoChanged, match="changed in file:"):
+        made.verify("a.mp4", mark, state)
+    made.verify("a.mp4", mark, None)
+    with pytest.raises(VideoChanged, match="changed in file:"):
+        made.fetch("a.mp4", mark)
+    (store / "a.mp4").unlink()
+    with pytest.raises(VideoGone):
+        made.verify("a.mp4", mark, state)
+    with pytest.raises(VideoGone, match=r"is not in file:.* any more"):
+        made.fetch("a.mp4", mark)
+    assert files(made) == set()
+
+
+class Flaky:
+    """A store that raises what it is told to before it answers."""
+
+    def __init__(self, store: Any, errors: list[Exception]) -> None:
+        self._store, self._errors, self.asked = store, errors, 0
+
+    def __getattr__(self, name: str) -> Any:
+        def call(*arguments: Any, **more: Any) -> Any:
+            self.asked += 1
+            if self._errors:
+                raise self._errors.pop(0)
+            return getattr(self._store, name)(*arguments, **more)
+
+        return call if name in ("find", "info", "get_file") else getattr(self._store, name)
+
+
+class NoCredentialsError(Exception):
+    """As botocore calls it, which is no OSError."""
+
+
+def flaky(store: Path, *errors: Exception) -> tuple[Copies, Flaky]:
+    made = copies(store)
+    made.bucket.__dict__["_store"] = wrapped = Flaky(made.bucket._store, list(errors))
+    return made, wrapped
+
+
+def test_what_may_pass_is_tried_again(store: Path) -> None:
+    made, asked = flaky(store, OSError("SlowDown"), TimeoutError("read"))
+    made.fetch("a.mp4", fingerprint(store / "a.mp4"))
+    assert asked.asked == 3
+    made, asked = flaky(store, *[OSError("SlowDown")] * 9)
+    with pytest.raises(VideoUnreadable, match=r"the store gives no answer \(OSError: SlowDown; tried 3 times\)"):
+        made.fetch("b.mp4", fingerprint(store / "b.mp4"))
+    assert asked.asked == 3
+    made.verify("b.mp4", "", (SIZE, 0, 0))  # a store that does not answer condemns nothing
+    assert asked.asked == 4
+    with pytest.raises(VideoUnreadable):
+        made.bucket.state("b.mp4")
+    with pytest.raises(VideoGone):
+        copies(store).bucket.state("none.mp4")
+
+
+@pytest.mark.parametrize("error", [PermissionError("403"), NoCredentialsError("Unable to locate credentials")])
+def test_a_credentials_problem_is_one_message_and_not_tried_again(store: Path, error: Exception) -> None:
+    made, asked = flaky(store, error, error)
+    with pytest.raises(CorpusError, match=r"access is denied .* AWS_PROFILE") as raised:
+        list(made.videos({}, Counter()))
+    assert "\n" not in str(raised.value)
+    assert asked.asked == 1
+    with pytest.raises(VideoDenied):
+        made.bucket.state("a.mp4")
+
+
+def test_what_was_not_read_for_longest_goes(store: Path) -> None:
+    made = copies(store, most=2 * SIZE)
+    marks = {name: fingerprint(store / name) for name in ("a.mp4", "b.mp4", "deep/c.mp4")}
+    for name in ("a.mp4", "b.mp4"):
+        with made.open_local(name, marks[name]):
+            pass
+    assert files(made) == {b"\0", b"\1"}
+    assert made.has("a.mp4", marks["a.mp4"])  # read again: b is the older one now
+    made.release()
+    made.fetch("deep/c.mp4", marks["deep/c.mp4"])
+    assert b"\1" not in files(made)
+    assert b"\2" in files(made)
+
+
+def test_what_is_being_read_stays(store: Path) -> None:
+    made, other = copies(store, most=SIZE), copies(store, most=SIZE)
+    mark = fingerprint(store / "a.mp4")
+    with made.open_local("a.mp4", mark) as path:
+        with pytest.raises(VideoUnreadable, match="raise --copies-gib"):
+            other.fetch("b.mp4", fingerprint(store / "b.mp4"))
+        assert path.exists()
+    other.fetch("b.mp4", fingerprint(store / "b.mp4"))
+    assert files(made) == {b"\1"}
+    assert not made.has("a.mp4", mark)
+
+
+def _read(made: Copies, marks: dict[str, str], turns: int) -> set[tuple[str, bytes]]:
+    got = set()
+    for _ in range(turns):
+        for name, mark in marks.items():
+            with made.open_local(name, mark) as path:
+                got.add((name, path.read_bytes()))
+    made.release()
+    return got
+
+
+def test_many_at_once(store: Path) -> None:
+    """Two processes with room for two of three videos evict what the other wants next: both see whole files only."""
+    made = copies(store, most=2 * SIZE)
+    marks = {name: fingerprint(store / name) for name in ("a.mp4", "b.mp4", "deep/c.mp4")}
+    backwards = dict(reversed(marks.items()))
+    with multiprocessing.get_context("spawn").Pool(2) as processes:
+        told = [processes.apply_async(_read, (made, order, 100)) for order in (marks, backwards)]
+        for each in told:
+            assert each.get(60) == {(name, bytes([number]) * SIZE) for number, name in enumerate(marks)}
+    assert 1 <= len(files(made)) <= 2
+
+
+def test_addresses_that_cannot_be(store: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="leave user and password out") as raised:
+        Bucket("ftp://me:secret@host/videos")
+    assert "secret" not in str(raised.value)
+    with pytest.raises(UsageError, match="nonsense"):
+        _ = Bucket("nonsense://x").objects()
+    with pytest.raises(ProtocolError, match="leads out"):
+        copies(store).fetch("../a.mp4", "1-2")
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(CorpusError, match="cannot be written to"):
+        Copies(Bucket("file:///x"), tmp_path / "file", 1).make()
+    with pytest.raises(UsageError, match="--copies-gib 0"):
+        open_source("file:///x", SourceOptions(copies=tmp_path, copies_gib=0.0))
+
+
+def test_it_travels_to_processes(store: Path) -> None:
+    made = copies(store)
+    made.fetch("a.mp4", fingerprint(store / "a.mp4"))
+    again = pickle.loads(pickle.dumps(made))
+    assert (str(again), again.copies, again.most_bytes) == (f"file://{store}", made.copies, made.most_bytes)

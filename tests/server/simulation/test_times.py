@@ -1,0 +1,346 @@
+"""Events in time: the general kernel against events one by one, against the paper's kernel, and against scenes that can
+be solved on paper."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.oracles.in_time import bilinear_of, counts_of, stacked_histogram, watch
+from tests.server.simulation.generic_processor import printed_on_a_generic_processor
+from tests.server.simulation.test_pixel import moving_frames
+from v2v_protocol.errors import UsageError
+from v2v_server.simulation import noise, simulate, simulate_log
+from v2v_server.simulation.kernels import ARRAYS, fill, list_events
+from v2v_server.simulation.result import Voxels
+from v2v_server.simulation.voxel import Levels, Moments, bin_edges, rounding_tolerance, timeline
+
+FPS = 25.0
+ALL = {
+    "threshold_mismatch_sigma": 0.15, "shot_noise_hz": 20.0, "leak_hz": 3.0, "refractory_seconds": 0.005,
+    "photoreceptor_hz": 20.0, "dead_pixel_share": 0.02,
+}  # fmt: skip
+RATES = {name: 1 / fps * np.ones(fps) for name, fps in (("24", 24), ("30", 30), ("60", 60), ("240", 240))}
+RATES["variable"] = np.random.default_rng(3).uniform(0.004, 0.042, 40)
+
+
+def again(made: Voxels, *names: str, precision: Any = None, **changes: Any) -> dict[str, Any]:
+    """Simulate the same clip by the general kernel."""
+    return fill(dataclasses.replace(made.given, **changes), precision or made.real, dict.fromkeys(names))[0]
+
+
+# --- against the paper's kernel ---------------------------------------------------------------------------------------
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    size=st.sampled_from([(1, 1), (6, 8), (1, 513), (31, 33)]),
+    noise_sigma=st.sampled_from([0.0, 0.1]),
+    hot_count=st.integers(0, 1),
+    start_residual=st.none() | st.floats(-0.2, 0.2),
+    dtype=st.sampled_from(["int8", "float32"]),
+    precision=st.sampled_from(["float32", "float64"]),
+    seed=st.integers(0, 2**64 - 1),
+)
+def test_it_counts_the_events_of_the_papers_kernel(
+    size: Any, noise_sigma: float, hot_count: int, start_residual: float | None, dtype: str, precision: str, seed: int
+) -> None:
+    made = simulate(
+        moving_frames(21, *size, seed=seed % 256), threshold_pos=0.2, threshold_neg=0.25, noise_sigma=noise_sigma,
+        hot_pixel_count=hot_count, hot_pixel_sigma=2.0, start_residual=start_residual, bins=5, frames_per_bin=2,
+        seed=seed, dtype=dtype, precision=precision,
+    )  # fmt: skip
+    assert not made.given.needs_general
+    found = again(made, *ARRAYS)
+    np.testing.assert_array_equal(found["voxels"], made.voxels)
+    counts = found["event_counts"].astype(np.int64)
+    assert counts.min() >= 0
+    if not made.saturated_bins:
+        np.testing.assert_array_equal(counts[:, 1] - counts[:, 0], made.voxels)
+        events = made.to_events(1000.0)
+        assert len(events) == counts.sum()
+        np.testing.assert_array_equal(events.voxels(2, 5, 1000.0, dtype), made.voxels)
+
+
+# --- against events one by one ----------------------------------------------------------------------------------------
+
+
+@settings(max_examples=40, deadline=None)
+@given(data=st.data(), precision=st.sampled_from(["float32", "float64"]), grids=st.integers(1, 4))
+def test_kernel_equals_the_oracle(data: Any, precision: str, grids: int) -> None:
+    """Noise, hot drift, intermediate levels and a refractory period; bins that do not meet the intermediate levels."""
+    seed, bins, steps, pixels = data.draw(st.integers(0, 2**32)), 3, 6, 24
+    random = np.random.default_rng(seed)
+    effects = {"refractory_seconds": 0.006} if data.draw(st.booleans()) else {}
+    sigma = data.draw(st.sampled_from([0.0, 0.1]))
+    made = simulate(
+        moving_frames(steps + 1, 4, 6, seed % 256), threshold_pos=0.2, threshold_neg=0.25, noise_sigma=sigma,
+        hot_pixel_count=2, hot_pixel_sigma=0.5, bins=bins, grids_per_frame=grids, seed=seed, dtype="int16",
+        precision=precision, frames_per_second=FPS, **effects,
+    )  # fmt: skip
+    at = Moments(np.array([0, 0, 2, 3, 3, 3]), np.array([0.25, 0.7, 1 / 3, 0.1, 0.5, 0.9]))
+    levels = Levels(at, random.uniform(-6.9, 0.0, (6, 4, 6)).astype(np.float32))
+    found = again(made, *ARRAYS, levels=levels)
+    events = list_events(dataclasses.replace(made.given, levels=levels), made.real, np.full(steps, 1e6 / FPS))
+
+    table_levels = np.log(1e-3 + (made.given.frames.reshape(steps + 1, pixels) / 255) ** 2.2)
+    times = np.r_[np.arange(steps + 1.0), at.step + at.share]
+    known = np.concatenate([table_levels, levels.log_intensity.reshape(6, pixels)])[np.argsort(times)]
+    times = np.sort(times)
+    key = made.given.params.noise_key
+    added = np.zeros((steps, pixels))
+    if sigma:
+        added += noise.standard_normals(key, steps, pixels) * sigma
+    position, normal = noise.hot_pixels(key, 2, pixels)
+    added[:, position] += 0.5 * normal
+    sums = np.concatenate([np.zeros((1, pixels)), np.cumsum(added, axis=0)])
+    known += np.stack([np.interp(times, np.arange(steps + 1.0), sums[:, p]) for p in range(pixels)], axis=1)
+    start = -0.25 + noise.start_uniforms(key, pixels).astype(np.float64) * 0.45
+    edges = np.linspace(0, steps, steps * grids * bins + 1)
+    wrong = 0
+    for p in range(pixels):
+        seen = watch(
+            times, known[:, p], start[p], 0.2, 0.25, tolerance=rounding_tolerance(0.2, 0.2),
+            refractory=effects.get("refractory_seconds", 0.0) * FPS,
+        )  # fmt: skip
+        y, x = divmod(p, 6)
+        got = found["event_counts"][:, :, :, y, x].astype(np.int64).transpose(1, 0, 2).reshape(2, -1)
+        wrong += int(np.abs(got - counts_of(seen, edges)).sum())
+        here = (events.x == x) & (events.y == y)
+        # An event within a rounding of the end of a bin may come a rounding later, and then shifts none of the others.
+        if here.sum() == len(seen.times):
+            np.testing.assert_allclose(events.t[here], np.array(seen.times) * 1e6 / FPS, atol=120)
+            for grid in range(steps * grids):
+                inside = (np.array(seen.times) > grid / grids) & (np.array(seen.times) <= (grid + 1) / grids)
+                expected = bilinear_of(
+                    np.array(seen.times)[inside], np.array(seen.signs)[inside], grid / grids, (grid + 1) / grids, bins
+                )
+                close = np.abs(found["voxels_bilinear"][grid, :, y, x] - expected) < 0.02 + 1e-3 * inside.sum()
+                wrong += int(np.count_nonzero(~close))
+    assert wrong <= 6
+
+
+# --- what can be solved on paper --------------------------------------------------------------------------------------
+
+
+def at_seconds(seconds: Any, durations: Any) -> Moments:
+    """Return the moments of a clip whose steps have these durations."""
+    ends = np.r_[0.0, np.cumsum(durations)]
+    step = np.clip(np.searchsorted(ends, seconds, side="right") - 1, 0, len(durations))
+    return Moments(step, np.where(step < len(durations), (seconds - ends[step]) / np.append(durations, 1.0)[step], 0.0))
+
+
+@pytest.mark.parametrize("bin_ms", [1, 5, 10, 33])
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("scene", ["ramp", "exponential"])
+def test_bins_of_any_length(scene: str, rate: str, bin_ms: int) -> None:
+    """Every bin has the events of the change in it. A log intensity that is not linear is off by what lies between the
+    curve and the line from frame to frame."""
+    durations = RATES[rate]
+    ends = np.r_[0.0, np.cumsum(durations)]
+    slopes = np.array([-40.0, -3.0, -0.1, 0.0, 0.3, 7.0, 90.0])
+
+    def level(time: Any) -> Any:
+        return slopes * time if scene == "ramp" else slopes * 0.3 * (1 - np.exp(-time / 0.3))
+
+    count = int(ends[-1] / (bin_ms * 1e-3))
+    cuts = np.r_[np.arange(count) * bin_ms * 1e-3, ends[-1]]
+    made = simulate_log(level(ends[:, None])[:, None, :], threshold_pos=0.05, bins=len(durations), start_residual=0.0)
+    found = again(made, "voxels", "event_counts", edges=at_seconds(cuts, durations), bins=count, dtype="float32")
+    events = found["voxels"].reshape(count, -1)
+    lines = np.stack([np.interp(cuts, ends, level(ends[:, None])[:, each]) for each in range(len(slopes))], axis=1)
+    tolerance = 1e-4  # of sums of up to 1,600 thresholds in float32
+    assert (np.abs(0.05 * np.cumsum(events, axis=0) - lines[1:]) < 0.05 + tolerance).all()
+    change = np.diff(level(cuts[:, None]), axis=0)
+    bend = np.abs(lines - level(cuts[:, None])).max()
+    assert (
+        bend == pytest.approx(0.0, abs=1e-9) if scene == "ramp" else bend < 0.11 * 90 * durations.max() ** 2 / 0.3 * 4
+    )
+    assert (np.abs(0.05 * events - change) < 0.05 + 2 * bend + tolerance).all()
+    counts = found["event_counts"][0]
+    np.testing.assert_array_equal(counts[1] - counts[0], found["voxels"][0])
+    assert not counts[1][:, :, slopes < 0].any()
+    assert not counts[0][:, :, slopes > 0].any()
+
+
+def test_a_ramp_fires_at_even_times() -> None:
+    """A threshold every 100 microseconds, from half a threshold on."""
+    made = simulate_log(np.array([0.0, 2.0])[:, None, None], threshold_pos=0.2, start_residual=0.1, bins=1)
+    events = made.to_events(1000.0)
+    np.testing.assert_allclose(events.t, np.arange(50, 1000, 100), atol=1)
+    assert events.p.all()
+
+
+def test_what_cancels_in_a_bin_has_both_polarities() -> None:
+    made = simulate_log(
+        np.array([0.0, 1.0, 0.0])[:, None, None], threshold_pos=0.2, start_residual=0.01, frames_per_bin=2, bins=1
+    )
+    assert made.voxels.ravel().tolist() == [1]
+    assert made.array("event_counts").ravel().tolist() == [4, 5]
+
+
+def test_shot_noise_has_both_polarities_and_random_times() -> None:
+    made = simulate(
+        np.zeros((501, 8, 8), np.uint8), threshold_pos=0.2, bins=1, frames_per_bin=500, dtype="float32",
+        frames_per_second=FPS, shot_noise_hz=40.0,
+    )  # fmt: skip
+    counts = made.array("event_counts").reshape(2, -1)
+    for each in counts:
+        assert abs(each.mean() - 400) < 4 * 20 / 8
+    events = made.to_events(500e6 / FPS)
+    within = (events.t % 40_000) / 40_000
+    assert abs(within.mean() - 0.5) < 4 / np.sqrt(12 * len(within))
+    assert abs(np.corrcoef(within[:-1], within[1:])[0, 1]) < 0.05 or len(np.unique(events.t)) > 0.9 * len(events) / 2
+
+
+@pytest.mark.parametrize("effects", [{}, ALL])
+@pytest.mark.parametrize("grids", [0, 3])
+def test_arrays_and_events_agree(effects: dict[str, float], grids: int) -> None:
+    made = simulate(
+        moving_frames(31, 37, 45, 5), threshold_pos=0.2, threshold_neg=0.25, noise_sigma=0.1, bins=5,
+        grids_per_frame=grids, dtype="int16", seed=9, **(effects and effects | {"frames_per_second": FPS}),
+    )  # fmt: skip
+    assert made.voxels.shape == ((30 * grids, 5, 37, 45) if grids else (6, 5, 37, 45))
+    counts, bilinear = made.array("event_counts"), made.array("voxels_bilinear").astype(np.float64)
+    assert counts.dtype == np.int16
+    assert bilinear.shape == made.voxels.shape
+    np.testing.assert_array_equal(counts[:, 1] - counts[:, 0], made.voxels)
+    # A bin's width apart from edges that do not fall on whole microseconds: 33_333.3.
+    bin_us = 100_000 / 3
+    events = made.to_events(bin_us)
+    np.testing.assert_array_equal(events.voxels(*made.voxels.shape[:2], bin_us), made.voxels)
+    assert len(events) == counts.astype(np.int64).sum()
+    np.testing.assert_allclose(bilinear.sum(axis=1), made.voxels.sum(axis=1), atol=0.05)
+    grid = 2
+    inside = (events.t >= grid * 5 * bin_us) & (events.t < (grid + 1) * 5 * bin_us)
+    here = inside & (events.x == 20) & (events.y == 11)
+    expected = bilinear_of(
+        events.t[here].astype(float), np.where(events.p[here], 1.0, -1.0), grid * 5 * bin_us, (grid + 1) * 5 * bin_us, 5
+    )
+    np.testing.assert_allclose(bilinear[grid, :, 11, 20], expected, atol=0.01)
+
+
+@pytest.mark.parametrize("grids", [0, 2])
+def test_the_published_stacked_histogram_of_the_events_is_the_array(grids: int) -> None:
+    """Its bins reach from the first to the last event. A column beside the picture has one at either end of a grid."""
+    made = simulate(
+        moving_frames(21, 30, 40, 5), threshold_pos=0.1, bins=10, grids_per_frame=grids, dtype="int16", seed=4
+    )
+    counts, bin_us = made.array("event_counts"), 5000
+    events = made.to_events(bin_us)
+    for grid, expected in enumerate(counts):
+        begin, end = grid * 10 * bin_us, (grid + 1) * 10 * bin_us
+        inside = (events.t >= begin) & (events.t < end)
+        columns = (events.x, 40, 40), (events.y, 0, 0), (events.t, begin, end), (events.p, 0, 0)
+        x, y, t, p = (np.r_[first, column[inside].astype(np.int64), last] for column, first, last in columns)
+        got = stacked_histogram(x, y, p, t, 10, 30, 41)[:, :, :40]
+        np.testing.assert_array_equal(got, expected.reshape(20, 30, 40))
+
+
+def test_steps_of_a_still_camera_are_still() -> None:
+    """A pause repeats a frame: nothing moves in any part of its step."""
+    frames = np.array([[[10]], [[200]], [[200]], [[30]]], np.uint8)
+    made = simulate(frames, threshold_pos=0.1, bins=2, grids_per_frame=2, start_residual=0.0)
+    paused = simulate(frames[[0, 1, 3]], threshold_pos=0.1, bins=2, grids_per_frame=2, start_residual=0.0)
+    index = np.array([0, 1, 1, 2])
+    again_paused = again(
+        paused, "voxels", source_index=index, noise_durations=np.ones(3), step_seconds=np.ones(3),
+        edges=bin_edges(3, 1, 4),
+    )["voxels"]  # fmt: skip
+    np.testing.assert_array_equal(again_paused, made.voxels)
+    assert not made.voxels[2:4].any()
+    assert made.voxels[:2].all()
+
+
+# --- limits -----------------------------------------------------------------------------------------------------------
+
+
+def test_every_array_saturates_and_counts_it() -> None:
+    level = np.array([0.0, 300.5, 0.0])[:, None, None]
+    made = simulate_log(level, threshold_pos=1.0, bins=1, frames_per_bin=2, start_residual=0.0)
+    arrays, saturated = fill(made.given, made.real, dict.fromkeys(ARRAYS))
+    assert made.voxels.ravel().tolist() == [0]
+    assert arrays["event_counts"].ravel().tolist() == [127, 127]
+    assert saturated == {"voxels": 0, "event_counts": 2, "voxels_bilinear": 0}
+
+
+@pytest.mark.parametrize("height", [2049.5, 65504.5, 65520.5, 1e5 + 0.5])
+def test_float16_beyond_whole_numbers(height: float) -> None:
+    """Above 2,048 float16 rounds to every second number and more; beyond its largest number it is clipped."""
+    level = np.array([0.0, height])[:, None, None]
+    made = simulate_log(level, threshold_pos=1.0, bins=1, start_residual=0.0)
+    arrays, saturated = fill(made.given, made.real, {"voxels_bilinear": None})
+    whole = np.floor(height)
+    assert arrays["voxels_bilinear"].dtype == np.float16
+    assert float(arrays["voxels_bilinear"].ravel()[0]) == float(np.float16(min(whole, 65504.0)))
+    assert saturated["voxels_bilinear"] == (whole > 65504)
+    exact = again(made, "voxels_bilinear", dtype="float32")["voxels_bilinear"]
+    assert exact.dtype == np.float32
+    assert float(exact.ravel()[0]) == whole
+
+
+def test_timeline_by_hand() -> None:
+    """Two steps, bins of 2/3 of a step, a level at half of the first step."""
+    part = timeline(
+        Moments(np.array([0, 0, 1, 2]), np.array([0.0, 2 / 3, 1 / 3, 0.0])), 3, np.ones(2),
+        Moments(np.array([0]), np.array([0.5])),
+    )  # fmt: skip
+    assert part.step.tolist() == [0, 0, 0, 1, 1]
+    np.testing.assert_allclose(part.start, [0, 1 / 2, 2 / 3, 0, 1 / 3])
+    np.testing.assert_allclose(part.share, [1 / 2, 1 / 6, 1 / 3, 1 / 3, 2 / 3])
+    assert part.level.tolist() == [-1, 1, 1, 2, 2]
+    np.testing.assert_allclose(part.reached, [1, 1 / 3, 1, 1 / 3, 1])
+    assert (part.reached[[0, 2, 4]] == 1).all()
+    assert part.bin.tolist() == [0, 0, 1, 1, 2]
+    np.testing.assert_allclose(part.place, [[0, 0.75, 1, 1.5, 2], [0.75, 0.25, 0.5, 0.5, 1]])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"grids_per_frame": 2, "frames_per_bin": 3}, "frames_per_bin = 3"),
+        ({"grids_per_frame": -1}, "grids_per_frame = -1"),
+        ({"dtype": "uint8"}, "uint8"),
+    ],
+)
+def test_what_is_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        simulate(moving_frames(7, 4, 5), threshold_pos=0.2, bins=3, **change)
+    with pytest.raises(UsageError, match="'counts'"):
+        simulate(moving_frames(4, 4, 5), threshold_pos=0.2, bins=3).array("counts")
+
+
+DIGEST = """
+import dataclasses, hashlib
+import numpy as np
+from tests.server.simulation.test_pixel import moving_frames
+from tests.server.simulation.test_times import ALL, FPS
+from v2v_server.simulation import simulate
+from v2v_server.simulation.kernels import ARRAYS, fill
+from v2v_server.simulation.voxel import Levels, Moments
+
+levels = Levels(Moments(np.array([0, 2]), np.array([0.25, 1 / 3])), np.linspace(-6, 0, 80, dtype="f4").reshape(2, 5, 8))
+digest = hashlib.sha256()
+for effects in ({}, ALL):
+    for precision in ("float32", "float64"):
+        made = simulate(
+            moving_frames(9, 5, 8, 3), threshold_pos=0.2, noise_sigma=0.1, bins=3, grids_per_frame=2, dtype="int16",
+            seed=5, frames_per_second=FPS, precision=precision, **effects,
+        )
+        for array in fill(dataclasses.replace(made.given, levels=levels), made.real, dict.fromkeys(ARRAYS))[0].values():
+            digest.update(array.tobytes())
+        digest.update(made.to_events(1000.0).t.tobytes())
+print(digest.hexdigest()[:32])
+"""
+
+
+@pytest.mark.slow
+def test_bytes_do_not_depend_on_the_processor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    exec(DIGEST)
+    assert printed_on_a_generic_processor(DIGEST, tmp_path) == capsys.readouterr().out.split()

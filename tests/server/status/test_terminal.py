@@ -1,0 +1,135 @@
+"""Test what a running server shows of its status."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from tests.server.peers import peers
+from tests.server.status.services import published
+from v2v_server.broker.counters import Counters
+from v2v_server.status.parts import Status
+from v2v_server.status.terminal import StatusView
+from v2v_server.system.log import Log
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def said(status: Status) -> str:
+    """Return the line of a status in a log."""
+    stream = io.StringIO()
+    StatusView(Log(), stream).show(0.0, status)
+    return stream.getvalue().removesuffix("\n")
+
+
+def test_the_line_counts_what_happened() -> None:
+    at = peers()
+    service = published(at)
+    before = service.status()
+    at.join()
+    at.hello(batch_size=2)
+    at.want(0, 1, 2, 3)
+    at.finish()
+    at.finish()
+    at.now = 10.0
+    assert said(before) == (
+        "0.00 batches/s  0.0 samples/s  workers 0/0  consumers 0  queue 0  faults 0  total 0 samples"
+    )
+    assert said(service.status()) == (
+        "0.10 batches/s  0.2 samples/s  workers 1/1  consumers 1  queue 0  faults 0  total 2 samples"
+    )
+
+
+def test_a_log_gets_a_line_every_ten_seconds_without_control_sequences() -> None:
+    out, status = io.StringIO(), published(peers()).status()
+    view = StatusView(Log(), out)
+    assert view.is_due(100.0)
+    view.show(100.0, status)
+    assert not view.is_due(109.9)
+    assert view.is_due(110.0)
+    view.interrupt()
+    view.close()
+    assert out.getvalue() == said(status) + "\n"
+
+
+def test_programs_get_the_same_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    status = published(peers()).status()
+    StatusView(Log(is_json=True), Terminal()).show(0.0, status)
+    line: dict[str, Any] = json.loads(capsys.readouterr().err)
+    assert line["text"] == status["waiting"]["sentence"]
+    names = ("samples_per_second", "batches_per_second", "workers", "consumers", "queue", "faults", "samples")
+    assert [line[name] for name in names] == [0] * 7
+    assert line["slow_part"] == "no_consumers"
+    assert line["totals"] == status["totals"]
+
+
+def test_workers_that_start_and_those_of_other_hosts_are_counted() -> None:
+    at = peers()
+    for number in range(3):
+        at.join(b"remote%d" % number)
+    status = published(at).plain()
+    assert "workers 3/3" in said(status)
+    assert "workers 3/7" in said(status | {"worker_processes": 7})
+
+
+def test_shared_decodes_shared_memory_and_the_cache_are_named_where_there_are_any() -> None:
+    at = peers()
+    at.dispatcher.counters.samples, at.dispatcher.counters.decodes = 30, 12
+    at.dispatcher.counters.in_slots, at.dispatcher.counters.cache_hits, at.dispatcher.counters.cache_misses = 15, 9, 3
+    status = published(at).plain()
+    assert "2.5 samples per decode  50% by shared memory  cache 75% hits  workers" in said(status)
+    cache = {"folder": "/cache", "held_gib": 1.5, "most_gib": 4.0, "hits": 9, "misses": 3, "trouble": "no room"}
+    assert "cache 75% hits, 1.50 of 4 GiB (no room)  workers" in said(status | {"cache": cache})
+
+
+def test_unusual_events_are_named_once_there_are_any() -> None:
+    at = peers()
+    at.dispatcher.counters.malformed, at.dispatcher.counters.returned_leases = 2, 3
+    assert said(published(at).status()).endswith("faults 2  total 0 samples  3 returned leases  2 malformed")
+
+
+def test_a_terminal_shows_a_few_lines_in_the_place_of_the_previous_ones() -> None:
+    at = peers()
+    out = Terminal()
+    view = StatusView(Log(), out)
+    service = published(at)
+    view.show(0.0, service.status())
+    first = out.getvalue()
+    assert "No consumer is connected" in first
+    assert not view.is_due(0.4)
+    assert view.is_due(0.5)
+    at.join()
+    at.hello(batch_size=2)
+    at.want(0, 1)
+    at.finish()
+    view.show(0.6, service.status())
+    second = out.getvalue().removeprefix(first)
+    assert second.startswith(f"\x1b[{first.count(chr(10))}F\x1b[J")
+    assert "1 consumers" in second
+    assert "1/50" in second
+    view.interrupt()
+    assert out.getvalue().endswith(f"\x1b[{second.count(chr(10))}F\x1b[J")
+    view.close()
+    view.interrupt()
+    assert out.getvalue().count("\x1b[J") == 2
+
+
+def test_a_hostile_name_does_not_steer_the_terminal() -> None:
+    status = published(peers()).plain()
+    status["waiting"]["sentence"] = "a\x1b[2Jb"
+    out = Terminal()
+    StatusView(Log(), out).show(0.0, status)
+    assert "\x1b[2J" not in out.getvalue()
+
+
+def test_faults_are_the_counters_that_say_so() -> None:
+    counters = Counters(samples=9, refused_candidates=1, unavailable=2, workers_lost=4, malformed=8, late_results=16)
+    assert counters.faults == 15
+    assert replace(counters, returned_leases=5).faults == 15

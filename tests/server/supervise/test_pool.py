@@ -1,0 +1,485 @@
+"""The pool with harmless programs in the place of workers."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from tests.waiting import until
+from v2v_protocol.errors import WorkerCrashLoop
+from v2v_server.broker.blame import Cause, Loss
+from v2v_server.supervise import child as child_module
+from v2v_server.supervise import local_host as host_module
+from v2v_server.supervise.local_host import LocalHost
+from v2v_server.supervise.pool import Death, Pool
+from v2v_server.worker.logbook import note
+
+SLEEPS = "import time\ntime.sleep(600)"
+NAPS = "import time\nwhile True:\n    time.sleep(0.01)"
+"""For programs with a handler in Python: a signal just before a long sleep would be handled after it."""
+LEAVES = "import sys\nsys.exit(3)"
+
+
+@pytest.fixture(autouse=True)
+def _hangups_and_interrupts_count() -> Iterator[None]:
+    """Under ``nohup``, or in the background of a script, they are ignored, and children inherit that."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGHUP, signal.SIGINT)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture
+def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, str], Pool]]:
+    """Makes a pool of programs given as Python text; all are gone at the end."""
+    pools: list[Pool] = []
+
+    def make(workers: int, program: str) -> Pool:
+        monkeypatch.setattr(
+            child_module, "command", lambda address, root, name: [sys.executable, "-S", "-E", "-c", program, name]
+        )
+        pools.append(Pool(LocalHost("/corpus"), "label"))
+        pools[-1].start("tcp://127.0.0.1:1")
+        pools[-1].scale(workers)
+        return pools[-1]
+
+    yield make
+    for each in pools:
+        each.stop(join_seconds=0.0, terminate_seconds=0.0)
+
+
+def pids_of(pool: Pool) -> list[int]:
+    """Process ids of the workers that are alive."""
+    return [slot.place.process.pid for slot in pool._slots if slot.place.is_running]
+
+
+def all_dead(pool: Pool) -> None:
+    until(lambda: pool.running == 0)
+
+
+def is_loaded(pid: int) -> bool:
+    """Whether the process runs its program: before that it still has the signal handlers of the one it came from."""
+    return b"label-" in Path(f"/proc/{pid}/cmdline").read_bytes()
+
+
+def is_gone(pid: int) -> bool:
+    """Neither running nor a zombie."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+# --- starting and watching --------------------------------------------------------------------------------------------
+
+
+def test_it_starts_as_many_as_asked_each_with_a_name_of_its_own(start: Callable[[int, str], Pool]) -> None:
+    pool = start(2, SLEEPS)
+    assert (pool.running, pids_of(pool)) == (0, [])
+    assert pool.watch(0.0, 0) == []
+    assert pool.running == 2
+    pids = pids_of(pool)
+
+    def names() -> list[bytes]:
+        # The argument before the logbook's two; a process has none to show until its program has been loaded.
+        return [(b"\0\0\0" + Path(f"/proc/{pid}/cmdline").read_bytes()).split(b"\0")[-4] for pid in pids]
+
+    until(lambda: b"" not in names())
+    assert names() == [b"label-0.1", b"label-1.1"]
+    assert pool.watch(100.0, 0) == []
+    assert pids_of(pool) == pids
+
+
+def test_an_empty_pool_is_content(start: Callable[[int, str], Pool]) -> None:
+    pool = start(0, SLEEPS)
+    assert pool.watch(0.0, 0) == []
+    pool.stop()
+
+
+def test_those_that_are_too_many_are_told_to_leave_and_not_missed(start: Callable[[int, str], Pool]) -> None:
+    pool = start(3, "import signal, sys, time\nsignal.signal(15, lambda *_: sys.exit(0))\n" + NAPS)
+    assert pool.watch(0.0, 0) == []
+    pool.scale(1)
+    assert [pool.watches(name) for name in (b"label-0.1", b"label-2.1")] == [True, True]
+    until(lambda: pool.running == 1)
+    assert pool.watch(100.0, 0) == []
+    assert not pool.watches(b"label-2.1")
+    pool.scale(2)
+    assert pool.watch(200.0, 0) == []
+    assert (pool.running, pool.watches(b"label-3.1")) == (2, True)
+
+
+def test_one_that_dies_while_it_leaves_is_reported_and_not_replaced(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, "import os, signal, time\nsignal.signal(15, lambda *_: os.kill(os.getpid(), 11))\n" + NAPS)
+    pool.watch(0.0, 0)
+    until(lambda: is_loaded(pids_of(pool)[0]) and _catches_terminate(pids_of(pool)[0]))
+    pool.scale(0)
+    all_dead(pool)
+    assert pool.watch(1.0, 0) == [Death(b"label-0.1", Loss(Cause.CRASHED, "was ended by SIGSEGV"))]
+    assert pool.watch(100.0, 0) == []
+    assert pool.running == 0
+
+
+def _catches_terminate(pid: int) -> bool:
+    (caught,) = (
+        line.split()[1]
+        for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines()
+        if line.startswith("SigCgt")
+    )
+    return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
+
+
+def test_workers_are_in_a_process_group_of_their_own(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, SLEEPS)
+    pool.watch(0.0, 0)
+    (pid,) = pids_of(pool)
+    assert os.getpgid(pid) == pid != os.getpgid(0)
+
+
+def test_a_process_that_the_system_does_not_start_is_tried_again(
+    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has no memory, process or file left for it; those that run go on."""
+    pool = start(2, SLEEPS)
+    short = [False]
+    popen = subprocess.Popen
+
+    def spawn(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
+        if short[0]:
+            raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+        return popen(*arguments, **options)
+
+    monkeypatch.setattr(subprocess, "Popen", spawn)
+    assert pool.watch(0.0, 0) == []
+    os.kill(pids_of(pool)[0], signal.SIGKILL)
+    until(lambda: pool.running == 1)
+    short[0] = True
+    assert [death.identity for death in pool.watch(1.0, 0)] == [b"label-0.1"]
+    lost = Death(b"label-0.2", Loss(Cause.KILLED, "could not be started: Resource temporarily unavailable"))
+    assert pool.watch(2.0, 0) == [lost]
+    assert not pool.watches(b"label-0.2")
+    for turn in range(1, pool.crash_budget + 2):  # however often: no worker has crashed
+        assert len(pool.watch(2.0 + 10.0 * turn, 0)) == 1
+    short[0] = False
+    assert pool.watch(1e3, 0) == []
+    assert pool.running == 2
+
+
+def test_a_system_that_starts_no_process_at_all_ends_in_the_crash_budget(
+    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any, **options: Any) -> subprocess.Popen[bytes]:
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory", "/gone/python")
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    pool = start(1, SLEEPS)
+    for now in range(pool.crash_budget):
+        assert len(pool.watch(100.0 * now, 0)) == 1
+    with pytest.raises(WorkerCrashLoop, match="could not be started: No such file or directory"):
+        pool.watch(1e6, 0)
+
+
+@pytest.mark.parametrize(
+    ("number", "cause", "text"),
+    [
+        (signal.SIGKILL, Cause.KILLED, "was ended by SIGKILL from outside"),
+        (signal.SIGTERM, Cause.KILLED, "was ended by SIGTERM from outside"),
+        (signal.SIGINT, Cause.KILLED, "was ended by SIGINT from outside"),
+        (signal.SIGHUP, Cause.KILLED, "was ended by SIGHUP from outside"),
+        (signal.SIGSEGV, Cause.CRASHED, "was ended by SIGSEGV"),
+        (signal.SIGBUS, Cause.CRASHED, "was ended by SIGBUS"),
+        (signal.SIGABRT, Cause.CRASHED, "was ended by SIGABRT"),
+        (signal.SIGFPE, Cause.CRASHED, "was ended by SIGFPE"),
+        (signal.SIGILL, Cause.CRASHED, "was ended by SIGILL"),
+        (signal.SIGALRM, Cause.UNEXPLAINED, "was ended by SIGALRM"),
+        (signal.SIGRTMIN + 3, Cause.UNEXPLAINED, f"was ended by signal {signal.SIGRTMIN + 3}"),
+    ],
+)
+def test_a_crash_is_told_from_a_kill(
+    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch, number: int, cause: Cause, text: str
+) -> None:
+    monkeypatch.setattr(host_module, "out_of_memory_kills", lambda: 5)
+    pool = start(1, SLEEPS)
+    pool.watch(0.0, 0)
+    until(lambda: is_loaded(pids_of(pool)[0]))
+    os.kill(pids_of(pool)[0], number)
+    all_dead(pool)
+    assert pool.watch(1.0, 0) == [Death(b"label-0.1", Loss(cause, text))]
+
+
+def test_a_kill_while_the_host_runs_out_of_memory_may_be_the_samples_doing(
+    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kills = [7]
+    monkeypatch.setattr(host_module, "out_of_memory_kills", lambda: kills[0])
+    pool = start(1, SLEEPS)
+    pool.watch(0.0, 0)
+    causes = []
+    for now, more in ((10.0, 1), (20.0, 0)):
+        kill_one(pool)
+        kills[0] += more
+        (death,) = pool.watch(now, 1)
+        causes.append(death.loss.cause)
+        pool.watch(now + 5.0, 2)
+    assert causes == [Cause.UNEXPLAINED, Cause.KILLED]
+
+
+def test_all_that_are_killed_at_once_for_want_of_memory_are_told_so_and_none_long_after(
+    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kills = [7]
+    monkeypatch.setattr(host_module, "out_of_memory_kills", lambda: kills[0])
+    pool = start(2, SLEEPS)
+
+    def causes_of_deaths_at(now: float) -> list[Cause]:
+        for pid in pids_of(pool):
+            os.kill(pid, signal.SIGKILL)
+        all_dead(pool)
+        return [death.loss.cause for death in pool.watch(now, 1)]
+
+    pool.watch(0.0, 0)
+    kills[0] += 2
+    assert causes_of_deaths_at(10.0) == [Cause.UNEXPLAINED] * 2
+    pool.watch(20.0, 1)
+    kills[0] += 1
+    pool.watch(30.0, 1)  # what was killed takes a moment to be gone
+    assert causes_of_deaths_at(30.1) == [Cause.UNEXPLAINED] * 2
+    pool.watch(40.0, 1)
+    kills[0] += 1  # something else on this host
+    pool.watch(50.0, 1)
+    assert causes_of_deaths_at(1000.0) == [Cause.KILLED] * 2
+
+
+def test_the_kernels_count_of_such_kills_is_read() -> None:
+    said = Path("/proc/vmstat").read_text(encoding="ascii")
+    assert f"\noom_kill {child_module.out_of_memory_kills()}\n" in said
+
+
+@pytest.mark.parametrize("status", [0, 1, 3])
+def test_an_exit_is_not_blamed_on_the_sample(start: Callable[[int, str], Pool], status: int) -> None:
+    pool = start(1, f"import sys\nsys.exit({status})")
+    pool.watch(0.0, 0)
+    all_dead(pool)
+    expected = Loss(Cause.UNEXPLAINED, f"exited with status {status}")
+    assert pool.watch(0.0, 0) == [Death(b"label-0.1", expected)]
+
+
+def test_a_worker_that_was_given_up_is_killed_and_not_reported_again(start: Callable[[int, str], Pool]) -> None:
+    pool = start(2, SLEEPS)
+    pool.watch(0.0, 0)
+    hung, other = pids_of(pool)
+    assert pool.watches(b"label-0.1")
+    assert pool.give_up(b"label-9.9", "slept") is None
+    assert pool.give_up(b"label-0.1", "slept") == Loss(Cause.HUNG, "slept", for_all=False)
+    assert [pool.watches(name) for name in (b"label-0.1", b"label-1.1", b"label-9.9", b"")] == [
+        False,
+        True,
+        False,
+        False,
+    ]
+    until(lambda: pool.running == 1)
+    assert pool.watch(0.0, 0) == []
+    assert pids_of(pool) == [other]
+    assert pool.watch(100.0, 0) == []
+    assert pool.running == 2
+    assert is_gone(hung)
+    # The next life of the slot is a new worker: its death is reported.
+    assert pool.watches(b"label-0.2")
+    os.kill(pids_of(pool)[0], signal.SIGKILL)
+    until(lambda: pool.running == 1)
+    assert [death.identity for death in pool.watch(200.0, 0)] == [b"label-0.2"]
+    assert not pool.watches(b"label-0.2")
+
+
+def test_a_worker_that_somebody_stopped_is_not_called_hung(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, SLEEPS)
+    pool.watch(0.0, 0)
+    (pid,) = pids_of(pool)
+    os.kill(pid, signal.SIGSTOP)
+    until(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED)
+    loss = pool.give_up(b"label-0.1", "slept")
+    assert loss is not None
+    assert loss.cause is Cause.KILLED
+    all_dead(pool)
+
+
+def test_it_says_how_long_a_worker_was_stopped_from_outside(start: Callable[[int, str], Pool]) -> None:
+    """It may go on just before its deadline, and look like any other then."""
+    pool = start(2, SLEEPS)
+    pool.watch(0.0, 0)
+    pid, _ = pids_of(pool)
+
+    def stopped(now: float) -> dict[bytes, float]:
+        seconds = {name: stalled.stopped_seconds for name, stalled in pool.stalled(now).items()}
+        return {name: each for name, each in seconds.items() if each}
+
+    assert stopped(0.0) == {}
+    os.kill(pid, signal.SIGSTOP)
+    until(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED)
+    assert stopped(0.5) == {}  # it looks once a second
+    assert stopped(1.5) == {b"label-0.1": 1.5}
+    assert stopped(2.5) == {b"label-0.1": 1.0}
+    os.kill(pid, signal.SIGCONT)
+    until(lambda: psutil.Process(pid).status() != psutil.STATUS_STOPPED)
+    assert stopped(5.0) == {}
+
+
+def test_it_says_how_long_a_worker_waited_for_a_core(start: Callable[[int, str], Pool]) -> None:
+    """Many that want the one core that they may use."""
+    pool = start(4, "while True: pass")
+    pool.watch(0.0, 0)
+    core = min(os.sched_getaffinity(0))
+    for pid in pids_of(pool):
+        os.sched_setaffinity(pid, {core})
+    looks = count(1.0)  # a second between one look and the next, as it goes by the clock that it is told
+
+    def all_waited() -> bool:
+        found = pool.stalled(next(looks)).values()
+        return len(found) == 4 and all(0 < each.queued_seconds <= 1 and not each.stopped_seconds for each in found)
+
+    until(all_waited)
+
+
+def test_one_that_hangs_in_a_decoder_speaks_against_the_video(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, SLEEPS)
+    pool.watch(0.0, 0)
+    book = pool._slots[0].place.logbook
+    assert book is not None
+    with open(f"/proc/self/fd/{book.descriptor}", "r+b") as worker:
+        note(worker.fileno(), 7, decodes=True)
+    assert pool.give_up(b"label-0.1", "slept") == Loss(Cause.HUNG, "slept", 7, for_all=True)
+    all_dead(pool)
+
+
+def test_a_worker_whose_storage_does_not_answer_is_not_called_hung(
+    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All workers of a host wait then, each at a sound clip."""
+    pool = start(1, SLEEPS)
+    pool.watch(0.0, 0)
+    monkeypatch.setattr(psutil.Process, "status", lambda self: psutil.STATUS_DISK_SLEEP)
+    expected = Loss(Cause.UNEXPLAINED, "waited for its storage and gave no answer for 60 s", for_all=False)
+    assert pool.give_up(b"label-0.1", "gave no answer for 60 s") == expected
+    all_dead(pool)
+
+
+# --- restarting -------------------------------------------------------------------------------------------------------
+
+
+def kill_one(pool: Pool) -> None:
+    os.kill(pids_of(pool)[0], signal.SIGKILL)
+    all_dead(pool)
+
+
+def test_each_death_in_a_row_doubles_the_wait(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, SLEEPS)
+    now = 0.0
+    pool.watch(now, 0)
+    for wait in (0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10.0):
+        kill_one(pool)
+        pool.watch(now, 0)
+        pool.watch(now + 0.99 * wait, 0)
+        assert pool.running == 0
+        now += 1.01 * wait
+        pool.watch(now, 0)
+        assert pool.running == 1
+
+
+def test_the_wait_is_bounded_however_large_the_pool() -> None:
+    """A thousand deaths in a row are within the budget of a large pool; two to the thousandth seconds are not."""
+    pool = Pool(LocalHost("/corpus"), "label")
+    pool.scale(1000)
+    for slot in pool._slots[1:]:
+        slot.start_at = float("inf")
+    pool._restarts._deaths_in_a_row = pool.crash_budget - 1
+    dead = subprocess.Popen([sys.executable, "-S", "-E", "-c", LEAVES])
+    dead.wait()
+    pool._slots[0].place.process = dead
+    pool._slots[0].is_started, pool._slots[0].name = True, "label-0.1"
+    (death,) = pool.watch(100.0, 0)
+    assert death.identity == b"label-0.1"
+    assert pool._slots[0].start_at == 110.0
+
+
+def test_workers_that_only_die_use_up_the_budget(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, LEAVES)
+    assert pool.crash_budget == 7
+    now = 0.0
+    for _ in range(pool.crash_budget):
+        pool.watch(now, 0)
+        all_dead(pool)
+        assert len(pool.watch(now, 0)) == 1
+        now += 60.0
+    pool.watch(now, 0)
+    all_dead(pool)
+    with pytest.raises(WorkerCrashLoop, match=r"8 server workers died in a row .* \(limit 7\).*exited with status 3"):
+        pool.watch(now, 0)
+
+
+def test_any_finished_sample_forgives(start: Callable[[int, str], Pool]) -> None:
+    pool = start(1, SLEEPS)
+    now = 0.0
+    for samples in range(2 * pool.crash_budget):
+        pool.watch(now, samples)
+        kill_one(pool)
+        # The first death after progress waits the shortest time again.
+        assert len(pool.watch(now, samples + 1)) == 1
+        now += 0.21
+
+
+# --- stopping ---------------------------------------------------------------------------------------------------------
+
+
+def test_stop_waits_for_those_that_leave_by_themselves(start: Callable[[int, str], Pool]) -> None:
+    pool = start(2, "import time\ntime.sleep(0.05)")
+    pool.watch(0.0, 0)
+    pids = pids_of(pool)
+    pool.stop(join_seconds=60.0)
+    assert all(is_gone(pid) for pid in pids)
+
+
+def test_stop_reaps_what_ignores_every_request(start: Callable[[int, str], Pool], tmp_path: Path) -> None:
+    stubborn = (
+        "import signal, sys, time\n"
+        "for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):\n"
+        "    signal.signal(number, signal.SIG_IGN)\n"
+        f"open({str(tmp_path)!r} + '/' + sys.argv[1], 'w').close()\n"
+        "time.sleep(600)\n"
+    )
+    pool = start(2, stubborn)
+    pool.watch(0.0, 0)
+    pids = pids_of(pool)
+    until(lambda: len(list(tmp_path.iterdir())) == 2)
+    pool.stop(join_seconds=0.0, terminate_seconds=0.1)
+    assert pool.running == 0
+    assert all(is_gone(pid) for pid in pids)
+
+
+def test_stop_after_a_crash_leaves_no_zombie_and_may_come_twice(start: Callable[[int, str], Pool]) -> None:
+    pool = start(2, SLEEPS)
+    pool.watch(0.0, 0)
+    pids = pids_of(pool)
+    os.kill(pids[0], signal.SIGKILL)
+    pool.stop(join_seconds=0.0)
+    pool.stop()
+    assert all(is_gone(pid) for pid in pids)
+
+
+def test_the_programs_of_real_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    command = child_module.command("tcp://127.0.0.1:5556", "/a folder", "w-0.1")
+    assert command[:3] == [sys.executable, "-m", "v2v_server.commands.worker"]
+    assert command[3:] == [
+        *("--connect", "tcp://127.0.0.1:5556", "--videos", "/a folder", "--name", "w-0.1"),
+        *("--parent-pid", str(os.getpid())),
+    ]

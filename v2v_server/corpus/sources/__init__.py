@@ -1,0 +1,11 @@
+"""Where the videos of a corpus come from: one file for each kind of source, named in ``source.KINDS``.
+
+source    what every source can do
+folder    a folder, a video or a list file on this host
+prepared  a folder that v2v-prepare made
+copies    object storage, by way of a folder of copies on this host
+bucket    an address in object storage
+listfile  list files like the paper's
+names     which names are videos', and how a name is shown
+asking    asking about many files at a time
+"""

@@ -1,0 +1,282 @@
+"""A folder of this host, also by the name of a video or of a list file in it."""
+
+from __future__ import annotations
+
+import os
+import stat
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
+from itertools import chain
+from operator import attrgetter
+from pathlib import Path, PurePosixPath
+
+from v2v_protocol.errors import CorpusError
+from v2v_server.corpus.manifest import MANIFEST_NAME
+from v2v_server.corpus.sources.asking import answers
+from v2v_server.corpus.sources.listfile import LIST_SUFFIXES, ListEntry, read_list
+from v2v_server.corpus.sources.names import UNPRINTABLE, count_left_out, is_video_name, printable
+from v2v_server.corpus.sources.source import GONE, NO_STATE, SourceOptions, State, VideoSource
+from v2v_server.store.clips import check_file
+from v2v_server.video.fingerprint import unreadable
+
+PSEUDO_FILE_SYSTEMS = frozenset({
+    "binfmt_misc", "bpf", "cgroup", "cgroup2", "configfs", "debugfs", "devpts", "devtmpfs", "efivarfs", "fusectl",
+    "mqueue", "nsfs", "proc", "pstore", "securityfs", "selinuxfs", "sysfs", "tracefs",
+})  # fmt: skip
+"""Kinds whose files are the kernel's: reading one may block, end never, or change something."""
+PSEUDO = "lies in a file system of the kernel, such as /proc or /sys, where no videos are"
+MOST_PATHS = 64
+"""Paths with two or more links by which one folder is searched."""
+
+
+class Folder(VideoSource):
+    """Videos below a folder.
+
+    Args:
+        root: the folder, resolved; the ids are relative to it.
+        listed: reads the videos to take from it; None takes all.
+    """
+
+    def __init__(self, root: Path, listed: Callable[[], tuple[ListEntry, ...] | None] = lambda: None) -> None:
+        super().__init__(str(root), listed)
+
+    def __reduce__(self) -> tuple[type[Folder], tuple[Path]]:
+        return type(self), (self.folder,)
+
+    @property
+    def folder(self) -> Path:
+        """The folder that ids are relative to."""
+        return Path(self.name)
+
+    def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
+        """List the videos, see :meth:`VideoSource.videos` and :func:`video_files`."""
+        folders: set[str] = set()
+        found = video_files(self.folder, refused, left_out) if self.listed is None else self._regular_files(refused)
+        for id in found:
+            folders.add(id.rpartition("/")[0])
+            yield id
+        self._refuse_prepared(folders)
+
+    def states(self, ids: Sequence[str]) -> array[int]:
+        """Return the states of many files, see :meth:`VideoSource.states`."""
+        root, found = os.path.join(self.name, ""), array("q")
+        for id in ids:
+            try:
+                status = os.stat(root + id)
+            except OSError as error:
+                found.extend(GONE if isinstance(error, FileNotFoundError | NotADirectoryError) else NO_STATE)
+            else:
+                is_file = stat.S_ISREG(status.st_mode)
+                found.extend((status.st_size, status.st_mtime_ns, status.st_ctime_ns) if is_file else GONE)
+        return found
+
+    def state(self, id: str) -> State:
+        """Ask for the state of one file.
+
+        Raises:
+            VideoUnreadable: it cannot be had.
+        """
+        try:
+            status = (self.folder / id).stat()
+        except OSError as error:
+            raise unreadable(id, error) from error
+        return status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+    def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
+        """Lend the file, unchecked."""
+        return nullcontext(self.folder / id)
+
+    def verify(self, id: str, fingerprint: str, state: State | None) -> None:
+        """Check the file against its fingerprint.
+
+        Raises:
+            VideoError: it is gone, another one by now, or cannot be read.
+        """
+        check_file(self.folder / id, fingerprint)
+
+    def _regular_files(self, refused: dict[str, str]) -> Iterator[str]:
+        """Yield the listed ids that do not name something else than a file.
+
+        Opening a FIFO blocks until there is a writer, and reading a device may never end. An id that names nothing is
+        kept: probing it reports why.
+        """
+        pseudo = pseudo_devices()
+
+        def may_be_read(id: str) -> bool:
+            try:
+                status = os.stat(os.path.join(self.name, id))
+            except OSError:
+                return True
+            return stat.S_ISREG(status.st_mode) and status.st_dev not in pseudo
+
+        for id, is_regular in answers(may_be_read, [entry.id for entry in self.listed or ()]):
+            if is_regular:
+                yield id
+            else:
+                refused[id] = "is no regular file"
+
+    def _refuse_prepared(self, below: set[str]) -> None:
+        """Check that no video comes from a prepared folder, whose rows are cut already.
+
+        Args:
+            below: the folders that videos lie in.
+
+        Raises:
+            CorpusError: one does.
+        """
+
+        def is_prepared(folder: PurePosixPath) -> bool:
+            try:
+                return (self.folder / folder / MANIFEST_NAME).exists()
+            except OSError:  # a video of such a folder cannot be read either, and is refused itself
+                return False
+
+        folders = {PurePosixPath(folder) for folder in below}
+        folders.update({parent for folder in folders for parent in folder.parents})
+        for folder, refused in answers(is_prepared, sorted(folders)):
+            if refused:
+                raise CorpusError(
+                    f"{self.folder / folder} is a prepared folder and cannot be a part of another corpus: name it "
+                    "itself, or move it out"
+                )
+
+
+def open_source(name: str, options: SourceOptions) -> Folder:
+    """Open a folder, a video or a list file.
+
+    Raises:
+        CorpusError: there is none.
+        OSError: this user may not look at it.
+    """
+    root, listed = locate(name, options)
+    return Folder(root, listed)
+
+
+def locate(name: str, options: SourceOptions) -> tuple[Path, Callable[[], tuple[ListEntry, ...] | None]]:
+    """Return the folder that ids are relative to, and what reads the videos to take from it.
+
+    Raises:
+        CorpusError: there is no such folder, video or list file.
+        OSError: this user may not look at it.
+    """
+    path = Path(name)
+    if path.is_dir():
+        return path.resolve(), options.listed
+    if not path.is_file():
+        raise CorpusError(f"{name}: there is no such folder, video or list file on this host")
+    if options.list_file is not None:
+        raise CorpusError(f"{name}: not a folder; a list file names videos of a folder")
+    if path.suffix.lower() in LIST_SUFFIXES:
+        return path.parent.resolve(), partial(read_list, path)
+    if printable(path.name) != path.name:
+        raise CorpusError(f"{printable(path.name)}: {UNPRINTABLE}")
+    return path.parent.resolve(), lambda: (ListEntry(path.name),)
+
+
+def video_files(root: Path, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
+    """Return relative POSIX paths of the video files below ``root``, known by their suffixes.
+
+    Links are followed; a link to a folder that it lies in is not. A folder that several links lead to has its videos
+    under each path, because each such id is part of the digests of existing corpora. Folders that link to each other
+    have a factorial number of paths, so a folder is searched by at most :data:`MOST_PATHS` paths with two or more
+    links; paths with fewer links are not limited. Kernel file systems (/proc, /sys, /dev) are not entered. Hidden files
+    and folders (".name") are passed over.
+
+    Args:
+        root: the folder.
+        refused: receives, by relative path, why a folder or file cannot be taken in.
+        left_out: counts, by suffix, files that may be videos of other endings.
+    """
+    walk = _Walk(refused, left_out)
+    return chain.from_iterable(walk.below(root, "", frozenset(), 0))
+
+
+class _Walk:
+    """One search of a folder for videos.
+
+    Args:
+        refused, left_out: as in :func:`video_files`.
+    """
+
+    def __init__(self, refused: dict[str, str], left_out: Counter[str]) -> None:
+        self._refused, self._left_out = refused, left_out
+        self._pseudo = pseudo_devices()
+        self._paths = Counter[tuple[int, int]]()
+
+    def below(self, folder: Path, prefix: str, above: frozenset[tuple[int, int]], links: int) -> Iterator[list[str]]:
+        """Yield the videos below a folder, some at a time.
+
+        Args:
+            prefix: of their ids.
+            above: identities (device, inode) of the folders that it lies in.
+            links: of the path that leads here.
+        """
+        refused = self._refused
+        name = printable(prefix.rstrip("/") or ".")
+        try:
+            here = folder.stat()
+            if here.st_dev in self._pseudo:
+                refused[name] = PSEUDO
+                return
+            identity = (here.st_dev, here.st_ino)
+            if identity in above:
+                return
+            if links > 1:
+                self._paths[identity] += 1
+                if (paths := self._paths[identity]) > MOST_PATHS:
+                    if paths == MOST_PATHS + 1:
+                        refused[name] = f"links lead to this folder by more than {MOST_PATHS} paths: remove some links"
+                    return
+            with os.scandir(folder) as listing:
+                entries = sorted(listing, key=attrgetter("name"))
+        except OSError as error:
+            refused[name] = f"the folder cannot be read: {error.strerror or error}"
+            return
+        found: list[str] = []
+        for entry in entries:
+            if entry.name[0] == ".":
+                continue
+            relative = prefix + entry.name
+            try:
+                is_file = entry.is_file()
+                is_folder = not is_file and entry.is_dir()
+                is_pseudo = is_file and entry.is_symlink() and entry.stat().st_dev in self._pseudo
+            except OSError as error:  # a link that leads in a circle, or where this user may not look
+                refused[printable(relative)] = f"cannot be looked at: {error.strerror or error}"
+                continue
+            if is_folder:
+                yield found
+                found = []
+                more = links + entry.is_symlink()
+                yield from self.below(folder / entry.name, f"{relative}/", above | {identity}, more)
+            elif is_video_name(entry.name):
+                if printable(relative) != relative:
+                    refused[printable(relative)] = UNPRINTABLE
+                elif not is_file:
+                    refused[relative] = "is no regular file, or a link that leads nowhere"
+                elif is_pseudo:
+                    refused[relative] = PSEUDO
+                else:
+                    found.append(relative)
+            elif is_file:
+                count_left_out(entry.name, self._left_out)
+        yield found
+
+
+def pseudo_devices() -> frozenset[int]:
+    """Return the device numbers (``st_dev``) of the kernel file systems that are mounted here."""
+    found = set()
+    try:
+        mounts = Path("/proc/self/mountinfo").read_bytes().splitlines()
+    except OSError:
+        return frozenset()
+    for mount in mounts:
+        before, _, after = mount.partition(b" - ")
+        is_dev = before.split()[4] == b"/dev"  # in a container a tmpfs of its own
+        if is_dev or after.split()[0].decode("ascii", "replace") in PSEUDO_FILE_SYSTEMS:
+            major, _, minor = before.split()[2].partition(b":")
+            found.add(os.makedev(int(major), int(minor)))
+    return frozenset(found)

@@ -1,0 +1,139 @@
+"""List files like the paper's: one video a line, ``path frames c+ c-``.
+
+The columns after the path may be left out from the right. A single threshold holds for both polarities. Paths may hold
+spaces, since no path ends in a number of its own; ``#`` at the beginning of a line makes it a comment. In a ``.csv``
+file commas separate the columns, and a first line whose first column reads ``path`` is its heading. WebVid's own tables
+(``videoid,contentUrl,duration,page_dir,name``) name ``page_dir/videoid.mp4``, as its downloaders write them.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from v2v_protocol.errors import CorpusError
+from v2v_server.corpus.sources.names import printable
+
+LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
+
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
+_SUFFIX = re.compile(r"\.(?=.*[a-z]|26[45]$)[a-z0-9]+", re.IGNORECASE)
+_MOST_COLUMNS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class ListEntry:
+    """One line of a list file.
+
+    Attributes:
+        id: relative POSIX path of the video, normalised ("./a//b.mp4" is "a/b.mp4").
+        frames: the frame count the list states, or None.
+        threshold_pos, threshold_neg: contrast thresholds the list states, log units, or None.
+    """
+
+    id: str
+    frames: int | None = None
+    threshold_pos: float | None = None
+    threshold_neg: float | None = None
+
+
+def read_list(path: str | os.PathLike[str]) -> tuple[ListEntry, ...]:
+    """The entries of a list file, in its order.
+
+    Raises:
+        CorpusError: the file cannot be read, is empty, or a line makes no sense; the message gives the line number.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise CorpusError(f"list {path}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise CorpusError(f"list {path}: is not UTF-8 text ({error.reason} at byte {error.start})") from error
+    columns = _comma_columns if Path(path).suffix.lower() == ".csv" else _space_columns
+    entries: dict[str, int] = {}
+    found: list[ListEntry] = []
+    webvid: list[int] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
+            fields = columns(line.strip())
+            if not found and fields[0].lower() == "path":
+                continue
+            if not found and {"videoid", "page_dir"} <= set(fields):
+                webvid = [fields.index("page_dir"), fields.index("videoid")]
+                continue
+            entry = _webvid_entry(fields, *webvid) if webvid else _entry(fields)
+            if entry.id in entries:
+                raise ValueError(f"{entry.id} is listed already in line {entries[entry.id]}")
+        except (ValueError, csv.Error) as error:
+            raise CorpusError(f"list {path}, line {number}: {error}") from error
+        entries[entry.id] = number
+        found.append(entry)
+    if not found:
+        raise CorpusError(f"list {path}: names no video; write one a line: path [frames [c+ [c-]]]")
+    return tuple(found)
+
+
+def _comma_columns(line: str) -> list[str]:
+    return [field.strip() for field in next(csv.reader([line], strict=True))]
+
+
+def _space_columns(line: str) -> list[str]:
+    words = list(_words_from_the_right(line))
+    return [line[: len(line) - sum(map(len, words))].strip(), *(word.strip() for word in reversed(words))]
+
+
+def _words_from_the_right(line: str) -> Iterator[str]:
+    """The numbers that end the line, last first, each with the space in front of it; never the whole line."""
+    for _ in range(_MOST_COLUMNS - 1):
+        match = re.search(r"\s+(\S+)$", line)
+        if match is None or not _NUMBER.fullmatch(match[1]):
+            return
+        yield match[0]
+        line = line[: match.start()]
+
+
+def _webvid_entry(fields: list[str], folder: int, video: int) -> ListEntry:
+    if len(fields) <= max(folder, video):
+        raise ValueError(f"{len(fields)} columns, fewer than the heading has")
+    return ListEntry(_relative(f"{fields[folder]}/{fields[video]}.mp4"))
+
+
+def _entry(fields: list[str]) -> ListEntry:
+    if len(fields) > _MOST_COLUMNS:
+        raise ValueError(f"{len(fields)} columns; there are at most {_MOST_COLUMNS}: path frames c+ c-")
+    values = [_number(field) for field in fields[1:]]
+    frames = values[0] if values else None
+    if frames is not None and (frames < 1 or frames != int(frames)):
+        raise ValueError(f"{fields[1]} frames; give a whole number from 1")
+    thresholds = values[1:] * (2 if len(values) == 2 else 1)
+    for value in thresholds:
+        if value <= 0:
+            raise ValueError(f"contrast threshold {value:g}; give one above 0")
+    positive, negative = thresholds or (None, None)
+    return ListEntry(_relative(fields[0]), None if frames is None else int(frames), positive, negative)
+
+
+def _number(field: str) -> float:
+    if not _NUMBER.fullmatch(field) or not math.isfinite(float(field)):
+        raise ValueError(f"{field!r} is not a number")
+    return float(field)
+
+
+def _relative(text: str) -> str:
+    path = PurePosixPath(text.replace("\\", "/"))
+    if path.is_absolute() or re.match(r"[A-Za-z]:/", str(path)):
+        raise ValueError(f"{text} is absolute; give paths relative to the folder of the videos")
+    if ".." in path.parts:
+        raise ValueError(f"{text} leaves the folder of the videos")
+    if not _SUFFIX.fullmatch(path.suffix):
+        raise ValueError(f"{text!r} does not name a video file")
+    if printable(text) != text:
+        raise ValueError(f"{printable(text)} holds control characters")
+    return str(path)

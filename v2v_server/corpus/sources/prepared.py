@@ -1,0 +1,52 @@
+"""A prepared folder: the files that v2v-prepare made, under the ids of their sources."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from functools import cached_property
+
+from v2v_protocol.errors import CorpusError
+from v2v_server.corpus.manifest import MANIFEST_NAME, Manifest, read_manifest
+from v2v_server.corpus.sources.folder import Folder, locate
+from v2v_server.corpus.sources.source import SourceOptions
+from v2v_server.video.rows import Rows
+
+
+class Prepared(Folder):
+    """A folder with a manifest, which says what its files are."""
+
+    @cached_property
+    def manifest(self) -> Manifest:
+        """The manifest; only the process that lists the videos reads it.
+
+        Raises:
+            CorpusError: it cannot be read, or makes no sense.
+        """
+        return read_manifest(self.folder)
+
+    def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
+        """List the videos of the manifest; other files are passed over."""
+        listed = None if self.listed is None else [entry.id for entry in self.listed]
+        return iter(self.manifest.wanted(listed, refused))
+
+    def rows(self, asked: Rows | None) -> Rows:
+        """Return which rows of the pictures may be used, see :meth:`Manifest.served_rows`."""
+        return self.manifest.served_rows(asked)
+
+
+def open_source(name: str, options: SourceOptions) -> Prepared | None:
+    """Open a prepared folder; None for any other.
+
+    Raises:
+        CorpusError: the folder is a part of a prepared one.
+        OSError: this user may not look at it.
+    """
+    root, listed = locate(name, options)
+    for folder in root.parents:
+        if (folder / MANIFEST_NAME).exists():
+            raise CorpusError(
+                f"{root} lies in the prepared folder {folder}, where its manifest is: name that folder, and restrict "
+                "it by a list file"
+            )
+    return Prepared(root, listed) if (root / MANIFEST_NAME).exists() else None

@@ -1,0 +1,208 @@
+"""Where the videos of a corpus come from, and what every source can do.
+
+A kind of source is a file beside this one, named in :data:`KINDS`: a subclass of :class:`VideoSource`, and a function
+``open_source(name, options)`` that returns one, or None if the name belongs to another kind.
+
+Errors are the same for every source: :class:`VideoGone` (not there), :class:`VideoDenied` (not permitted),
+:class:`VideoChanged` (another file by now), and :class:`VideoUnreadable` for every other fault, which may pass.
+"""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from v2v_protocol.errors import CorpusError
+from v2v_server.corpus.sources.listfile import ListEntry, read_list
+from v2v_server.video.rows import Rows
+
+if TYPE_CHECKING:
+    from v2v_server.corpus.manifest import Manifest
+
+KINDS = ("copies", "prepared", "folder")
+"""Files of the kinds of sources, in the order in which they are asked. The last one takes any name."""
+
+COPIES_GIB = 100.0
+"""Default limit of the folder of copies."""
+
+State = tuple[int, int, int]
+"""Size in bytes, and two numbers that change with the content: the times of the last modification and change of status,
+or a mark of an object's ETag and 0."""
+NO_STATE: State = (-1, 0, 0)
+"""The state cannot be told now."""
+GONE: State = (-2, 0, 0)
+"""There is no such file."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceOptions:
+    """Settings beside the name of a source.
+
+    Attributes:
+        list_file: a list that restricts a folder or an address to the videos that it names.
+        copies: folder for copies of videos from object storage; None: a folder where the index lies.
+        copies_gib: limit of that folder, GiB.
+        cache_dir: see :func:`v2v_server.system.process.cache_folder`.
+    """
+
+    list_file: str | os.PathLike[str] | None = None
+    copies: str | os.PathLike[str] | None = None
+    copies_gib: float = COPIES_GIB
+    cache_dir: str | os.PathLike[str] | None = None
+
+    def listed(self) -> tuple[ListEntry, ...] | None:
+        """Return the entries of the list; None without one.
+
+        Raises:
+            CorpusError: the list cannot be read, or makes no sense.
+        """
+        return None if self.list_file is None else read_list(self.list_file)
+
+
+class VideoSource(ABC):
+    """Videos, by id. Can be pickled; what arrives in another process opens files, but does not list them.
+
+    Args:
+        name: see Attributes.
+        listed: reads the list that restricts it, when it is first needed; returns None without one.
+
+    Attributes:
+        name: names the source for people, and to workers, who open it by this name; equal names share an index.
+        is_local: whether the files lie on this host. False: opening one fetches it over the network.
+    """
+
+    is_local = True
+
+    def __init__(self, name: str, listed: Callable[[], tuple[ListEntry, ...] | None] = lambda: None) -> None:
+        self.name, self._read_list = name, listed
+
+    @cached_property
+    def listed(self) -> tuple[ListEntry, ...] | None:
+        """The entries of the list that restricts it; None without one.
+
+        Raises:
+            CorpusError: the list cannot be read, or makes no sense.
+        """
+        return self._read_list()
+
+    def __str__(self) -> str:
+        return self.name
+
+    @property
+    def folder(self) -> Path:
+        """The folder that ids are relative to.
+
+        Raises:
+            CorpusError: there is no such folder on this host.
+        """
+        raise CorpusError(f"{self}: is no folder of this host, which this needs: copy the videos to one first")
+
+    @property
+    def manifest(self) -> Manifest | None:
+        """What a prepared corpus says of itself; None for any other."""
+        return None
+
+    @abstractmethod
+    def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
+        """List the ids of the files that may be videos: those that the list names, or else all of them.
+
+        Args:
+            refused: receives, by id, why a file, folder or entry of the list cannot be taken in.
+            left_out: counts, by suffix, files that may be videos of other endings.
+
+        Raises:
+            CorpusError: the source cannot be listed, or cannot be served.
+        """
+
+    @abstractmethod
+    def states(self, ids: Sequence[str]) -> array[int]:
+        """Return the states of many files, three numbers each, as they are cheapest to have: those of a listing will
+        do. Of a file without one it is :data:`GONE` or :data:`NO_STATE`. Called in threads.
+        """
+
+    @abstractmethod
+    def state(self, id: str) -> State:
+        """Ask for the state of one file now.
+
+        Raises:
+            VideoUnreadable: it cannot be had.
+        """
+
+    @abstractmethod
+    def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
+        """Lend a file of this host with the video's bytes until the end of the context.
+
+        Args:
+            fingerprint: of the video as catalogued; "" takes what is there now.
+
+        Raises:
+            VideoUnreadable, VideoChanged: it cannot be had. A file that is on this host anyway may be lent unchecked:
+                reading it reports the same errors.
+        """
+
+    @abstractmethod
+    def verify(self, id: str, fingerprint: str, state: State | None) -> None:
+        """Check that a video is as catalogued. An answer that cannot be had now is no error of a remote source.
+
+        Args:
+            fingerprint, state: as catalogued; None: unknown.
+
+        Raises:
+            VideoError: it is gone, another one by now, or (on a disk) cannot be read.
+        """
+
+    def has(self, id: str, fingerprint: str) -> bool:
+        """Return whether :meth:`open_local` needs no network. If so, the file stays until the next one is asked for."""
+        return True
+
+    def fetch(self, id: str, fingerprint: str) -> None:  # noqa: B027 - a local source has nothing to fetch
+        """Do the part of :meth:`open_local` that needs the network, so that :meth:`has` returns True.
+
+        Raises:
+            VideoUnreadable, VideoChanged: it cannot be had.
+        """
+
+    def release(self) -> None:  # noqa: B027 - a local source keeps nothing
+        """Release the file that :meth:`has` or :meth:`fetch` keeps."""
+
+    def rows(self, asked: Rows | None) -> Rows:
+        """Return which rows of the pictures may be used.
+
+        Args:
+            asked: rows that the user asks for; None: all that there are.
+
+        Raises:
+            CorpusError: the source does not have them.
+        """
+        return asked or Rows()
+
+    def worker_flags(self) -> list[str]:
+        """Return the flags of ``v2v-worker`` with which another process opens this source, beside its name."""
+        return []
+
+
+def open_source(name: str | os.PathLike[str], options: SourceOptions = SourceOptions()) -> VideoSource:
+    """Open the source that a user names: a folder, a video, a list file, or an address in object storage.
+
+    Raises:
+        CorpusError: there is no such source, or this user may not look at it.
+        UsageError: an address or a setting is malformed.
+    """
+    name = os.fspath(name)
+    try:
+        for kind in KINDS:
+            source: VideoSource | None = import_module(f"{__package__}.{kind}").open_source(name, options)
+            if source is not None:
+                return source
+    except OSError as error:  # a folder that this user may not enter, a share that has gone
+        raise CorpusError(f"{name}: cannot be looked at: {error.strerror or error}") from error
+    raise CorpusError(f"{name}: no kind of source takes this name")

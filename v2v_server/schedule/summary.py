@@ -1,0 +1,58 @@
+"""Summarize for the operator what a corpus gives under a spec."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from v2v_protocol.refusal import Refusal
+from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.schedule.sequences import SequenceTable
+
+_SHOWN = 5
+
+
+def corpus_summary(
+    catalogue: Catalogue, spec: StreamSpec, table: SequenceTable, *, list_refused: bool = False
+) -> list[str]:
+    """Return lines that say how many sequences there are, which videos give none, and which setting would admit them.
+
+    Args:
+        catalogue, spec, table: of the server.
+        list_refused: whether to name all of those videos, not only the first few.
+    """
+    recipe = spec.recipe
+    lines = [
+        f"{len(catalogue.videos)} videos in {catalogue.source}: {table.videos} give {table.count} sequences of "
+        f"{recipe.frames_needed} frames (at most {spec.max_sequences_per_video} a video), rows {catalogue.rows}"
+    ]
+    if spec.scene != "off":
+        split = 0 if catalogue.videos.split is None else len(catalogue.videos.split)
+        lines.append(
+            f"scene {spec.scene}: {split} videos have shot boundaries or empty parts; {table.spoilt} sequences are "
+            "left out or moved"
+        )
+    if table.refusals:
+        lines.append(f"{len(table.refusals)} videos give none under the server's own recipe:")
+        lines += _listed(table.refusals, list_refused)
+        lines += _shorter_clips(table)
+    if catalogue.refusals:
+        lines.append(f"{len(catalogue.refusals)} files cannot be used at all:")
+        lines += _listed(catalogue.refusals, list_refused)
+    return lines
+
+
+def _listed(refused: Sequence[Refusal], all_of_them: bool) -> list[str]:
+    shown = refused if all_of_them else refused[:_SHOWN]
+    rest = len(refused) - len(shown)
+    return [f"  {line}" for line in shown] + ([f"  ... and {rest} more: --list-refused names all"] if rest else [])
+
+
+def _shorter_clips(table: SequenceTable) -> list[str]:
+    """Say how many of the videos that are too short a shorter clip would admit: half of them, and all."""
+    longest = sorted(table.longest_clips, reverse=True)
+    if not longest:
+        return []
+    choices = dict.fromkeys((longest[(len(longest) - 1) // 2], longest[-1]))
+    shown = ", ".join(f"{choice} admits {sum(voxels >= choice for voxels in longest)}" for choice in choices)
+    return [f"  with --set voxels_per_clip=N (now the longest that fits is {longest[0]}): {shown} of them"]

@@ -1,0 +1,230 @@
+"""Keep a number of workers running: start, watch, restart with backoff, stop.
+
+    slot   empty --start--> started --exit--> empty (started again after a delay)
+                               |
+                               `--too many--> leaving --exit--> gone
+
+A worker that dies is started again after a delay that doubles with every death in a row. If the workers die repeatedly
+and not one sample is finished, restarting does not help, and the pool says so.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+from dataclasses import dataclass, field
+from typing import Any
+
+from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.leases import Stall
+from v2v_server.supervise.child import STOPPED, hung
+from v2v_server.supervise.host import Exit, Host, ProcessStatus, WorkerPlace
+from v2v_server.supervise.restarts import Restarts, crash_budget
+
+_STALL_SECONDS = 1.0
+"""Time from one check for stalled workers to the next."""
+_STALE_SECONDS = 15.0
+"""Age at which an observation says nothing about a process any more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Death:
+    """A worker that ended without being told to, or that could not be started.
+
+    Attributes:
+        identity: the worker's name, as in its hello.
+        loss: what its end says about the sample in work.
+    """
+
+    identity: bytes
+    loss: Loss
+
+
+@dataclass(slots=True, eq=False)
+class WorkerSlot:
+    """A place for one worker at a time.
+
+    Attributes:
+        number: of the slot; part of its workers' names.
+        place: where its worker runs.
+        generation: number of workers started so far.
+        name: name of the latest worker.
+        is_started: whether that worker has not ended, as far as is known.
+        is_given_up: whether it hung; its end is not reported again.
+        is_leaving: whether the slot ends with its worker.
+        start_at: time of the next start.
+        seen: observation at the last check for stalled workers.
+    """
+
+    number: int
+    place: WorkerPlace
+    generation: int = 0
+    name: str = ""
+    is_started: bool = False
+    is_given_up: bool = False
+    is_leaving: bool = False
+    start_at: float = 0.0
+    seen: ProcessStatus = field(default_factory=ProcessStatus)
+
+
+class Pool:
+    """The workers of one server.
+
+    Args:
+        host: runs the processes.
+        label: prefix of the workers' names, unique to this server.
+    """
+
+    def __init__(self, host: Host[Any], label: str) -> None:
+        self._host = host
+        self._label = label
+        self._slots: list[WorkerSlot] = []
+        self._workers = 0
+        self._numbered = 0
+        self._address = ""
+        self._restarts = Restarts()
+        self._now = 0.0
+        self._checked_at = -math.inf
+
+    @property
+    def is_local(self) -> bool:
+        """Whether all workers run on this host."""
+        return self._host.is_local
+
+    @property
+    def crash_budget(self) -> int:
+        """Deaths in a row, without any finished sample between them, that are tolerated."""
+        return crash_budget(self._workers)
+
+    @property
+    def running(self) -> int:
+        """Number of workers whose process runs."""
+        return sum(slot.place.is_running for slot in self._slots)
+
+    @property
+    def restarts(self) -> dict[bytes, int]:
+        """Number of earlier workers in the slot of each worker."""
+        return {slot.name.encode(): slot.generation - 1 for slot in self._slots if slot.is_started}
+
+    def start(self, address: str) -> None:
+        """Set the address that workers connect to; :meth:`watch` starts them."""
+        self._address = address
+
+    def scale(self, workers: int) -> None:
+        """Set the number of workers. Surplus workers finish their current sample and exit."""
+        self._workers = workers
+        staying = [slot for slot in self._slots if not slot.is_leaving]
+        for _ in range(workers - len(staying)):
+            self._slots.append(WorkerSlot(self._numbered, self._host.place(self._numbered)))
+            self._numbered += 1
+        for slot in staying[workers:]:
+            slot.is_leaving = slot.place.leave()
+            if not slot.is_leaving:
+                self._release(slot)
+        self._host.request(workers)
+
+    def watches(self, identity: bytes) -> bool:
+        """Return whether :meth:`watch` will report how a worker ends."""
+        slot = self._slot_of(identity)
+        return slot is not None and not slot.is_given_up
+
+    def watch(self, now: float, samples: int) -> list[Death]:
+        """Return the workers that have died, and start those that are due. Call it a few times a second.
+
+        Args:
+            now: monotonic time, seconds.
+            samples: samples finished so far by all workers; any progress resets the count of deaths in a row.
+
+        Raises:
+            WorkerCrashLoop: the crash budget is used up.
+        """
+        self._now = now
+        self._restarts.progress(samples)
+        self._host.refresh(now)
+        deaths = [death for slot in list(self._slots) for death in self._ended(slot)]
+        for slot in self._slots:
+            if not slot.is_started and now >= slot.start_at:
+                self._start(slot)
+                deaths += self._ended(slot)
+        return deaths
+
+    def stalled(self, now: float) -> dict[bytes, Stall]:
+        """Return the workers that could not run since the last call, and for how long. No deadline counts that time."""
+        if now - self._checked_at < _STALL_SECONDS:
+            return {}
+        self._checked_at = now
+        found = {}
+        for slot in self._slots:
+            seen = slot.place.status(now) if slot.is_started else None
+            if seen is None:
+                continue
+            before, slot.seen = slot.seen, seen
+            since = seen.seen_at - before.seen_at
+            stopped = min(since, 2 * self._host.status_seconds) if seen.status in STOPPED else 0.0
+            queued = max(0.0, min(since - stopped, seen.queued_seconds - before.queued_seconds))
+            if stopped or queued:
+                found[slot.name.encode()] = Stall(stopped, queued)
+        return found
+
+    def give_up(self, identity: bytes, reason: str) -> Loss | None:
+        """Kill a worker that hangs.
+
+        Returns:
+            what its loss means, which :meth:`watch` does not report again; None if it is not a worker of this pool.
+        """
+        slot = self._slot_of(identity)
+        if slot is None:
+            return None
+        slot.is_given_up = True
+        seen = slot.place.status(self._now)
+        slot.place.signal(signal.SIGKILL)
+        if seen is None or self._now - seen.seen_at > _STALE_SECONDS:
+            return Loss(Cause.UNEXPLAINED, f"{reason}, nor does its node answer", for_all=False)
+        return hung(seen.status, reason, seen.lease, decodes=seen.decodes)
+
+    def news(self) -> list[str]:
+        """Return lines for the operator since the last call, such as where workers are placed."""
+        return self._host.news()
+
+    def stop(self, join_seconds: float = 5.0, terminate_seconds: float = 2.0) -> None:
+        """End every worker: wait for those that were told to stop, then terminate, then kill."""
+        left = self._host.wait([slot.place for slot in self._slots if slot.place.is_running], join_seconds)
+        for place in left:
+            place.signal(signal.SIGTERM)
+        self._host.wait(left, terminate_seconds)
+        for slot in list(self._slots):
+            self._release(slot)
+        self._host.close()
+
+    def _slot_of(self, identity: bytes) -> WorkerSlot | None:
+        return next((slot for slot in self._slots if slot.is_started and slot.name.encode() == identity), None)
+
+    def _start(self, slot: WorkerSlot) -> None:
+        slot.generation += 1
+        slot.name = f"{self._label}-{slot.number}.{slot.generation}"
+        slot.is_started, slot.is_given_up, slot.seen = True, False, ProcessStatus(seen_at=self._now)
+        slot.place.start(slot.name, self._address)
+
+    def _ended(self, slot: WorkerSlot) -> list[Death]:
+        """Handle the end of a slot's worker, if it has ended, and return the death to report.
+
+        Raises:
+            WorkerCrashLoop: the crash budget is used up.
+        """
+        end = slot.place.take_exit() if slot.is_started else None
+        if end is None:
+            return []
+        slot.is_started = False
+        if slot.is_leaving:
+            self._release(slot)
+        else:
+            slot.start_at = self._now + self._delay(end)
+        is_expected = slot.is_given_up or (slot.is_leaving and end.returncode in (0, -signal.SIGTERM))
+        return [Death(slot.name.encode(), end.loss)] if end.is_loss and not is_expected else []
+
+    def _delay(self, end: Exit) -> float:
+        return self._restarts.delay(self._workers, end.loss) if end.retry_seconds is None else end.retry_seconds
+
+    def _release(self, slot: WorkerSlot) -> None:
+        self._slots.remove(slot)
+        slot.place.release()

@@ -1,0 +1,96 @@
+"""Fields of a status. Each field states once what its value means, its unit, and its metric.
+
+A part of the server describes its state as a dataclass of these fields. ``/state``, ``/metrics``, page, terminal, log
+and shutdown summary walk the fields. So a new counter is two edits: declare the field, and count.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+GIB = 1 << 30
+
+
+@dataclass(frozen=True, slots=True)
+class Meaning:
+    """Description of a field.
+
+    Attributes:
+        help: what the value is: one sentence.
+        kind: "counter", "gauge", "states" (one of ``states``) or "text".
+        unit: "s", "bytes", "GiB", "cores", "/s", "0 to 1"; empty: a number of what the name says.
+        metric: name of the metric without prefix and suffix; empty: it is no metric, None: the field's name.
+        part: value of the label "part", where fields share a metric.
+        states: every value that the field can have.
+        merge: makes one value of the values of peers with the same name.
+        is_event: whether it counts unusual events, which one-line views name once there are any.
+        is_fault: whether each event is a fault that the service survived.
+    """
+
+    help: str
+    kind: str = "gauge"
+    unit: str = ""
+    metric: str | None = ""
+    part: str = ""
+    states: tuple[str, ...] = ()
+    merge: Callable[[Iterable[float]], float] = sum
+    is_event: bool = False
+    is_fault: bool = False
+
+
+def counter(
+    help: str,
+    metric: str | None = None,
+    *,
+    unit: str = "",
+    part: str = "",
+    is_routine: bool = False,
+    is_fault: bool = False,
+) -> Any:
+    """Declare a total since the start, which begins at 0. One that is not routine counts unusual events. See
+    :class:`Meaning`."""
+    meaning = Meaning(help, "counter", unit, metric, part, is_event=not is_routine, is_fault=is_fault)
+    return _field(meaning, default=0)
+
+
+def gauge(
+    help: str,
+    metric: str | None = "",
+    *,
+    unit: str = "",
+    part: str = "",
+    merge: Callable[[Iterable[float]], float] = sum,
+    **options: Any,
+) -> Any:
+    """Declare a value that rises and falls; ``options`` are those of ``dataclasses.field``. See :class:`Meaning`."""
+    return _field(Meaning(help, "gauge", unit, metric, part, merge=merge), **options)
+
+
+def states(help: str, metric: str, *values: str) -> Any:
+    """Declare a field that has one of a few values; the metric has a sample for each of them."""
+    return _field(Meaning(help, "states", metric=metric, states=values))
+
+
+def text(help: str, **options: Any) -> Any:
+    """Declare a text, or another value that is no metric; ``options`` are those of ``dataclasses.field``."""
+    return _field(Meaning(help, "text"), **options)
+
+
+@cache
+def meanings(kind: Any) -> dict[str, Meaning]:
+    """Return the meaning of each status field of a dataclass, by the field's name. Other fields are no status."""
+    return {each.name: each.metadata["meaning"] for each in dataclasses.fields(kind) if "meaning" in each.metadata}
+
+
+def values(item: Any) -> dict[str, Any]:
+    """Return the values of an instance's status fields, by name."""
+    kind: Any = type(item)
+    return {name: getattr(item, name) for name in meanings(kind)}
+
+
+def _field(meaning: Meaning, **options: Any) -> Any:
+    return dataclasses.field(metadata={"meaning": meaning}, **options)
