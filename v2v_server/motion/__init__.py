@@ -12,6 +12,6 @@ that is wrong: the pixels on its way brighten and darken again. So a step in whi
 All of it is integer arithmetic, so that every host makes the same bytes.
 """
 
-from v2v_server.motion.clip import MARGIN_PX, levels_between, levels_of, substeps
+from v2v_server.motion.clip import MARGIN_PX, levels_between, levels_of, load, substeps
 
-__all__ = ["MARGIN_PX", "levels_between", "levels_of", "substeps"]
+__all__ = ["MARGIN_PX", "levels_between", "levels_of", "load", "substeps"]

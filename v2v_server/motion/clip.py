@@ -1,6 +1,6 @@
 """The levels between the frames of a clip: which steps are divided, into how many parts.
 
-A step has n sub-steps if the longest motion of its cells, apart from the fastest twentieth, is n - 1 to n times
+A step has n sub-steps if the longest motion of its cells, apart from the fastest tenth, is n - 1 to n times
 ``substep_px``; at most MOST_SUBSTEPS. A cell that moves by less than half of ``substep_px`` counts as still: its light
 changes evenly. A step in which less than 1/256 of the cells move is not divided.
 """
@@ -26,7 +26,7 @@ from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
 MARGIN_PX = 16
 """Margin around the crop that motion is estimated on and warped from."""
 _LEAST_SHARE = 1 / 256
-_FASTEST_SHARE = 0.05
+_FASTEST_SHARE = 0.1
 
 
 def levels_of(
@@ -113,3 +113,9 @@ def substeps(vectors: Vectors, substep_px: float) -> int:
         return 1
     longest = math.sqrt(int(moving[int(len(moving) * (1 - _FASTEST_SHARE))])) / UNITS_PER_PX
     return min(1 + int(longest / substep_px), MOST_SUBSTEPS)
+
+
+def load() -> None:
+    """Load this folder's kernels from numba's cache, or compile them."""
+    first = (np.arange(32 * 32) * 37 % 251).astype(np.uint8).reshape(32, 32)
+    levels_between(np.stack([first, np.roll(first, 3, 1)]), (0, 0, 32, 32), np.arange(2), 1.0)

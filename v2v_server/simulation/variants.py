@@ -23,9 +23,12 @@ class Variant(NamedTuple):
     voxel_dtype: str
     is_general: bool
     precision: str
+    is_divided: bool = False
+    """Whether steps have sub-steps, whose levels the kernels of ``v2v_server.motion`` make."""
 
     def __str__(self) -> str:
-        return f"{self.voxel_dtype} voxels{' by the general kernel' if self.is_general else ''} in {self.precision}"
+        kind = f"{' by the general kernel' if self.is_general else ''}{' with sub-steps' if self.is_divided else ''}"
+        return f"{self.voxel_dtype} voxels{kind} in {self.precision}"
 
 
 USUAL = frozenset({*(Variant(dtype, False, "float32") for dtype in VOXEL_DTYPES), Variant("int8", True, "float32")})
@@ -58,7 +61,7 @@ def variants(
     )
     precisions = ["float32"] if events <= LIMITS["float32"][1] else list(LIMITS)
     is_general = recipe.has_effects or recipe.grids_per_frame > 0 or levels_per_step > 0 or {"voxels"} != set(arrays)
-    return frozenset(Variant(voxel_dtype, is_general, precision) for precision in precisions)
+    return frozenset(Variant(voxel_dtype, is_general, precision, levels_per_step > 0) for precision in precisions)
 
 
 def load(variant: Variant) -> None:
