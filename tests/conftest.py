@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from collections.abc import Iterator
+from typing import Any
 
+import numba.core.dispatcher
 import pytest
 from hypothesis import settings
 
@@ -19,4 +22,29 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep catalogue indexes and quarantine files of the tests out of the user's cache."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("V2V_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_process_compiles(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Let one test process compile at a time: the others wait, and then find its kernels in numba's cache."""
+    dispatcher: Any = numba.core.dispatcher.Dispatcher
+    compile_one = dispatcher.compile
+    compiling = False
+
+    def compile_in_turn(self: Any, signature: Any) -> Any:
+        nonlocal compiling
+        if compiling:  # a function that the one being compiled calls
+            return compile_one(self, signature)
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        compiling = True
+        try:
+            return compile_one(self, signature)
+        finally:
+            compiling = False
+            fcntl.flock(lock, fcntl.LOCK_UN)
+
+    folder = tmp_path_factory.getbasetemp().parent  # that of all processes of pytest-xdist
+    with (folder / "compiling.lock").open("ab") as lock, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dispatcher, "compile", compile_in_turn)
         yield

@@ -42,12 +42,10 @@ def test_the_unit_does_not_restart_after_a_mistyped_key(
     assert str(status) in service["RestartPreventExitStatus"].split()
 
 
-def test_the_unit_names_what_it_needs_and_where_the_quarantine_lies(service: dict[str, str], tmp_path: Path) -> None:
+def test_the_units_example_is_valid_and_its_quarantine_lies_where_it_says(
+    service: dict[str, str], tmp_path: Path
+) -> None:
     notes = "".join(line for line in UNIT.read_text().splitlines(True) if line.startswith("#"))
-    venv = service["ExecStart"].partition("/bin/")[0]
-    assert f"-m venv {venv}\n" in notes
-    assert re.search(rf"useradd .* {service['User']}\n", notes)
-    assert notes.index("install -d /etc/v2v\n") < notes.index("/etc/v2v/serve.yaml")
     state = f"/var/lib/{service['StateDirectory']}"
     assert service["Environment"] == f"V2V_CACHE_DIR={state}"
     assert f"v2v-quarantine --videos /data/webvid --cache-dir {state}\n" in notes

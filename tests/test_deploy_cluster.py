@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.server.page.told import told
+from tests.server.page.metric_names import metric_names
 from tests.waiting import until
 from v2v_server.commands import serve as serve_command
 from v2v_server.commands import worker as worker_command
@@ -143,7 +143,7 @@ def test_mounted_volumes_exist_and_the_root_is_read_only(deployment: str) -> Non
 def test_the_scaler_queries_existing_metrics() -> None:
     query = yaml.safe_load((KUBERNETES / "autoscale" / "scaled-object.yaml").read_text())["spec"]["triggers"][0]
     assert "v2v_waiting_share{" in query["metadata"]["query"]
-    assert "v2v_waiting_share" in told()
+    assert "v2v_waiting_share" in metric_names()
 
 
 # --- systemd, shell ---------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from tests.server.page.told import told
+from tests.server.page.metric_names import metric_names
 from v2v_server.commands import serve as serve_command
 from v2v_server.config import ServeConfig
 
@@ -24,7 +24,7 @@ def queries() -> list[str]:
 
 
 def test_every_dashboard_query_uses_existing_metrics() -> None:
-    names = told()
+    names = metric_names()
     assert queries()
     for query in [*queries(), *(each["query"] for each in DASHBOARD["templating"]["list"] if each["type"] == "query")]:
         assert _NAME.findall(query), query

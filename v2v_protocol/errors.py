@@ -10,6 +10,9 @@
     |-- VideoError               the file: it cannot deliver what was catalogued (path, frame, reason)
     |   |-- VideoChanged             it is not the file that was catalogued
     |   `-- VideoUnreadable          this host cannot read it, whatever its content
+    |       |-- VideoGone                    there is no such file
+    |       `-- VideoDenied                  this user may not read it
+    |-- SidecarError             a file beside a video, such as its labels (path, ending, reason)
     |-- ProtocolError            the peer: it sent something outside the protocol
     |   |-- VersionMismatch          another protocol or numerics version
     |   `-- LimitExceeded            a message, a list or a credit larger than stated
@@ -107,6 +110,24 @@ class VideoGone(VideoUnreadable):
 
 class VideoDenied(VideoUnreadable):
     """This user may not read the file."""
+
+
+class SidecarError(V2VError):
+    """A file or folder beside a video, which an array is made from, cannot be used. The video is not at fault.
+
+    Attributes:
+        video: catalogue id of the video.
+        ending: of the sidecar, see ``v2v_protocol.sample.FromSidecar``.
+        reason: one line of text.
+        here: this host cannot read the file, or has another one in its place; it may be sound elsewhere.
+    """
+
+    def __init__(self, video: str, ending: str, reason: str, here: bool = False) -> None:
+        self.video, self.ending, self.reason, self.here = video, ending, reason, here
+        super().__init__(f"{video}: its sidecar {ending}: {reason}")
+
+    def __reduce__(self) -> tuple[type[SidecarError], tuple[str, str, str, bool]]:
+        return type(self), (self.video, self.ending, self.reason, self.here)
 
 
 class ProtocolError(V2VError):

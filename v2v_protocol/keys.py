@@ -9,14 +9,11 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import stat
-import struct
 import tempfile
-from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from v2v_protocol.errors import KeyRefused
 from v2v_protocol.safe_json import parse_json
@@ -26,14 +23,6 @@ VARIABLE = "V2V_KEYS"
 KEY_LETTERS = 40
 """Length of a CURVE key in Z85, characters."""
 _Z85 = "0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ.-:+=^!/*?&<>()[]{}@%$#"
-HANDSHAKE_EVENTS = 0x0800 | 0x1000 | 0x2000 | 0x4000
-"""Handshake events of a socket monitor: failed without detail, succeeded, protocol error, authentication failed."""
-_SILENT, _SUCCEEDED, _MECHANISM, _AUTHENTICATION = 0x0800, 0x1000, 0x2000, 0x4000
-_MISMATCH = 0x11000002
-_MOST_SILENT = 5
-"""Consecutive handshakes that the server ended without a reply; a server that is stopping may end one or two."""
-_ASK_EVERY = 5
-_OUR_SIGNATURE = b"\xff" + bytes(8) + b"\x7f\x03"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,12 +34,6 @@ class PeerKey:
     server: str
     public: str
     secret: str = field(repr=False)
-
-    def secure(self, socket: Any) -> None:
-        """Set this key on a ZeroMQ socket. Call it before the socket connects."""
-        socket.curve_serverkey = self.server.encode()
-        socket.curve_publickey = self.public.encode()
-        socket.curve_secretkey = self.secret.encode()
 
 
 def key_for(address: str, side: str, file: str | os.PathLike[str] | None) -> PeerKey | None:
@@ -148,86 +131,3 @@ def nameless_key(key: PeerKey) -> IO[bytes]:
     file.write(json.dumps(asdict(key)).encode())
     file.flush()
     return file
-
-
-class Handshakes:
-    """Count the handshakes of a socket that connects, from the events of its monitor.
-
-    Args:
-        address, key, side: of the socket, for messages.
-    """
-
-    def __init__(self, address: str, key: PeerKey | None, side: str) -> None:
-        self.succeeded = 0
-        self._is_proven = False  # that the server is the one of the key
-        self._silent = 0
-        self._address, self._side = address, side
-        self._mine = "no key was given" if key is None else f"{side} key {key.name!r}"
-        self._has_key = key is not None
-
-    def begin(self) -> None:
-        """Start again for a new socket."""
-        self.succeeded = 0
-
-    def take(self, waiting: Callable[[], int], receive: Callable[[], Sequence[bytes]]) -> None:
-        """Process the available events.
-
-        Args:
-            waiting: returns whether an event is available.
-            receive: returns the next event.
-
-        Raises:
-            KeyRefused: the two sides cannot agree.
-        """
-        while waiting():
-            event, value = struct.unpack("=Hi", receive()[0])
-            self._silent = self._silent + 1 if event == _SILENT else 0
-            if event == _SUCCEEDED:
-                self.succeeded += 1
-                self._is_proven = True
-            elif event == _AUTHENTICATION:
-                raise KeyRefused(
-                    f"{self._address} refuses {self._mine}: the key was revoked, or is not a {self._side} key there; "
-                    f"`v2v-keys list` on the server's host shows the valid keys"
-                )
-            elif (event == _MECHANISM and value == _MISMATCH) or self._is_lost():
-                raise KeyRefused(
-                    f"{self._address} asks for no key, and this side has one ({self._mine}): nothing was sent; leave "
-                    f"the key out (keys='', or no {VARIABLE}) only if you know that this server uses no keys"
-                    if self._has_key
-                    else f"{self._address} asks for a key, and {self._mine}: set {VARIABLE} (or keys=, --keys) to a "
-                    f"file that `v2v-keys new NAME --for {self._side}` made"
-                )
-            elif self._has_key and not self._is_proven and self._silent >= _MOST_SILENT:
-                raise KeyRefused(
-                    f"{self._address} ended {self._silent} handshakes without a reply: it is not the server that "
-                    f"{self._mine} was made for, or not a v2v server; ask for a new key file"
-                )
-
-    def _is_lost(self) -> bool:
-        """Return whether the two sides disagree about a key and the server's reply was lost. The server ends such a
-        handshake as soon as it notices, and the reply may be lost with the connection. So this side asks again from
-        time to time.
-        """
-        if self._is_proven or self._silent % _ASK_EVERY != 1:
-            return False
-        return mechanism_of(self._address) == (b"NULL" if self._has_key else b"CURVE")
-
-
-def mechanism_of(address: str, seconds: float = 2.0) -> bytes:
-    """Return the security mechanism of the server, from its greeting (ZMTP 3: 64 bytes, of which 20 name the
-    mechanism).
-
-    Returns:
-        ``b"CURVE"`` or ``b"NULL"``; empty if no such server answers in time.
-    """
-    host, _, port = address.removeprefix("tcp://").rpartition(":")
-    greeting = b""
-    try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout=seconds) as peer:
-            peer.sendall(_OUR_SIGNATURE)  # send no more: the side that has the whole greeting of the other decides
-            while len(greeting) < 64 and (piece := peer.recv(64 - len(greeting))):
-                greeting += piece
-    except (OSError, ValueError):
-        return b""
-    return greeting[12:32].rstrip(b"\0") if greeting[:1] == b"\xff" else b""

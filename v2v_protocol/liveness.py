@@ -39,6 +39,11 @@ class Liveness:
         self._wait = self._ping_seconds
         self._ask_at = now + self._wait
 
+    @property
+    def heard_at(self) -> float:
+        """When the peer was last heard."""
+        return self._heard
+
     def silence(self, now: float) -> float:
         """Return the seconds since the peer was heard."""
         return now - self._heard

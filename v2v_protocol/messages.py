@@ -15,7 +15,7 @@ float or str, and Mapping (plain values, checked by the code that uses them).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
@@ -122,6 +122,7 @@ class Welcome:
         sequences: N, samples of one epoch before ranks drop a remainder.
         credit: largest number of samples that the consumer may have requested and not yet received.
         quarantine: number of the quarantine snapshot that its samples are made under, until a new entry is written.
+        sidecars: names the files beside the videos that the requested arrays are made from; "" if there are none.
     """
 
     spec: Mapping[str, Any]
@@ -131,6 +132,7 @@ class Welcome:
     sequences: int
     credit: int
     quarantine: int = 0
+    sidecars: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,12 +270,14 @@ class LeaseFailed:
 
     Attributes:
         here: the worker's host cannot read the file, or has another one in its place; the video may be sound elsewhere.
+        sidecar: ending of the sidecar that failed, not the video; "" if the video failed.
     """
 
     lease: int
     frame: int | None
     reason: str
     here: bool = False
+    sidecar: str = ""
 
 
 # --- server -> worker -------------------------------------------------------------------------------------------------
@@ -305,6 +309,8 @@ class Lease:
         scene: ``Scene.to_bytes()`` of the needed part of the video; empty if the spec does not use scenes.
         arena, slot: memory that the sample may be written to, see :mod:`v2v_protocol.arena`; "" and 0: none.
         packed: whether to compress arrays that go into the message.
+        sidecars: fingerprints of the video's sidecars that the arrays are made from, by ending; a missing one is left
+            out.
     """
 
     lease: int
@@ -331,6 +337,7 @@ class Lease:
     arena: str = ""
     slot: int = 0
     packed: bool = False
+    sidecars: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

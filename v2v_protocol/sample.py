@@ -20,7 +20,27 @@ from v2v_protocol.tables import html_table
 LARGEST_SEED = 2**64 - 1
 LARGEST_EPOCH = 2**32 - 1
 LARGEST_INDEX = 2**48 - 1
-ARRAYS: dict[str, Callable[[Recipe, str], tuple[str, tuple[int, ...]]]] = {
+ArrayForm: TypeAlias = Callable[[Recipe, str], tuple[str, tuple[int, ...]]]
+
+
+@dataclass(frozen=True, slots=True)
+class FromSidecar:
+    """The form of an array that is made from a sidecar, a file or folder beside the video.
+
+    Attributes:
+        ending: of the sidecar's name, in the place of the video's: ".boxes.json" for ``clip.boxes.json`` beside
+            ``clip.mp4``; with a slash at its end for a folder.
+        form: dtype and shape, as for any array.
+    """
+
+    ending: str
+    form: ArrayForm
+
+    def __call__(self, recipe: Recipe, voxel_dtype: str) -> tuple[str, tuple[int, ...]]:
+        return self.form(recipe, voxel_dtype)
+
+
+ARRAYS: dict[str, ArrayForm] = {
     "voxels": lambda recipe, voxel_dtype: (voxel_dtype, (recipe.voxel_grids, recipe.bins, *recipe.crop_px)),
     "event_counts": lambda recipe, voxel_dtype: (
         voxel_dtype, (recipe.voxel_grids, 2, recipe.bins, *recipe.crop_px)
@@ -147,6 +167,7 @@ class Provenance:
         quarantine: number of the quarantine snapshot it was made under.
         scene: decisions from the statistics of its scene, and the figures behind them; empty with scene "off".
         saturated: as ``saturated_bins``, for other arrays by name; only those that have any.
+        sidecars: fingerprints of the sidecars that its arrays were made from, by ending.
     """
 
     id: SampleId
@@ -162,6 +183,7 @@ class Provenance:
     quarantine: int = 0
     scene: str = ""
     saturated: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    sidecars: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
         where = f"seed {self.id.seed}, epoch {self.id.epoch}, index {self.id.index}"
@@ -174,15 +196,16 @@ class Provenance:
         return html_table(f"{self.video}, from frame {self.start_frame}", rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values, as they travel in the sample's header; ``scene`` and ``saturated`` are left out if they
-        are empty.
+        """Return plain values, as they travel in the sample's header; ``scene``, ``saturated`` and ``sidecars`` are
+        left out if they are empty.
         """
         values = _fields(self) | {
             "id": _fields(self.id),
             "refusals": tuple(refusal.to_dict() for refusal in self.refusals),
             "params": self.params.to_dict(),
         }
-        return {name: value for name, value in values.items() if value or name not in ("scene", "saturated")}
+        optional = ("scene", "saturated", "sidecars")
+        return {name: value for name, value in values.items() if value or name not in optional}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Provenance:
@@ -229,6 +252,12 @@ def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> L
         if name not in ARRAYS:
             raise UsageError(f"arrays: unknown array {name!r}; known: {', '.join(ARRAYS)}")
     return {name: ARRAYS[name](recipe, voxel_dtype) for name in arrays}
+
+
+def sidecar_endings(arrays: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the endings of the sidecars that these arrays are made from, sorted."""
+    forms = (ARRAYS.get(name) for name in arrays)
+    return tuple(sorted({form.ending for form in forms if isinstance(form, FromSidecar)}))
 
 
 def layout_bytes(layout: Layout) -> int:

@@ -83,6 +83,12 @@ _TYPES: dict[str, type[Any]] = {
     "seen": Status,
 }
 _NAMES = {cls: name for name, cls in _TYPES.items()}
+_LATER: dict[type[Any], dict[str, Any]] = {
+    Welcome: {"sidecars": ""},
+    LeaseFailed: {"sidecar": ""},
+    Lease: {"sidecars": {}},
+}
+"""Fields that were added within a protocol version, with their defaults: a header leaves them out at the default."""
 
 
 def encode(message: Message) -> Frames:
@@ -95,6 +101,9 @@ def encode(message: Message) -> Frames:
     fields: dict[str, Any] = {"v": PROTOCOL_VERSION, "t": _NAMES[cls]}
     for name in _CHECKS[cls]:
         fields[name] = getattr(message, name)
+    for name, default in _LATER.get(cls, {}).items():
+        if fields[name] == default:
+            del fields[name]
     header = msgpack.packb(fields, use_bin_type=True)
     if len(header) > LARGEST_HEADER_BYTES:
         raise LimitExceeded(f"a {_NAMES[cls]} header of {len(header)} bytes; the limit is {LARGEST_HEADER_BYTES}")
@@ -197,6 +206,8 @@ def decode(header: Buffer, most_bytes: int = LARGEST_HEADER_BYTES) -> Message:
     if cls is None:
         raise ProtocolError(f"unknown message type {_shown(name)}")
     checks = _CHECKS[cls]
+    if fields.keys() != checks.keys():
+        fields = _LATER.get(cls, {}) | fields
     if fields.keys() != checks.keys():
         raise ProtocolError(f"{name}: fields {sorted(map(str, fields))[:40]!r:.400}, expected {sorted(checks)}")
     key = ""

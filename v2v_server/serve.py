@@ -20,6 +20,7 @@ from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, V2VError, VideoChanged, VideoError, VideoGone
+from v2v_protocol.link.guard import most_connections
 from v2v_protocol.progress import Progress
 from v2v_protocol.wire import encode
 from v2v_protocol.write_aside import write_aside_and_rename
@@ -37,16 +38,15 @@ from v2v_server.broker.actions import (
 )
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.door import most_connections
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, quarantine_path, read_quarantine, write_entry
-from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets, TurnedAway
+from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets
 from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
-from v2v_server.keys.callers import AWAY_SECONDS
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
+from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
+from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.schedule.summary import corpus_summary
 from v2v_server.status.publisher import StatusPublisher
@@ -249,8 +249,6 @@ class Server:
                 case ConsumerGone(identity):
                     self._dispatcher.consumer_gone(identity, now)
                     self._give_back_at = min(self._give_back_at, now + _GIVE_BACK_SECONDS)
-                case TurnedAway():
-                    self._say(_turned_away(arrival), "warning")
         if now >= self._next_tick:
             self._next_tick = now + _TURN_SECONDS
             for name, stalled in self._pool.stalled(now).items():
@@ -390,9 +388,10 @@ class Server:
         alike) that the worker's host does not have it.
         """
         try:
-            self._catalogue.check(missing.video, missing.fingerprint)
+            self._catalogue.check(missing.video, missing.fingerprint, missing.sidecar)
         except (VideoChanged, VideoGone):
-            self._catalogue.mark_stale(missing.video)
+            if not missing.sidecar:
+                self._catalogue.mark_stale(missing.video)
             return False
         except (VideoError, CorpusError):
             return False
@@ -401,8 +400,9 @@ class Server:
             self._missing_told = now
             name = clean_name(self._name(missing.identity).decode())
             is_local = self._catalogue.source.is_local
+            file = f"the sidecar {missing.sidecar} of {missing.video}" if missing.sidecar else missing.video
             self._say(
-                f"worker {name} failed on {missing.video}, which "
+                f"worker {name} failed on {file}, which "
                 f"{'is on this host as catalogued' if is_local else 'is not known to be gone or changed'}: "
                 f"{missing.reason}; other workers make the sample, and this one gets no work for {REST_SECONDS:g} s. "
                 "Check --videos on its host",
@@ -460,19 +460,6 @@ class Server:
         if identity is not None:
             about["sample"] = asdict(identity)
         self._log.say(text, level, **about)
-
-
-def _turned_away(news: TurnedAway) -> str:
-    times = f"rejected, for {AWAY_SECONDS:g} s at a time, until that ends; existing connections continue"
-    if news.address:
-        return (
-            f"{news.address} opens connections for {news.side}s and sends nothing: new ones from this address are "
-            f"{times}"
-        )
-    return (
-        f"connections for {news.side}s close before their addresses can be read: hosts that have sent no message "
-        f"within the hour are {times}"
-    )
 
 
 def _private_address(label: str) -> str:

@@ -3,6 +3,8 @@
     python -m bench.chaos.hostile --address tcp://127.0.0.1:5555 --kind parts
 
     parts      raw peers that send a message without end: every part has the MORE flag
+    unfinished opens connections and sends 380 kB of empty parts on each, just below the limit of one connection
+    segments   the same with parts of 34 bytes, each in a TCP segment of its own
     headers    the largest and most expensive header that is allowed, as fast as possible
     hello      sends Hello ten times a second, requests as much as allowed, and never reads
     leave      sends Hello under a new name and disconnects, repeatedly: its sessions stay
@@ -17,32 +19,34 @@
     handshakes only with keys: sends the recorded first message of a handshake over new connections: cheap for the
                sender, expensive for the server
 
-They connect from 127.0.0.2 to a server at 127.0.0.1, so that measures against their host do not hit other peers. If
-`V2V_KEYS` names a consumer's key they use it, except for `parts`. A disconnected peer reconnects. Nothing is checked
-here: the effect on other peers counts.
+If `V2V_KEYS` names a consumer's key they use it, except for `parts`, `unfinished` and `segments`. A disconnected peer
+reconnects. Nothing is checked here: the effect on other peers counts.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import json
 import os
+import select
 import signal
 import socket
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NoReturn
 
-import zmq
-
+from v2v_protocol.errors import KeyRefused, V2VError
 from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
-from v2v_protocol.keys import key_for, read_key
+from v2v_protocol.keys import PeerKey, key_for, read_key
+from v2v_protocol.link.curve import new_key_pair
+from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import GetStatus, Goodbye, Hello, Status, Want
 from v2v_protocol.spec import SpecOptions
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, decode, encode
@@ -50,11 +54,12 @@ from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, decode, en
 PEERS = 8
 IDLE_EACH = 125  # Connections of each idle peer: a thousand of all eight
 _GREETING = b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0%s" + bytes(1 + 31)
-_READY = b"\x04\x19\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
+_READY = b"\x04\x1c\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
 _PART = b"\x01\xff" + bytes(255)
 SPEC = {"recipe": {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}}
-_REFUSAL_MS = 2000
-_ELSEWHERE = "127.0.0.2"
+_REFUSAL_SECONDS = 2.0
+_UNFINISHED_EACH = 8  # connections with unfinished messages of each peer
+_UNFINISHED_BYTES = 380_000
 _tally: Path | None = None
 _GREETING_BYTES, _HELLO_BYTES, _WELCOME_BYTES = 64, 202, 170  # with their framing
 SLOW_SPEC: SpecOptions = {"flow_method": "dis-fast-1", "flow_margin_px": -1}
@@ -64,7 +69,32 @@ def parts(address: str, number: int) -> None:
     """Act as a peer of this kind until it is disconnected; likewise the functions below."""
     with _raw(address) as peer:
         while True:
-            peer.sendall(_PART * 256)
+            _push(peer, _PART * 256)
+
+
+def unfinished(address: str, number: int) -> None:
+    """See the module."""
+    _hold(address, b"\x01\x00" * 1000)
+
+
+def segments(address: str, number: int) -> None:
+    """See the module."""
+    _hold(address, b"\x01\x22" + bytes(34))
+
+
+def _hold(address: str, piece: bytes) -> None:
+    """Send pieces of a message without end over several connections, and hold these until one is ended."""
+    with ExitStack() as stack:
+        peers = [stack.enter_context(_raw(address)) for _ in range(_UNFINISHED_EACH)]
+        for peer in peers:
+            peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        for _ in range(_UNFINISHED_BYTES // len(piece)):
+            for peer in peers:
+                _push(peer, piece)
+        while True:
+            for peer in select.select(peers, [], [])[0]:
+                if not peer.recv(1 << 16):
+                    return
 
 
 def headers(address: str, number: int) -> None:
@@ -73,46 +103,47 @@ def headers(address: str, number: int) -> None:
     costly = b"\xdd" + items.to_bytes(4, "big") + b"\x90" * MOST_CONTAINERS + bytes(items - MOST_CONTAINERS)
     with _dealer(address, number) as peer:
         for _ in range(64):  # the server disconnects such a peer
-            peer.send(costly)
+            peer.send([costly])
 
 
 def hello(address: str, number: int) -> None:
     """See the module."""
     with _dealer(address, number) as peer:
         for epoch in itertools.count():
-            peer.send_multipart(encode(Hello(SPEC, ("voxels", "frames"), 2000, number)))
-            peer.send_multipart(encode(Want(epoch, tuple(range(256)))))
+            peer.send(encode(Hello(SPEC, ("voxels", "frames"), 2000, number)))
+            peer.send(encode(Want(epoch, tuple(range(256)))))
             time.sleep(0.1)
 
 
 def leave(address: str, number: int) -> None:
     """See the module."""
     with _dealer(address, None) as peer:
-        peer.send_multipart(encode(Hello(SPEC, ("voxels",), 8, number)))
-        peer.poll(1000)
+        peer.send(encode(Hello(SPEC, ("voxels",), 8, number)))
+        peer.receive(1.0)
 
 
 def thief(address: str, number: int) -> None:
     """See the module."""
     with _dealer(address, number) as peer:
-        peer.send_multipart(encode(GetStatus()))
-        if not peer.poll(_REFUSAL_MS):
+        peer.send(encode(GetStatus()))
+        frames = peer.receive(_REFUSAL_SECONDS)
+        if frames is None:
             return
-        seen = decode(peer.recv_multipart()[0])
+        seen = decode(frames[0])
     shown = json.loads(seen.json)["consumers"] if isinstance(seen, Status) else []
     for each in shown:
         for name in (each["id"].encode(), bytes.fromhex(each["id"])):
             with _dealer(address, name) as peer:
-                peer.send_multipart(encode(Goodbye()))
-                peer.send_multipart(encode(Hello(SPEC, ("voxels",), 8, number)))
-                peer.poll(100)
+                peer.send(encode(Goodbye()))
+                peer.send(encode(Hello(SPEC, ("voxels",), 8, number)))
+                peer.receive(0.1)
 
 
 def look(address: str, number: int) -> None:
     """See the module."""
     with _dealer(address, number) as peer:
         while True:
-            peer.send_multipart(encode(GetStatus()))
+            peer.send(encode(GetStatus()))
 
 
 def idle(address: str, number: int) -> None:
@@ -133,7 +164,7 @@ def flood(address: str, number: int) -> None:
     """See the module."""
     with _connected(address) as peer:
         while True:
-            peer.sendall(os.urandom(1 << 16))
+            _push(peer, os.urandom(1 << 16))
 
 
 def trickle(address: str, number: int) -> None:
@@ -172,20 +203,23 @@ class Refused:
 
     def __call__(self, address: str, number: int) -> None:
         known, revoked = read_key(Path(os.environ[KEY_VARIABLE])), read_key(self.revoked)
-        public, secret = (half.decode() for half in zmq.curve_keypair())
+        public, secret = new_key_pair()
         unknown = replace(known, public=public, secret=secret)
         for key, where in ((unknown, address), (revoked, address), (known, self.worker_address)):
-            peer: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
-            monitor = peer.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_AUTH)
+            if _is_refused(where, key):
+                _count()
+
+
+def _is_refused(address: str, key: PeerKey) -> bool:
+    with _closing(Dealer(address, key, beside=_first())) as peer:
+        deadline = time.monotonic() + _REFUSAL_SECONDS
+        while (left := deadline - time.monotonic()) > 0:
+            peer.receive(left)
             try:
-                peer.setsockopt(zmq.LINGER, 0)
-                key.secure(peer)
-                peer.connect(_from_elsewhere(where))
-                if monitor.poll(_REFUSAL_MS):
-                    _count()
-            finally:
-                peer.disable_monitor()
-                peer.close()
+                peer.has_reconnected()
+            except KeyRefused:
+                return True
+    return False
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,20 +231,15 @@ class Handshakes:
     @classmethod
     def recorded(cls) -> Handshakes:
         """Record what a peer with the key of ``V2V_KEYS`` sends to a server that only listens."""
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            peer: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
-            try:
-                peer.setsockopt(zmq.LINGER, 0)
-                read_key(Path(os.environ[KEY_VARIABLE])).secure(peer)
-                peer.connect(f"tcp://127.0.0.1:{server.getsockname()[1]}")
-                link, _ = server.accept()
-                with link:
-                    link.sendall(_GREETING % b"CURVE".ljust(20, b"\0"))
-                    said = b""
-                    while len(said) < _GREETING_BYTES + _HELLO_BYTES:
-                        said += link.recv(4096)
-            finally:
-                peer.close()
+        with (
+            socket.create_server(("127.0.0.1", 0)) as server,
+            _closing(Dealer(f"tcp://127.0.0.1:{server.getsockname()[1]}", beside=_first())),
+            server.accept()[0] as link,
+        ):
+            link.sendall(_GREETING % b"CURVE".ljust(20, b"\0"))
+            said = b""
+            while len(said) < _GREETING_BYTES + _HELLO_BYTES:
+                said += link.recv(4096)
         return cls(said)
 
     def __call__(self, address: str, number: int) -> None:
@@ -223,7 +252,8 @@ class Handshakes:
 
 
 KINDS: dict[str, Callable[[str, int], None]] = {
-    each.__name__: each for each in (parts, headers, hello, leave, thief, look, idle, flood, trickle, slow)
+    each.__name__: each
+    for each in (parts, unfinished, segments, headers, hello, leave, thief, look, idle, flood, trickle, slow)
 }
 REFUSED, HANDSHAKES = "refused", "handshakes"
 KEYED_KINDS = (REFUSED, HANDSHAKES)
@@ -234,7 +264,7 @@ def attack(address: str, kind: str, act: Callable[[str, int], None]) -> NoReturn
 
     def live(number: int) -> NoReturn:
         while True:
-            with suppress(OSError, zmq.ZMQError):  # disconnected, or the server restarts
+            with suppress(OSError, V2VError):  # disconnected, or the server restarts
                 act(address, number)
             time.sleep(0.01)
 
@@ -258,9 +288,24 @@ def _raw(address: str) -> Iterator[socket.socket]:
 
 def _connected(address: str) -> socket.socket:
     host, _, port = address.removeprefix("tcp://").rpartition(":")
-    link = socket.create_connection((host, int(port)), 5.0, (_ELSEWHERE, 0) if host == "127.0.0.1" else None)
+    link = socket.create_connection((host, int(port)), 5.0)
     _count()
     return link
+
+
+def _push(peer: socket.socket, data: bytes) -> None:
+    """Send data, and notice at once if the server ends the connection, which ``sendall`` does not.
+
+    Raises:
+        ConnectionError: the server has ended the connection.
+    """
+    left = memoryview(data)
+    while left:
+        readable, writable, _ = select.select([peer], [peer], [])
+        if readable and not peer.recv(1 << 16):
+            raise ConnectionResetError
+        if writable:
+            left = left[peer.send(left) :]
 
 
 def _count() -> None:
@@ -270,35 +315,37 @@ def _count() -> None:
             file.write(b".")
 
 
-def _from_elsewhere(address: str) -> str:
-    """Return the address with 127.0.0.2 as source, for ZeroMQ."""
-    return address.replace("tcp://127.0.0.1:", f"tcp://{_ELSEWHERE}:0;127.0.0.1:")
+@functools.cache
+def _first() -> Dealer:
+    """Return the dealer whose context and thread all others share."""
+    return Dealer("", "")
 
 
 @contextmanager
-def _dealer(address: str, number: int | bytes | None) -> Iterator[zmq.Socket[bytes]]:
+def _closing(peer: Dealer) -> Iterator[Dealer]:
+    """Connect a peer; close it at the end of the block."""
+    try:
+        peer.connect()
+        yield peer
+    finally:
+        peer.close()
+
+
+@contextmanager
+def _dealer(address: str, number: int | bytes | None) -> Iterator[Dealer]:
     """Connect a peer that takes one message at a time.
 
     Args:
         address: of the server.
         number: of the peer, which makes its routing id; or that id; None takes a new one.
     """
-    peer: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
-    try:
-        if isinstance(number, bytes):
-            name = number
-        else:
-            name = b"leaver-" + os.urandom(8) if number is None else b"hostile-%d-%d" % (os.getpid(), number)
-        peer.setsockopt(zmq.ROUTING_ID, name)
-        peer.setsockopt(zmq.LINGER, 0)
-        peer.setsockopt(zmq.RCVHWM, 1)
-        peer.setsockopt(zmq.SNDTIMEO, 2000)
-        if key := key_for(address, "consumer", None):
-            key.secure(peer)
-        peer.connect(_from_elsewhere(address))
+    if isinstance(number, bytes):
+        name = number
+    else:
+        name = b"leaver-" + os.urandom(8) if number is None else b"hostile-%d-%d" % (os.getpid(), number)
+    options: dict[str, int | bytes] = {"ROUTING_ID": name, "RCVHWM": 1, "SNDHWM": 1000, "SNDTIMEO": 2000}
+    with _closing(Dealer(address, options=options, beside=_first())) as peer:
         yield peer
-    finally:
-        peer.close()
 
 
 def main() -> NoReturn:

@@ -25,13 +25,13 @@ from typing import Any
 import av
 import numpy as np
 import numpy.typing as npt
-import zmq
 from av.video.frame import VideoFrame
 
 from bench.processes import Roles
 from v2v_client.local_server import LocalServer
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import RemoteError, ServerLost
+from v2v_protocol.link.dealer import Dealer, wait
 from v2v_protocol.messages import (
     Begun,
     Denied,
@@ -46,7 +46,7 @@ from v2v_protocol.messages import (
 )
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, SampleId, SampleParams
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, encode_sample
+from v2v_protocol.wire import decode, encode, encode_sample
 from v2v_server.system.process import die_with_parent, keep_freed_memory
 from v2v_server.worker.output_buffer import open_output_buffer, pack, sample_message
 from v2v_server.worker.produce import sample_layout
@@ -80,27 +80,21 @@ class NullWorkers:
 
     def __init__(self, address: str, count: int, samples: Ready | None = None) -> None:
         self._samples = samples
-        self._context = zmq.Context()
-        self._poller = zmq.Poller()
-        self._names: dict[zmq.Socket[bytes], str] = {}
-        self._joining: set[zmq.Socket[bytes]] = set()
-        self._leases: dict[zmq.Socket[bytes], deque[Lease]] = defaultdict(deque)
-        self._begun: dict[zmq.Socket[bytes], int] = {}
+        self._first = Dealer(address, "", "worker")
+        self._names: dict[Dealer, str] = {}
+        self._stopped: list[Dealer] = []
+        self._joining: set[Dealer] = set()
+        self._leases: dict[Dealer, deque[Lease]] = defaultdict(deque)
+        self._begun: dict[Dealer, int] = {}
         for number in range(count):
-            link = self._context.socket(zmq.DEALER)
+            link = Dealer(address, "", "worker", beside=self._first)
             name = f"null-{os.getpid()}-{number}"
-            link.setsockopt(zmq.ROUTING_ID, name.encode())
-            link.setsockopt(zmq.LINGER, 0)
-            link.setsockopt(zmq.MAXMSGSIZE, LARGEST_HEADER_BYTES)
-            link.setsockopt(zmq.SNDHWM, 0)
-            link.setsockopt(zmq.RCVHWM, 0)
-            link.connect(address)
+            link.connect()
             self._names[link] = name
-            self._poller.register(link, zmq.POLLIN)
-            link.send_multipart(encode(WorkerHello(name, NUMERICS_VERSION, CREDIT)))
+            link.send(encode(WorkerHello(name, NUMERICS_VERSION, CREDIT)))
             # The server does not answer a hello; it answers the ping after it.
             self._joining.add(link)
-            link.send_multipart(encode(Ping()))
+            link.send(encode(Ping()))
 
     def run(self) -> None:
         """Answer leases until the server stops all workers; print "joined" once it knows all of them.
@@ -112,19 +106,21 @@ class NullWorkers:
         try:
             while self._names:
                 waiting = not any(self._leases.values())
-                for link, _ in self._poller.poll(int(_PING_SECONDS * 1000) if waiting else 0):
-                    self._handle(link, decode(link.recv_multipart()[0]))
+                for link in wait([*self._names], _PING_SECONDS if waiting else 0):
+                    if (frames := link.receive(0)) is not None:
+                        self._handle(link, decode(frames[0]))
                 for link, leases in self._leases.items():
                     if leases:
                         self._answer(link, leases)
                 if time.monotonic() >= next_ping:
                     next_ping = time.monotonic() + _PING_SECONDS
                     for link in self._names:
-                        link.send_multipart(encode(Ping()))
+                        link.send(encode(Ping()))
         finally:
-            self._context.destroy(linger=0)
+            for link in (*self._stopped, *self._names, self._first):
+                link.close()
 
-    def _handle(self, link: zmq.Socket[bytes], message: Message) -> None:
+    def _handle(self, link: Dealer, message: Message) -> None:
         match message:
             case Lease():
                 self._leases[link].append(message)
@@ -133,23 +129,23 @@ class NullWorkers:
                 if not self._joining:
                     print("joined", flush=True)
             case Stop():
-                link.send_multipart(encode(Goodbye()))
-                self._poller.unregister(link)
+                link.send(encode(Goodbye()))
                 del self._names[link]
+                self._stopped.append(link)
                 self._leases.pop(link, None)
             case Denied(code, text):
                 raise RemoteError(code, text)
             case _:
                 pass
 
-    def _answer(self, link: zmq.Socket[bytes], leases: deque[Lease]) -> None:
+    def _answer(self, link: Dealer, leases: deque[Lease]) -> None:
         """Answer the oldest lease with the messages of a worker that already holds the next one."""
         lease = leases.popleft()
         if self._begun.get(link) != lease.lease:
-            link.send_multipart(encode(Begun(lease.lease)))
+            link.send(encode(Begun(lease.lease)))
         begins = self._begun[link] = leases[0].lease if leases else 0
         frames = answer(lease, self._names[link], self._samples)
-        link.send_multipart([*encode(Result(lease.lease, begins)), *frames], copy=False)
+        link.send([*encode(Result(lease.lease, begins)), *frames])
 
 
 def answer(lease: Lease, name: str, samples: Ready | None = None) -> list[Any]:

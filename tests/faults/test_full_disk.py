@@ -23,11 +23,11 @@ from tests.stream.conftest import SMALL_FLAGS, digest, epoch_of
 from tests.waiting import until
 from v2v_client import Batch
 from v2v_client.local_server import LocalServer
-from v2v_server.broker.quarantine import read_quarantine
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.manifest import read_manifest
 from v2v_server.prepare.prepare import prepare
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX
+from v2v_server.quarantine.file import read_quarantine
 from v2v_server.simulation.variants import warm_up
 from v2v_server.store.encoding import Encoding
 from v2v_server.video.fingerprint import fingerprint

@@ -25,10 +25,11 @@ from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.counters import Counters
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, read_quarantine
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.sources.folder import Folder
+from v2v_server.quarantine.file import read_quarantine
+from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.serve import Server, question_workers
 from v2v_server.system import clock as clock_module
 
@@ -151,7 +152,7 @@ def test_a_record_waits_for_another_writer_and_the_server_does_not(is_freed: boo
 
 @pytest.mark.parametrize("found", [True, False])
 def test_what_is_looked_for_is_reported(found: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def check(id: str, fingerprint: str) -> None:
+    def check(id: str, fingerprint: str, sidecar: str) -> None:
         if not found:
             raise VideoChanged("a.mp4", None, "another file")
 

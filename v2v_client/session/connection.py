@@ -16,23 +16,46 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any, Protocol
 
 from v2v_client.position.state import StreamIdentity
 from v2v_client.session.conversation import WAIT_REPORT_SECONDS, Arrival, Conversation
-from v2v_client.session.link import Link, Transport
 from v2v_client.session.liveness import ListeningClock, Patience
 from v2v_client.session.states import Event, State
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ServerLost, UsageError
+from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Hello, SampleHeader
 from v2v_protocol.sample import Layout, Provenance
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, largest_frame_bytes
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames, decode, encode, largest_frame_bytes
 
 _GOODBYE_LINGER_MS = 250
 """Time that closing may spend on sending the Goodbye. Without it the server would go on making requested samples."""
 _NO_SLOTS: Mapping[int, Slot] = {}
 
 _log = logging.getLogger(__name__)
+
+
+class Transport(Protocol):
+    """The interface of :class:`Dealer`, which tests implement with queues. After ``close`` methods raise ServerLost."""
+
+    def connect(self, largest_frame_bytes: int, *, again: bool = False) -> None:
+        """See :meth:`Dealer.connect`."""
+
+    def disconnect(self, *, linger_ms: int) -> None:
+        """See :meth:`Dealer.disconnect`."""
+
+    def send(self, frames: Sequence[Any]) -> None:
+        """See :meth:`Dealer.send`."""
+
+    def receive(self, seconds: float) -> Frames | None:
+        """See :meth:`Dealer.receive`."""
+
+    def has_reconnected(self) -> bool:
+        """See :meth:`Dealer.has_reconnected`."""
+
+    def close(self) -> None:
+        """See :meth:`Dealer.close`."""
 
 
 class Connection:
@@ -60,7 +83,7 @@ class Connection:
         pinned_by: str = "this dataset",
         patience: Patience | None = None,
         clock: Callable[[], float] = time.monotonic,
-        transport: Callable[[str], Transport] = Link,
+        transport: Callable[[str], Transport] = Dealer,
     ) -> None:
         hello = replace(hello, secret=secrets.token_bytes(32))
         self._brokers = (address,) if isinstance(address, str) else tuple(address)

@@ -14,9 +14,9 @@ from v2v_client.options import Options
 from v2v_client.position.state import ResumeState
 from v2v_client.session.brokers import order
 from v2v_client.session.connection import Connection
-from v2v_client.session.link import Link
 from v2v_client.session.liveness import Patience
 from v2v_protocol.errors import ServerLost
+from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Hello
 
 _log = logging.getLogger(__name__)
@@ -101,7 +101,7 @@ class Connector:
             pinned=state.stream,
             pinned_by="this dataset" if state.is_beginning else "the saved state",
             patience=patience or self.patience,
-            transport=functools.partial(Link, keys=self.keys),
+            transport=functools.partial(Dealer, keys=self.keys),
         )
 
     def compare(self, connection: Connection, member: ConsumerId, state: ResumeState) -> None:

@@ -8,12 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from v2v_protocol.errors import ProtocolError, VersionMismatch
 from v2v_protocol.messages import Denied, ErrorCode, Lease
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Frames, encode
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import QuarantineEntry
+from v2v_server.quarantine.snapshots import QuarantineEntry
 
 _LONGEST_TEXT = 2000
 """Characters of a denial. It quotes what the peer sent, which may be long, and must fit a header."""
@@ -80,13 +81,14 @@ class AddToQuarantine:
 
 @dataclass(frozen=True, slots=True)
 class CheckVideo:
-    """Check whether this host has a video as catalogued, because a worker cannot read it on its own host.
+    """Check whether this host has a video (or its sidecar) as catalogued, because a worker cannot read it on its host.
 
     Attributes:
         video, fingerprint: of the file.
         identity: routing id of the worker.
         frame, reason: what the worker reported.
         request: the request that it could not make.
+        sidecar: ending of the video's sidecar that is meant, with its fingerprint; "": the video itself.
     """
 
     video: str
@@ -95,6 +97,7 @@ class CheckVideo:
     frame: int | None
     reason: str
     request: Request
+    sidecar: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,3 +134,8 @@ Action: TypeAlias = (
 def denial(code: ErrorCode, text: str) -> Frames:
     """Build a Denied message, shortened to fit a header."""
     return encode(Denied(code, text if len(text) <= _LONGEST_TEXT else text[:_LONGEST_TEXT] + " ..."))
+
+
+def malformed(error: ProtocolError) -> Frames:
+    """Build the reply to a message that cannot be used."""
+    return denial(ErrorCode.VERSION if isinstance(error, VersionMismatch) else ErrorCode.MALFORMED, str(error))

@@ -11,16 +11,16 @@ from v2v_protocol.messages import Hello, Welcome
 from v2v_protocol.sample import array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES
-from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.session import Session
 from v2v_server.broker.worker_registry import clean_name
 from v2v_server.corpus.videos import CorpusFacts
+from v2v_server.quarantine.snapshots import Quarantine
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import Columns, SequenceTable
 
 MOST_BATCH_SIZE = 65_536
 MOST_CREDIT = 400
-"""Less than ``transport.MOST_QUEUED``, the number of queued messages at which a consumer is disconnected."""
+"""Less than ``router.MOST_QUEUED``, the number of queued messages at which a consumer is disconnected."""
 MOST_TABLES = 16
 """Sequence tables cached for later consumers. A session keeps its own, which is small."""
 
@@ -127,6 +127,7 @@ class Admission:
             sequences=schedule.count,
             credit=session.credit,
             quarantine=quarantine,
+            sidecars=self._facts.sidecars_digest(hello.arrays),
         )
 
     def _check_sizes(self, layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:

@@ -13,11 +13,11 @@ from dataclasses import replace
 from v2v_protocol.messages import Unavailable
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.wire import encode
-from v2v_server.broker.actions import Action, AddToQuarantine, ReportRefusal, ToConsumer
+from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, ReportRefusal, ToConsumer
 from v2v_server.broker.counters import Counters
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
 from v2v_server.broker.session import Session, Sessions
+from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.schedule.epoch import MOST_CANDIDATES
 from v2v_server.schedule.sequences import VideoSequence
 
@@ -126,11 +126,20 @@ class Candidates:
         if passed_over.candidate < MOST_CANDIDATES and session.spec.on_bad_video == "substitute":
             self._sessions.put_back(replace(passed_over, deaths=0))
             return actions
+        return [*actions, *self.fail(request, "; ".join(dict.fromkeys(map(str, passed_over.refusals))))]
+
+    def blame(self, failure: CheckVideo) -> list[Action]:
+        """Refuse a video. A sidecar never changes which video is shown: its consumer gets an error instead."""
+        if failure.sidecar:
+            return self.fail(failure.request, f"{failure.video}: its sidecar {failure.sidecar}: {failure.reason}")
+        return self.refuse(failure.request, failure.frame, failure.reason)
+
+    def fail(self, request: Request, text: str) -> list[Action]:
+        """Tell the consumer that a sample is unavailable, without blaming its video."""
         if not self._sessions.mark_answered(request, 0.0):
-            return actions
+            return []
         self._counters.unavailable += 1
-        text = "; ".join(dict.fromkeys(map(str, passed_over.refusals)))
-        return [*actions, ToConsumer(request.session, encode(Unavailable(request.epoch, request.index, text)))]
+        return [ToConsumer(request.session, encode(Unavailable(request.epoch, request.index, text)))]
 
 
 def next_candidate(request: Request, refusal: Refusal) -> Request:

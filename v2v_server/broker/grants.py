@@ -183,6 +183,7 @@ def lease_for(
         arena="" if request.slot is None else request.slot.arena,
         slot=NO_SLOT if request.slot is None else request.slot.number,
         packed=packed,
+        sidecars=facts.sidecars_of(video.id, arrays),
     )
 
 

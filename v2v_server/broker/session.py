@@ -54,6 +54,8 @@ class ConsumerTotals:
     Attributes:
         number: of the consumer, from 0; no other one has it.
         since: when it came, or returned after :data:`AWAY_SECONDS` or more.
+        left_at: when its last session ended; None while it has one.
+        present_seconds: for how long it was there before ``since``.
         served: samples sent.
         waited_seconds: time that it waited for samples, as it reports.
         passed: by how many indices its position advanced, over all epochs.
@@ -61,9 +63,21 @@ class ConsumerTotals:
 
     number: int
     since: float
+    left_at: float | None = None
+    present_seconds: float = 0.0
     served: int = 0
     waited_seconds: float = 0.0
     passed: int = 0
+
+    def present(self, now: float) -> float:
+        """Return for how long it was there until now; pauses shorter than :data:`AWAY_SECONDS` count."""
+        return self.present_seconds + (now if self.left_at is None else self.left_at) - self.since
+
+    def resume(self, now: float) -> None:
+        """Note a new session of the consumer."""
+        if self.left_at is not None and now - self.left_at >= AWAY_SECONDS:
+            self.present_seconds, self.since = self.present(now), now
+        self.left_at = None
 
 
 @dataclass(slots=True)
@@ -158,7 +172,7 @@ class Sessions:
     def __init__(self, leases: LeaseBook) -> None:
         self._leases = leases
         self._sessions: dict[bytes, Session] = {}
-        self._departed: deque[tuple[tuple[object, ...], Liveness, ConsumerTotals]] = deque(maxlen=_MOST_DEPARTED)
+        self._departed: deque[tuple[tuple[object, ...], ConsumerTotals]] = deque(maxlen=_MOST_DEPARTED)
         self._numbers = count()
         self._queue = FairQueue()
 
@@ -186,16 +200,16 @@ class Sessions:
     def totals(self) -> Iterator[ConsumerTotals]:
         """Yield the totals of all consumers, and of those that left and may return."""
         yield from (session.totals for session in self)
-        yield from (totals for _, _, totals in self._departed)
+        yield from (totals for _, totals in self._departed)
 
     def _totals_of(self, session: Session) -> ConsumerTotals:
         """Return the totals of the consumer that opens a session: those of its last one, if it left a moment ago."""
+        wanted, earliest = session.display, session.since - RETURN_SECONDS
         for place in range(len(self._departed) - 1, -1, -1):
-            display, liveness, totals = self._departed[place]
-            if display == session.display and liveness.silence(session.since) < RETURN_SECONDS:
+            display, totals = self._departed[place]
+            if display == wanted and (totals.left_at or 0.0) > earliest:
                 del self._departed[place]
-                if liveness.silence(session.since) >= AWAY_SECONDS:
-                    totals.since = session.since
+                totals.resume(session.since)
                 return totals
         return ConsumerTotals(next(self._numbers), session.since)
 
@@ -207,7 +221,8 @@ class Sessions:
         """Drop a session, if there is one; its debt is remembered."""
         session = self._sessions.pop(identity, None)
         if session is not None:
-            self._departed.append((session.display, session.liveness, session.totals))
+            session.totals.left_at = session.liveness.heard_at
+            self._departed.append((session.display, session.totals))
             self._queue.remove(identity)
 
     def charge(self, identity: bytes, seconds: float) -> None:

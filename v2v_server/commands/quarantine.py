@@ -16,8 +16,9 @@ from pathlib import Path
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.records import write_json
-from v2v_server.broker.quarantine import Quarantine, clearing, quarantine_path, read_quarantine, write_entry
 from v2v_server.corpus.sources.source import SourceOptions, open_source
+from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
+from v2v_server.quarantine.snapshots import Quarantine, clearing
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +14,7 @@ import numpy as np
 from v2v_protocol.errors import CorpusError, IndexUnreadable, VideoChanged
 from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal, RefusalKind
+from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.corpus import Corpus, format_problems, list_corpus
 from v2v_server.corpus.index.columns import VideoTable
@@ -23,8 +24,10 @@ from v2v_server.corpus.probe import Progress
 from v2v_server.corpus.refresh import index_path, refresh_index
 from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.corpus.sidecars import Sidecars, collect_sidecars
 from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.listfile import ListEntry
+from v2v_server.corpus.sources.sidecar import sidecar_id
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
 from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos
 from v2v_server.store.clips import STORE_FORMAT
@@ -56,6 +59,7 @@ class Catalogue:
             are those of its source in number, order, id and frames, so that every position means the same frames;
             one without a sound prepared file is refused when it is opened, like a damaged one.
         scene_digest: names this snapshot together with the statistics of its videos; None without them.
+        sidecars: the files beside the videos that arrays can be made from, by ending.
     """
 
     source: VideoSource
@@ -66,6 +70,7 @@ class Catalogue:
     digest: str
     prepared: Header | None
     scene_digest: str | None
+    sidecars: Mapping[str, Sidecars]
     _store: Store = field(repr=False, compare=False)
     _files: dict[str, str] = field(repr=False, compare=False)  # of what is prepared, that of the file that lies here
     _absent: dict[str, PreparedVideo] = field(repr=False, compare=False)
@@ -88,8 +93,8 @@ class Catalogue:
         self._fingerprint(id)
         return self.folder / id
 
-    def check(self, id: str, fingerprint: str) -> None:
-        """Check that the video is as catalogued, see :meth:`VideoSource.verify`.
+    def check(self, id: str, fingerprint: str, sidecar: str = "") -> None:
+        """Check that the video is as catalogued, or its sidecar of that ending, see :meth:`VideoSource.verify`.
 
         Raises:
             CorpusError: there is no such id in this catalogue.
@@ -99,7 +104,7 @@ class Catalogue:
         state = None
         with suppress(sqlite3.Error):
             state = self._store.state(id)
-        self.source.verify(id, fingerprint, state)
+        self.source.verify(sidecar_id(id, sidecar) if sidecar else id, fingerprint, state)
 
     def frame_index(self, id: str) -> FrameIndex:
         """The frames of a video, read from the index on disk.
@@ -183,7 +188,7 @@ class Catalogue:
     @property
     def facts(self) -> CorpusFacts:
         """What is known in memory: all that a server's dispatcher needs."""
-        return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest)
+        return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars)
 
     def digest_under(self, scene: str) -> str:
         """See :meth:`CorpusFacts.digest_under`."""
@@ -269,14 +274,19 @@ def open_catalogue(
     store, table, notes = refresh_index(opened, corpus.ids, path, scenes, processes, progress, notice)
     try:
         with without_collections():
-            return _snapshot(corpus, table, notes, store, scenes)
+            return _snapshot(corpus, table, notes, store, scenes, notice)
     except BaseException:
         store.close()
         raise
 
 
 def _snapshot(
-    corpus: Corpus, on_disk: VideoTable, notes: list[str], store: Store, scenes: SceneCollection | None
+    corpus: Corpus,
+    on_disk: VideoTable,
+    notes: list[str],
+    store: Store,
+    scenes: SceneCollection | None,
+    notice: Notice | None,
 ) -> Catalogue:
     source, manifest, table = corpus.source, corpus.source.manifest, on_disk
     problems, files = dict(corpus.refused), dict[str, str]()
@@ -328,6 +338,11 @@ def _snapshot(
         videos = Videos(table, thresholds, split)
         if died := sorted(unknown - absent.keys()):
             notes = [*notes, f"{len(died)} videos crash the decoder that analyses their scenes: {died[0]}"]
+    sidecars = dict[str, Sidecars]()
+    for ending in sidecar_endings(tuple(ARRAYS)):
+        marks = {id: files.get(id, mark) for id, mark in zip(videos.ids, videos.fingerprints, strict=True)}
+        sidecars[ending], said = collect_sidecars(source, store, marks, ending, notice)
+        notes = [*notes, *said]
     return Catalogue(
         source=source,
         rows=corpus.rows,
@@ -337,6 +352,7 @@ def _snapshot(
         digest=digest,
         prepared=None if manifest is None else manifest.header,
         scene_digest=scene_digest,
+        sidecars=sidecars,
         _store=store,
         _files=files,
         _absent=absent,

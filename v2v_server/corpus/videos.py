@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import overload
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.sample import sidecar_endings
 from v2v_server.corpus.index.columns import CHUNK, VideoTable
 from v2v_server.corpus.scenes.runs import Runs, SplitVideos
+from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.video.rows import Rows
 
 Thresholds = tuple[float | None, float | None]
@@ -138,12 +140,24 @@ class CorpusFacts:
         rows: the usable rows of each picture.
         digest: names this snapshot.
         scene_digest: names this snapshot together with the statistics of its videos; None without them.
+        sidecars: the files beside the videos, by ending.
     """
 
     videos: Sequence[VideoEntry]
     rows: Rows
     digest: str
     scene_digest: str | None
+    sidecars: Mapping[str, Sidecars] = field(default_factory=dict)
+
+    def sidecars_of(self, video: str, arrays: tuple[str, ...]) -> dict[str, str]:
+        """Return the fingerprints of a video's sidecars that these arrays are made from, by ending."""
+        found = {ending: self.sidecars[ending].fingerprints.get(video) for ending in sidecar_endings(arrays)}
+        return {ending: fingerprint for ending, fingerprint in found.items() if fingerprint is not None}
+
+    def sidecars_digest(self, arrays: tuple[str, ...]) -> str:
+        """Return a name of all sidecars that these arrays are made from; "" if they are made from none."""
+        digests = [self.sidecars[ending].digest for ending in sidecar_endings(arrays)]
+        return hashlib.sha256("\n".join(digests).encode()).hexdigest()[:32] if digests else ""
 
     def digest_under(self, scene: str) -> str:
         """Return the digest that names this snapshot in samples of a spec.

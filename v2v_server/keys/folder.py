@@ -16,10 +16,9 @@ import re
 import stat
 from pathlib import Path
 
-import zmq
-
 from v2v_protocol.errors import KeyRefused, UsageError
 from v2v_protocol.keys import SIDES, PeerKey, is_key, read_private, write_key, write_private
+from v2v_protocol.link.curve import new_key_pair
 from v2v_protocol.safe_json import parse_json
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -43,7 +42,7 @@ class KeyFolder:
         Raises:
             UsageError: there are keys already, or the folder cannot be created.
         """
-        public, secret = (key.decode() for key in zmq.curve_keypair())
+        public, secret = new_key_pair()
         try:
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
             for side in SIDES:
@@ -92,7 +91,7 @@ class KeyFolder:
         if not _NAME.fullmatch(name):
             raise UsageError(f"{name!r}: a key's name is up to 64 letters, digits, dots, dashes and underscores")
         server, _ = self.server_keys()
-        public, secret = (key.decode() for key in zmq.curve_keypair())
+        public, secret = new_key_pair()
         entry = self.path / side / name
         if entry.exists():
             raise UsageError(f"there is a {side} key {name!r}: revoke it first, or use another name")
@@ -109,7 +108,7 @@ class KeyFolder:
             KeyRefused: the server has no keys.
         """
         server, _ = self.server_keys()
-        public, secret = (key.decode() for key in zmq.curve_keypair())
+        public, secret = new_key_pair()
         self._lent[side][public] = name
         return PeerKey(side, name, server.decode(), public, secret)
 

@@ -21,15 +21,16 @@ from v2v_protocol.sample import DEFAULT_ARRAYS, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.candidates import next_candidate
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import Quarantine, quarantine_path, read_quarantine
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.event_files import check_event_file, write_events
 from v2v_server.offline.leases import lease_for
+from v2v_server.quarantine.file import quarantine_path, read_quarantine
+from v2v_server.quarantine.snapshots import Quarantine
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample
+from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample, open_sidecars
 
 _MOMENTS = 4
 """Voxel grids that a picture shows."""
@@ -92,6 +93,7 @@ class Remaker:
         Raises:
             UsageError: an index outside the epoch.
             SampleUnavailable: no candidate could give the sample.
+            SidecarError: a file beside the video, which an array is made from, cannot be used.
             VideoUnreadable: this host cannot read a candidate's file, which a server may have read.
         """
         catalogue, spec = self._catalogue, self._spec
@@ -114,7 +116,8 @@ class Remaker:
             )
             try:
                 decoded = decode_for(lease, lease.indices, catalogue.source)[0]
-                return RemadeSample(lease, decoded, make_sample(lease, decoded))
+                with open_sidecars(lease, catalogue.source) as sidecars:
+                    return RemadeSample(lease, decoded, make_sample(lease, decoded, sidecars=sidecars))
             except VideoError as error:
                 if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
                     raise

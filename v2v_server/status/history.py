@@ -26,8 +26,8 @@ class Moment:
         totals: the counters; and, of the time in which there was a consumer, ``attended``, ``broker`` (the loop did not
             wait for a message), ``worker`` and ``consumer`` (times their number), ``idle`` (of ``worker``, without a
             lease), in seconds.
-        peers: busy and processor seconds of each worker, by routing id; samples, seconds waited and indices passed of
-            each consumer, by number.
+        peers: totals of each peer, the first of them the seconds that it was there; then busy and processor seconds of
+            a worker, by routing id, or samples, seconds waited and indices passed of a consumer, by number.
     """
 
     now: float
@@ -59,11 +59,11 @@ class TimeWindow:
         """Return the growth of one total as a share of another's, 0 to 1."""
         return min(1.0, max(0.0, self.change(part) / self.change(whole))) if self.change(whole) > 0.0 else 0.0
 
-    def rates_of(self, peer: bytes | int, since: float = -math.inf) -> list[float]:
-        """Return the rates of a peer's totals; of one that came at ``since``, within the window, over its own time."""
-        seconds = min(self.seconds, max(_LEAST_SECONDS, self.last.now - since))
-        totals = self.last.peers[peer]
-        before = self.before.peers.get(peer, (0.0,) * len(totals))
+    def rates_of(self, peer: bytes | int) -> list[float]:
+        """Return the rates of a peer's totals, over the time within the window that it was there."""
+        present, *totals = self.last.peers[peer]
+        before_present, *before = self.before.peers.get(peer, (0.0,) * (1 + len(totals)))
+        seconds = min(self.seconds, max(_LEAST_SECONDS, present - before_present))
         return [(now - then) / seconds if seconds > 0.0 else 0.0 for now, then in zip(totals, before, strict=True)]
 
 
@@ -123,9 +123,9 @@ class History:
 
     def _moment(self, now: float) -> Moment:
         peers: dict[bytes | int, tuple[float, ...]] = {
-            identity: (member.work.busy_seconds, member.work.cpu_seconds)
+            identity: (now, member.work.busy_seconds, member.work.cpu_seconds)
             for identity, member in self._dispatcher.registry.members().items()
         }
         for each in self._dispatcher.sessions.totals():
-            peers[each.number] = each.served, each.waited_seconds, each.passed
+            peers[each.number] = each.present(now), each.served, each.waited_seconds, each.passed
         return Moment(now, values(self._dispatcher.counters) | self._clocks, peers)

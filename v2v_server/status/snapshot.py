@@ -16,12 +16,12 @@ from v2v_protocol import PROTOCOL_VERSION, __version__
 from v2v_protocol.wire import LARGEST_HEADER_BYTES
 from v2v_server.broker.counters import FaultTotal
 from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.quarantine import Quarantine
 from v2v_server.broker.session import Session
 from v2v_server.broker.transport import ServerTransport
 from v2v_server.broker.worker_registry import Member, clean_name
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.quarantine.snapshots import Quarantine
 from v2v_server.status.bottleneck import NOTICEABLE_SHARE, Bottleneck, Shares, find_bottleneck
 from v2v_server.status.history import TimeWindow
 from v2v_server.status.parts import (
@@ -35,7 +35,7 @@ from v2v_server.status.parts import (
     VerdictPart,
     WorkerPart,
 )
-from v2v_server.store.used import used_bytes
+from v2v_server.store.quota import used_bytes
 from v2v_server.supervise.pool import Pool
 from v2v_server.system.status_fields import GIB, values
 
@@ -197,7 +197,7 @@ def _worker(
 
 def _consumer(session: Session, window: TimeWindow) -> ConsumerPart:
     now, totals = window.last.now, session.totals
-    samples, waited, passed = window.rates_of(totals.number, totals.since)
+    samples, waited, passed = window.rates_of(totals.number)
     share, left = min(1.0, waited), session.schedule.count - session.position
     if session.left_at is not None:
         state = "gone"

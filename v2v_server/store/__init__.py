@@ -6,7 +6,7 @@ packing   compression of these differences
 writer    write a file, frame by frame
 reader    read a crop of some frames
 encoding  how a prepared corpus stores its pictures
-used      the size of a folder that many processes fill
+quota     a folder that many processes fill up to a limit: the cache, and copies of videos in object storage
 cache     a folder of pieces that are stored when they are first decoded
 clips     the pixels of a video, decoded or read from the store
 """

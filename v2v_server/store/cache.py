@@ -4,10 +4,9 @@ A piece is a store file (:mod:`v2v_server.store.format`) with some hundred conse
 a multiple of that number. So only frames that samples read are decoded and stored, and samples of other recipes reuse
 them. Its name is a hash of the video's id, its fingerprint and the rows: a changed source has other names.
 
-Several workers and servers may share a folder. A piece is written under a temporary name, and renamed once it is
-complete and fits the limit. The file ``used``, behind a lock, holds the number of bytes in the folder. A killed worker
-leaves a temporary file that is never read; the next worker to start removes it, because its lock is free. At the limit
-existing pieces stay: every epoch reads all of them, so replacing one by another would gain nothing.
+Several workers and servers may share the folder (:mod:`v2v_server.store.quota`). A killed worker leaves a temporary
+file that is never read; the next worker to start removes it, because its lock is free. At the limit existing pieces
+stay: every epoch reads all of them, so replacing one by another would gain nothing.
 
 A fault here costs time but no sample: its video is then decoded without the cache.
 """
@@ -18,7 +17,6 @@ import contextlib
 import fcntl
 import hashlib
 import secrets
-import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -31,8 +29,8 @@ import numpy.typing as npt
 from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnreadable
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
 from v2v_server.store.packing import QUICK
+from v2v_server.store.quota import GIB, LEAST_FREE_BYTES, PARTIAL, QuotaFolder
 from v2v_server.store.reader import StoreFile
-from v2v_server.store.used import PARTIAL, Used, count_bytes, locked_use, used_bytes
 from v2v_server.store.writer import StoreWriter
 from v2v_server.system.private import make_private
 from v2v_server.video.collect import Cut
@@ -41,10 +39,8 @@ from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import Window
 
-GIB = 1 << 30
-LEAST_FREE_BYTES = GIB
-"""Always keep this much disk space free."""
-
+_LOCK_SECONDS = 0.06
+"""Longest wait for the lock of the folder; a sample does without the cache rather than wait."""
 _LARGE_PICTURE_PX = 1 << 20
 _EXPECTED_BITS = 4
 """Largest size of a packed pixel; the real size is known only after writing."""
@@ -66,8 +62,7 @@ class Cache:
     """The cache of a worker.
 
     Args:
-        folder: created by :func:`make_cache` and never later: if a disk is unmounted, the disk below must not be
-            filled.
+        folder: created by :func:`make_cache`.
         most_bytes: largest size of the folder, bytes.
         least_free_bytes: disk space to keep free, bytes.
 
@@ -78,8 +73,7 @@ class Cache:
 
     def __init__(self, folder: Path, most_bytes: int, least_free_bytes: int = LEAST_FREE_BYTES) -> None:
         self.folder = folder
-        self._most_bytes = most_bytes
-        self._least_free_bytes = least_free_bytes
+        self._quota = QuotaFolder(folder, most_bytes, _LOCK_SECONDS, least_free_bytes)
         self._rest_until, self._rest_reason = 0.0, ""
         self.trouble = ""
         self.on_wait: Callable[[bool], object] = lambda waits: None
@@ -142,7 +136,7 @@ class Cache:
     @property
     def used_bytes(self) -> int:
         """Bytes stored in the folder by all processes that share it; 0 if unknown."""
-        return used_bytes(self.folder)
+        return self._quota.used_bytes
 
     def _read(
         self,
@@ -187,15 +181,15 @@ class Cache:
             return False
         pixels = (rows[1] - rows[0]) * index.width_px * sum(piece.end - piece.first for piece in missing)
         try:
-            free = shutil.disk_usage(self.folder).free
+            free = self._quota.free_bytes
         except OSError as error:
             self._rest(f"is gone: {error.strerror or error}")
             return False
         expected = pixels * _EXPECTED_BITS // 8
-        if self.used_bytes + expected > self._most_bytes:
-            self.trouble = f"full: {self.used_bytes / GIB:.2f} of {self._most_bytes / GIB:g} GiB"
+        if self.used_bytes + expected > self._quota.most_bytes:
+            self.trouble = f"full: {self.used_bytes / GIB:.2f} of {self._quota.most_bytes / GIB:g} GiB"
             return False
-        if free - expected < self._least_free_bytes:
+        if free - expected < self._quota.least_free_bytes:
             self._rest(f"disk full: {free / GIB:.2f} GiB free")
             return False
         return True
@@ -245,14 +239,8 @@ class Cache:
                 for picture in pictures:
                     writer.add(picture)
                 writer.close()
-            with self._locked_use() as used:
-                if path.exists() or used.bytes + writer.bytes > self._most_bytes:
-                    return
-                path.parent.mkdir(exist_ok=True)
-                used.add(
-                    writer.bytes
-                )  # count before renaming: a process killed in between has counted too much, not too little
-                partial.replace(path)
+            with self._waiting():
+                self._quota.add(partial, path)
         finally:
             with contextlib.suppress(OSError):
                 partial.unlink()
@@ -260,17 +248,14 @@ class Cache:
     def _remove(self, path: Path, why: str) -> None:
         """Remove an unreadable piece, so that it is decoded again."""
         self.trouble = f"a damaged piece was removed: {why}"
-        with contextlib.suppress(OSError), self._locked_use() as used:
-            size = path.stat().st_size
-            path.unlink()
-            used.add(-size)
+        with contextlib.suppress(OSError), self._waiting():
+            self._quota.remove(path)
 
     @contextlib.contextmanager
-    def _locked_use(self) -> Iterator[Used]:
+    def _waiting(self) -> Iterator[None]:
         self.on_wait(True)
         try:
-            with locked_use(self.folder) as used:
-                yield used
+            yield
         finally:
             self.on_wait(False)
 
@@ -289,16 +274,13 @@ class _Piece:
 
 
 def make_cache(folder: Path) -> None:
-    """Create the folder of a cache if it is missing, and recount its bytes: a killed worker may have counted a piece
-    that it did not store.
+    """Create the folder of a cache if it is missing, and recount its bytes.
 
     Raises:
         CorpusError: the folder cannot be created, read or written.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(BlockingIOError), locked_use(folder) as used:
-            used.bytes = count_bytes(folder)
+        QuotaFolder(folder, 0, _LOCK_SECONDS).make()
     except OSError as error:
         raise CorpusError(f"--cache {folder}: cannot be written to: {error.strerror or error}") from error
 

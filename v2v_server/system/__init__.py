@@ -5,8 +5,8 @@ isolate         a function applied to many items in processes of their own, so t
 sandbox         restrictions of a process that decodes: programs, networks, writing
 compile_cache   where numba stores compiled kernels
 private         files that other users of the host cannot open
-turn_away       has the kernel drop newcomers from some addresses
 status_fields   what each number of the status means
+locks           locks on files that processes share
 log             log lines, as text or JSON
 clock           a clock that stands still while its process is stopped
 opencv          OpenCV, imported on first use

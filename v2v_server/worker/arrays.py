@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.resources.abc import Traversable
 from typing import Any
 
 import numpy as np
@@ -30,12 +31,30 @@ from v2v_server.simulation.view import Frames
 from v2v_server.simulation.voxel import Levels
 
 
+@dataclass(frozen=True, slots=True)
+class SourceClip:
+    """Where a sample's frames lie in their video, and what lies beside it.
+
+    Attributes:
+        start_frame: number of the clip's first frame in the video, in presentation order from 0. Frame ``n`` of the
+            clip is frame ``start_frame + n * recipe.frame_stride`` of the video.
+        seconds: [n] float64, presentation time of each frame of the clip; NaN where unknown.
+        sidecars: the opened sidecars by ending, see :class:`v2v_protocol.sample.FromSidecar`: a file, or a folder in
+            the manner of ``pathlib``; None if the video has none.
+    """
+
+    start_frame: int
+    seconds: npt.NDArray[np.float64]
+    sidecars: Mapping[str, Traversable | None]
+
+
 @dataclass(slots=True)
 class SampleContext:
     """Inputs of the functions that fill the arrays of one sample.
 
     Attributes:
         video: catalogue id.
+        clip: the frames' place in the video, their times, and the opened sidecars.
         spec, params: the stream's spec, and the sample's draw.
         source: [steps + 1] int64, which frame of ``view`` each position of the clip shows.
         view: [n, H, W] uint8, the decoded frames as the camera sees them.
@@ -47,6 +66,7 @@ class SampleContext:
     """
 
     video: str
+    clip: SourceClip
     spec: StreamSpec
     params: SampleParams
     source: npt.NDArray[np.int64]
@@ -69,7 +89,10 @@ ARRAY_BUILDERS: dict[str, ArrayBuilder] = {}
 
 
 def makes(name: str) -> Callable[[ArrayBuilder], ArrayBuilder]:
-    """Register a function that fills the array of this name. It gets a C-contiguous output array."""
+    """Register a function that fills the array of this name. It gets a C-contiguous output array.
+
+    A function that cannot use a sidecar raises :class:`v2v_protocol.errors.SidecarError`, which reaches the consumer.
+    """
 
     def register(builder: ArrayBuilder) -> ArrayBuilder:
         ARRAY_BUILDERS[name] = builder

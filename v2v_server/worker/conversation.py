@@ -25,7 +25,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from v2v_protocol.errors import ProtocolError, RemoteError, VersionMismatch, VideoChanged, VideoError, VideoUnreadable
+from v2v_protocol.errors import (
+    ProtocolError,
+    RemoteError,
+    SidecarError,
+    VersionMismatch,
+    VideoChanged,
+    VideoError,
+    VideoUnreadable,
+)
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import (
     Begun,
@@ -215,9 +223,12 @@ class WorkerConversation:
             return [self._make(now)]
         return [Listen(0.0)]
 
-    def on_failure(self, error: VideoError, now: float) -> list[Action]:
-        """Report at once that the video could not be used."""
+    def on_failure(self, error: VideoError | SidecarError, now: float) -> list[Action]:
+        """Report at once that the video, or its sidecar, could not be used."""
         lease = self._done(now)
+        if isinstance(error, SidecarError):
+            failed = LeaseFailed(lease.lease, None, error.reason, error.here, error.ending)
+            return [Send(encode(failed)), Listen(0.0)]
         here = isinstance(error, VideoChanged | VideoUnreadable)
         return [Send(encode(LeaseFailed(lease.lease, error.frame, error.reason, here))), Listen(0.0)]
 

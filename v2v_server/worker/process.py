@@ -15,14 +15,13 @@ import socket
 import time
 from pathlib import Path
 
-import zmq
-
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.addresses import leaves_host
-from v2v_protocol.errors import UsageError, VideoError
-from v2v_protocol.keys import HANDSHAKE_EVENTS, Handshakes, key_for
+from v2v_protocol.errors import SidecarError, UsageError, VideoError
+from v2v_protocol.keys import key_for
+from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Lease, WorkerHello
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames
+from v2v_protocol.wire import Frames
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.simulation.variants import USUAL
 from v2v_server.store.cache import Cache
@@ -54,7 +53,7 @@ from v2v_server.worker.conversation import (
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.logbook import IDLE, note
 from v2v_server.worker.output_buffer import open_output_buffer, sample_message
-from v2v_server.worker.produce import kernels_of, make_sample, sample_layout
+from v2v_server.worker.produce import kernels_of, make_sample, open_sidecars, sample_layout, sidecar_files
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 _SOON_FETCHED_BYTES = 32 << 20
@@ -66,8 +65,8 @@ LONGEST_LEASE_SECONDS = 3600.0
 ends hung workers on other hosts."""
 MOST_NAME_BYTES = 200
 """What an operator may call a worker; with what is added to it a name has 255 at most."""
-_MORE = int(zmq.SNDMORE)
-"""A plain number: send_multipart combines flags of an enumeration, which takes longer than sending a small frame."""
+_LINGER_MS = 5000
+"""Time that leaving may spend on sending the last sample."""
 
 
 class Worker:
@@ -101,7 +100,7 @@ class Worker:
         keys: str | None = None,
         log: Log | None = None,
     ) -> None:
-        key = key_for(address, "worker", keys)
+        self._link = Dealer(address, keys, "worker")
         self._name = name
         self._log = log or Log()
         self._logbook = logbook
@@ -110,7 +109,7 @@ class Worker:
         if cache is not None:
             cache.on_wait = self._note_wait
         self._source = source
-        self._unfetched: tuple[tuple[str, str], VideoError] | None = None  # the last video that could not be fetched
+        self._unfetched: tuple[dict[str, str], VideoError] | None = None  # the last files that could not be fetched
         self._is_remote = leaves_host(address)
         self._kernels = set(USUAL)  # loaded kernels
         self._handover_seconds = 0.0  # not yet reported in a result
@@ -128,39 +127,11 @@ class Worker:
             ),
             is_watched=logbook is not None,
         )
-        self._address, self._key = address, key
-        self._handshakes = Handshakes(address, key, "worker")
-        self._context = zmq.Context()
         try:
-            self._connect()
-        except zmq.ZMQError as error:
-            self._context.destroy(linger=0)
-            raise UsageError(f"--connect {address}: {error.strerror}; write tcp://HOST:PORT") from error
-
-    def _connect(self) -> None:
-        """Open a socket under a new routing id, which no other peer knows."""
-        self._socket = self._context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.ROUTING_ID, b"\x01" + secrets.token_bytes(15))  # a first byte of 0 is ZeroMQ's own
-        self._socket.setsockopt(zmq.LINGER, 5000)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_HEADER_BYTES)
-        # Leases bound the queues: at most CREDIT samples in either direction.
-        self._socket.setsockopt(zmq.SNDHWM, 0)
-        self._socket.setsockopt(zmq.RCVHWM, 0)
-        self._socket.setsockopt(zmq.IPV6, int("[" in self._address))
-        if self._key is not None:
-            self._key.secure(self._socket)
-        self._monitor = self._socket.get_monitor_socket(HANDSHAKE_EVENTS)
-        self._handshakes.begin()
-        self._socket.connect(self._address)
-        self._poller = zmq.Poller()
-        self._poller.register(self._socket, zmq.POLLIN)
-        self._poller.register(self._monitor, zmq.POLLIN)
-
-    def _reconnect(self) -> None:
-        before = self._socket, self._monitor
-        self._connect()  # before the old ones are closed: the address of a monitor is made from a descriptor
-        for each in before:
-            each.close(linger=0)
+            self._link.connect()
+        except UsageError as error:
+            self._link.close()
+            raise UsageError(f"--connect: {error}") from error
 
     def stop(self) -> None:
         """Finish the current sample, return the other leases, and leave. Safe to call from a signal handler."""
@@ -182,18 +153,16 @@ class Worker:
                     self._do(action)
                 actions = self._take(step)
         finally:
-            self._context.destroy()
+            self._link.disconnect(linger_ms=_LINGER_MS)
+            self._link.close()
 
     def _do(self, action: Action) -> None:
         if isinstance(action, Send):
             began = time.monotonic()
-            *first, last = action.frames
-            for frame in first:
-                self._socket.send(frame, _MORE, copy=False)
-            self._socket.send(last, copy=False)
+            self._link.send(action.frames)
             self._handover_seconds += time.monotonic() - began
         elif isinstance(action, Reconnect):
-            self._reconnect()
+            self._link.connect(again=True)
         elif isinstance(action, Say):
             self._log.say(f"{self._name}: {action.text}", "warning", worker=self._name)
 
@@ -217,12 +186,12 @@ class Worker:
                 self._at = lease.lease
                 note(self._logbook, self._at, decodes=True)
                 try:
-                    made: tuple[Frames, Timings] | VideoError = self._make_sample(lease)
-                except VideoError as error:
+                    made: tuple[Frames, Timings] | VideoError | SidecarError = self._make_sample(lease)
+                except (VideoError, SidecarError) as error:
                     made = error
                 note(self._logbook, IDLE)  # not after another exception: it ends the worker, and this lease is to blame
                 now = time.monotonic()
-                if isinstance(made, VideoError):
+                if isinstance(made, VideoError | SidecarError):
                     return conversation.on_failure(made, now)
                 frames, timings = made
                 return conversation.on_sample(frames, now, timings)
@@ -239,42 +208,39 @@ class Worker:
         """
         if self._clips.has(lease):
             return True
-        video = lease.video, lease.fingerprint
-        return (self._unfetched is not None and self._unfetched[0] == video) or self._source.has(*video)
+        files = _files(lease)
+        return (self._unfetched is not None and self._unfetched[0] == files) or self._source.has(files)
 
     def _fetch(self, lease: Lease) -> None:
-        """Fetch the lease's video before the lease is begun, so that network time does not count against the sample."""
+        """Fetch the lease's files before the lease is begun, so that network time does not count against the sample."""
         if self._has_video(lease):
             return
+        files = _files(lease)
         try:
-            self._source.fetch(lease.video, lease.fingerprint)
+            self._source.fetch(files)
         except VideoError as error:
-            self._unfetched = (lease.video, lease.fingerprint), error
+            self._unfetched = files, error
 
     def _messages(self, wait_seconds: float) -> list[bytes]:
         """Return the first frames of all available messages."""
         messages: list[bytes] = []
-        timeout_ms = math.ceil(wait_seconds * 1000)
-        while ready := dict(self._poller.poll(0 if messages else timeout_ms)):
-            if self._monitor in ready:
-                self._handshakes.take(
-                    lambda: self._monitor.poll(0), lambda: self._monitor.recv_multipart(flags=zmq.NOBLOCK)
-                )
-            if self._socket not in ready:
-                break  # the conversation checks the time
-            first, *_ = self._socket.recv_multipart()
-            messages.append(first)
+        frames = self._link.receive(wait_seconds)
+        while frames is not None:
+            messages.append(bytes(frames[0]))
+            frames = self._link.receive(0)
+        self._link.has_reconnected()  # raises if the server refuses the key; the conversation notices interruptions
         return messages
 
     def _make_sample(self, lease: Lease) -> tuple[Frames, Timings]:
         """Make a lease's sample and return its message with the timings.
 
         Raises:
-            VideoError: its video cannot be used.
+            VideoError, SidecarError: its video, or a file beside it, cannot be used.
         """
-        if self._unfetched is not None and self._unfetched[0] == (lease.video, lease.fingerprint):
+        if self._unfetched is not None and self._unfetched[0] == _files(lease):
             error, self._unfetched = self._unfetched[1], None
-            raise error
+            if error.video == lease.video:
+                raise error  # otherwise opening the sidecar reports it
         began = time.monotonic()
         buffer = open_output_buffer(lease, sample_layout(lease))
         has_room = time.monotonic()
@@ -286,7 +252,8 @@ class Worker:
             # counts few objects and waits, but each of them holds pictures.
             gc.collect()
         has_clip = time.monotonic()
-        sample = make_sample(lease, clip, buffer.arrays)
+        with open_sidecars(lease, self._source) as sidecars:
+            sample = make_sample(lease, clip, buffer.arrays, sidecars)
         has_sample = time.monotonic()
         frames = sample_message(
             lease,
@@ -333,6 +300,11 @@ def _size_bytes(lease: Lease) -> int:
     """Return the size of the lease's video, which starts the fingerprint."""
     size = lease.fingerprint.partition("-")[0]
     return int(size) if size.isdecimal() else 0
+
+
+def _files(lease: Lease) -> dict[str, str]:
+    """Return the fingerprints of the files that a lease's sample is made from, by id."""
+    return {lease.video: lease.fingerprint, **dict(sidecar_files(lease).values())}
 
 
 def _written(source: VideoSource, address: str, cache: Cache | None) -> list[Path] | None:

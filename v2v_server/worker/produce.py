@@ -5,24 +5,37 @@ Server workers and `v2v-simulate` both use this module, so they make equal sampl
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from importlib.resources.abc import Traversable
 from pathlib import PurePosixPath
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.errors import ProtocolError, UsageError, VideoError
+from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
 from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.safe_json import parse_json
-from v2v_protocol.sample import Layout, Provenance, Sample, SampleId, SampleParams, array_layout, new_arrays
+from v2v_protocol.sample import (
+    Layout,
+    Provenance,
+    Sample,
+    SampleId,
+    SampleParams,
+    array_layout,
+    new_arrays,
+    sidecar_endings,
+)
 from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.motion import MARGIN_PX, levels_of
@@ -38,7 +51,7 @@ from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
-from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, simulate
+from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, simulate
 from v2v_server.worker.scene_choice import FlowPlan, plan_flow
 
 
@@ -150,21 +163,63 @@ def sample_layout(lease: Lease) -> Layout:
         raise ProtocolError(f"lease {lease.lease}: {error}") from error
 
 
-def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[Any]] | None = None) -> Sample:
+def sidecar_files(lease: Lease) -> dict[str, tuple[str, str]]:
+    """Return id and fingerprint of each sidecar that a lease's arrays are made from and that the video has, by ending.
+
+    Raises:
+        ProtocolError: the lease is malformed.
+    """
+    found = {}
+    for ending in sidecar_endings(lease.arrays):
+        fingerprint = lease.sidecars.get(ending)
+        if fingerprint is not None and not isinstance(fingerprint, str):
+            raise ProtocolError(f"lease {lease.lease}: fingerprint {fingerprint!r:.80} of the sidecar {ending}")
+        if fingerprint:
+            found[ending] = sidecar_id(lease.video, ending), fingerprint
+    return found
+
+
+@contextmanager
+def open_sidecars(lease: Lease, source: VideoSource) -> Iterator[dict[str, Traversable | None]]:
+    """Lend the sidecars that a lease's arrays are made from, by ending, until the end of the context.
+
+    Raises:
+        SidecarError: one cannot be had as catalogued.
+        ProtocolError: the lease is malformed.
+    """
+    opened: dict[str, Traversable | None] = dict.fromkeys(sidecar_endings(lease.arrays))
+    with ExitStack() as stack:
+        for ending, (id, fingerprint) in sidecar_files(lease).items():
+            try:
+                opened[ending] = stack.enter_context(open_sidecar(source, id, fingerprint))
+            except VideoError as error:
+                raise SidecarError(lease.video, ending, error.reason, here=True) from error
+        yield opened
+
+
+def make_sample(
+    lease: Lease,
+    decoded: Decoded,
+    into: Mapping[str, npt.NDArray[Any]] | None = None,
+    sidecars: Mapping[str, Traversable | None] = MappingProxyType({}),
+) -> Sample:
     """Make a lease's sample from its decoded clip: view, flow, simulation.
 
     Args:
         lease: the work.
         decoded: its decoded clip.
         into: C-contiguous arrays of :func:`sample_layout` to fill; None allocates them.
+        sidecars: what :func:`open_sidecars` lends; needed if an array is made from one.
 
     Raises:
+        SidecarError: an array cannot be made from its sidecar.
         VideoError: the video's frame rate is unknown and the recipe needs it, or its stated thresholds or time stamps
             are beyond what can be simulated.
         ProtocolError: the lease is malformed.
     """
     plan, index = decoded.plan, lease.indices[0]
-    context, irregular = _context(lease, decoded, new_arrays(sample_layout(lease)) if into is None else into)
+    into = new_arrays(sample_layout(lease)) if into is None else into
+    context, irregular = _context(lease, decoded, into, sidecars)
     for name, array in context.into.items():
         ARRAY_BUILDERS[name](context, array)
     saturated = dict(context.saturated or {})
@@ -185,6 +240,7 @@ def make_sample(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[A
             quarantine=lease.quarantine,
             scene="" if plan.flow_plan is None else plan.flow_plan.reason,
             saturated={name: count for name, count in saturated.items() if count},
+            sidecars={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
         ),
     )
 
@@ -200,7 +256,12 @@ def list_sample_events(lease: Lease, decoded: Decoded) -> EventList:
     return list_events(made.given, made.real, 1e6 * seconds)
 
 
-def _context(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[Any]]) -> tuple[SampleContext, int]:
+def _context(
+    lease: Lease,
+    decoded: Decoded,
+    into: Mapping[str, npt.NDArray[Any]],
+    sidecars: Mapping[str, Traversable | None] = MappingProxyType({}),
+) -> tuple[SampleContext, int]:
     """Return what the arrays are made from, and the number of irregular time stamps."""
     plan = decoded.plan
     params, recipe = plan.params, plan.spec.recipe
@@ -214,7 +275,10 @@ def _context(lease: Lease, decoded: Decoded, into: Mapping[str, npt.NDArray[Any]
         levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px)
     seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
     view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe)
-    return SampleContext(lease.video, plan.spec, params, plan.source, view, seconds, flow, levels, into), irregular
+    clip = SourceClip(lease.start_frame, decoded.clip.seconds, sidecars)
+    return SampleContext(
+        lease.video, clip, plan.spec, params, plan.source, view, seconds, flow, levels, into
+    ), irregular
 
 
 def _step_seconds(lease: Lease, decoded: Decoded) -> tuple[npt.NDArray[np.float64], int]:

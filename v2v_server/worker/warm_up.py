@@ -28,7 +28,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from v2v_server import motion
+from v2v_server.motion import load as load_motion
 from v2v_server.simulation.pixel import simulate_pixels
 from v2v_server.simulation.variants import Variant, load, warm_up
 from v2v_server.system.compile_cache import sources_digest
@@ -65,7 +65,7 @@ def is_compiled(variant: Variant) -> bool:
 def _load(variant: Variant) -> None:
     load(variant)
     if variant.is_divided:
-        motion.load()
+        load_motion()
 
 
 def load_kernels() -> None:

@@ -17,10 +17,10 @@ import zmq.sugar.socket
 
 from tests.client.fake_server import SPEC, FakeServer
 from tests.waiting import until
-from v2v_client.session import link
 from v2v_client.session.connection import Connection
 from v2v_client.session.liveness import Patience
 from v2v_client.session.states import Event
+from v2v_protocol.link import dealer
 from v2v_protocol.messages import Hello
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.wire import Frames
@@ -81,15 +81,15 @@ def test_time_in_which_the_trainer_was_stopped_is_not_silence(
     hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
     with closing(Connection(server.address, hello, 0, clock=lambda: time.monotonic() + sum(stopped))) as connection:
         connection.open()
-        listen = link.Link.receive
+        listen = dealer.Dealer.receive
 
-        def receive(self: link.Link, seconds: float) -> Frames | None:
+        def receive(self: dealer.Dealer, seconds: float) -> Frames | None:
             if len(stopped) < 3:
                 stopped.append(3600.0)
                 return None
             return listen(self, seconds)
 
-        monkeypatch.setattr(link.Link, "receive", receive)
+        monkeypatch.setattr(dealer.Dealer, "receive", receive)
         connection.want([0])
         assert _next(connection) == 0
 
@@ -103,15 +103,15 @@ def test_time_spent_opening_counts_as_listening(server: FakeServer, monkeypatch:
         return time.monotonic() + sum(waited)
 
     with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK, clock=clock)) as connection:
-        listen = link.Link.receive
+        listen = dealer.Dealer.receive
 
-        def receive(self: link.Link, seconds: float) -> Frames | None:
+        def receive(self: dealer.Dealer, seconds: float) -> Frames | None:
             if len(waited) < 20:
                 waited.append(0.9)
                 return None
             return listen(self, seconds)
 
-        monkeypatch.setattr(link.Link, "receive", receive)
+        monkeypatch.setattr(dealer.Dealer, "receive", receive)
         connection.open()
         assert connection.receive(wait=False) is None
         assert connection._conversation.silence(connection._now()) >= 0.0
@@ -124,7 +124,7 @@ def test_time_spent_opening_counts_as_listening(server: FakeServer, monkeypatch:
 def test_a_host_name_is_tried_as_ipv4_then_ipv6_in_turn(address: str, kinds: list[int]) -> None:
     """On most hosts "localhost" has an IPv4 and an IPv6 address, and a server listens on 127.0.0.1."""
     found = []
-    with closing(link.Link(address)) as tried:
+    with closing(dealer.Dealer(address)) as tried:
         for _ in kinds:
             tried.connect(1 << 20, again=bool(found))
             assert tried._socket is not None
@@ -136,7 +136,7 @@ def test_a_reconnection_keeps_the_ip_version_that_worked(server: FakeServer) -> 
     with closing(Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)) as connection:
         connection.open()
         made_anew = connection._open_link()
-        assert isinstance(made_anew, link.Link)
+        assert isinstance(made_anew, dealer.Dealer)
         made_anew.connect(1 << 20, again=True)
         assert made_anew._socket is not None
         assert made_anew._socket.getsockopt(zmq.IPV6) == 0
@@ -169,7 +169,7 @@ def test_a_signal_at_any_line_of_opening_and_closing_raises_instead_of_hanging(s
 
     The exception's traceback keeps it alive, as that of an interrupted program does.
     """
-    sugar = {inspect.getfile(module) for module in (link, zmq.sugar.context, zmq.sugar.socket)}
+    sugar = {inspect.getfile(module) for module in (dealer, zmq.sugar.context, zmq.sugar.socket)}
 
     def interrupted_at(line: int) -> bool:
         """Return whether enough lines ran to reach the one to interrupt."""

@@ -12,7 +12,7 @@ from v2v_protocol.errors import CorpusError, UsageError, V2VError
 from v2v_protocol.messages import Hello
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.admission import MOST_BATCH_SIZE, Admission
-from v2v_server.broker.quarantine import Quarantine, QuarantineEntry
+from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.schedule import sequences
 
 SAMPLE_BYTES = 2 * 2 * 8 * 8

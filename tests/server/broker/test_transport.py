@@ -84,7 +84,7 @@ def test_one_message_of_each_side_comes_at_a_time_the_workers_first(sockets: Soc
             peer.connect(address)
             for number in range(2):
                 peer.send_multipart([*encode(Ping()), bytes([number])])
-        until(lambda: len(dict(sockets._poller.poll(0))) == 2)
+        until(lambda: len(dict(sockets._routers._poller.poll(0))) == 2)
         came: list[Arrival] = []
         while len(came) < 4:
             both = sockets.receive(5.0)

@@ -15,11 +15,12 @@ from pathlib import Path
 import pytest
 import zmq
 
-from tests.server.broker.test_door import next_from
+from tests.protocol.link.test_guard import next_from
 from tests.waiting import until
-from v2v_client.session.link import Link
 from v2v_protocol.errors import KeyRefused, UsageError, V2VError
-from v2v_protocol.keys import Handshakes, is_key, key_for, mechanism_of, read_key
+from v2v_protocol.keys import is_key, key_for, read_key
+from v2v_protocol.link.curve import secure
+from v2v_protocol.link.dealer import Dealer, Handshakes, mechanism_of
 from v2v_protocol.messages import Ping, Pong
 from v2v_protocol.wire import encode, largest_frame_bytes
 from v2v_server.broker.actions import ToConsumer
@@ -28,7 +29,7 @@ from v2v_server.commands.keys import main
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.worker.output_buffer import pack
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a door")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a connection guard")
 
 
 @pytest.fixture
@@ -48,11 +49,11 @@ def sockets(folder: KeyFolder) -> Iterator[Sockets]:
 
 
 @pytest.fixture
-def consumer(sockets: Sockets) -> Iterator[Callable[..., Link]]:
-    links: list[Link] = []
+def consumer(sockets: Sockets) -> Iterator[Callable[..., Dealer]]:
+    links: list[Dealer] = []
 
-    def connect(file: Path | None, address: str = sockets.address) -> Link:
-        links.append(Link(address, "" if file is None else str(file)))
+    def connect(file: Path | None, address: str = sockets.address) -> Dealer:
+        links.append(Dealer(address, "" if file is None else str(file)))
         links[-1].connect(1 << 16)
         links[-1].send(encode(Ping()))
         return links[-1]
@@ -62,7 +63,7 @@ def consumer(sockets: Sockets) -> Iterator[Callable[..., Link]]:
         link.close()
 
 
-def refusal(link: Link) -> str:
+def refusal(link: Dealer) -> str:
     """What the link says when it learns that it may not come in, which takes seconds at most."""
     ends = time.monotonic() + 10.0
     while time.monotonic() < ends:
@@ -82,7 +83,7 @@ def arrivals(sockets: Sockets, seconds: float) -> list[Arrival]:
     return found
 
 
-def test_who_has_a_key_is_served(sockets: Sockets, consumer: Callable[..., Link], tmp_path: Path) -> None:
+def test_who_has_a_key_is_served(sockets: Sockets, consumer: Callable[..., Dealer], tmp_path: Path) -> None:
     link = consumer(tmp_path / "gpu1.key")
     arrival = next_from(sockets, FromConsumer)
     assert isinstance(arrival, FromConsumer)
@@ -93,7 +94,7 @@ def test_who_has_a_key_is_served(sockets: Sockets, consumer: Callable[..., Link]
 @pytest.mark.parametrize("frame", [bytes(1 << 21), pack(os.urandom(1 << 21))], ids=["raw", "compressed noise"])
 def test_the_largest_array_passes_encrypted(sockets: Sockets, tmp_path: Path, frame: bytes) -> None:
     """ZeroMQ's limit counts what CURVE adds to a frame; samples of the paper's size never came without compression."""
-    link = Link(sockets.address, str(tmp_path / "gpu1.key"))
+    link = Dealer(sockets.address, str(tmp_path / "gpu1.key"))
     try:
         link.connect(largest_frame_bytes([1 << 21]))
         link.send(encode(Ping()))
@@ -105,23 +106,27 @@ def test_the_largest_array_passes_encrypted(sockets: Sockets, tmp_path: Path, fr
         link.close()
 
 
-def test_who_has_no_key_is_told_what_to_do(sockets: Sockets, consumer: Callable[..., Link]) -> None:
+def test_who_has_no_key_is_told_what_to_do(sockets: Sockets, consumer: Callable[..., Dealer]) -> None:
     said = refusal(consumer(None))
     assert "asks for a key" in said
     assert "v2v-keys new NAME --for consumer" in said
     assert arrivals(sockets, 0.5) == []
 
 
-def test_a_key_of_the_other_side_opens_nothing(sockets: Sockets, consumer: Callable[..., Link], tmp_path: Path) -> None:
+def test_a_key_of_the_other_side_opens_nothing(
+    sockets: Sockets, consumer: Callable[..., Dealer], tmp_path: Path
+) -> None:
     """A consumer's key on the worker port: refused by its domain, although it is a good key on the other."""
     said = refusal(consumer(tmp_path / "gpu1.key", sockets.worker_address))
     assert f"{sockets.worker_address} refuses consumer key 'gpu1'" in said
     assert arrivals(sockets, 0.5) == []
     with pytest.raises(KeyRefused, match=r"'cpu1' .* is a worker's, and this is a consumer.*--for consumer"):
-        Link(sockets.address, str(tmp_path / "cpu1.key"))
+        Dealer(sockets.address, str(tmp_path / "cpu1.key"))
 
 
-def test_a_key_of_another_server_opens_nothing(sockets: Sockets, consumer: Callable[..., Link], tmp_path: Path) -> None:
+def test_a_key_of_another_server_opens_nothing(
+    sockets: Sockets, consumer: Callable[..., Dealer], tmp_path: Path
+) -> None:
     other = KeyFolder(tmp_path / "other")
     other.init()
     other.new("gpu1", "consumer", tmp_path / "other.key")
@@ -130,13 +135,13 @@ def test_a_key_of_another_server_opens_nothing(sockets: Sockets, consumer: Calla
 
 
 def test_a_revoked_key_loses_its_open_connection(
-    folder: KeyFolder, sockets: Sockets, consumer: Callable[..., Link], tmp_path: Path
+    folder: KeyFolder, sockets: Sockets, consumer: Callable[..., Dealer], tmp_path: Path
 ) -> None:
     folder.new("gpu2", "consumer", tmp_path / "gpu2.key")  # while the server runs
     link, other = consumer(tmp_path / "gpu1.key"), consumer(tmp_path / "gpu2.key")
     assert len({next_from(sockets, FromConsumer).identity for _ in range(2)}) == 2  # type: ignore[union-attr]
     folder.revoke("gpu1")
-    gate = sockets._gate
+    gate = sockets._routers.gate
     assert gate is not None
     until(lambda: list(gate._allowed["consumer"].values()) == ["gpu2"])  # the server looks twice a second
     link.send(encode(Ping()))
@@ -157,7 +162,7 @@ def test_a_revoked_worker_is_cut_off_and_local_ones_need_no_key(
             peer = context.socket(zmq.DEALER)
             peers.append(peer)
             if address == sockets.worker_address:
-                read_key(tmp_path / "cpu1.key").secure(peer)
+                secure(peer, read_key(tmp_path / "cpu1.key"))
             peer.connect(address)
             peer.send_multipart(encode(Ping()))
         remote = peers[0].get_monitor_socket(zmq.EVENT_DISCONNECTED)
@@ -173,7 +178,7 @@ def test_a_revoked_worker_is_cut_off_and_local_ones_need_no_key(
 
 @pytest.mark.parametrize("half", [b"", b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0CURVE" + bytes(15 + 1 + 31)])
 def test_half_open_connections_end_and_do_not_starve_other_peers(
-    half: bytes, sockets: Sockets, consumer: Callable[..., Link], tmp_path: Path
+    half: bytes, sockets: Sockets, consumer: Callable[..., Dealer], tmp_path: Path
 ) -> None:
     port = int(sockets.address.rpartition(":")[2])
     peers = [socket.create_connection(("127.0.0.1", port)) for _ in range(200)]
@@ -232,13 +237,13 @@ def test_who_says_nothing_until_its_key_is_revoked_is_not_heard(
     with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
         peer.setsockopt(zmq.RECONNECT_IVL, -1)
         peer.setsockopt(zmq.LINGER, 0)
-        read_key(tmp_path / "gpu1.key").secure(peer)
+        secure(peer, read_key(tmp_path / "gpu1.key"))
         monitor = peer.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED)
         peer.connect(sockets.address)
         assert monitor.poll(5000)
         monitor.recv_multipart()
         folder.revoke("gpu1")
-        gate = sockets._gate
+        gate = sockets._routers.gate
         assert gate is not None
         public = read_key(tmp_path / "gpu1.key").public
         until(lambda: not gate.admits("consumer", public))
@@ -257,12 +262,12 @@ def test_who_says_nothing_until_its_key_is_revoked_is_not_heard(
 
 def test_without_an_authentication_thread_no_peer_connects(folder: KeyFolder, sockets: Sockets, tmp_path: Path) -> None:
     """ZAP_ENFORCE_DOMAIN is set; without it every peer would connect."""
-    gate = sockets._gate
+    gate = sockets._routers.gate
     assert gate is not None
     gate.close()
     with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
         peer.setsockopt(zmq.LINGER, 0)
-        read_key(tmp_path / "gpu1.key").secure(peer)
+        secure(peer, read_key(tmp_path / "gpu1.key"))
         monitor = peer.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL | zmq.EVENT_HANDSHAKE_FAILED_AUTH)
         peer.connect(sockets.address)
         peer.send_multipart(encode(Ping()))
@@ -296,7 +301,7 @@ def test_what_is_no_key_file(content: str, tmp_path: Path) -> None:
 
 def test_no_secret_is_in_an_error(folder: KeyFolder, sockets: Sockets, tmp_path: Path) -> None:
     secret = read_key(tmp_path / "gpu1.key").secret
-    link = Link(sockets.worker_address, str(tmp_path / "gpu1.key"))
+    link = Dealer(sockets.worker_address, str(tmp_path / "gpu1.key"))
     try:
         link.connect(1 << 16)
         assert secret not in refusal(link)
@@ -333,7 +338,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
 @pytest.mark.parametrize("is_late", [False, True])
 def test_a_server_without_keys_is_not_talked_to_with_one(tmp_path: Path, folder: KeyFolder, is_late: bool) -> None:
     plain = Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
-    link = Link(plain.address, str(tmp_path / "gpu1.key"))
+    link = Dealer(plain.address, str(tmp_path / "gpu1.key"))
     try:
         link.connect(1 << 16)
         if is_late:  # a busy host: the handshake has failed when it is this one's turn

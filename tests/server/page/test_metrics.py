@@ -1,4 +1,4 @@
-"""The metrics: in Prometheus's own form, by its conventions, and the numbers of the state."""
+"""Test the metrics: in the form of Prometheus, by its conventions, with the numbers of the status."""
 
 from __future__ import annotations
 

@@ -6,6 +6,8 @@ import json
 import time
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import Peers, answer_to, peers
@@ -16,8 +18,8 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import decode, encode
 from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
 from v2v_server.broker.blame import Cause
-from v2v_server.broker.quarantine import QuarantineEntry
 from v2v_server.broker.session import RETURN_SECONDS
+from v2v_server.quarantine.snapshots import QuarantineEntry
 from v2v_server.status.parts import STATUS_VERSION
 from v2v_server.status.publisher import ANSWER_SECONDS, MOST_WAITING
 from v2v_server.status.snapshot import MOST_SHOWN, to_json
@@ -187,6 +189,43 @@ def test_a_reconnect_continues_the_row_and_a_later_run_begins_one() -> None:
     (later,) = service.view().consumers
     assert later.id != first.id
     assert later.served == 0
+
+
+@pytest.mark.slow
+@given(
+    epochs=st.lists(
+        st.tuples(
+            st.sampled_from((b"a", b"b")),
+            st.integers(0, 4),
+            st.sampled_from((0.0, 0.3, 1.9, 2.0, 5.0, 15.0, 70.0)),
+            st.booleans(),
+        ),
+        max_size=8,
+    )
+)
+def test_rows_add_up_to_the_totals(epochs: list[tuple[bytes, int, float, bool]]) -> None:
+    """However consumers leave and return: with a Goodbye, or by a new Hello alone."""
+    at = peers()
+    service = published(at)
+    at.join()
+    for number, (name, batches, pause, leaves) in enumerate(epochs):
+        identity = name + b"%d" % number
+        hello(at, identity, name=name.decode())
+        for batch in range(batches):
+            service.pass_seconds(0.5)
+            at.consumer_says(identity, Want(number, (2 * batch, 2 * batch + 1), waited_seconds=0.1 * batch))
+            at.work_off()
+        if leaves:
+            at.consumer_says(identity, Goodbye(0.1 * batches))
+        service.pass_seconds(pause)
+        totals = list(at.dispatcher.sessions.totals())
+        assert len({each.number for each in totals}) == len(totals)
+        assert sum(each.served for each in totals) == at.dispatcher.counters.samples
+        assert sum(each.waited_seconds for each in totals) == pytest.approx(at.dispatcher.counters.waited_seconds)
+        for row in service.view().consumers:
+            assert 0.0 <= row.waiting_share <= 1.0
+            assert 0.0 <= row.epoch_share <= 1.0
+            assert 0.0 <= row.samples_per_second <= 4.0 + 1e-6  # two in half a second
 
 
 def test_consumers_of_one_name_keep_rows_of_their_own() -> None:

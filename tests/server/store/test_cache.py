@@ -26,7 +26,7 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.store.cache import Cache, make_cache, piece_frames
-from v2v_server.store.used import used_bytes
+from v2v_server.store.quota import used_bytes
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.produce import make_sample
 

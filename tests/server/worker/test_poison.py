@@ -15,10 +15,10 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.blame import ALONE_AFTER, Cause
-from v2v_server.broker.quarantine import Quarantine, QuarantineEntry, clearing
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.offline import remake as remake_module
 from v2v_server.offline.remake import remake
+from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry, clearing
 
 TIME = "2024-02-29T12:00:00+00:00"
 BLAMING = (Cause.CRASHED, Cause.HUNG)
@@ -506,7 +506,7 @@ def remade(
         return (lease,)
 
     monkeypatch.setattr(remake_module, "decode_for", decode_for)
-    monkeypatch.setattr(remake_module, "make_sample", lambda lease, decoded: cast(Sample, decoded))
+    monkeypatch.setattr(remake_module, "make_sample", lambda lease, decoded, sidecars: cast(Sample, decoded))
     remake(catalogue, spec, seed=0, epoch=0, index=index, arrays=("voxels",), quarantine=quarantine, snapshot=snapshot)
     return leases[0]
 

@@ -17,11 +17,12 @@ from tests.server.named_corpus import SMALL_SPEC
 from v2v_protocol.errors import ProtocolError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import Lease
 from v2v_server.broker.leases import Request
-from v2v_server.broker.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.commands.simulate import main as simulate
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.leases import lease_for
 from v2v_server.offline.remake import remake
+from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
+from v2v_server.quarantine.snapshots import QuarantineEntry
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.worker import decode_cache as clips

@@ -16,6 +16,7 @@ import zmq
 
 from tests.protocol.wire_messages import example
 from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.link.dealer import wait
 from v2v_protocol.messages import Begun, Goodbye, Lease, LeaseFailed, Message, Ping, Pong, Result, Stop, WorkerHello
 from v2v_protocol.sample import Layout, new_arrays
 from v2v_protocol.wire import decode, encode
@@ -124,18 +125,18 @@ def test_a_new_connection_has_a_new_routing_id(tmp_path: Path) -> None:
                 worker._do(Send(encode(Ping())))
                 assert at.heard() == Ping()
                 at.says(Pong())
-                assert worker._socket.poll(WAIT_MS)
+                assert wait([worker._link], WAIT_MS / 1000)
                 assert [decode(frame) for frame in worker._messages(0.0)] == [Pong()]
                 found.append(at.worker)
                 worker._do(Reconnect())
         finally:
-            worker._context.destroy(linger=0)
+            worker._link.close()
     assert len(set(found)) == 2
     assert all(len(identity) == 16 and identity != b"w" for identity in found)
 
 
 def test_a_malformed_address_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"--connect nowhere: .*; write tcp://HOST:PORT"):
+    with pytest.raises(UsageError, match=r"--connect: address 'nowhere': .*; give tcp://host:port"):
         Worker("w", Folder(tmp_path), "nowhere")
 
 

@@ -48,6 +48,8 @@ CREATE TABLE IF NOT EXISTS figures (
     data BLOB NOT NULL,
     PRIMARY KEY (kind, version, id)
 )"""
+_SUMMARIES = "CREATE INDEX IF NOT EXISTS summaries ON figures (kind, version, id, fingerprint, summary)"
+"""Summaries are read without the data beside them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,27 +208,40 @@ class Store:
             sqlite3.Error: as for :meth:`put`.
         """
         self._database.execute(_FIGURES)
+        self._database.execute(_SUMMARIES)
         return _has_table(self._database, "scene")
 
     def summaries(self, kind: FigureKind) -> Generator[tuple[str, bytes], None, None]:
-        """Yield (id, summary) of each video whose figures are those of its present fingerprint, sorted by id.
+        """Yield (id, summary) of each video that has figures for its present fingerprint, sorted by id.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
         yield from self._figures("summary", kind)
 
-    def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes, bytes], None, None]:
-        """Yield (id, summary, encoded figures) like :meth:`summaries`."""
-        yield from self._figures("summary, data", kind)
+    def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes], None, None]:
+        """Yield (id, encoded figures) like :meth:`summaries`."""
+        yield from self._figures("data", kind)
 
-    def _figures(self, columns: str, kind: FigureKind) -> Generator[tuple[Any, ...], None, None]:
+    def _figures(self, column: str, kind: FigureKind) -> Generator[tuple[str, bytes], None, None]:
         query = (
-            f"SELECT id, {columns} FROM video JOIN figures USING (id, fingerprint) WHERE kind = ? AND version = ? "
-            "AND typeof(summary) = 'blob' AND typeof(data) = 'blob' ORDER BY id"
+            f"SELECT figures.id, {column} FROM figures JOIN video USING (id, fingerprint) WHERE kind = ? "
+            f"AND version = ? AND typeof({column}) = 'blob' ORDER BY figures.id"
         )
         with closing(self._database.execute(query, (kind.name, kind.version))) as rows:
             yield from rows
+
+    def without_figures(self, kind: FigureKind) -> list[str]:
+        """Return the usable videos that have no figures for their present fingerprint.
+
+        Raises:
+            sqlite3.Error: the file is damaged.
+        """
+        query = (
+            "SELECT id FROM video WHERE problem IS NULL AND NOT EXISTS (SELECT 1 FROM figures WHERE kind = ? "
+            "AND version = ? AND id = video.id AND fingerprint = video.fingerprint) ORDER BY id"
+        )
+        return [id for (id,) in self._database.execute(query, (kind.name, kind.version))]
 
     def figures(self, id: str, fingerprint: str, kind: FigureKind) -> bytes | None:
         """Return the encoded figures of a video; None if the index has none of this state of it.

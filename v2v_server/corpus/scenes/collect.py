@@ -7,16 +7,18 @@ fingerprint and the rows that were analysed, together with the runs that follow 
 from __future__ import annotations
 
 import hashlib
+import sqlite3
 from array import array
 from base64 import b64decode
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 
 import numpy as np
 import numpy.typing as npt
+import xxhash
 
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
 from v2v_server.corpus.index.columns import VideoTable, joined
@@ -32,6 +34,8 @@ from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import Window
 from v2v_server.video.rows import Rows
+
+_UNKNOWN_MARK = bytes(8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +66,11 @@ class SceneCollection:
             sqlite3.Error: the index cannot be written.
         """
         has_earlier = store.make_figures()
-        known = joined(table.ids, store.summaries(self.kind), [], (None,))
-        missing = [table.row(at) for at, (_, runs) in enumerate(known) if runs is None and table.problem[at] is None]
-        with closing(self._found(store, source, missing, has_earlier, processes)) as found:
+        places = (table.ids.find(id) for id in store.without_figures(self.kind))
+        missing = [place for place in places if place is not None]
+        with closing(self._found(store, source, table, missing, has_earlier, processes)) as found:
             for batch in batches(found, len(missing), progress):
-                store.put_figures(self.kind, (figures(record, scene) for record, scene in batch))
+                store.put_figures(self.kind, (figures(*each) for each in batch))
 
     def read(
         self, store: Store, ids: Sequence[str], frames: npt.NDArray[np.int64], unknown: set[str], digest: str
@@ -81,36 +85,57 @@ class SceneCollection:
         Raises:
             sqlite3.Error: the index is damaged.
         """
-        sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
-        encoded, lengths, nothing = bytearray(), array("q"), Scene.unknown().to_bytes()
+        encoded, lengths = bytearray(), array("q")
         whole = np.stack((0 * frames, frames), 1).astype("<i4")
-        known = joined(ids, store.all_figures(self.kind), [], (None, nothing))
-        for number, (id, runs, data) in enumerate(known):
-            if runs is None or len(runs) % 8 or id in unknown:
+        for number, (id, summary) in enumerate(joined(ids, store.summaries(self.kind), [], (None,))):
+            if summary is None or len(summary) < 8 or len(summary) % 8 or id in unknown:
                 unknown.add(id)
-                runs, data = whole[number].tobytes(), nothing
-            sha.update(data)
-            encoded += runs
-            lengths.append(len(runs))
-        return SplitVideos.decode(frames, bytes(encoded), np.asarray(lengths)), sha.hexdigest()[:32]
+                summary = _UNKNOWN_MARK + whole[number].tobytes()
+            encoded += summary
+            lengths.append(len(summary))
+        pairs, counts = np.frombuffer(encoded, "<i4").astype(np.int32).reshape(-1, 2), np.asarray(lengths) // 8
+        is_run = np.ones(len(pairs), bool)
+        is_run[np.cumsum(counts) - counts] = False  # the mark of each
+        split = SplitVideos.select(frames, pairs[is_run], counts - 1)
+        return split, self._digest(store, ids, unknown, digest, hashlib.sha256(encoded + lengths.tobytes()).hexdigest())
+
+    def _digest(self, store: Store, ids: Sequence[str], unknown: set[str], digest: str, summaries: str) -> str:
+        """Return the digest of all figures. To compute it takes reading them: it is kept for the same summaries."""
+        kept, key = FigureKind("scene digest", self.kind.version), f"{digest} {summaries}"
+        if (known := store.figures("", key, kept)) is not None:
+            return known.decode()
+        sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
+        nothing = Scene.unknown().to_bytes()
+        for id, data in joined(ids, store.all_figures(self.kind), [], (nothing,)):
+            sha.update(nothing if id in unknown else data)
+        with suppress(sqlite3.Error):  # a locked index costs the next start this time again
+            store.put_figures(kept, [Figures("", key, b"", sha.hexdigest()[:32].encode())])
+        return sha.hexdigest()[:32]
 
     def _found(
-        self, store: Store, source: VideoSource, missing: list[IndexRow], has_earlier: bool, processes: int
-    ) -> Generator[tuple[IndexRow, Scene], None, None]:
-        by_id: dict[str, IndexRow] = {}
-        for record in missing:
+        self,
+        store: Store,
+        source: VideoSource,
+        table: VideoTable,
+        missing: list[int],
+        has_earlier: bool,
+        processes: int,
+    ) -> Generator[tuple[IndexRow | _Job, Scene], None, None]:
+        left = []
+        for place in missing:
+            record = table.row(place)
             data = self._prepared(record)
             if data is None and has_earlier:
                 data = store.earlier_scene(record.id, record.fingerprint, self.kind.version)
             if data is None:
-                by_id[record.id] = record
+                left.append(place)
             else:
                 yield record, Scene.from_bytes(data)
 
         def jobs() -> Iterator[_Job]:
-            for record in by_id.values():
+            for record in map(table.row, left):
                 index = store.frame_index(record.id, record.fingerprint) or b""
-                yield _Job(record.id, record.fingerprint, index, self._window(record))
+                yield _Job(record.id, record.fingerprint, record.frames, index, self._window(record))
 
         isolated = partial(
             run_isolated,
@@ -126,12 +151,12 @@ class SceneCollection:
             if isinstance(found, Died) or not found:
                 suspects.append(job)
             else:
-                yield by_id[job.id], Scene.from_bytes(found)
+                yield job, Scene.from_bytes(found)
         # Once more, alone: the process may have been killed from outside, or for lack of memory, or its storage failed
         # for a moment. A second failure is not kept: such a video counts as unknown, and the next start tries again.
         for job, found in isolated(suspects, 1):
             if not isinstance(found, Died) and found:
-                yield by_id[job.id], Scene.from_bytes(found)
+                yield job, Scene.from_bytes(found)
 
     def _prepared(self, record: IndexRow) -> bytes | None:
         """Return the encoded scene that the manifest states."""
@@ -147,16 +172,18 @@ class SceneCollection:
         return top, 0, bottom - top, record.width_px
 
 
-def figures(record: IndexRow, scene: Scene) -> Figures:
-    """Return what the index keeps of a scene."""
-    runs = np.array(scene.runs(record.frames), "<i4").tobytes()
-    return Figures(record.id, record.fingerprint, runs, scene.to_bytes())
+def figures(video: IndexRow | _Job, scene: Scene) -> Figures:
+    """Return what the index keeps of a scene; the summary is a hash of it and the usable runs."""
+    data = scene.to_bytes()
+    summary = xxhash.xxh3_64_digest(data) + np.array(scene.runs(video.frames), "<i4").tobytes()
+    return Figures(video.id, video.fingerprint, summary, data)
 
 
 @dataclass(frozen=True, slots=True)
 class _Job:
     id: str
     fingerprint: str
+    frames: int
     index: bytes
     window: Window | None
 

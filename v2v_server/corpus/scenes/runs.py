@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 import numpy.typing as npt
@@ -31,19 +32,19 @@ class SplitVideos:
     @classmethod
     def of(cls, frames: Iterable[int], runs: Iterable[Runs]) -> SplitVideos:
         """Make it from the frames and the runs of every video."""
-        each = [np.array(those, "<i4").tobytes() for those in runs]
-        return cls.decode(np.fromiter(frames, np.int64), b"".join(each), np.fromiter(map(len, each), np.int64))
+        each = list(runs)
+        flat = np.array(list(chain.from_iterable(each)), np.int32).reshape(-1, 2)
+        return cls.select(np.fromiter(frames, np.int64), flat, np.fromiter(map(len, each), np.int64))
 
     @classmethod
-    def decode(cls, frames: npt.NDArray[np.int64], encoded: bytes, lengths: npt.NDArray[np.int64]) -> SplitVideos:
-        """Make it from the runs of every video, encoded as int32 pairs (first frame, frame after the last).
+    def select(cls, frames: npt.NDArray[np.int64], runs: _Int32, counts: npt.NDArray[np.int64]) -> SplitVideos:
+        """Make it from the runs of every video in columns.
 
         Args:
             frames: [N] of each video.
-            encoded: those of all videos, one after the other.
-            lengths: [N] bytes of each video's runs.
+            runs: [R, 2] (first frame, frame after the last) of the runs of all videos.
+            counts: [N] number of each video's runs.
         """
-        runs, counts = np.frombuffer(encoded, "<i4").astype(np.int32).reshape(-1, 2), lengths // 8
         is_whole = counts == 1
         ends = np.cumsum(counts)
         is_whole[is_whole] = (runs[ends[is_whole] - 1] == np.stack((0 * frames, frames), 1)[is_whole]).all(1)

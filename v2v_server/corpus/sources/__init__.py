@@ -6,6 +6,7 @@ prepared  a folder that v2v-prepare made
 copies    object storage, by way of a folder of copies on this host
 bucket    an address in object storage
 listfile  list files like the paper's
+sidecar   files and folders beside videos, such as labels
 names     which names are videos', and how a name is shown
 asking    asking about many files at a time
 """

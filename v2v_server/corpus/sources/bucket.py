@@ -91,7 +91,7 @@ class Bucket:
             CorpusError: they cannot be listed.
         """
         try:
-            found = self._ask("", lambda: self._store.find(self._prefix, detail=True))
+            return self.find("")
         except VideoGone as error:
             raise CorpusError(f"--videos {self.url}: there is no such bucket or prefix") from error
         except VideoDenied as error:
@@ -102,7 +102,15 @@ class Bucket:
             ) from error
         except VideoUnreadable as error:
             raise CorpusError(f"--videos {self.url}: cannot be listed: {error.reason}") from error
-        start = f"{self._prefix}/"
+
+    def find(self, below: str) -> dict[str, State]:
+        """Return the states of all objects below a folder of the address, "" or ending in a slash, by relative path.
+
+        Raises:
+            VideoGone, VideoDenied, VideoUnreadable: they cannot be listed.
+        """
+        start = f"{self._prefix}/{below}"
+        found = self._ask(below, lambda: self._store.find(start.rstrip("/"), detail=True))
         return {path[len(start) :]: _state(info) for path, info in found.items() if path.startswith(start)}
 
     def state(self, id: str, tries: int = TRIES) -> State:

@@ -15,34 +15,38 @@ import hashlib
 import os
 import time
 from array import array
+from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
+from itertools import islice, takewhile
 from pathlib import Path, PurePosixPath
 from typing import IO
+from zipfile import Path as ZipPath
+from zipfile import ZipFile
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoGone, VideoUnreadable
 from v2v_server.corpus.manifest import MANIFEST_NAME
 from v2v_server.corpus.sources.bucket import Bucket, is_url
 from v2v_server.corpus.sources.listfile import ListEntry
 from v2v_server.corpus.sources.names import UNPRINTABLE, count_left_out, is_video_name, printable
+from v2v_server.corpus.sources.sidecar import fingerprint_of as sidecar_fingerprint
+from v2v_server.corpus.sources.sidecar import is_sidecar, state_text
 from v2v_server.corpus.sources.source import GONE, SourceOptions, State, VideoSource
-from v2v_server.store.used import PARTIAL, locked_use
+from v2v_server.store.quota import PARTIAL, QuotaFolder
+from v2v_server.system.locks import lock
 from v2v_server.system.private import make_private, open_private
 from v2v_server.system.process import cache_folder
-from v2v_server.video.fingerprint import fingerprint as fingerprint_of
+from v2v_server.video.fingerprint import fingerprint as video_fingerprint
 from v2v_server.video.fingerprint import is_same_file
 
 _SLOTS = 64
 """Videos that a host can fetch at a time, and so the most unfinished files that killed processes leave behind."""
-_KEPT_SHARE = 0.9
-"""Share of the limit that is used after an eviction. Evicting lists every file, so it frees space for several."""
 _LOCK_SECONDS = 30.0
 """Longest wait for another process that evicts copies. No lease has begun yet, so no video is blamed for it."""
 _SLOT_SECONDS = 20.0
 """Longest wait for another process that fetches a video of the same slot. Then the next free slot is used: the process
 may be stopped, and fetching one video twice costs less than a waiting worker."""
-_POLL_SECONDS = 0.05
 _ROOM_SECONDS = 2.0
 """Wait before the next try if all copies are being read."""
 
@@ -68,7 +72,8 @@ class Copies(VideoSource):
     ) -> None:
         super().__init__(bucket.url, listed)
         self.bucket, self.copies, self.most_bytes = bucket, copies, most_bytes
-        self._at_hand: tuple[tuple[str, str], IO[bytes]] | None = None
+        self._quota = QuotaFolder(copies, most_bytes, _LOCK_SECONDS)
+        self._at_hand: dict[tuple[str, str], IO[bytes]] = {}
 
     def __reduce__(self) -> tuple[type[Copies], tuple[Bucket, Path, int]]:
         return Copies, (self.bucket, self.copies, self.most_bytes)
@@ -81,6 +86,10 @@ class Copies(VideoSource):
             CorpusError: they cannot be listed.
         """
         return self.bucket.objects()
+
+    @cached_property
+    def _names(self) -> list[str]:
+        return sorted(self._objects)
 
     def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
         """List the objects that a folder would list as videos, see :meth:`VideoSource.videos`."""
@@ -110,9 +119,7 @@ class Copies(VideoSource):
             CorpusError: it cannot be created or written to.
         """
         try:
-            (self.copies / PARTIAL).mkdir(parents=True, exist_ok=True)
-            with locked_use(self.copies, _LOCK_SECONDS):
-                pass
+            self._quota.make()
         except OSError as error:
             raise CorpusError(f"--copies {self.copies}: cannot be written to: {error.strerror or error}") from error
 
@@ -142,32 +149,55 @@ class Copies(VideoSource):
             VideoGone, VideoChanged: the object is gone, or another one by now.
         """
         try:
-            found = self.bucket.state(id, tries=1)
+            if is_sidecar(id):
+                found = self.bucket.find(id) if id.endswith("/") else {"": self.bucket.state(id, tries=1)}
+                changed = state_text(sorted(found.items())) != self.sidecar_states([id])[0]
+            else:
+                changed = self.bucket.state(id, tries=1) != state and state is not None
         except VideoGone:
             raise
         except VideoUnreadable:
             return
-        if state is not None and found != state:
+        if changed:
             raise VideoChanged(id, None, f"changed in {self} since it was catalogued")
 
-    def has(self, id: str, fingerprint: str) -> bool:
-        """Return whether the copy is there. If so, it stays until the next one is asked for, or fetched."""
-        if self._at_hand is not None and self._at_hand[0] == (id, fingerprint):
-            return True
-        held = self._hold(self._path(id, fingerprint))
-        if held is not None:
-            self._keep(id, fingerprint, held)
-        return held is not None
+    def sidecar_states(self, ids: Sequence[str]) -> list[str]:
+        """Return texts that stand for the listed objects' states, see :meth:`VideoSource.sidecar_states`."""
+        return [state_text([(name[len(id) :], self._objects[name]) for name in self._below(id)]) for id in ids]
 
-    def fetch(self, id: str, fingerprint: str) -> None:
-        """Fetch the copy if it is missing; afterwards :meth:`has` returns True.
+    def _below(self, id: str) -> Iterator[str]:
+        """Yield the names of the listed objects of a sidecar, sorted."""
+        start = bisect_left(self._names, id)
+        if id.endswith("/"):
+            yield from takewhile(lambda name: name.startswith(id), islice(self._names, start, None))
+        elif id in self._objects:
+            yield id
+
+    def has(self, files: Mapping[str, str]) -> bool:
+        """Return whether the copies are there. If so, they stay until others are asked for, or fetched."""
+        if self._at_hand.keys() == files.items():
+            return True
+        held: dict[tuple[str, str], IO[bytes]] = {}
+        for id, fingerprint in files.items():
+            copy = self._hold(self._path(id, fingerprint))
+            if copy is None:
+                _close(held)
+                return False
+            held[id, fingerprint] = copy
+        self.release()
+        self._at_hand = held
+        return True
+
+    def fetch(self, files: Mapping[str, str]) -> None:
+        """Fetch the copies that are missing; afterwards :meth:`has` returns True.
 
         Raises:
-            VideoUnreadable: it cannot be had.
-            VideoChanged: the object is another one by now.
+            VideoUnreadable: one cannot be had.
+            VideoChanged: an object is another one by now.
         """
         self.release()
-        self._keep(id, fingerprint, self._get(id, fingerprint))
+        for id, fingerprint in files.items():
+            self._at_hand[id, fingerprint] = self._get(id, fingerprint)
 
     @contextlib.contextmanager
     def open_local(self, id: str, fingerprint: str) -> Iterator[Path]:
@@ -179,22 +209,20 @@ class Copies(VideoSource):
         Raises:
             VideoUnreadable, VideoChanged: see :meth:`fetch`.
         """
-        if fingerprint and self.has(id, fingerprint):
+        if (id, fingerprint) in self._at_hand:
             yield self._path(id, fingerprint)
             return
-        self.release()
-        with self._get(id, fingerprint) as held:
+        held = self._hold(self._path(id, fingerprint)) if fingerprint else None
+        if held is None:
+            self.release()
+            held = self._get(id, fingerprint)
+        with held:
             yield Path(held.name)
 
-    def _keep(self, id: str, fingerprint: str, held: IO[bytes]) -> None:
-        self.release()
-        self._at_hand = (id, fingerprint), held
-
     def release(self) -> None:
-        """Allow eviction of the copy that :meth:`has` or :meth:`fetch` keeps."""
-        if self._at_hand is not None:
-            self._at_hand[1].close()
-            self._at_hand = None
+        """Allow eviction of the copies that :meth:`has` or :meth:`fetch` keeps."""
+        _close(self._at_hand)
+        self._at_hand = {}
 
     def _path(self, id: str, fingerprint: str) -> Path:
         mark = "-".join(fingerprint.split("-")[:2])  # what a file's head and tail tell
@@ -232,18 +260,25 @@ class Copies(VideoSource):
         end = time.monotonic() + _SLOT_SECONDS
         for other in range(_SLOTS):
             slot = self.copies / PARTIAL / f"{(number + other) % _SLOTS:02}"
-            with open(open_private(slot.with_suffix(".lock"), os.O_WRONLY | os.O_CREAT), "wb") as lock:
-                if _lock(lock, end):
-                    yield slot
-                    return
+            name = slot.with_suffix(".lock")
+            with open(open_private(name, os.O_WRONLY | os.O_CREAT), "wb") as held:
+                try:
+                    lock(held.fileno(), end - time.monotonic(), name)
+                except BlockingIOError:
+                    continue
+                yield slot
+                return
         raise BlockingIOError(errno.EAGAIN, f"other processes keep all {_SLOTS} of its slots; end them")
 
     def _fetch(self, id: str, fingerprint: str, slot: Path) -> IO[bytes]:
         try:
             make_private(slot)
-            self.bucket.fetch(id, slot)
+            if id.endswith("/"):
+                self._pack(id, slot)
+            else:
+                self.bucket.fetch(id, slot)
             slot.chmod(0o600)  # where the store's own tools put another file there
-            found = fingerprint_of(slot)
+            found = self._fingerprint(id, slot)
             if fingerprint and not is_same_file(found, fingerprint):
                 why = f"changed in {self} since it was catalogued: {found} instead of {fingerprint}"
                 raise VideoChanged(id, None, why)
@@ -258,28 +293,39 @@ class Copies(VideoSource):
         finally:
             slot.unlink(missing_ok=True)
 
+    def _pack(self, id: str, slot: Path) -> None:
+        """Fetch a folder into one file, a ZIP archive without compression."""
+        part = slot.with_suffix(".part")
+        try:
+            with ZipFile(slot, "w") as packed:
+                for name in self.bucket.find(id):
+                    self.bucket.fetch(f"{id}{name}", part)
+                    packed.write(part, name)
+        finally:
+            part.unlink(missing_ok=True)
+
+    def _fingerprint(self, id: str, slot: Path) -> str:
+        if not is_sidecar(id):
+            return video_fingerprint(slot)
+        if not id.endswith("/"):
+            return sidecar_fingerprint(slot)
+        with ZipFile(slot) as packed:
+            return sidecar_fingerprint(ZipPath(packed))
+
     def _place(self, id: str, slot: Path, path: Path) -> None:
         """Give the fetched file its name. If space runs out, evict copies without a reader, least recently read first.
 
         Raises:
             VideoUnreadable: the copies that are being read leave too little space.
         """
-        size = slot.stat().st_size
-        path.parent.mkdir(exist_ok=True)
         for wait in (_ROOM_SECONDS, _ROOM_SECONDS, 0.0):
-            with locked_use(self.copies, _LOCK_SECONDS) as used:
-                if used.bytes + size > self.most_bytes:
-                    enough = max(0, int(self.most_bytes * _KEPT_SHARE) - size)
-                    for oldest in _oldest_first(self.copies):
-                        if used.bytes > enough:
-                            used.add(-_evicted(oldest))
-                if used.bytes + size <= self.most_bytes:
-                    used.add(size - (path.stat().st_size if path.exists() else 0))
-                    slot.replace(path)
-                    return
+            if self._quota.add(slot, path, evicts=True):
+                return
             time.sleep(wait)
-        why = f"its {size} bytes do not fit beside the {used.bytes} bytes that are being read: raise --copies-gib"
-        raise VideoUnreadable(id, None, why)
+        why = (
+            f"its {slot.stat().st_size} bytes do not fit beside the {self._quota.used_bytes} bytes that are being read"
+        )
+        raise VideoUnreadable(id, None, f"{why}: raise --copies-gib")
 
 
 def open_source(name: str, options: SourceOptions) -> Copies | None:
@@ -298,32 +344,6 @@ def open_source(name: str, options: SourceOptions) -> Copies | None:
     return copies
 
 
-def _lock(file: IO[bytes], end: float) -> bool:
-    """Try at least once, and until ``end`` (monotonic), to lock a file; return whether it is locked."""
-    while True:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return True
-        except BlockingIOError:
-            if time.monotonic() >= end:
-                return False
-        time.sleep(_POLL_SECONDS)
-
-
-def _oldest_first(folder: Path) -> list[Path]:
-    found = []
-    for below in folder.iterdir():
-        if below.is_dir() and below.name != PARTIAL:
-            with os.scandir(below) as entries:
-                found += [(entry.stat().st_mtime_ns, entry.path) for entry in entries]
-    return [Path(path) for _, path in sorted(found)]
-
-
-def _evicted(path: Path) -> int:
-    """Delete a copy, and return the bytes that this freed; 0 if it has a reader."""
-    with contextlib.suppress(OSError), path.open("rb") as file:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        size = os.fstat(file.fileno()).st_size
-        path.unlink()
-        return size
-    return 0
+def _close(held: Mapping[tuple[str, str], IO[bytes]]) -> None:
+    for file in held.values():
+        file.close()

@@ -18,6 +18,7 @@ from v2v_server.corpus.manifest import MANIFEST_NAME
 from v2v_server.corpus.sources.asking import answers
 from v2v_server.corpus.sources.listfile import LIST_SUFFIXES, ListEntry, read_list
 from v2v_server.corpus.sources.names import UNPRINTABLE, count_left_out, is_video_name, printable
+from v2v_server.corpus.sources.sidecar import check_local, is_sidecar, local_state
 from v2v_server.corpus.sources.source import GONE, NO_STATE, SourceOptions, State, VideoSource
 from v2v_server.store.clips import check_file
 from v2v_server.video.fingerprint import unreadable
@@ -86,8 +87,24 @@ class Folder(VideoSource):
         return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
-        """Lend the file, unchecked."""
+        """Lend the file; only a sidecar is checked.
+
+        Raises:
+            VideoUnreadable, VideoChanged: a sidecar cannot be read, or is another one by now.
+        """
+        if fingerprint and is_sidecar(id):
+            check_local(self.folder / id, id, fingerprint)
         return nullcontext(self.folder / id)
+
+    def sidecar_states(self, ids: Sequence[str]) -> list[str]:
+        """Return texts that stand for sizes and times, see :meth:`VideoSource.sidecar_states`."""
+        found = []
+        for id in ids:
+            try:
+                found.append(local_state(self.folder / id, id))
+            except OSError as error:  # opening it reports the same error
+                found.append(str(error))
+        return found
 
     def verify(self, id: str, fingerprint: str, state: State | None) -> None:
         """Check the file against its fingerprint.
@@ -95,7 +112,10 @@ class Folder(VideoSource):
         Raises:
             VideoError: it is gone, another one by now, or cannot be read.
         """
-        check_file(self.folder / id, fingerprint)
+        if is_sidecar(id):
+            check_local(self.folder / id, id, fingerprint)
+        else:
+            check_file(self.folder / id, fingerprint)
 
     def _regular_files(self, refused: dict[str, str]) -> Iterator[str]:
         """Yield the listed ids that do not name something else than a file.

@@ -13,7 +13,7 @@ import os
 from abc import ABC, abstractmethod
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
@@ -139,19 +139,19 @@ class VideoSource(ABC):
 
     @abstractmethod
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
-        """Lend a file of this host with the video's bytes until the end of the context.
+        """Lend a file of this host with the bytes of a video or sidecar until the end of the context.
 
         Args:
-            fingerprint: of the video as catalogued; "" takes what is there now.
+            fingerprint: as catalogued; "" takes what is there now.
 
         Raises:
-            VideoUnreadable, VideoChanged: it cannot be had. A file that is on this host anyway may be lent unchecked:
+            VideoUnreadable, VideoChanged: it cannot be had. A video that is on this host anyway may be lent unchecked:
                 reading it reports the same errors.
         """
 
     @abstractmethod
     def verify(self, id: str, fingerprint: str, state: State | None) -> None:
-        """Check that a video is as catalogued. An answer that cannot be had now is no error of a remote source.
+        """Check that a video or sidecar is as catalogued. A remote source that gives no answer now raises no error.
 
         Args:
             fingerprint, state: as catalogued; None: unknown.
@@ -160,11 +160,22 @@ class VideoSource(ABC):
             VideoError: it is gone, another one by now, or (on a disk) cannot be read.
         """
 
-    def has(self, id: str, fingerprint: str) -> bool:
-        """Return whether :meth:`open_local` needs no network. If so, the file stays until the next one is asked for."""
+    def sidecar_states(self, ids: Sequence[str]) -> list[str]:
+        """Return texts that change with the content of these sidecars; "" for one that is not there. Called in threads.
+        A source without sidecars need not implement this.
+        """
+        return [""] * len(ids)
+
+    def has(self, files: Mapping[str, str]) -> bool:
+        """Return whether :meth:`open_local` needs no network for these files. If so, they stay until others are asked
+        for.
+
+        Args:
+            files: their fingerprints, by id.
+        """
         return True
 
-    def fetch(self, id: str, fingerprint: str) -> None:  # noqa: B027 - a local source has nothing to fetch
+    def fetch(self, files: Mapping[str, str]) -> None:  # noqa: B027 - a local source has nothing to fetch
         """Do the part of :meth:`open_local` that needs the network, so that :meth:`has` returns True.
 
         Raises:
@@ -172,7 +183,7 @@ class VideoSource(ABC):
         """
 
     def release(self) -> None:  # noqa: B027 - a local source keeps nothing
-        """Release the file that :meth:`has` or :meth:`fetch` keeps."""
+        """Release the files that :meth:`has` or :meth:`fetch` keeps."""
 
     def rows(self, asked: Rows | None) -> Rows:
         """Return which rows of the pictures may be used.

@@ -177,7 +177,7 @@ function show(state) {
     ["workers idle", shares.idle],
     ["workers decode", shares.decode],
     ["workers simulate", shares.simulate],
-    ["workers hand over", shares.handover],
+    ["workers deliver", shares.handover],
     ["workers wait for a core", shares.queued],
     ["server's loop busy", shares.broker],
   ], true);
@@ -205,10 +205,10 @@ function workersCount(state) {
 function tiles(state) {
   const totals = state.totals;
   const pairs = [
-    ["batches a second", number(state.batches_per_second), `${number(totals.batches)} in all`],
-    ["samples a second", number(state.samples_per_second), `${totals.samples.toLocaleString("en")} in all`],
-    ["bytes a second", bytes(state.bytes_per_second), `${bytes(totals.bytes)} in all`],
-    ["decodes a second", number(state.decodes_per_second), `${totals.decodes.toLocaleString("en")} in all`],
+    ["batches a second", number(state.batches_per_second), `${number(totals.batches)} in total`],
+    ["samples a second", number(state.samples_per_second), `${totals.samples.toLocaleString("en")} in total`],
+    ["bytes a second", bytes(state.bytes_per_second), `${bytes(totals.bytes)} in total`],
+    ["decodes a second", number(state.decodes_per_second), `${totals.decodes.toLocaleString("en")} in total`],
     ["queued", String(state.queue), "samples without a worker"],
     ["faults", String(totals.faults), "handled"],
     ["videos", state.video_count.toLocaleString("en"), `${state.unusable_count} cannot be used`],

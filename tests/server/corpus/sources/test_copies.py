@@ -28,7 +28,7 @@ from v2v_server.corpus.sources import copies as copies_module
 from v2v_server.corpus.sources.bucket import Bucket, is_url
 from v2v_server.corpus.sources.copies import Copies
 from v2v_server.corpus.sources.source import GONE, SourceOptions, open_source
-from v2v_server.store.used import PARTIAL, count_bytes, used_bytes
+from v2v_server.store.quota import PARTIAL, count_bytes, used_bytes
 from v2v_server.video.fingerprint import fingerprint
 
 pytest.importorskip("fsspec", reason="the extra 'cloud' is not installed")
@@ -97,12 +97,12 @@ def test_an_address_is_told_from_a_path(source: str, expected: bool) -> None:
 
 def test_a_video_is_fetched_once(store: Path) -> None:
     made, mark = copies(store), fingerprint(store / "a.mp4")
-    assert not made.has("a.mp4", mark)
+    assert not made.has({"a.mp4": mark})
     with made.open_local("a.mp4", f"{mark}-content") as path:
         assert path.read_bytes() == (store / "a.mp4").read_bytes()
         assert path.suffix == ".mp4"
     (store / "a.mp4").unlink()
-    assert made.has("a.mp4", mark)
+    assert made.has({"a.mp4": mark})
     with made.open_local("a.mp4", mark) as path:
         assert path.stat().st_size == SIZE
     assert [each.name for each in (made.copies / PARTIAL).iterdir() if each.suffix != ".lock"] == []
@@ -115,18 +115,18 @@ def test_a_slot_that_another_process_keeps_is_not_waited_for(store: Path, monkey
         for number in range(63):
             lock = held.enter_context((made.copies / PARTIAL / f"{number:02}.lock").open("wb"))
             fcntl.flock(lock, fcntl.LOCK_EX)
-        made.fetch("a.mp4", mark)
-        assert made.has("a.mp4", mark)
+        made.fetch({"a.mp4": mark})
+        assert made.has({"a.mp4": mark})
         last = held.enter_context((made.copies / PARTIAL / "63.lock").open("wb"))
         fcntl.flock(last, fcntl.LOCK_EX)
         with pytest.raises(VideoUnreadable, match="other processes keep all 64 of its slots"):
-            made.fetch("b.mp4", fingerprint(store / "b.mp4"))
-    made.fetch("b.mp4", fingerprint(store / "b.mp4"))
+            made.fetch({"b.mp4": fingerprint(store / "b.mp4")})
+    made.fetch({"b.mp4": fingerprint(store / "b.mp4")})
 
 
 def test_other_users_cannot_lock_a_copy(store: Path) -> None:
     made = copies(store)
-    made.fetch("a.mp4", fingerprint(store / "a.mp4"))
+    made.fetch({"a.mp4": fingerprint(store / "a.mp4")})
     found = [path for path in made.copies.rglob("*") if path.is_file()]
     assert {path.suffix for path in found} >= {".mp4", ".lock"}
     assert {stat.S_IMODE(path.stat().st_mode) for path in found} == {0o600}
@@ -141,12 +141,12 @@ def test_an_object_that_is_gone_or_changed(store: Path) -> None:
         made.verify("a.mp4", mark, state)
     made.verify("a.mp4", mark, None)
     with pytest.raises(VideoChanged, match="changed in file:"):
-        made.fetch("a.mp4", mark)
+        made.fetch({"a.mp4": mark})
     (store / "a.mp4").unlink()
     with pytest.raises(VideoGone):
         made.verify("a.mp4", mark, state)
     with pytest.raises(VideoGone, match=r"is not in file:.* any more"):
-        made.fetch("a.mp4", mark)
+        made.fetch({"a.mp4": mark})
     assert files(made) == set()
 
 
@@ -178,11 +178,11 @@ def flaky(store: Path, *errors: Exception) -> tuple[Copies, Flaky]:
 
 def test_what_may_pass_is_tried_again(store: Path) -> None:
     made, asked = flaky(store, OSError("SlowDown"), TimeoutError("read"))
-    made.fetch("a.mp4", fingerprint(store / "a.mp4"))
+    made.fetch({"a.mp4": fingerprint(store / "a.mp4")})
     assert asked.asked == 3
     made, asked = flaky(store, *[OSError("SlowDown")] * 9)
     with pytest.raises(VideoUnreadable, match=r"the store gives no answer \(OSError: SlowDown; tried 3 times\)"):
-        made.fetch("b.mp4", fingerprint(store / "b.mp4"))
+        made.fetch({"b.mp4": fingerprint(store / "b.mp4")})
     assert asked.asked == 3
     made.verify("b.mp4", "", (SIZE, 0, 0))  # a store that does not answer condemns nothing
     assert asked.asked == 4
@@ -210,9 +210,9 @@ def test_what_was_not_read_for_longest_goes(store: Path) -> None:
         with made.open_local(name, marks[name]):
             pass
     assert files(made) == {b"\0", b"\1"}
-    assert made.has("a.mp4", marks["a.mp4"])  # read again: b is the older one now
+    assert made.has({"a.mp4": marks["a.mp4"]})  # read again: b is the older one now
     made.release()
-    made.fetch("deep/c.mp4", marks["deep/c.mp4"])
+    made.fetch({"deep/c.mp4": marks["deep/c.mp4"]})
     assert b"\1" not in files(made)
     assert b"\2" in files(made)
 
@@ -222,11 +222,11 @@ def test_what_is_being_read_stays(store: Path) -> None:
     mark = fingerprint(store / "a.mp4")
     with made.open_local("a.mp4", mark) as path:
         with pytest.raises(VideoUnreadable, match="raise --copies-gib"):
-            other.fetch("b.mp4", fingerprint(store / "b.mp4"))
+            other.fetch({"b.mp4": fingerprint(store / "b.mp4")})
         assert path.exists()
-    other.fetch("b.mp4", fingerprint(store / "b.mp4"))
+    other.fetch({"b.mp4": fingerprint(store / "b.mp4")})
     assert files(made) == {b"\1"}
-    assert not made.has("a.mp4", mark)
+    assert not made.has({"a.mp4": mark})
 
 
 def _read(made: Copies, marks: dict[str, str], turns: int) -> set[tuple[str, bytes]]:
@@ -258,7 +258,7 @@ def test_addresses_that_cannot_be(store: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="nonsense"):
         _ = Bucket("nonsense://x").objects()
     with pytest.raises(ProtocolError, match="leads out"):
-        copies(store).fetch("../a.mp4", "1-2")
+        copies(store).fetch({"../a.mp4": "1-2"})
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(CorpusError, match="cannot be written to"):
         Copies(Bucket("file:///x"), tmp_path / "file", 1).make()
@@ -268,6 +268,6 @@ def test_addresses_that_cannot_be(store: Path, tmp_path: Path) -> None:
 
 def test_it_travels_to_processes(store: Path) -> None:
     made = copies(store)
-    made.fetch("a.mp4", fingerprint(store / "a.mp4"))
+    made.fetch({"a.mp4": fingerprint(store / "a.mp4")})
     again = pickle.loads(pickle.dumps(made))
     assert (str(again), again.copies, again.most_bytes) == (f"file://{store}", made.copies, made.most_bytes)

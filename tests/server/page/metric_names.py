@@ -1,4 +1,4 @@
-"""Every metric that a server tells."""
+"""Name every metric that a server exports."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from tests.server.status.services import published
 from v2v_server.page.metrics import exposition
 
 
-def told() -> set[str]:
-    """The names, as a query writes them, of a service that has everything."""
+def metric_names() -> set[str]:
+    """Return the names, as a query writes them, of a service that has everything."""
     at = peers()
     at.join()
     at.hello()

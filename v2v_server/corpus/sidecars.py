@@ -1,0 +1,84 @@
+"""The sidecars of all videos of a catalogue. The index keeps their fingerprints."""
+
+from __future__ import annotations
+
+import hashlib
+import sqlite3
+from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass
+
+from v2v_protocol.errors import VideoError
+from v2v_server.corpus.index.file import FigureKind, Figures, Store
+from v2v_server.corpus.sources.asking import Notice, by_parts
+from v2v_server.corpus.sources.sidecar import fingerprint_of, open_sidecar, sidecar_id
+from v2v_server.corpus.sources.source import VideoSource
+
+
+@dataclass(frozen=True, slots=True)
+class Sidecars:
+    """The sidecars of one ending.
+
+    Attributes:
+        fingerprints: by the video's id; videos without such a sidecar are missing.
+        digest: names all of them.
+    """
+
+    fingerprints: Mapping[str, str]
+    digest: str
+
+
+def collect_sidecars(
+    source: VideoSource, store: Store, videos: Mapping[str, str], ending: str, notice: Notice | None
+) -> tuple[Sidecars, list[str]]:
+    """Return the sidecars of one ending, and notes for the user. Only new and changed ones are read.
+
+    Args:
+        source: where the videos come from.
+        store: the index.
+        videos: fingerprint of each video's file, by id.
+        ending: see :mod:`v2v_server.corpus.sources.sidecar`.
+        notice: progress callback.
+    """
+    kind, ids = FigureKind(f"sidecar {ending}", "1"), sorted(videos)
+    known = dict[str, tuple[bytes, bytes]]()
+    with suppress(sqlite3.Error):  # an index that cannot be read or written costs time only
+        store.make_figures()
+        pairs = zip(store.summaries(kind), store.all_figures(kind), strict=True)  # both sorted by id
+        known = {id: (state, mark) for (id, state), (_, mark) in pairs}
+    fingerprints, fresh, unreadable, done = dict[str, str](), list[Figures](), list[str](), 0
+
+    def states(part: Sequence[str]) -> list[str]:
+        return source.sidecar_states([sidecar_id(video, ending) for video in part])
+
+    with closing(by_parts(states, ids)) as answered:
+        for part, found in answered:
+            done += len(part)
+            for video, state in zip(part, found, strict=True):
+                before, mark = known.get(video, (b"", b""))
+                if not state:
+                    continue
+                if before != state.encode():
+                    try:
+                        with open_sidecar(source, sidecar_id(video, ending), "") as opened:
+                            mark = fingerprint_of(opened).encode()
+                    except (OSError, VideoError) as error:
+                        unreadable.append(f"{sidecar_id(video, ending)}: {getattr(error, 'reason', error)}")
+                        continue
+                    fresh.append(Figures(video, videos[video], state.encode(), mark))
+                fingerprints[video] = mark.decode()
+            if notice is not None:
+                notice(f"looking for sidecars {ending} in {source}: {done} of {len(ids)} videos")
+    with suppress(sqlite3.Error):
+        store.put_figures(kind, fresh)
+    notes = [f"{len(fingerprints)} of {len(ids)} videos have a sidecar {ending}"]
+    if unreadable:
+        notes.append(f"{len(unreadable)} sidecars cannot be read and count as missing ({unreadable[0]})")
+    return Sidecars(fingerprints, _digest(ending, fingerprints)), notes
+
+
+def _digest(ending: str, fingerprints: Mapping[str, str]) -> str:
+    sha = hashlib.sha256(f"v2v sidecars 1\n{ending}\n".encode())
+    for id in sorted(fingerprints):
+        sha.update(f"{id}\0{fingerprints[id]}\n".encode())
+    return sha.hexdigest()[:32]

@@ -1,0 +1,134 @@
+"""Keep sequences and videos that crash or hang workers, in numbered snapshots. Pure.
+
+A decode error depends only on the file's bytes: every worker meets it again, so it need not be remembered. A crash or a
+hang may not happen again. It is written down, because otherwise the same stream could not be made a second time:
+
+    snapshot 0      empty
+    snapshot n + 1  snapshot n and one more entry, or empty (after a clearing)
+
+An entry says that decoding a video brought a worker down, or that the work that one spec asks for took too long; the
+latter counts under that spec only. An entry refuses one sequence of a video; a second entry for the same file refuses
+the whole video. A file that has changed since (another fingerprint) is another file. The number of the snapshot that a
+sample was made under is part of its provenance, and every snapshot stays available.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from v2v_protocol.errors import CorpusError
+
+VERDICTS_PER_VIDEO = 2
+
+
+@dataclass(frozen=True, slots=True)
+class QuarantineEntry:
+    """One line of the quarantine.
+
+    Attributes:
+        snapshot: the first snapshot that holds it; 0 until it is written.
+        path: catalogue id of the video; empty in a line that clears the quarantine.
+        fingerprint: of the file.
+        frame: first frame of the sequence.
+        reason: what happened.
+        time: when, ISO 8601, UTC.
+        spec: digest of the only spec under which it refuses the sequence; empty: under every spec.
+    """
+
+    snapshot: int
+    path: str
+    fingerprint: str
+    frame: int
+    reason: str
+    time: str
+    spec: str = ""
+
+    def __str__(self) -> str:
+        if not self.path:
+            return f"snapshot {self.snapshot} ({self.time}): cleared"
+        only = f" (under spec {self.spec:.12} only)" if self.spec else ""
+        return f"snapshot {self.snapshot} ({self.time}): {self.path} from frame {self.frame}: {self.reason}{only}"
+
+
+def clearing(time: str) -> QuarantineEntry:
+    """Return the line that makes the next snapshot empty; older snapshots stay available."""
+    return QuarantineEntry(0, "", "", 0, "cleared", time)
+
+
+class Quarantine:
+    """All snapshots, stored as the list of entries that led to them.
+
+    Args:
+        entries: the lines so far, oldest first.
+
+    Raises:
+        CorpusError: their numbers are not 1, 2, 3 ...
+    """
+
+    def __init__(self, entries: Iterable[QuarantineEntry] = ()) -> None:
+        self._entries: list[QuarantineEntry] = []
+        self._of_file: dict[tuple[str, str], list[QuarantineEntry]] = {}
+        self._clearings: list[int] = []
+        self.extend(entries)
+
+    @property
+    def latest(self) -> int:
+        """Number of the newest snapshot."""
+        return len(self._entries)
+
+    @property
+    def lines(self) -> tuple[QuarantineEntry, ...]:
+        """All entries and clearings, oldest first."""
+        return tuple(self._entries)
+
+    def entries(self, snapshot: int) -> list[QuarantineEntry]:
+        """Return the entries of a snapshot, oldest first.
+
+        Raises:
+            CorpusError: there is no such snapshot.
+        """
+        return self._entries[self._cleared(snapshot) : snapshot]
+
+    def refusal(self, snapshot: int, path: str, fingerprint: str, frame: int, spec: str = "") -> str | None:
+        """Return why a sequence is refused under a snapshot; None if it is not.
+
+        Args:
+            snapshot: number of the snapshot.
+            path, fingerprint: catalogue id and fingerprint of the video.
+            frame: first frame of the sequence.
+            spec: digest of the spec that the sequence is requested under.
+
+        Raises:
+            CorpusError: there is no such snapshot.
+        """
+        cleared = self._cleared(snapshot)
+        of_file = (v for v in self._of_file.get((path, fingerprint), ()) if v.spec in ("", spec))
+        against = [v for v in of_file if cleared < v.snapshot <= snapshot]
+        if len(against) >= VERDICTS_PER_VIDEO:
+            return f"video in quarantine snapshot {snapshot} ({len(against)} verdicts): {against[-1].reason}"
+        for entry in against:
+            if entry.frame == frame:
+                return f"sequence in quarantine snapshot {snapshot}: {entry.reason}"
+        return None
+
+    def extend(self, entries: Iterable[QuarantineEntry]) -> None:
+        """Append lines that have been written since.
+
+        Raises:
+            CorpusError: their numbers do not continue the existing ones.
+        """
+        for entry in entries:
+            if entry.snapshot != self.latest + 1:
+                raise CorpusError(f"quarantine: line {self.latest + 1} has snapshot number {entry.snapshot}")
+            self._entries.append(entry)
+            if entry.path:
+                self._of_file.setdefault((entry.path, entry.fingerprint), []).append(entry)
+            else:
+                self._clearings.append(entry.snapshot)
+
+    def _cleared(self, snapshot: int) -> int:
+        """Return the number of the last empty snapshot up to this one."""
+        if not 0 <= snapshot <= self.latest:
+            raise CorpusError(f"quarantine snapshot {snapshot}: there are 0 .. {self.latest}")
+        return max((number for number in self._clearings if number <= snapshot), default=0)

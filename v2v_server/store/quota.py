@@ -1,0 +1,178 @@
+"""Fill a folder up to a limit, from many processes.
+
+The number of bytes lies in the file ``used``, behind a lock. Files lie one folder deep (``ab/ab12...``). A file is
+written in ``partial``, which does not count, and renamed once it is complete and fits the limit. Disk space is kept
+free for others.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from v2v_server.system.locks import lock
+from v2v_server.system.private import open_private
+
+GIB = 1 << 30
+LEAST_FREE_BYTES = GIB
+"""Always keep this much disk space free."""
+_USED, PARTIAL = "used", "partial"
+_KEPT_SHARE = 0.9
+"""Share of the limit that is used after an eviction. Evicting lists every file, so it frees space for several."""
+
+
+@dataclass(slots=True)
+class Used:
+    """The number of bytes, for the holder of the lock."""
+
+    bytes: int
+
+    def add(self, more: int) -> None:
+        """Add to the number of bytes."""
+        self.bytes = max(0, self.bytes + more)
+
+
+class QuotaFolder:
+    """A folder with a limit. Can be pickled.
+
+    Args:
+        folder: the folder. It is created by :meth:`make` and never later: if a disk is unmounted, the disk below must
+            not be filled.
+        most_bytes: its limit, bytes.
+        wait_seconds: longest wait for the lock; other processes hold it for less than a millisecond, or while they
+            evict files.
+        least_free_bytes: disk space to keep free, bytes.
+    """
+
+    def __init__(
+        self, folder: Path, most_bytes: int, wait_seconds: float, least_free_bytes: int = LEAST_FREE_BYTES
+    ) -> None:
+        self.folder, self.most_bytes, self.least_free_bytes = folder, most_bytes, least_free_bytes
+        self._wait_seconds = wait_seconds
+
+    def make(self) -> None:
+        """Create the folder if it is missing, and recount its bytes: a killed process may have counted a file that it
+        did not store.
+
+        Raises:
+            OSError: the folder cannot be created, read or written.
+        """
+        (self.folder / PARTIAL).mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(BlockingIOError), self.locked() as used:
+            used.bytes = count_bytes(self.folder)
+
+    @property
+    def used_bytes(self) -> int:
+        """Number of bytes in the folder; 0 if it is unknown."""
+        return used_bytes(self.folder)
+
+    @property
+    def free_bytes(self) -> int:
+        """Free space of the disk, bytes.
+
+        Raises:
+            OSError: the folder is gone.
+        """
+        return shutil.disk_usage(self.folder).free
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[Used]:
+        """Lock the number of bytes for one process at a time.
+
+        Raises:
+            BlockingIOError: another process keeps the lock for longer than an update takes. Callers continue without
+                it.
+            OSError: the file cannot be opened or written.
+        """
+        path = self.folder / _USED
+        with open(open_private(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW), "r+b") as file:
+            lock(file.fileno(), self._wait_seconds, path)
+            text = file.read(64)
+            used = Used(int(text) if text.isdigit() else count_bytes(self.folder))
+            yield used
+            file.seek(0)
+            file.write(b"%020d" % used.bytes)
+            file.truncate()
+
+    def add(self, partial: Path, path: Path, *, evicts: bool = False) -> bool:
+        """Give a complete file its name; return False if it does not fit the limit.
+
+        Args:
+            partial: the file, on the same disk.
+            path: its name in the folder.
+            evicts: whether other files go if space runs out: those without a reader (a reader holds a shared lock),
+                least recently read first (by their modification time).
+
+        Raises:
+            OSError: it cannot be renamed; BlockingIOError: see :meth:`locked`.
+        """
+        size = partial.stat().st_size
+        with self.locked() as used:
+            if evicts and (used.bytes + size > self.most_bytes or self.free_bytes < self.least_free_bytes):
+                self._evict(used, size)
+            if used.bytes + size > self.most_bytes:
+                return False
+            path.parent.mkdir(exist_ok=True)
+            # Count before renaming: a process killed in between has counted too much, not too little.
+            used.add(size - (path.stat().st_size if path.exists() else 0))
+            partial.replace(path)
+        return True
+
+    def remove(self, path: Path) -> None:
+        """Remove a file.
+
+        Raises:
+            OSError: it cannot be removed; BlockingIOError: see :meth:`locked`.
+        """
+        with self.locked() as used:
+            size = path.stat().st_size
+            path.unlink()
+            used.add(-size)
+
+    def _evict(self, used: Used, size: int) -> None:
+        enough = max(0, int(self.most_bytes * _KEPT_SHARE) - size)
+        for oldest in _oldest_first(self.folder):
+            if used.bytes <= enough and self.free_bytes >= self.least_free_bytes:
+                return
+            used.add(-_evicted(oldest))
+
+
+def used_bytes(folder: Path) -> int:
+    """Return the number of bytes in a folder; 0 if it is unknown."""
+    try:
+        with open(open_private(folder / _USED, os.O_RDONLY | os.O_NOFOLLOW), "rb") as file:
+            text = file.read(64)
+    except OSError:
+        return 0
+    return int(text) if text.isdigit() else 0
+
+
+def count_bytes(folder: Path) -> int:
+    """Count the bytes of all files in a folder."""
+    return sum(entry.stat().st_size for entry in _files(folder))
+
+
+def _files(folder: Path) -> Iterator[os.DirEntry[str]]:
+    for below in folder.iterdir():
+        if below.is_dir() and below.name != PARTIAL:
+            with os.scandir(below) as entries:
+                yield from entries
+
+
+def _oldest_first(folder: Path) -> list[Path]:
+    return [Path(path) for _, path in sorted((entry.stat().st_mtime_ns, entry.path) for entry in _files(folder))]
+
+
+def _evicted(path: Path) -> int:
+    """Delete a file, and return the bytes that this freed; 0 if it has a reader."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        size = os.fstat(file.fileno()).st_size
+        path.unlink()
+        return size
+    return 0
