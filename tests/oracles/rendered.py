@@ -38,7 +38,8 @@ class Counts(NamedTuple):
     negative: npt.NDArray[np.int64]
 
 
-class Errors(NamedTuple):
+@dataclass(frozen=True)
+class Errors:
     """Errors of counts, as shares: of the number of events, of signed bins, of bins of both polarities."""
 
     count: float
