@@ -124,7 +124,7 @@ _OWN_ROWS = sum(effect.ROWS for effect in EFFECTS)
 
 @compiled
 def _simulate(
-    frames, between_frames, table, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
+    frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
     tolerance, drawn_start, start_residual, drifts_first, bins, limit, out, tables, state, words, floats,
 ):  # fmt: skip
     """Run the kernel without reference counting, which every view of an array would cost; the caller provides all
@@ -182,7 +182,7 @@ def _simulate(
                     look_up(table, frames[level, first:last], coming, levels[known])
                 else:
                     for i in range(last - first):
-                        levels[known, i] = between_frames[-1 - level, first + i]
+                        levels[known, i] = fine[between_frames[-1 - level, first + i]]
             if segments.reached[each] >= 1:
                 now = known
             elif known_before != known:
@@ -293,14 +293,15 @@ def _time(segments, each, block, old, first, last, bins, folds, out):
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def simulate_general(
-    frames, between_frames, table, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg, tolerance,
-    drawn_start, start_residual, drifts_first, bins, limit, out, tables,
+    frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
+    tolerance, drawn_start, start_residual, drifts_first, bins, limit, out, tables,
 ):  # fmt: skip
     """Simulate every pixel of a clip.
 
     Args:
         frames: [n, pixels] uint8 grey levels, or real log intensities; C-contiguous. Row 0 is the clip's first frame.
-        between_frames: [K, pixels] float32, intermediate levels of log intensity.
+        between_frames: [K, pixels] uint16, intermediate levels: grey, in 1/FINE_STEPS.
+        fine: [255 FINE_STEPS + 1] real, their log intensity (``intensity.fine_table``).
         table, key, hot_position, hot_drift, limit: as in ``pixel.simulate_pixels``.
         segments: what is simulated, and when.
         threshold_pos, threshold_neg, tolerance: real, log units (``voxel.py``).
@@ -314,6 +315,6 @@ def simulate_general(
     words = aligned_rows(6, PITCH, np.uint32)
     floats = aligned_rows(6, PITCH, np.float32)
     _simulate(
-        frames, between_frames, table, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
+        frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
         tolerance, drawn_start, start_residual, drifts_first, bins, limit, out, tables, state, words, floats,
     )  # fmt: skip
