@@ -65,7 +65,7 @@ def steps_of_any_duration() -> int:
     seconds = np.where(np.arange(steps) % 2, MICROSECOND, HOUR)
     frames = np.random.default_rng(5).integers(0, 256, (steps + 1, 4, 5), np.uint8)
 
-    def counts(frames: npt.NDArray[np.uint8], seconds: Doubles = seconds, **effects: float) -> Doubles:
+    def counts(frames: npt.NDArray[np.uint8], seconds: Doubles = seconds, **effects: Any) -> Doubles:
         made = simulate(
             frames, threshold_pos=0.2, bins=2, grids_per_frame=2, dtype="float32", frames_per_second=1.0, **effects
         )

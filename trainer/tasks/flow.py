@@ -153,7 +153,7 @@ class FlowScorer:
     run: FlowRun
 
     def check(self, path: Path, data_set: DataSet) -> None:
-        """Check that the recording has flow in the cut."""
+        """Check that the recording has flow in its time range."""
         with Recording(path) as recording:
             flow_windows(recording, data_set.time_ranges[path.stem])
 

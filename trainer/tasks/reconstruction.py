@@ -28,7 +28,7 @@ from v2v_protocol.recipe import Recipe
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReconstructionSettings:
-    """The loss: a weighted sum; a term of weight 0 costs nothing and needs no file.
+    """Hold the settings of the loss, a weighted sum. A term of weight 0 is not computed and needs no file.
 
     Attributes:
         l1_weight, lpips_weight, temporal_weight: weights of the terms.
@@ -168,7 +168,7 @@ class PictureScorer:
     run: Run
 
     def check(self, path: Path, data_set: DataSet) -> None:
-        """Check that the recording has the pictures of the cut."""
+        """Check that the recording has the pictures of its time range."""
         check_recording(self.run, path, data_set)
 
     def score(self, path: Path, data_set: DataSet, *, baseline: bool) -> dict[str, float]:
