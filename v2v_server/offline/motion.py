@@ -161,13 +161,14 @@ class WholePictures:
         width, height = recipe.crop_width_px / params.scale, recipe.crop_height_px / params.scale
         whole = self.camera(sequence).voxels
         bins = whole.reshape(-1, *whole.shape[2:])
-        seen = int(params.source_index(recipe.steps)[-1]) // recipe.frames_per_bin  # pauses leave the rest out
+        steps = recipe.voxels_per_clip * recipe.steps_per_frame
+        seen = int(params.source_index(recipe.steps)[-1]) * len(bins) // steps  # pauses leave the rest out
         scale = bins.shape[-1] / video.width_px
         rows, columns = (
             slice(int(at * scale), int((at + size) * scale)) for at, size in ((top, height), (left, width))
         )
         crop = bins[:, rows, columns]
-        events = float(np.abs(crop[:seen], dtype=np.float32).sum()) / crop.size / recipe.frames_per_bin
+        events = float(np.abs(crop[:seen], dtype=np.float32).sum()) / (crop[0].size * steps)
         seconds = recipe.frame_stride / video.frames_per_second if video.frames_per_second > 0 else 0.0
         return CropEstimate(
             (video.id, sequence.start_frame),

@@ -116,6 +116,8 @@ def fill(
     arrays = {name: new_array(*given.form(name), array) for name, array in out.items()}
     if out.keys() == {"voxels"} and not given.needs_general:
         return arrays, {"voxels": _paper(given, real, arrays["voxels"])}
+    if not out:
+        return {}, {}
     general = _General(given, real)
     bilinear = None
     if "voxels_bilinear" in arrays:
