@@ -153,8 +153,9 @@ class RunConfig:
         preview_samples: number of its samples that are shown.
         validate: recordings (as ``v2v-eval --data``) that are scored at the ends of epochs; the best network so far is
             kept as best.pt. Empty: none.
-        validate_config: YAML file of ``v2v-eval``, or the name of a shipped one, that says which data sets and cuts
-            under ``validate`` are scored, and with which voxel grids. Empty: all recordings of that folder.
+        validate_config: YAML file of ``v2v-eval``, or the name of a shipped one, that says which data sets under
+            ``validate`` are scored, in which time ranges and with which voxel grids. Empty: all recordings of the
+            folder.
         validate_every: epochs between two scorings.
     """
 

@@ -12,6 +12,7 @@ Modules and folders:
     memory/     arena (workers of this host write there), slots (which sample has which row), buffers (reused)
     position/   plan (which samples a consumer gets), state (what is saved), position (one copy), shared (all copies)
     loaders     adjustments for other loaders and training loops
+    representations  inputs of other networks, from the arrays of a batch
     in_process  samples by index, without a server; notebook: their pictures
     tools/      the load test; local_server: a server as a subprocess
 """

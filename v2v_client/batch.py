@@ -25,7 +25,8 @@ class Batch:
     """Hold the samples of one batch, in the order of the epoch.
 
     Attributes:
-        arrays: the requested tensors by name. "voxels", "frames", "flow" and "flow_valid" are also attributes.
+        arrays: the requested tensors by name (``v2v_protocol.sample.ARRAYS``). "voxels", "frames", "flow" and
+            "flow_valid" are also attributes.
         indices: global index of each sample.
         epoch: epoch of the samples.
         provenance: origin of each sample.
@@ -92,13 +93,13 @@ class Batch:
 
     def _picture(self) -> Any:
         spec = self.resume_state.get("spec")
-        frames_per_bin = None if spec is None else StreamSpec.from_dict(spec).recipe.frames_per_bin
+        recipe = None if spec is None else StreamSpec.from_dict(spec).recipe
         count = min(_SHOWN, len(self))
         samples = [
             ({name: tensor[place].cpu().numpy() for name, tensor in self.arrays.items()}, self.provenance[place])
             for place in range(count)
         ]
-        return notebook.draw_samples(samples, frames_per_bin, f"{count} of {len(self)} samples, epoch {self.epoch}")
+        return notebook.draw_samples(samples, recipe, f"{count} of {len(self)} samples, epoch {self.epoch}")
 
     def _repr_png_(self) -> bytes | None:
         return notebook.try_png(self._picture)
@@ -111,7 +112,8 @@ class Batch:
     def voxels(self) -> torch.Tensor:
         """Return the voxel grids: [B, T + lead_voxels, bins, H, W] in the spec's ``voxel_dtype``.
 
-        Positive counts are ON events. Voxel t spans frames t - 1 -> t of the target sequence.
+        Positive counts are ON events. Voxel t spans frames t - 1 -> t of the target sequence. With ``grids_per_frame``
+        n, [B, (T + lead_voxels) n, bins, H, W], and :attr:`frame_grids` says which grid ends at which frame.
 
         Raises:
             UsageError: the dataset did not request this array.
@@ -126,6 +128,20 @@ class Batch:
             UsageError: the dataset did not request this array.
         """
         return self._array("frames")
+
+    @property
+    def frame_grids(self) -> torch.Tensor:
+        """Return the number of the voxel grid that ends at each frame: int64 [T + lead_frames].
+
+        ``outputs[:, batch.frame_grids]`` are the outputs of a network at the frames. A lead frame before the first grid
+        has -1.
+
+        Raises:
+            UsageError: the batch does not state its spec.
+        """
+        if "spec" not in self.resume_state:
+            raise UsageError("batch.frame_grids: resume_state of this batch has no spec; use Recipe.frame_grids")
+        return torch.tensor(StreamSpec.from_dict(self.resume_state["spec"]).recipe.frame_grids)
 
     @property
     def flow(self) -> torch.Tensor:

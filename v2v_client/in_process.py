@@ -32,11 +32,11 @@ class ShownSample(Sample):
     """Hold a sample that a notebook can display.
 
     Attributes:
-        frames_per_bin: the recipe's; needed to mark pauses, which are runs of repeated frames.
+        recipe: needed to mark pauses, which are runs of repeated frames.
         title: title of its picture.
     """
 
-    frames_per_bin: int
+    recipe: Recipe
     title: str
 
     def show(self, path: str | os.PathLike[str] | None = None) -> Any:
@@ -55,7 +55,7 @@ class ShownSample(Sample):
         return notebook.to_pil_image(self._picture(), path)
 
     def _picture(self) -> Any:
-        return notebook.draw_samples([(self.arrays, self.provenance)], self.frames_per_bin, self.title)
+        return notebook.draw_samples([(self.arrays, self.provenance)], self.recipe, self.title)
 
     def _repr_png_(self) -> bytes | None:
         return notebook.try_png(self._picture)
@@ -128,7 +128,7 @@ class V2VDataset(Dataset[Sample]):
             raise IndexError(f"index {index}: the epoch has {self._length} samples")
         sample: Sample = self._open().sample(self.seed, self.epoch, place)
         title = f"Sample {place} of {self._length}"
-        return ShownSample(sample.arrays, sample.provenance, self.spec.recipe.frames_per_bin, title)
+        return ShownSample(sample.arrays, sample.provenance, self.spec.recipe, title)
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, which selects other cameras and another order. Call it before a DataLoader starts workers."""

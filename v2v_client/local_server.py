@@ -61,10 +61,11 @@ class LocalServer:
         self._stop_seconds = stop_seconds
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: IO[bytes] | None = None
-        self._owner = os.getpid()
+        self._owner = 0  # the process that started the server
         self._cpu_seconds: dict[tuple[int, float], float] = {}
 
     def __enter__(self) -> LocalServer:
+        self._owner = os.getpid()
         # The server needs the port file's folder only while it starts. Its output goes to a file, because it would
         # block on a full pipe.
         with tempfile.TemporaryDirectory(prefix="v2v-server-") as folder:

@@ -17,18 +17,18 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance
 
 
 def draw_samples(
-    samples: Sequence[tuple[Mapping[str, npt.NDArray[Any]], Provenance]], frames_per_bin: int | None, title: str
+    samples: Sequence[tuple[Mapping[str, npt.NDArray[Any]], Provenance]], recipe: Recipe | None, title: str
 ) -> npt.NDArray[np.uint8]:
     """Draw a sheet of samples: frame, bins, flow, and activity over time.
 
     Args:
         samples: arrays and provenance of each, at least one.
-        frames_per_bin: the recipe's; None if it is unknown. Then pauses cannot be placed: they are not marked, and the
-            title says so.
+        recipe: None if it is unknown. Then pauses cannot be placed: they are not marked, and the title says so.
 
     Returns:
         [height, width, 3] uint8 RGB.
@@ -39,10 +39,10 @@ def draw_samples(
     camera, sheet = _drawing("camera"), _drawing("sheet")
     cameras = []
     for arrays, provenance in samples:
-        if frames_per_bin is None and provenance.params.pauses:
+        if recipe is None and provenance.params.pauses:
             provenance = dataclasses.replace(provenance, params=dataclasses.replace(provenance.params, pauses=()))
             title = title.removesuffix(_UNMARKED) + _UNMARKED
-        cameras.append(camera.Camera.of(arrays, provenance, "", frames_per_bin or 1))
+        cameras.append(camera.Camera.of(arrays, provenance, "", recipe))
     drawn: npt.NDArray[np.uint8] = sheet.draw_sheet(cameras, title)
     return drawn
 

@@ -11,11 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance
 
 _SETTLED_SHARE = 0.1
 """Moments are chosen behind this share of a clip: at its beginning every pixel still waits for its first event."""
 _MOSTLY = 0.5
+_EVENTS = frozenset(("voxels", "event_counts", "voxels_bilinear"))
 _FEWEST_EVENTS = 1e-3
 """Events a pixel and voxel grid below which a camera without noise counts as blind: 16 of a crop of 128 x 128."""
 _STILL_QUANTILE, _STILL_LEVELS = 0.995, 8
@@ -26,10 +28,18 @@ def check_drawable(arrays: Collection[str]) -> None:
     """Check that a picture can be made of these arrays.
 
     Raises:
-        UsageError: voxels or frames are missing.
+        UsageError: frames are missing, or all of voxels, event_counts and voxels_bilinear.
     """
-    if not {"voxels", "frames"} <= set(arrays):
-        raise UsageError("a picture needs both arrays: voxels,frames")
+    if "frames" not in arrays or _EVENTS.isdisjoint(arrays):
+        raise UsageError("a picture needs both arrays: voxels,frames (or event_counts or voxels_bilinear for voxels)")
+
+
+def signed_counts(arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    """Return signed events, [T, bins, H, W], from the first of voxels, event_counts and voxels_bilinear."""
+    if "voxels" not in arrays and "event_counts" in arrays:
+        counts = np.asarray(arrays["event_counts"])
+        return np.asarray(np.subtract(counts[:, 1], counts[:, 0], dtype=np.float32))
+    return np.asarray(arrays["voxels"] if "voxels" in arrays else arrays["voxels_bilinear"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +47,12 @@ class Camera:
     """A clip and its camera.
 
     Attributes:
-        voxels: [T, bins, H, W], signed event counts.
+        voxels: [T, bins, H, W], signed event counts; with ``grids_per_frame``, the bins of all grids of a frame.
         frames: [T, H, W] uint8; frame t closes voxel grid t.
         flow: [T, 2, H, W], px, or None.
         title: written beside the camera, for instance the recipe's name.
         provenance: where the clip came from, and the draw.
-        frames_per_bin: of the recipe; a pause is a run of repeated frames.
+        steps_per_frame: of the recipe; a pause is a run of repeated frames.
         lead_voxels: voxel grids of the clip in front of the first one here.
         whole: [rows, columns] uint8, the video's picture that the camera's crop was taken from, or None.
         quiet: as ``rates``, of the same draw without noise, or None: not measured.
@@ -53,7 +63,7 @@ class Camera:
     flow: npt.NDArray[Any] | None
     title: str
     provenance: Provenance
-    frames_per_bin: int = 1
+    steps_per_frame: int
     lead_voxels: int = 0
     whole: npt.NDArray[np.uint8] | None = None
     quiet: npt.NDArray[np.float64] | None = None
@@ -64,24 +74,27 @@ class Camera:
         arrays: Mapping[str, npt.NDArray[Any]],
         provenance: Provenance,
         title: str,
-        frames_per_bin: int = 1,
+        recipe: Recipe | None = None,
         whole: npt.NDArray[np.uint8] | None = None,
     ) -> Camera:
         """Create a camera from the arrays of one sample, without lead frames and lead voxels.
 
         Raises:
-            UsageError: voxels or frames are missing.
+            UsageError: see :func:`check_drawable`.
         """
         check_drawable(arrays)
-        voxels, frames, flow = arrays["voxels"], arrays["frames"][:, 0], arrays.get("flow")
+        voxels, frames, flow = signed_counts(arrays), arrays["frames"][:, 0], arrays.get("flow")
+        steps_per_frame = voxels.shape[1] if recipe is None else recipe.steps_per_frame
+        if recipe is not None and recipe.grids_per_frame:
+            voxels = voxels.reshape(-1, recipe.grids_per_frame * recipe.bins, *voxels.shape[2:])
         count = min(len(array) for array in (voxels, frames, flow) if array is not None)
         return cls(
-            np.asarray(voxels[len(voxels) - count :]),
+            voxels[len(voxels) - count :],
             np.asarray(frames[len(frames) - count :]),
             None if flow is None else np.asarray(flow[len(flow) - count :]),
             title,
             provenance,
-            frames_per_bin,
+            steps_per_frame,
             len(voxels) - count,
             whole,
         )
@@ -106,11 +119,12 @@ class Camera:
     def paused(self) -> npt.NDArray[np.bool_]:
         """[T * bins] bool: True where every frame of the bin repeats the one before."""
         grids, bins = self.voxels.shape[:2]
-        still = np.zeros(((self.lead_voxels + grids) * bins, self.frames_per_bin), np.bool_)
+        still = np.zeros((self.lead_voxels + grids) * self.steps_per_frame, np.bool_)
         for first, length in self.provenance.params.pauses:
-            still.reshape(-1)[first - 1 : first - 1 + length] = True  # positions count from 1
-        still_bins: npt.NDArray[np.bool_] = np.all(still, axis=1)
-        return still_bins[self.lead_voxels * bins :]
+            still[first - 1 : first - 1 + length] = True  # positions count from 1
+        # A bin holds several steps, or a step several bins.
+        parts = np.repeat(still, bins).reshape(-1, self.steps_per_frame)
+        return np.asarray(parts.all(axis=1))[self.lead_voxels * bins :]
 
     def moments(self, count: int) -> list[int]:
         """Choose voxel grids to show: the most active one of each of ``count`` equal stretches of time.

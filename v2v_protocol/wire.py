@@ -140,7 +140,11 @@ def encode_sample(
     shapes: list[int] = []
     for name, array in arrays.items():
         if array.dtype not in _DTYPE_NAMES or not array.flags.c_contiguous:
-            raise LimitExceeded(f"array {name}: dtype {array.dtype} (allowed: {', '.join(ARRAY_DTYPES)}), C-contiguous")
+            order = "" if array.flags.c_contiguous else "not "
+            raise LimitExceeded(
+                f"array {name} has dtype {array.dtype} and is {order}C-contiguous; samples have C-contiguous arrays of "
+                f"{', '.join(ARRAY_DTYPES)}"
+            )
         shapes += [array.ndim, *array.shape]
     header = SampleHeader(
         epoch=epoch,

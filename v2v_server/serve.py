@@ -7,23 +7,18 @@ import gc
 import math
 import os
 import secrets
-import signal
 import sys
 import threading
-import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
-from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, V2VError, VideoChanged, VideoError, VideoGone
+from v2v_protocol.errors import CorpusError
 from v2v_protocol.link.guard import most_connections
 from v2v_protocol.progress import Progress
-from v2v_protocol.wire import encode
-from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,
@@ -40,13 +35,14 @@ from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Request
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets
-from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
+from v2v_server.broker.worker_registry import clean_name
 from v2v_server.config import ServeConfig
-from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus_actions import CorpusActions
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
-from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
-from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
+from v2v_server.quarantine.file import quarantine_path, read_quarantine
+from v2v_server.quarantine.snapshots import Quarantine
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.schedule.summary import corpus_summary
 from v2v_server.status.publisher import StatusPublisher
@@ -60,6 +56,7 @@ from v2v_server.supervise.scaling import Scaling
 from v2v_server.system.clock import Clock
 from v2v_server.system.log import Level, Log
 from v2v_server.system.process import keep_freed_memory, open_many_files, usable_cores
+from v2v_server.system.service import stop_on_signals, utc_now, write_port_file
 from v2v_server.video.rows import Rows
 
 _MANY_WORKERS_A_CORE = 4
@@ -68,8 +65,6 @@ _TURN_SECONDS = 0.1
 """Longest wait of the loop without a message; also the interval of checks of deadlines and workers."""
 _SOON_SECONDS = 5.0
 """Time after which blocked leases are reported."""
-_RECORD_SECONDS = 2.0
-"""Longest time to retry writing a quarantine entry while another process writes to the file."""
 _GIVE_BACK_SECONDS = 12.0
 """Time from the end of a connection until its memory is returned to the kernel; its session is forgotten by then."""
 
@@ -139,7 +134,7 @@ def serve(config: ServeConfig) -> None:
         catalogue.facts,
         config.spec,
         quarantine=quarantine,
-        wall_clock=_utc_now,
+        wall_clock=utc_now,
         lease_deadline_seconds=config.lease_deadline_seconds,
         session_idle_seconds=config.session_idle_seconds,
         max_credit_bytes=config.max_credit_bytes,
@@ -156,7 +151,7 @@ def serve(config: ServeConfig) -> None:
     label = f"w{secrets.token_hex(4)}"
     keys = KeyFolder(Path(config.keys)) if config.keys else None
     stop = threading.Event()
-    with _stop_on_signals(stop):
+    with stop_on_signals(stop):
         pool = make_pool(config, catalogue.source, label, worker_flags, keys)
         sockets = Sockets(
             config.bind,
@@ -215,21 +210,18 @@ class Server:
         self._dispatcher = dispatcher
         self._transport = transport
         self._pool = pool
-        self._quarantine = quarantine
-        self._quarantine_file = quarantine_file
         self._clock = clock or Clock()
+        self._corpus = CorpusActions(catalogue, dispatcher, quarantine, quarantine_file, self._clock, self._say)
         self._next_tick = self._clock()
         is_fixed = config.least_workers == config.most_workers
         self._scaling = None if is_fixed else Scaling(*config.workers, config.scale_seconds)
         self._view = StatusView(self._log, sys.stderr)
         service = Service(config, catalogue, dispatcher, pool, quarantine, transport)
-        self._publisher = StatusPublisher(service, self._clock(), _utc_now)
+        self._publisher = StatusPublisher(service, self._clock(), utc_now)
         self._announced = False
         self._port_file: Path | None = None
-        self._missing_told = -math.inf
         self._blocked_due: float | None = None
         self._give_back_at = math.inf
-        self._unrecorded: list[tuple[AddToQuarantine, float]] = []  # until when each is tried
 
     def turn(self, longest_wait_seconds: float) -> None:
         """Handle the available messages, waiting for one if there are none, and do what is due.
@@ -253,9 +245,7 @@ class Server:
             self._next_tick = now + _TURN_SECONDS
             for name, stalled in self._pool.stalled(now).items():
                 self._dispatcher.worker_stalled(self._route(name), stalled)
-            unrecorded, self._unrecorded = self._unrecorded, []
-            for record, until in unrecorded:
-                self._carry_out(self._record(record, until))
+            self._carry_out(self._corpus.retry())
             self._carry_out(self._dispatcher.tick(now))
             for death in self._pool.watch(now, self._dispatcher.counters.samples):
                 self._say(
@@ -304,39 +294,20 @@ class Server:
                     if not self._transport.send(message) and not self._pool.watches(self._name(message.identity)):
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
                 case SendLease() as grant:
-                    todo.extendleft(reversed(self._complete(grant, todo)))
+                    todo.extendleft(reversed(self._corpus.complete(grant, todo)))
                 case Disconnect(identity):
                     self._transport.cut(identity)
                 case GiveUp() as hopeless:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
                 case AddToQuarantine() as record:
                     # Before anything that follows is sent.
-                    todo.extendleft(reversed(self._record(record, now() + _RECORD_SECONDS)))
+                    todo.extendleft(reversed(self._corpus.record(record)))
                 case CheckVideo() as missing:
-                    todo.extend(dispatcher.video_checked(missing, self._check_video(missing), now()))
+                    todo.extend(dispatcher.video_checked(missing, self._corpus.check_video(missing), now()))
                 case ReportRefusal(refusal, request):
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
                 case SendStatus() as request:
                     todo.extend(self._publisher.ask(request))
-
-    def _complete(self, grant: SendLease, todo: deque[Action]) -> list[Action]:
-        """Return the message of a lease, complete; if it cannot be completed, what the dispatcher does about it.
-
-        Args:
-            grant: the lease.
-            todo: later actions; leases among them are dropped if the index cannot be read at the moment.
-        """
-        try:
-            return [ToWorker(grant.worker, encode(complete_lease(grant.lease, self._catalogue, grant.spec)))]
-        except IndexUnreadable as error:
-            unsent = [grant, *(each for each in todo if isinstance(each, SendLease))]
-            later = [each for each in todo if not isinstance(each, SendLease)]
-            todo.clear()
-            todo.extend(later)
-            self._dispatcher.index_unreadable(unsent, str(error), self._clock())
-            return []
-        except V2VError as error:
-            return self._dispatcher.lease_refused(grant, str(error), self._clock())
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
         """End the process of a hung worker, if it is one of ours."""
@@ -353,64 +324,6 @@ class Server:
     def _route(self, name: bytes) -> bytes:
         """Return the routing id of a worker of the pool; empty if it has not said hello."""
         return self._dispatcher.registry.named(name.decode()) or b""
-
-    def _record(self, record: AddToQuarantine, until: float) -> list[Action]:
-        """Write a quarantine entry. If that fails, the server continues and logs the consequence.
-
-        Args:
-            record: the entry.
-            until: time until which the next turns retry while another process writes.
-
-        Returns:
-            what the dispatcher does about it; nothing while it is retried.
-        """
-        entry, now = record.entry, self._clock()
-        written: list[QuarantineEntry] = []
-        try:
-            written = write_entry(self._quarantine_file, entry, self._quarantine, wait_seconds=0.0)
-        except (OSError, CorpusError) as error:
-            if isinstance(error, BlockingIOError) and now < until:
-                self._unrecorded.append((record, until))
-                return []
-            self._say(
-                f"{entry.path} from frame {entry.frame}: {entry.reason}; the sequence is skipped once and will "
-                f"be tried again, because the quarantine cannot be written: {error}",
-                "error",
-                record.request,
-                video=entry.path,
-            )
-        for line in written:
-            self._say(f"quarantine: {line}", "warning", record.request, video=line.path)
-        return self._dispatcher.quarantine_recorded(record, written, now)
-
-    def _check_video(self, missing: CheckVideo) -> bool:
-        """Check the file against the catalogue. If it matches, warn (rate-limited, since all workers of a host fail
-        alike) that the worker's host does not have it.
-        """
-        try:
-            self._catalogue.check(missing.video, missing.fingerprint, missing.sidecar)
-        except (VideoChanged, VideoGone):
-            if not missing.sidecar:
-                self._catalogue.mark_stale(missing.video)
-            return False
-        except (VideoError, CorpusError):
-            return False
-        now = time.monotonic()
-        if now >= self._missing_told + REST_SECONDS:
-            self._missing_told = now
-            name = clean_name(self._name(missing.identity).decode())
-            is_local = self._catalogue.source.is_local
-            file = f"the sidecar {missing.sidecar} of {missing.video}" if missing.sidecar else missing.video
-            self._say(
-                f"worker {name} failed on {file}, which "
-                f"{'is on this host as catalogued' if is_local else 'is not known to be gone or changed'}: "
-                f"{missing.reason}; other workers make the sample, and this one gets no work for {REST_SECONDS:g} s. "
-                "Check --videos on its host",
-                "warning",
-                missing.request,
-                video=missing.video,
-            )
-        return True
 
     def _warn_if_blocked(self, now: float) -> None:
         """Warn once if leases stay blocked. Another server that writes blocks the index only briefly."""
@@ -441,7 +354,7 @@ class Server:
             workers = "" if worker_address.startswith("ipc:") else f", workers to {worker_address}"
             self._say(f"ready: consumers connect to {address}{workers}", address=address)
             if self._config.port_file:
-                _write_port_file(self._config.port_file, address)
+                write_port_file(self._config.port_file, address)
                 self._port_file = Path(self._config.port_file)
             self._publisher.is_ready = True
         if self._announced and self._view.is_due(now):
@@ -465,35 +378,3 @@ class Server:
 def _private_address(label: str) -> str:
     """Return an address for local workers: a socket without a file, so that nothing is left even after a kill -9."""
     return f"ipc://@v2v-{label}-{secrets.token_hex(8)}" if sys.platform.startswith("linux") else "tcp://127.0.0.1:*"
-
-
-def _write_port_file(file: str, address: str) -> None:
-    """Write the address in one step, so that readers see the whole content or no file."""
-    try:
-        with write_aside_and_rename(Path(file)) as partial:
-            partial.write_text(address + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"--port-file {file}: {error.strerror}") from error
-
-
-@contextlib.contextmanager
-def _stop_on_signals(stop: threading.Event) -> Iterator[None]:
-    """Set ``stop`` at the first SIGINT or SIGTERM; a second signal has its usual effect."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def on_signal(number: int, frame: object) -> None:
-        for each, handler in before.items():
-            signal.signal(each, handler)
-        stop.set()
-
-    for number in before:
-        signal.signal(number, on_signal)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _utc_now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")

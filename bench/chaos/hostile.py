@@ -280,9 +280,14 @@ def _greeting(address: str) -> bytes:
 
 @contextmanager
 def _raw(address: str) -> Iterator[socket.socket]:
-    """Connect a raw socket and send a ZMTP handshake."""
+    """Connect a raw socket and complete a ZMTP handshake without a key; a server with keys ends it."""
     with _connected(address) as peer:
         peer.sendall(_greeting("") + _READY)
+        answer = b""
+        while b"READY" not in answer:
+            if not (piece := peer.recv(4096)):
+                raise ConnectionResetError
+            answer += piece
         yield peer
 
 

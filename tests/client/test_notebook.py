@@ -15,6 +15,7 @@ from tests.clips import panned_luma, write_clip
 from v2v_client import UsageError, V2VDataset, V2VStreamDataset, notebook
 from v2v_client.position.state import ResumeState, StreamIdentity
 from v2v_pictures.colours import BRIGHTER
+from v2v_protocol.recipe import Recipe
 from v2v_server.simulation import simulate
 
 RECIPE = {"preset": "noise-free", "voxels_per_clip": 4, "crop_height_px": 48, "crop_width_px": 48}
@@ -100,7 +101,7 @@ def test_pauses_of_unknown_length_are_not_marked(dataset: V2VDataset, monkeypatc
 
     monkeypatch.setattr(sheet, "draw_sheet", draw)
     notebook.draw_samples([(sample.arrays, paused)], None, "T")
-    notebook.draw_samples([(sample.arrays, paused)], 1, "T")
+    notebook.draw_samples([(sample.arrays, paused)], dataset.spec.recipe, "T")
     assert titles == [("T (pauses are not marked)", False), ("T", True)]
 
 
@@ -108,11 +109,27 @@ def test_a_streamed_batch_knows_its_recipe(dataset: V2VDataset, monkeypatch: pyt
     batch = next(iter(DataLoader(dataset, batch_size=1)))
     stream = StreamIdentity(dataset.spec.to_dict(), dataset.spec.digest, "", 1, len(dataset))
     state = ResumeState(stream=stream, seed=0, epoch=0, origin=0, position=1, world_size=1, quarantine=0).to_dict()
-    asked: list[int | None] = []
-    monkeypatch.setattr(notebook, "draw_samples", lambda samples, frames_per_bin, title: asked.append(frames_per_bin))
+    asked: list[Recipe | None] = []
+    monkeypatch.setattr(notebook, "draw_samples", lambda samples, recipe, title: asked.append(recipe))
     dataclasses.replace(batch, resume_state=state)._picture()
     batch._picture()
-    assert asked == [dataset.spec.recipe.frames_per_bin, None]
+    assert asked == [dataset.spec.recipe, None]
+
+
+def test_grids_within_a_step_are_shown_and_found_at_their_frames(tmp_path: Path) -> None:
+    write_clip(tmp_path / NAME, panned_luma(60, 64, 80, step=(1, 2)))
+    recipe = RECIPE | {"grids_per_frame": 3, "bins": 2, "lead_frames": 1}
+    arrays = ("event_counts", "voxels_bilinear", "frames")
+    divided = V2VDataset(tmp_path, recipe, arrays=arrays, cache_dir=str(tmp_path / "cache"))
+    batch = next(iter(DataLoader(divided, batch_size=1)))
+    assert batch["event_counts"].shape == (1, 12, 2, 2, 48, 48)
+    assert batch["voxels_bilinear"].shape == (1, 12, 2, 48, 48)
+    assert divided.show(0).width > 500
+    assert divided.spec.recipe.frame_grids == (-1, 2, 5, 8, 11)
+    with pytest.raises(UsageError, match="no spec"):
+        _ = batch.frame_grids
+    streamed = dataclasses.replace(batch, resume_state={"spec": divided.spec.to_dict()})
+    assert streamed.frame_grids.tolist() == [-1, 2, 5, 8, 11]
 
 
 def test_datasets_show_themselves_as_tables(dataset: V2VDataset) -> None:

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from tests.oracles.balance import Camera, balance, imbalance, trace_of
 from tests.oracles.dense import trace
+from tests.oracles.extremes_in_time import excess_of_divided_steps, steps_of_any_duration
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import Recipe, most_events, preset
 from v2v_server.simulation import noise, simulate, simulate_log
@@ -320,6 +321,24 @@ def recipe_beyond_float64() -> Finding:
     )
 
 
+def divided_rows() -> list[Row]:
+    """Return the rows of steps that are divided into bins and by intermediate levels."""
+    asked: dict[str, tuple[Any, ...]] = {
+        "64 grids in a step": (0.2, 1.3, 64, 1),
+        "1 grid of 1024 bins in a step": (0.2, 1.3, 1, 1024),
+        "divided steps, thresholds 1e-6": (1e-6, 1.0, 3, 5),
+        "divided steps, thresholds 1e3": (1e3, 1.0, 3, 5),
+        "divided steps, c- = 1e4 c+": (1e-4, 1e4, 3, 5),
+        "64 levels in a step": (0.2, 1.3, 3, 5, 64),
+    }
+
+    def check(setting: tuple[Any, ...]) -> Finding:
+        return Finding(*excess_of_divided_steps(*setting))
+
+    quantity = "more than a threshold left, log units"
+    return [Row(name, "counted", quantity, partial(check, setting)) for name, setting in asked.items()]
+
+
 def rows() -> list[Row]:
     """Return all rows."""
     error = "imbalance, log units"
@@ -364,6 +383,8 @@ def rows() -> list[Row]:
         Row("correlation of noise", "counted", "standard errors", noise_correlation),
         Row("more than float64 can count", "refused", "calls not refused", beyond_float64),
         Row("recipes beyond float64", "refused", "calls not refused", recipe_beyond_float64),
+        *divided_rows(),
+        Row("steps of 1 us and 1 h", "counted", "violations", lambda: Finding(steps_of_any_duration(), 0.0)),
         Row("table of gamma 4, eps 0.1", "counted", "falls of log intensity", table_never_falls),
     ]  # fmt: skip
 

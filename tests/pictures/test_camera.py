@@ -13,6 +13,7 @@ from tests.pictures.cameras import camera, without_noise
 from tests.protocol.test_sample import PARAMS, PROVENANCE
 from v2v_pictures.camera import Camera
 from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
 
 
 def test_rates_are_events_a_pixel_of_each_sign() -> None:
@@ -34,7 +35,7 @@ def test_a_bin_is_paused_where_all_its_frames_repeat(data: st.DataObject) -> Non
     edges = np.flatnonzero(np.diff([False, *still, False]))
     pauses = tuple((int(start) + 1, int(end - start)) for start, end in zip(edges[::2], edges[1::2], strict=True))
     shown = dataclasses.replace(
-        camera(np.zeros((grids + lead, bins, 2, 2), np.int8), pauses=pauses, lead=lead), frames_per_bin=per_bin
+        camera(np.zeros((grids + lead, bins, 2, 2), np.int8), pauses=pauses, lead=lead), steps_per_frame=per_bin * bins
     )
     source = shown.provenance.params.source_index(steps)
     expected = [
@@ -42,6 +43,18 @@ def test_a_bin_is_paused_where_all_its_frames_repeat(data: st.DataObject) -> Non
         for first in range(lead * bins * per_bin, steps, per_bin)
     ]
     assert shown.paused.tolist() == expected
+
+
+@pytest.mark.parametrize("name", ["event_counts", "voxels_bilinear"])
+def test_events_of_either_form_are_signed_counts(name: str) -> None:
+    """Two grids of three bins in each of two steps: the bins of a step are shown together."""
+    counts = np.random.default_rng(1).integers(0, 5, (4, 2, 3, 8, 8)).astype(np.int8)
+    signed = counts[:, 1] - counts[:, 0]
+    arrays = {name: counts if name == "event_counts" else signed, "frames": np.zeros((2, 1, 8, 8), np.uint8)}
+    paused = dataclasses.replace(PROVENANCE, params=dataclasses.replace(PARAMS, pauses=((2, 1),)))
+    shown = Camera.of(arrays, paused, "", Recipe(voxels_per_clip=2, bins=3, grids_per_frame=2))
+    np.testing.assert_array_equal(shown.voxels, signed.reshape(2, 6, 8, 8))
+    assert shown.paused.tolist() == [False] * 6 + [True] * 6
 
 
 def test_moments_are_active_and_not_paused() -> None:

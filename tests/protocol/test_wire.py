@@ -327,7 +327,7 @@ def test_nothing_is_copied_and_nothing_can_be_written() -> None:
 def test_only_listed_dtypes_and_contiguous_arrays_are_sent() -> None:
     good = np.zeros((4, 4), np.int16)
     for bad in (good.astype(np.float64), good.astype(bool), good[:, ::2], good.T[1:], good.astype(object)):
-        with pytest.raises(LimitExceeded, match="array v: dtype"):
+        with pytest.raises(LimitExceeded, match="array v has dtype"):
             encode_sample(epoch=0, index=0, arrays={"v": bad}, provenance={}, worker="", cpu_seconds=0.0)
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import cast
 
 import numpy as np
@@ -12,7 +14,8 @@ from v2v_protocol.errors import IndexUnreadable, ProtocolError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.catalogue import Catalogue, CorpusPart
+from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.corpus.videos import CorpusFacts, VideoEntry
@@ -41,6 +44,7 @@ class NamedCorpus:
     unreadable: frozenset[str] = frozenset()
     held: set[str] = field(default_factory=set)
     notes: tuple[str, ...] = ()
+    sidecars: Mapping[str, Sidecars] = field(default_factory=dict)
 
     def fail_fast(self) -> None:
         """There is no index to wait for."""
@@ -48,7 +52,10 @@ class NamedCorpus:
     @property
     def facts(self) -> CorpusFacts:
         """What is known in memory; these videos have no statistics."""
-        return CorpusFacts(self.videos, self.rows, self.digest, None)
+        return CorpusFacts(self.videos, self.rows, self.digest, None, self.sidecars)
+
+    def part(self) -> CorpusPart:
+        return CorpusPart(str(self.source), len(self.videos), len(self.refusals))
 
     def digest_under(self, scene: str) -> str:
         return self.facts.digest_under(scene)
@@ -69,10 +76,18 @@ class NamedCorpus:
 
 
 def corpus(
-    *videos: VideoEntry, rows: str = "full", unreadable: tuple[str, ...] = (), held: set[str] | None = None
+    *videos: VideoEntry,
+    rows: str = "full",
+    unreadable: tuple[str, ...] = (),
+    held: set[str] | None = None,
+    sidecars: Mapping[str, Sidecars] = MappingProxyType({}),
 ) -> Catalogue:
     """A catalogue of these videos; ``held`` may change later."""
     named = NamedCorpus(
-        videos, Rows.parse(rows), unreadable=frozenset(unreadable), held=set() if held is None else held
+        videos,
+        Rows.parse(rows),
+        unreadable=frozenset(unreadable),
+        held=set() if held is None else held,
+        sidecars=sidecars,
     )
     return cast(Catalogue, named)

@@ -257,10 +257,16 @@ class Peers:
         return lease
 
     def fail(
-        self, identity: bytes = b"w", reason: str = "cut short", frame: int | None = 7, *, here: bool = False
+        self,
+        identity: bytes = b"w",
+        reason: str = "cut short",
+        frame: int | None = 7,
+        *,
+        here: bool = False,
+        sidecar: str = "",
     ) -> Lease:
         lease = self.leases[identity].popleft()
-        self.worker_says(identity, LeaseFailed(lease.lease, frame, reason, here))
+        self.worker_says(identity, LeaseFailed(lease.lease, frame, reason, here, sidecar))
         return lease
 
     def die(self, identity: bytes = b"w", cause: Cause = Cause.KILLED, text: str = "died") -> list[Lease]:

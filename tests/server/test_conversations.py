@@ -42,11 +42,12 @@ from v2v_server.serve import Server
 from v2v_server.worker.conversation import (
     CREDIT,
     Action,
-    Callbacks,
+    Inspect,
     Leave,
     Listen,
     Load,
     Make,
+    Readiness,
     Send,
     WorkerConversation,
 )
@@ -105,13 +106,8 @@ class Worker:
     def __init__(self, name: bytes, world: World) -> None:
         self.name, self.world = name, world
         self.kernels = False
-        callbacks = Callbacks(
-            is_ready=lambda lease: self.kernels or lease.indices[0] % 5 != 0,
-            is_compiled=lambda lease: lease.indices[0] % 2 == 0,
-            is_decoded=lambda lease: lease.indices[0] % 3 == 0,
-        )
         hello = WorkerHello(name.decode(), NUMERICS_VERSION, CREDIT)
-        self.conversation = WorkerConversation(hello, "queue://workers", callbacks, is_watched=True)
+        self.conversation = WorkerConversation(hello, "queue://workers", is_watched=True)
         self.step: Action = Leave()
         world.queues.connect(name)
         self._take(self.conversation.start(world.now))
@@ -132,6 +128,10 @@ class Worker:
                 messages = [frames[0] for frames in inbox]
                 inbox.clear()
                 self._take(self.conversation.on_messages(messages, self.world.now))
+            case Inspect(lease):
+                place = lease.indices[0]
+                readiness = Readiness(self.kernels or place % 5 != 0, place % 2 == 0, place % 3 == 0)
+                self._take(self.conversation.on_inspected(readiness, self.world.now))
             case Load():
                 self.kernels = True
                 self._take(self.conversation.on_kernels_loaded(self.world.now))

@@ -26,7 +26,7 @@ from v2v_server.broker.counters import Counters
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Request
 from v2v_server.config import ServeConfig
-from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.catalogue import Catalogue, CorpusPart
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.quarantine.file import read_quarantine
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
@@ -96,7 +96,7 @@ def served(
     """A server that has made one turn."""
     stale: list[str] = []
     catalogue = SimpleNamespace(
-        check=check, stale=stale, mark_stale=stale.append, source=Folder(folder), videos=(), refusals=()
+        check=check, stale=stale, mark_stale=stale.append, source=Folder(folder), part=lambda: CorpusPart("", 0, 0)
     )
     server = Server(
         ServeConfig.load(None, {"videos": "videos", "workers": 0} | settings),

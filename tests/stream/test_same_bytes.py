@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_workers
 from tests.waiting import until
@@ -40,6 +41,30 @@ def test_another_number_of_workers_and_the_way_samples_travel_change_nothing(
     ]
     assert got == reference
     assert len(reference) == len(set(reference))
+
+
+def test_events_in_time_are_the_same_however_they_travel(server: LocalServer, clips: Path) -> None:
+    """Event counts, bilinear voxels and grids within a step, by shared memory, by network, and made again."""
+    recipe = {"preset": "davis346", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}
+    recipe |= {"grids_per_frame": 2, "bins": 3}
+    arrays = ("voxels", "event_counts", "voxels_bilinear", "frames")
+    got = []
+    for shared in (True, False):
+        with V2VStreamDataset(
+            server.address, batch_size=3, recipe=recipe, seed=3, arrays=arrays, shared_memory=shared
+        ) as dataset:
+            batch = next(iter(dataset))
+            got.append(digest(batch))
+            frame_grids = batch.frame_grids.tolist()
+    assert got[0] == got[1]
+    spec = StreamSpec.from_dict({"recipe": recipe})
+    assert frame_grids == list(spec.recipe.frame_grids)
+    again = remake(open_catalogue(clips), spec, seed=3, epoch=0, index=batch.indices[0], arrays=arrays)
+    for name in arrays:
+        assert batch[name][0].numpy().tobytes() == again.arrays[name].tobytes()
+    counts = batch["event_counts"].int()
+    assert torch.equal(counts[:, :, 1] - counts[:, :, 0], batch.voxels.int())
+    assert batch.voxels.any()
 
 
 def test_many_workers_change_nothing(clips: Path, reference: list[str]) -> None:

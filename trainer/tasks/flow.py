@@ -23,6 +23,8 @@ from trainer.models.raft_flow import WHERE_TO_GET_WEIGHTS, RaftFlow
 from trainer.models.sequence import VoxelNetwork
 from trainer.tasks.task import Asked, Task, Work, chosen, limited, required_file
 from v2v_client import Batch
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +94,15 @@ class Flow(Task):
             weights = required_file(settings, "raft_weights", "loss.flow = raft (or take loss.flow = stream)", origin)
             self._raft = RaftFlow(settings.raft_size, weights, device, bfloat16=bfloat16)
 
+    @classmethod
+    def check(cls, _settings: FlowTaskSettings, recipe: Recipe) -> None:
+        """See :meth:`Task.check`."""
+        if recipe.grids_per_frame > 1:
+            raise UsageError(
+                f"stream.recipe.grids_per_frame = {recipe.grids_per_frame}: a flow network needs the flow of every "
+                "voxel grid, and frames give that of a whole step; set grids_per_frame to 1 or 0"
+            )
+
     @property
     def asked(self) -> Asked:
         """Flow, or the frames to estimate it from, including the one before the first voxel grid."""
@@ -142,7 +153,7 @@ class FlowScorer:
     run: FlowRun
 
     def check(self, path: Path, data_set: DataSet) -> None:
-        """Check that the recording has flow in the cut."""
+        """Check that the recording has flow in its time range."""
         with Recording(path) as recording:
             flow_windows(recording, data_set.time_ranges[path.stem])
 

@@ -28,7 +28,7 @@ from v2v_protocol.recipe import Recipe
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReconstructionSettings:
-    """The loss: a weighted sum; a term of weight 0 costs nothing and needs no file.
+    """Hold the settings of the loss, a weighted sum. A term of weight 0 is not computed and needs no file.
 
     Attributes:
         l1_weight, lpips_weight, temporal_weight: weights of the terms.
@@ -90,6 +90,12 @@ class Reconstruction(Task):
                 f"loss.temporal_first_step = {settings.temporal_first_step}: give less than "
                 f"stream.recipe.voxels_per_clip = {recipe.voxels_per_clip}"
             )
+        if settings.guide_epochs and recipe.grids_per_frame > 1:
+            raise UsageError(
+                f"stream.recipe.grids_per_frame = {recipe.grids_per_frame}: loss.guide_epochs = "
+                f"{settings.guide_epochs} needs a picture for every voxel grid; set grids_per_frame to 1, or "
+                "guide_epochs to 0"
+            )
 
     @property
     def asked(self) -> Asked:
@@ -142,15 +148,16 @@ class Reconstruction(Task):
 
     def losses(self, prediction: Tensor, work: Work) -> dict[str, Tensor]:
         """See :meth:`Task.losses`: terms "lpips", "l1", "temporal" with a weight above 0."""
-        losses: dict[str, Tensor] = self._loss(prediction, work.truth["frames"], work.truth.get("flow"))
+        truth = work.truth["frames"]
+        losses: dict[str, Tensor] = self._loss(_at_frames(prediction, truth, 1), truth, work.truth.get("flow"))
         return losses
 
     def film(self, voxels: Tensor, prediction: Tensor, work: Work, sample: int) -> pictures.Image:
         """Draw events, target and reconstruction."""
-        panels = [
-            pictures.draw_events(voxels[sample].cpu().numpy()),
-            *(pictures.draw_grey(x[sample, :, 0].cpu().numpy()) for x in (work.truth["frames"], prediction)),
-        ]
+        truth = work.truth["frames"][sample]
+        seen, found = (_at_frames(each[sample], truth, 0).cpu().numpy() for each in (voxels, prediction))
+        grey = (pictures.draw_grey(each[:, 0]) for each in (truth.cpu().numpy(), found))
+        panels = [pictures.draw_events(seen), *grey]
         return pictures.side_by_side(panels)
 
 
@@ -161,7 +168,7 @@ class PictureScorer:
     run: Run
 
     def check(self, path: Path, data_set: DataSet) -> None:
-        """Check that the recording has the pictures of the cut."""
+        """Check that the recording has the pictures of its time range."""
         check_recording(self.run, path, data_set)
 
     def score(self, path: Path, data_set: DataSet, *, baseline: bool) -> dict[str, float]:
@@ -173,6 +180,12 @@ class PictureScorer:
             for prefix, means in scores.items()
             for name, value in means.items()
         }
+
+
+def _at_frames(each_grid: Tensor, frames: Tensor, axis: int) -> Tensor:
+    """Return what belongs to the voxel grids that end at a frame: every n-th of n for each frame, along an axis."""
+    grids = each_grid.shape[axis] // frames.shape[axis]
+    return torch.unflatten(each_grid, axis, (-1, grids)).select(axis + 1, -1)
 
 
 def _loss(settings: ReconstructionSettings) -> ReconstructionLoss:

@@ -75,7 +75,7 @@ class Work:
 
 
 class RecordingScorer(Protocol):
-    """Scores a network on single recordings of a data set, within its cuts."""
+    """Score a network on single recordings of a data set, within its time ranges."""
 
     def check(self, path: Path, data_set: DataSet) -> None:
         """Check, without running the network, that a recording can be scored.

@@ -94,7 +94,7 @@ class Position:
 
     @property
     def stream(self) -> StreamIdentity | None:
-        """Return what the samples are made of; None before a server or a state told."""
+        """Return what the samples are made of; None before the first connection or loaded state."""
         return self._shared.read().stream
 
     def start(self, consumer: Consumer) -> ResumeState:

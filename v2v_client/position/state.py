@@ -28,6 +28,7 @@ class StreamIdentity:
         spec: the resolved spec as plain values.
         spec_digest, catalogue_digest, numerics_version: see :class:`v2v_protocol.sample.SampleId`.
         sequences: N, samples of an epoch.
+        sidecars: names the files beside the videos that the requested arrays are made from; "" if there are none.
     """
 
     spec: Mapping[str, Any]
@@ -35,6 +36,7 @@ class StreamIdentity:
     catalogue_digest: str
     numerics_version: int
     sequences: int
+    sidecars: str = ""
 
     @classmethod
     def of(cls, welcome: Welcome) -> StreamIdentity:
@@ -58,6 +60,7 @@ class StreamIdentity:
             catalogue_digest=welcome.catalogue_digest,
             numerics_version=welcome.numerics_version,
             sequences=welcome.sequences,
+            sidecars=welcome.sidecars,
         )
 
     @property
@@ -81,6 +84,7 @@ class StreamIdentity:
             "spec_digest": "ask for the recipe and options that were saved",
             "catalogue_digest": "serve the same folder of videos (added, removed or changed files alter it)",
             "sequences": "serve the same folder of videos",
+            "sidecars": "request the same arrays, and serve the same files beside the videos",
         }
         for name, remedy in remedies.items():
             mine, offered = getattr(self, name), getattr(other, name)
@@ -161,6 +165,8 @@ class ResumeState:
     def to_dict(self) -> dict[str, Any]:
         """Return plain values."""
         pinned = {field.name: getattr(self.stream, field.name, None) for field in dataclasses.fields(StreamIdentity)}
+        if not pinned["sidecars"]:
+            del pinned["sidecars"]  # as in states of earlier releases
         return {
             "version": STATE_VERSION,
             **pinned,
@@ -185,7 +191,7 @@ class ResumeState:
             raise UsageError(f"not a state of V2VStreamDataset: version {version!r}, expected {STATE_VERSION}")
         known = {"version", "seed", "epoch", "origin", "position", "world_size", "quarantine", "loader_worker"}
         known |= {field.name for field in dataclasses.fields(StreamIdentity)}
-        if values.keys() != known:
+        if values.keys() | {"sidecars"} != known:
             raise UsageError(
                 f"not a state of V2VStreamDataset: keys {sorted(map(str, values))!r:.400}, expected {sorted(known)}"
             )
@@ -207,8 +213,8 @@ def _stream(values: Mapping[str, Any]) -> StreamIdentity | None:
         return None
     if not isinstance(values["spec"], Mapping):
         raise UsageError("state: spec is not a mapping")
-    for name in ("spec_digest", "catalogue_digest"):
-        if not isinstance(values[name], str):
+    for name in ("spec_digest", "catalogue_digest", "sidecars"):
+        if not isinstance(values.get(name, ""), str):
             raise UsageError(f"state: {name} = {values[name]!r} is not text")
     return StreamIdentity(
         spec=values["spec"],
@@ -216,6 +222,7 @@ def _stream(values: Mapping[str, Any]) -> StreamIdentity | None:
         catalogue_digest=values["catalogue_digest"],
         numerics_version=_whole(values, "numerics_version", 0, LARGEST_INDEX),
         sequences=_whole(values, "sequences", 0, LARGEST_INDEX),
+        sidecars=values.get("sidecars", ""),
     )
 
 

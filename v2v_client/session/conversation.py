@@ -306,7 +306,7 @@ class Conversation:
             case Denied(code=ErrorCode.UNKNOWN_SESSION):
                 # Every request under way is denied; a single Hello recovers all of them.
                 self.handle_event(Event.FORGOTTEN, now)
-            case Denied(code=ErrorCode.CREDIT) if self._may_exceed_credit():
+            case Denied(code=ErrorCode.CREDIT) if self._asked_again and self._credit_denials < _MOST_CREDIT_DENIALS:
                 # The server makes samples again that were already on their way when the requests were repeated, and
                 # these use up credit. The denied requests stay in _asked; they are sent again when such a sample
                 # arrives a second time, or with the next ping.
@@ -326,9 +326,6 @@ class Conversation:
                     f"{self._address} sent {type(message).__name__}, which servers do not send to consumers"
                 )
         return None
-
-    def _may_exceed_credit(self) -> bool:
-        return self._asked_again and self._credit_denials < _MOST_CREDIT_DENIALS
 
     def _accept_welcome(self, welcome: Welcome, now: float) -> None:
         stream = StreamIdentity.of(welcome)

@@ -11,6 +11,7 @@ because the server still holds the old one. The server recognises the peer by th
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import struct
@@ -37,6 +38,7 @@ _ASK_EVERY = 5
 _OUR_SIGNATURE = b"\xff" + bytes(8) + b"\x7f\x03"
 _RECONNECT_MS, _LONGEST_RECONNECT_MS = 100, 1000
 _MORE = int(zmq.SNDMORE)
+_monitors = itertools.count()
 _NO_OPTIONS: Mapping[str, int | bytes] = {}
 
 
@@ -84,7 +86,6 @@ class Dealer:
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
         self._poller = zmq.Poller()
-        self._sockets = 0
         self._ipv6 = "[" in address
         self._torn = False
 
@@ -112,10 +113,9 @@ class Dealer:
             socket.setsockopt(zmq.MAXMSGSIZE, largest_frame_bytes)
             socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
             socket.setsockopt(zmq.RECONNECT_IVL_MAX, _LONGEST_RECONNECT_MS)
-            self._sockets += 1
             for name, value in self._options.items():
                 socket.setsockopt(getattr(zmq, name), value)
-            events = f"inproc://handshakes-{id(self)}-{self._sockets}"
+            events = f"inproc://handshakes-{next(_monitors)}"
             socket.monitor(events, HANDSHAKE_EVENTS)
             if self._key is not None:
                 secure(socket, self._key)

@@ -41,16 +41,16 @@ import zmq
 
 from v2v_protocol.wire import LARGEST_REQUEST_BYTES
 
-CHECK_SECONDS = 0.05
+CHECK_SECONDS, _HURRIED_CHECK_SECONDS = 0.05, 0.01
 IDLE_SECONDS = 30.0
 """A connection without a message for this long ends: at once if it never sent one, else if another needs its place."""
 MOST_CONNECTIONS = 4096 + 256
 _MOST_UNFINISHED_BYTES = 6 * LARGEST_REQUEST_BYTES
 """Of one connection: more than ZeroMQ holds of whole messages (``router.MOST_UNREAD``) and of one on its way."""
-_MOST_UNFINISHED_IN_ALL_BYTES = 4 << 20
-"""Of all connections: 128 MiB of empty parts."""
-_SLOW_BYTES, _MOST_SLOW_CHECKS = 4096, 400
-"""A message with more unfinished bytes must end within that number of checks, 20 s of this process's own time."""
+_MOST_UNFINISHED_IN_ALL_BYTES = 2 << 20
+"""Of all connections: 64 MiB of empty parts. A request has at most 1 KB as a rule, so 2,000 may wait at a time."""
+_SLOW_BYTES, _MOST_SLOW_SECONDS = 4096, 20.0
+"""A message with more unfinished bytes must end within this time, in which this process runs."""
 _HANDSHAKE_BYTES, _CURVE_HANDSHAKE_BYTES = 128, 640
 _CURVE_FRAME_BYTES = 33
 _SLACK_BYTES = 64 << 20
@@ -77,7 +77,7 @@ class _Connection:
     identity: bytes | None = None
     is_heard: bool = False  # since the last check
     delivered: int = 0  # bytes on the wire of its handshake and of the messages that were delivered
-    slow_checks: int = 0
+    slow_seconds: float = 0.0  # in which its message did not end
     sent: int = 0
     is_cut: bool = False
 
@@ -111,7 +111,7 @@ class ConnectionGuard:
         self._to_check: set[int] = set()
         self._unfinished: dict[int, int] = {}  # bytes of messages that were not delivered
         self._ended: list[bytes] = []
-        self._now = time.monotonic()
+        self._now, self._elapsed_seconds = time.monotonic(), 0.0
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._monitor: zmq.Socket[bytes] | None = None
@@ -197,8 +197,9 @@ class ConnectionGuard:
             with self._lock:
                 self._take_events()
                 if (now := time.monotonic()) >= check_at:
-                    check_at = now + CHECK_SECONDS
-                    self._check(now)
+                    unfinished = self._check(now)
+                    is_calm = unfinished < _MOST_UNFINISHED_IN_ALL_BYTES / 4
+                    check_at = now + (CHECK_SECONDS if is_calm else _HURRIED_CHECK_SECONDS)
 
     # --- under the lock -----------------------------------------------------------------------------------------------
 
@@ -221,6 +222,7 @@ class ConnectionGuard:
             _peer(descriptor), time.monotonic(), delivered=self._handshake_bytes
         )
         self._silent[descriptor] = None
+        self._to_check.add(descriptor)  # what it sent before it is registered below is not reported
         if self._most_queued_bytes is not None:
             with contextlib.suppress(OSError):  # it has ended, or ended late and is still registered
                 # Edge-triggered: reports a connection once after each arrival of data, although ZeroMQ reads the data.
@@ -257,9 +259,12 @@ class ConnectionGuard:
             del self._descriptors[identity]
             self._ended.append(identity)
 
-    def _check(self, now: float) -> None:
-        """Measure the connections on which something happened, and end those beyond a limit."""
-        self._now = now
+    def _check(self, now: float) -> int:
+        """Measure the connections on which something happened, and end those beyond a limit; return the unfinished
+        bytes of all.
+        """
+        # Time in which this process was stopped does not count.
+        self._now, self._elapsed_seconds = now, min(now - self._now, 2 * CHECK_SECONDS)
         while self._silent and now - self._connections[oldest := next(iter(self._silent))].heard_at > IDLE_SECONDS:
             self._cut(oldest)
         self._to_check.update(descriptor for descriptor, _ in self._received.poll(0, MOST_CONNECTIONS))
@@ -271,6 +276,7 @@ class ConnectionGuard:
             largest = max(self._unfinished, key=self._unfinished.__getitem__)
             in_all -= self._unfinished[largest]
             self._cut(largest)
+        return in_all
 
     def _measure(self, descriptor: int, connection: _Connection) -> None:
         """Measure a connection, and end it if it is beyond a limit of its own."""
@@ -281,10 +287,10 @@ class ConnectionGuard:
         connection.delivered = min(connection.delivered, max(consumed, self._handshake_bytes))
         unfinished = self._unfinished[descriptor] = max(0, consumed - connection.delivered)
         is_slow = unfinished > _SLOW_BYTES and not is_heard
-        connection.slow_checks = connection.slow_checks + 1 if is_slow else 0
+        connection.slow_seconds = connection.slow_seconds + self._elapsed_seconds if is_slow else 0.0
         if (
             unfinished > _MOST_UNFINISHED_BYTES
-            or connection.slow_checks > _MOST_SLOW_CHECKS
+            or connection.slow_seconds > _MOST_SLOW_SECONDS
             or connection.sent - acknowledged > self._most_queued_bytes
         ):
             self._cut(descriptor)

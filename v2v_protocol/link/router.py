@@ -24,6 +24,8 @@ MOST_QUEUED = 512
 """Messages queued for one peer at which it is disconnected."""
 MOST_UNREAD = 4
 """Messages queued from one peer. Beyond that its connection is not read, so only this peer waits."""
+MOST_FRAMES = 64
+"""Frames of a message; the largest in use has a dozen. A peer that sends more is disconnected."""
 HANDSHAKE_MS = 3000
 """Time limit of a handshake, after which ZeroMQ disconnects the peer."""
 _KEEPALIVE_SECONDS = 300
@@ -60,7 +62,7 @@ class Routers:
 
     def __init__(self, keys: KeyStore | None = None) -> None:
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        # Otherwise each small frame of a peer may keep the whole buffer of 18 KiB that it was read into.
+        # Otherwise each small frame of a peer may keep the whole buffer of 8 KiB that it was read into.
         self.context.set(_ZERO_COPY_RECEIVE, 0)
         self._routers: list[Router] = []
         self._poller = zmq.Poller()
@@ -161,13 +163,16 @@ class Router:
         return self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
     def receive(self) -> Received | None:
-        """Return an available message, if its sender's key has not been revoked since it connected."""
+        """Return an available message, if its sender's key has not been revoked since it connected, and it has at most
+        MOST_FRAMES frames.
+        """
         frames: list[Any] = []
         try:
             identity = frame = self.socket.recv(_NOBLOCK, copy=False)
             while frame.more:  # recv_multipart queries the socket instead, which takes longer
                 frame = self.socket.recv(_NOBLOCK, copy=False)
-                frames.append(frame if frames else frame.bytes)
+                if len(frames) <= MOST_FRAMES:
+                    frames.append(frame if frames else frame.bytes)
         except zmq.Again:
             return None  # the connection has just ended, and its message is gone
         sender, user = identity.bytes, ""
@@ -179,6 +184,9 @@ class Router:
                 user = self._users[sender] = str(identity.get("User-Id"))
                 if not self._gate.admits(self._side, user):
                     return None  # the next review disconnects it
+        if len(frames) > MOST_FRAMES:
+            self.disconnect(sender)
+            return None
         return Received(sender, frames, user)
 
     def send(self, identity: bytes, frames: Sequence[Any]) -> bool:

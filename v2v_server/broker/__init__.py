@@ -1,11 +1,12 @@
-"""The broker decides which worker makes which sample for which consumer. It handles no pixels. Only two files do I/O.
+"""The broker decides which worker makes which sample for which consumer. It handles no pixels. Only one file does I/O.
 
 dispatcher        takes messages and lost peers, returns actions; the consumers' half
 worker_side       the workers' half
 actions           what the dispatcher wants done; the loop in ``serve.py`` does it
 transport         the protocol of the two sockets, and its implementation (I/O)
 admission         turns a consumer's Hello into a session
-session           what each consumer has asked for, its credit, and the order of service
+session           what each consumer has asked for, and its credit
+fair_queue        which waiting consumer is served next
 leases            requests, and which worker holds which of them
 grants            gives waiting requests to free workers: the content of a lease, and the checks on its result
 worker_registry   which workers are connected, have free credit, or are silent

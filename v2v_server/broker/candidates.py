@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from v2v_protocol.messages import Unavailable
 from v2v_protocol.refusal import Refusal, RefusalKind
@@ -20,11 +20,23 @@ from v2v_server.broker.session import Session, Sessions
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.schedule.epoch import MOST_CANDIDATES
 from v2v_server.schedule.sequences import VideoSequence
+from v2v_server.system.status_fields import short, text
 
 MOST_LATEST = 20
 """Number of refusals kept for the status."""
 LONGEST_REASON = 500
 """Characters kept of a refusal's reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class RefusalPart:
+    """One of the last skipped candidates, newest first."""
+
+    time: str = text("Time, ISO 8601, UTC.")
+    video: str = text("Catalogue id of the video.")
+    frame: int | None = text("First frame; null if it is the whole video.")
+    reason: str = text("Why it was skipped.")
+    kind: str = text("Kind of refusal: failed, quarantined and others.")
 
 
 class Candidates:
@@ -48,6 +60,13 @@ class Candidates:
         self._counters = counters
         self._wall_clock = wall_clock
         self.latest: deque[tuple[str, Refusal]] = deque(maxlen=MOST_LATEST)
+
+    def parts(self) -> list[RefusalPart]:
+        """Return the last few refusals, newest first, for the status."""
+        return [
+            RefusalPart(when, short(each.video), each.frame, short(each.reason), str(each.kind))
+            for when, each in reversed(self.latest)
+        ]
 
     def current(self, request: Request, session: Session) -> Request:
         """Return the request under its session's snapshot.

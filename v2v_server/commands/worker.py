@@ -11,8 +11,8 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_source
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.quota import GIB
 from v2v_server.system.log import LOG_FORMATS, Log, report_errors
+from v2v_server.system.status_fields import GIB
 from v2v_server.worker.process import run_worker, unshared_name
 
 

@@ -33,6 +33,7 @@ from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Vid
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.system.process import without_collections
+from v2v_server.system.status_fields import gauge, text
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
 
@@ -42,6 +43,15 @@ _KEPT_LONG_FRAMES = 1 << 22
 _SMALL_INDEX_BYTES = 4096
 """Up to here an index goes into a lease as it is stored: to open it, cut it and pack it again would be a quarter of all
 that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB."""
+
+
+@dataclass(frozen=True, slots=True)
+class CorpusPart:
+    """The corpus in the status."""
+
+    videos: str = text("Where the videos are.")
+    video_count: int = gauge("Videos of the catalogue.", "videos")
+    unusable_count: int = gauge("Files that cannot be used.", "unusable_videos")
 
 
 @dataclass(frozen=True)
@@ -107,7 +117,7 @@ class Catalogue:
         self.source.verify(sidecar_id(id, sidecar) if sidecar else id, fingerprint, state)
 
     def frame_index(self, id: str) -> FrameIndex:
-        """The frames of a video, read from the index on disk.
+        """Read the frames of a video from the index on disk.
 
         Raises:
             CorpusError: no such id in this catalogue.
@@ -118,11 +128,10 @@ class Catalogue:
         return FrameIndex.from_bytes(self._stored_index(id))
 
     def frame_index_bytes(self, id: str, start: int, count: int) -> bytes:
-        """At least the part of :meth:`frame_index` that frames start .. start + count - 1 need, and the pieces of the
-        cache that they lie in, encoded.
+        """Return, encoded, at least the part of :meth:`frame_index` that frames start .. start + count - 1 need.
 
-        A small index is handed on whole and unopened: whoever opens it finds out whether it is damaged. The latest are
-        kept, because siblings ask for the same one after the other.
+        The part covers the pieces of the cache that these frames lie in. A small index is returned whole and undecoded:
+        its reader checks whether it is damaged. The latest parts are kept, because siblings ask for the same one.
 
         Raises:
             CorpusError, IndexUnreadable, VideoChanged, ProtocolError, UsageError: see :meth:`frame_index` and
@@ -145,7 +154,7 @@ class Catalogue:
         return self._slices[key]
 
     def _keep_long(self, id: str, index: FrameIndex) -> FrameIndex:
-        """Opening the index of a day takes a tenth of a second, in the broker's only thread: a few stay open."""
+        """Keep a few large indexes decoded: to decode that of a day takes a tenth of a second of the loop."""
         while self._long and len(index) + sum(map(len, self._long.values())) > _KEPT_LONG_FRAMES:
             del self._long[next(iter(self._long))]
         self._long[id] = index
@@ -161,11 +170,13 @@ class Catalogue:
         except sqlite3.Error as error:
             raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
         if data is None:
-            raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
+            raise VideoChanged(
+                id, None, "has changed since this catalogue was opened; start again to serve it as it is now"
+            )
         return data
 
     def scene(self, id: str) -> Scene:
-        """The statistics of a video, read from the index on disk.
+        """Read the statistics of a video from the index on disk.
 
         Raises:
             CorpusError: no such id in this catalogue, or it was opened without ``scene``.
@@ -182,7 +193,9 @@ class Catalogue:
         except sqlite3.Error as error:
             raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
         if data is None:
-            raise VideoChanged(id, None, "catalogued anew since this catalogue was opened; start again to take it in")
+            raise VideoChanged(
+                id, None, "has changed since this catalogue was opened; start again to serve it as it is now"
+            )
         return Scene.from_bytes(data)
 
     @property
@@ -190,22 +203,28 @@ class Catalogue:
         """What is known in memory: all that a server's dispatcher needs."""
         return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars)
 
+    def part(self) -> CorpusPart:
+        """Return what the status says of it."""
+        return CorpusPart(str(self.source), len(self.videos), len(self.refusals))
+
     def digest_under(self, scene: str) -> str:
         """See :meth:`CorpusFacts.digest_under`."""
         return self.facts.digest_under(scene)
 
     def fail_fast(self) -> None:
-        """For a server's loop: an index that another process holds is an error at once, not after half a minute."""
+        """Report a locked index at once, not after half a minute: a server's loop must not wait."""
         self._store.fail_fast()
 
     def mark_stale(self, id: str) -> None:
-        """Let the next start probe a video again, because it is not what was catalogued, whatever its size and times
-        say. Does nothing where the index cannot be written now."""
+        """Let the next start probe a video again: it differs from the catalogue, whatever its size and times say.
+
+        Does nothing where the index cannot be written now.
+        """
         with suppress(sqlite3.Error):
             self._store.mark_stale(id)
 
     def close(self) -> None:
-        """Close the index; ``frame_index`` works no more."""
+        """Close the index; ``frame_index`` and ``scene`` fail afterwards."""
         self._store.close()
         self.source.release()
 
@@ -246,7 +265,7 @@ def open_catalogue(
     progress: Progress | None = None,
     notice: Notice | None = None,
 ) -> Catalogue:
-    """Take in a corpus: probe what is new or changed, forget what is gone.
+    """Open a corpus: probe what is new or changed, forget what is gone.
 
     Args:
         source: a folder (searched to all depths), one video, a list file whose paths are relative to its folder, or an
@@ -256,16 +275,17 @@ def open_catalogue(
         cache_dir: where the index lies; None takes ``$V2V_CACHE_DIR``, else ``$XDG_CACHE_HOME/v2v``, else
             ``~/.cache/v2v``.
         copies: folder for copies of videos from object storage; None takes one where the index lies.
-        copies_gib: at most so much lies there.
-        scene: also take in what the videos show, which decodes what was not looked at yet; see
+        copies_gib: largest size of that folder, GiB.
+        scene: also analyse what the videos show, which decodes those not analysed yet; see
             :mod:`v2v_server.corpus.scenes`.
-        processes: how many processes probe at a time; 0 probes in this one, unprotected from files that crash it.
-        progress: told after each file that had to be probed; starts again where the index turns out to be unusable.
-        notice: told what is looked at before that, file by file, and how far it is.
+        processes: number of processes that probe; 0 probes in this one, which a file that crashes the decoder ends.
+        progress: called after each probed file; starts again where the index turns out to be unusable.
+        notice: called with a line of text as the search for files advances.
 
     Raises:
         CorpusError: there is no such folder or list, it cannot be read, it makes no sense, or not one video of it can
             be used.
+        IndexUnreadable: the index cannot be read any more after the probes.
     """
     opened = open_source(source, SourceOptions(list_file, copies, copies_gib, cache_dir))
     corpus = list_corpus(opened, rows, notice)
@@ -275,6 +295,9 @@ def open_catalogue(
     try:
         with without_collections():
             return _snapshot(corpus, table, notes, store, scenes, notice)
+    except sqlite3.Error as error:
+        store.close()
+        raise IndexUnreadable(f"the catalogue's index {path} cannot be read: {error}; start again") from error
     except BaseException:
         store.close()
         raise
@@ -295,7 +318,8 @@ def _snapshot(
         records = [on_disk.row(at) for at in range(len(on_disk))]
         files = {record.id: record.fingerprint for record in records}
         absent = {record.id: manifest.videos[record.id] for record in records if not manifest.describes(record)}
-        table, _ = VideoTable.read((manifest.as_source(record).columns for record in records), len(records))
+        rows = ((*manifest.as_source(record).columns, None) for record in records)
+        table = replace(VideoTable.read(rows, len(records))[0], summaries=on_disk.summaries)
     else:
         table.problem[table.codec == STORE_FORMAT] = "is a file of a lossless corpus by itself: serve the whole folder"
     usable = table.problem == np.array(None)
@@ -334,7 +358,7 @@ def _snapshot(
     digest = videos.digest(corpus.rows)
     scene_digest, unknown = None, set(absent)
     if scenes is not None:
-        split, scene_digest = scenes.read(store, videos.ids, videos.frames, unknown, digest)
+        split, scene_digest = scenes.read(store, table, unknown, digest)
         videos = Videos(table, thresholds, split)
         if died := sorted(unknown - absent.keys()):
             notes = [*notes, f"{len(died)} videos crash the decoder that analyses their scenes: {died[0]}"]
@@ -362,7 +386,7 @@ def _snapshot(
 
 
 def _listed(listed: Sequence[ListEntry], videos: Videos) -> tuple[dict[int, Thresholds], list[str]]:
-    """What a list states: thresholds, by number of the video, and the videos that are shorter than it says."""
+    """Return what a list states: thresholds by number of the video, and the videos that are shorter than it says."""
     thresholds: dict[int, Thresholds] = {}
     shorter = []
     for entry in sorted({entry.id: entry for entry in listed}.values(), key=lambda entry: entry.id):

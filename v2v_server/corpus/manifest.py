@@ -154,7 +154,7 @@ class Manifest:
         return kept if self.lossless else Rows()
 
     def wanted(self, listed: Iterable[str] | None, refused: dict[str, str]) -> tuple[str, ...]:
-        """The ids that a corpus of this folder has; files that the manifest does not know are none.
+        """Return the ids that a corpus of this folder has, without files that the manifest does not know.
 
         Args:
             listed: the ids that a list file names; None takes all.
@@ -183,8 +183,11 @@ class Manifest:
         return is_same_file(record.fingerprint, video.fingerprint) and record.frames == video.frames
 
     def as_source(self, record: IndexRow) -> IndexRow:
-        """The record of a prepared file, with what has to agree with its source even where there is no sound file:
-        the sequences of all others keep their places only if the source's frames are counted."""
+        """Return the record of a prepared file with the facts that have to agree with its source.
+
+        They do even where there is no sound file: the sequences of all others keep their places only if the source's
+        frames are counted.
+        """
         video = self.videos[record.id]
         made = video.fingerprint or f"none-of-{video.source_fingerprint}"
         return replace(
@@ -199,7 +202,7 @@ class Manifest:
 
 
 def read_manifest(root: Path) -> Manifest:
-    """The manifest in that folder.
+    """Read the manifest in a folder.
 
     Raises:
         CorpusError: it cannot be read, or is no manifest of this version.
@@ -241,7 +244,7 @@ def _header(line: bytes) -> Header:
 
 
 def _video(line: bytes) -> tuple[PreparedVideo, bool]:
-    """The record, and whether it is set aside."""
+    """Return the record, and whether it is set aside."""
     data = _object(line)
     aside = data.pop("aside", False) is True
     video = _record(PreparedVideo, data)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.corpus.index.columns import VideoTable, joined
-from v2v_server.corpus.index.file import SCHEMA_VERSION, Store
+from v2v_server.corpus.index.file import SCHEMA_VERSION, FigureKind, Store
 from v2v_server.corpus.index.parts import Shard
 from v2v_server.corpus.probe import Progress, batches, probe_files
 from v2v_server.corpus.scenes.collect import SceneCollection
@@ -90,9 +90,12 @@ def _refreshed(
 ) -> tuple[Store, VideoTable]:
     store = Store(path)
     try:
+        kind = None if scenes is None else scenes.kind
+        if kind is not None:
+            store.make_figures()
         with without_collections():
             unasked = list[str]()
-            table, states = VideoTable.read(joined(ids, store.rows(), unasked), len(ids))
+            table, states = VideoTable.read(joined(ids, store.rows(kind), unasked), len(ids))
             stale = _changed(source, ids, states, notice)
         del states
         store.forget(_gone(source, unasked, notice))
@@ -100,15 +103,20 @@ def _refreshed(
             for batch in batches(found, len(stale), progress):
                 store.put(batch)
         if stale:
-            with without_collections():
-                table, _ = VideoTable.read(joined(ids, store.rows(), []), len(ids))
-        if scenes is not None:
-            scenes.collect(store, source, table, processes, progress)
+            table = _table(store, ids, kind)
+        if scenes is not None and scenes.collect(store, source, table, processes, progress):
+            table = _table(store, ids, kind)
         _remove_earlier_caches(path)
         return store, table
     except BaseException:
         store.close()
         raise
+
+
+def _table(store: Store, ids: list[str], kind: FigureKind | None) -> VideoTable:
+    with without_collections():
+        table, _ = VideoTable.read(joined(ids, store.rows(kind), []), len(ids))
+    return table
 
 
 def _changed(source: VideoSource, ids: list[str], states: npt.NDArray[np.int64], notice: Notice | None) -> list[int]:
@@ -119,7 +127,7 @@ def _changed(source: VideoSource, ids: list[str], states: npt.NDArray[np.int64],
         changed += (np.flatnonzero((found != known).any(1) | (found[:, 0] < 0)) + done).tolist()
         done += len(part)
         if notice is not None:
-            notice(f"looking at files: {done} of {len(ids)}, {len(changed)} of them new or changed")
+            notice(f"looking at files in {source}: {done} of {len(ids)}, {len(changed)} of them new or changed")
     return changed
 
 
@@ -130,7 +138,7 @@ def _gone(source: VideoSource, ids: Sequence[str], notice: Notice | None) -> lis
         done += len(part)
         gone += [id for id, size in zip(part, states[::3], strict=True) if size == GONE[0]]
         if notice is not None:
-            notice(f"looking for files that are gone: {done} of {len(ids)} that this corpus does not name")
+            notice(f"looking for files that are gone from {source}: {done} of {len(ids)} that are not listed")
     return gone
 
 

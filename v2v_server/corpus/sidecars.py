@@ -41,11 +41,10 @@ def collect_sidecars(
         notice: progress callback.
     """
     kind, ids = FigureKind(f"sidecar {ending}", "1"), sorted(videos)
-    known = dict[str, tuple[bytes, bytes]]()
+    known = dict[str, str]()  # state and fingerprint
     with suppress(sqlite3.Error):  # an index that cannot be read or written costs time only
         store.make_figures()
-        pairs = zip(store.summaries(kind), store.all_figures(kind), strict=True)  # both sorted by id
-        known = {id: (state, mark) for (id, state), (_, mark) in pairs}
+        known = {id: data.decode("ascii", "replace") for id, _, data in store.all_figures(kind)}
     fingerprints, fresh, unreadable, done = dict[str, str](), list[Figures](), list[str](), 0
 
     def states(part: Sequence[str]) -> list[str]:
@@ -55,18 +54,18 @@ def collect_sidecars(
         for part, found in answered:
             done += len(part)
             for video, state in zip(part, found, strict=True):
-                before, mark = known.get(video, (b"", b""))
+                before, _, mark = known.get(video, "").partition(" ")
                 if not state:
                     continue
-                if before != state.encode():
+                if before != state:
                     try:
                         with open_sidecar(source, sidecar_id(video, ending), "") as opened:
-                            mark = fingerprint_of(opened).encode()
+                            mark = fingerprint_of(opened)
                     except (OSError, VideoError) as error:
                         unreadable.append(f"{sidecar_id(video, ending)}: {getattr(error, 'reason', error)}")
                         continue
-                    fresh.append(Figures(video, videos[video], state.encode(), mark))
-                fingerprints[video] = mark.decode()
+                    fresh.append(Figures(video, videos[video], b"", f"{state} {mark}".encode()))
+                fingerprints[video] = mark
             if notice is not None:
                 notice(f"looking for sidecars {ending} in {source}: {done} of {len(ids)} videos")
     with suppress(sqlite3.Error):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import overload
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import sidecar_endings
-from v2v_server.corpus.index.columns import CHUNK, VideoTable
+from v2v_server.corpus.index.columns import CHUNK, NO_STRINGS, VideoTable
 from v2v_server.corpus.scenes.runs import Runs, SplitVideos
 from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.video.rows import Rows
@@ -63,7 +63,8 @@ class Videos(Sequence[VideoEntry]):
     def __init__(
         self, table: VideoTable, thresholds: Mapping[int, Thresholds], split: SplitVideos | None = None
     ) -> None:
-        self._table, self._thresholds, self.split = table, thresholds, split
+        self._table = replace(table, summaries=NO_STRINGS)  # tens of MB that only ``split`` is made of
+        self._thresholds, self.split = thresholds, split
         self.ids, self.fingerprints, self.frames = table.ids, table.fingerprints, table.frames
         self.width_px, self.height_px, self.interlaced = table.width_px, table.height_px, table.interlaced
 
@@ -77,17 +78,19 @@ class Videos(Sequence[VideoEntry]):
         Fingerprints cover the track and its orientation.
         """
         sha = hashlib.sha256(f"v2v catalogue 2\n{rows}\n".encode())
+        pos, neg = NO_THRESHOLDS
+        none, limits = f"{pos}\0{neg}", {number: f"{pos}\0{neg}" for number, (pos, neg) in self._thresholds.items()}
         table = self._table
+        numbers = table.frames, table.width_px, table.height_px, table.frames_per_second
         for start in range(0, len(self), CHUNK):
             those = slice(start, start + CHUNK)
-            columns = (table.frames, table.width_px, table.height_px, table.frames_per_second)
-            values = zip(
-                table.ids[those], table.fingerprints[those], *(c[those].tolist() for c in columns), strict=True
-            )
-            lines = []
-            for number, (id, fingerprint, frames, width, height, rate) in enumerate(values, start):
-                pos, neg = self._thresholds.get(number, NO_THRESHOLDS)
-                lines.append(f"{id}\0{fingerprint}\0{frames}\0{width}\0{height}\0{rate}\0{pos}\0{neg}\n")
+            columns = table.ids[those], table.fingerprints[those], *(column[those].tolist() for column in numbers)
+            lines = [
+                f"{id}\0{fingerprint}\0{frames}\0{width}\0{height}\0{rate}\0{limits.get(number, none)}\n"
+                for number, (id, fingerprint, frames, width, height, rate) in enumerate(
+                    zip(*columns, strict=True), start
+                )
+            ]
             sha.update("".join(lines).encode())
         return sha.hexdigest()[:32]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.corpus import list_corpus
-from v2v_server.corpus.index.parts import Shard, make_folder, parts_in, take_in_parts, write_part
+from v2v_server.corpus.index.parts import Shard, make_folder, merge_parts, parts_in, write_part
 from v2v_server.corpus.probe import Progress
 from v2v_server.corpus.refresh import index_path, refresh_index
 from v2v_server.corpus.scenes.collect import SceneCollection
@@ -62,7 +62,7 @@ def catalogue_ahead(asked: Ahead, parts: Path | None, progress: Progress | None,
     """
     if parts is not None:
         complete = parts_in(parts)
-        take_in_parts(index_path(_source(asked).name, asked.cache_dir), complete)
+        merge_parts(index_path(_source(asked).name, asked.cache_dir), complete)
     return open_catalogue(
         asked.videos,
         list_file=asked.list_file,

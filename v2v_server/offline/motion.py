@@ -143,7 +143,7 @@ class WholePictures:
         seconds = index.seconds(sequence.start_frame, recipe.frames_needed)[::stride]
         clip = DecodedClip(frames, seconds, codec="", bit_exact=False)
         sample = make_sample(lease, Decoded(plan_sample(lease, 0), clip))
-        return Camera.of(sample.arrays, sample.provenance, f"threshold {THRESHOLD:g}, no noise", recipe.frames_per_bin)
+        return Camera.of(sample.arrays, sample.provenance, f"threshold {THRESHOLD:g}, no noise", recipe)
 
     def estimate(self, sequence: VideoSequence, seed: int) -> CropEstimate:
         """Estimate what the camera of a seed sees of a sequence.

@@ -162,10 +162,11 @@ def _camera(
         notes.setdefault(note, []).append(title)
     arrays = ("voxels", "frames", "flow") if with_flow else ("voxels", "frames")
     made = Remaker(catalogue, stream, arrays).made(shot.seed, 0, 0)
-    provenance, frames_per_bin = made.sample.provenance, stream.recipe.frames_per_bin
+    provenance = made.sample.provenance
     whole = _whole_picture(catalogue, provenance)
-    camera = Camera.of(made.sample.arrays, provenance, title, frames_per_bin, whole)
-    quiet = dataclasses.replace(camera, voxels=quiet_voxels(made)[camera.lead_voxels :])
+    camera = Camera.of(made.sample.arrays, provenance, title, stream.recipe, whole)
+    quiet_grids = quiet_voxels(made).reshape(-1, *camera.voxels.shape[1:])
+    quiet = dataclasses.replace(camera, voxels=quiet_grids[camera.lead_voxels :])
     return dataclasses.replace(camera, quiet=quiet.rates)
 
 

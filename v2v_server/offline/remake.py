@@ -30,7 +30,8 @@ from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample, open_sidecars
+from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample
+from v2v_server.worker.sidecars import open_sidecars
 
 _MOMENTS = 4
 """Voxel grids that a picture shows."""
@@ -224,7 +225,7 @@ def simulate_to_file(
     try:
         np.savez_compressed(out, **content)
         if picture is not None:
-            camera = Camera.of(sample.arrays, sample.provenance, f"index {index}", stream.recipe.frames_per_bin)
+            camera = Camera.of(sample.arrays, sample.provenance, f"index {index}", stream.recipe)
             write_png(picture, draw_sheet([camera], f"seed {seed}, epoch {epoch}", moments=_MOMENTS))
         if events is not None:
             made = list_sample_events(remade.lease, remade.decoded)

@@ -5,6 +5,6 @@ __main__   the process: python -m v2v_server.page
 app        the answer for each path
 guard      which requests are answered, and what a browser may do with the answer
 silent     closes connections that send no request
-source     the newest state, requested on demand
-metrics    the state as Prometheus metrics
+source     the newest status, requested on demand
+metrics    the status as Prometheus metrics
 """

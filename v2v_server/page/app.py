@@ -77,7 +77,8 @@ class Pages:
         """Return the place, name, help and unit of each field."""
         return JSONResponse(
             [
-                {"place": place, "name": name, "help": meaning.help, "unit": meaning.unit, "kind": meaning.kind}
+                {"place": place, "name": name, "words": meaning.words or name.replace("_", " ")}
+                | {"help": meaning.help, "unit": meaning.unit, "kind": meaning.kind}
                 for place in PARTS
                 for name, meaning in meanings_at(place).items()
             ]

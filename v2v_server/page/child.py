@@ -1,7 +1,7 @@
 """Run the page's process from the server. Needs none of the packages that the page needs.
 
 The server binds the port and passes it on. So a port in use is reported at the start, and requests wait while the
-process is restarted. The process reads the state over ZeroMQ from the address for the server's own workers. That
+process is restarted. The process reads the status over ZeroMQ from the address for the server's own workers. That
 address is private to this host and user (the kernel reports whose process connects). So the page needs no consumer key,
 which a person would have to create, store and revoke.
 """
@@ -64,7 +64,7 @@ class PageProcess:
         return None if self._process is None else self._process.pid
 
     def start(self, address: str) -> None:
-        """Make :meth:`watch` keep a process running, which reads the state from the server at ``address``."""
+        """Make :meth:`watch` keep a process running, which reads the status from the server at ``address``."""
         self._address = address
 
     def watch(self, now: float) -> list[str]:

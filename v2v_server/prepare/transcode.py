@@ -209,7 +209,7 @@ def _verified(job: Transcoding, index: FrameIndex, made: Path, pts: list[int], t
 
 
 def _squared_errors(job: Transcoding, index: FrameIndex, made: Path, found: FrameIndex) -> npt.NDArray[np.float64]:
-    """Return [n] the mean squared error of each prepared frame, as the server will decode it, against the source's."""
+    """Return the mean squared error of each prepared frame [n], as the server will decode it, against the source."""
     errors = np.empty(len(index))
     for ordinal, wanted in enumerate(_frames(job, index)):
         at = ordinal % _COMPARED_FRAMES

@@ -18,8 +18,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from v2v_protocol.errors import CorpusError
+from v2v_server.system.status_fields import gauge, short, text
 
 VERDICTS_PER_VIDEO = 2
+_MOST_VERDICTS = 20
+
+_MOST_VERDICTS = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +53,25 @@ class QuarantineEntry:
             return f"snapshot {self.snapshot} ({self.time}): cleared"
         only = f" (under spec {self.spec:.12} only)" if self.spec else ""
         return f"snapshot {self.snapshot} ({self.time}): {self.path} from frame {self.frame}: {self.reason}{only}"
+
+
+@dataclass(frozen=True, slots=True)
+class QuarantinePart:
+    """The quarantine in the status."""
+
+    quarantine_snapshot: int = gauge("Number of the newest quarantine snapshot.")
+    quarantined: int = gauge("Quarantine entries in force.", "quarantined_sequences")
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictPart:
+    """One of the last quarantine entries in force, newest first."""
+
+    snapshot: int = text("Snapshot that it began.")
+    time: str = text("Time, ISO 8601, UTC.")
+    video: str = text("Catalogue id of the video.")
+    frame: int = text("First frame of the sequence.")
+    reason: str = text("What happened.")
 
 
 def clearing(time: str) -> QuarantineEntry:
@@ -89,6 +112,17 @@ class Quarantine:
             CorpusError: there is no such snapshot.
         """
         return self._entries[self._cleared(snapshot) : snapshot]
+
+    def part(self) -> QuarantinePart:
+        """Return what the status says of it."""
+        return QuarantinePart(self.latest, len(self.entries(self.latest)))
+
+    def verdict_parts(self) -> list[VerdictPart]:
+        """Return the last few entries in force, newest first, for the status."""
+        return [
+            VerdictPart(each.snapshot, each.time, short(each.path), each.frame, short(each.reason))
+            for each in reversed(self.entries(self.latest)[-_MOST_VERDICTS:])
+        ]
 
     def refusal(self, snapshot: int, path: str, fingerprint: str, frame: int, spec: str = "") -> str | None:
         """Return why a sequence is refused under a snapshot; None if it is not.

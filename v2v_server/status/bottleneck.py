@@ -32,8 +32,8 @@ _SPARE_SHARE = 0.5
 """If workers are idle for a larger share of their time, fewer of them would do."""
 
 
-def _share(help: str, part: str) -> Any:
-    return gauge(help, "time_ratio", unit="0 to 1", part=part, default=0.0)
+def _share(help: str, part: str, words: str) -> Any:
+    return gauge(help, "time_ratio", unit="0 to 1", part=part, words=words, default=0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +41,21 @@ class Shares:
     """Shares of the last ten seconds in which there was a consumer."""
 
     seconds: float = gauge("Seconds of the last ten in which there was a consumer.", unit="s", default=0.0)
-    consumers: float = _share("Share of the consumers' time in which they waited for batches.", "consumers")
-    idle: float = _share("Share of the workers' time in which they held no lease.", "idle")
-    broker: float = _share("Share of the time in which the server's loop did not wait for a message.", "broker")
-    decode: float = _share("Share of the workers' time that decoding took.", "decode")
-    simulate: float = _share("Share of the workers' time that simulating took.", "simulate")
-    handover: float = _share("Share of the workers' time that delivering took.", "handover")
-    queued: float = _share("Share of all workers' time in which those of this server waited for a core.", "queued")
+    consumers: float = _share(
+        "Share of the consumers' time in which they waited for batches.", "consumers", "consumers wait"
+    )
+    idle: float = _share("Share of the workers' time in which they held no lease.", "idle", "workers idle")
+    broker: float = _share(
+        "Share of the time in which the server's loop did not wait for a message.", "broker", "server's loop busy"
+    )
+    decode: float = _share("Share of the workers' time that decoding took.", "decode", "workers decode")
+    simulate: float = _share("Share of the workers' time that simulating took.", "simulate", "workers simulate")
+    handover: float = _share("Share of the workers' time that delivering took.", "handover", "workers deliver")
+    queued: float = _share(
+        "Share of all workers' time in which those of this server waited for a core.",
+        "queued",
+        "workers wait for a core",
+    )
     cores: float = gauge("Processor time of the workers by their time.", unit="cores", default=0.0)
 
     @classmethod
@@ -156,7 +164,7 @@ def find_bottleneck(
             "cores",
             f"The workers' host is overloaded: consumers wait {wait} of their time for workers, which wait "
             f"{shares.queued:.0%} of theirs for a core and get {shares.cores:.2f} of a core each.",
-            "more workers on this host would not help: stop other programs there, or start v2v-worker on other hosts",
+            "stop other programs there, or start v2v-worker on other hosts; more workers on this host would not help",
         )
     part = max(("decode", "simulate", "handover"), key=lambda name: getattr(shares, name))
     activity, remedy = {

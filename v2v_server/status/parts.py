@@ -9,8 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from v2v_server.broker.candidates import RefusalPart
 from v2v_server.broker.counters import Counters, FaultTotal
+from v2v_server.corpus.catalogue import CorpusPart
+from v2v_server.quarantine.snapshots import QuarantinePart, VerdictPart
 from v2v_server.status.bottleneck import Bottleneck, Shares
+from v2v_server.store.quota import CachePart
 from v2v_server.system.status_fields import Meaning, counter, gauge, meanings, states, text
 
 STATUS_VERSION = 1
@@ -20,7 +24,7 @@ Status: TypeAlias = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class ServerPart:
-    """The server and its corpus."""
+    """The server."""
 
     version: int = text("Version of this form of the status.")
     time: str = text("Time of the status, ISO 8601, UTC.")
@@ -31,9 +35,6 @@ class ServerPart:
     is_ready: bool = gauge("Whether workers are connected, or none are to be started.", "ready")
     address: str = text("Where consumers connect.")
     worker_address: str = text("Where workers connect.")
-    videos: str = text("Where the videos are.")
-    video_count: int = gauge("Videos of the catalogue.", "videos")
-    unusable_count: int = gauge("Files that cannot be used.", "unusable_videos")
     spec: Mapping[str, Any] = text("The complete default spec of consumers, with the recipe.")
 
 
@@ -54,20 +55,6 @@ class LoadPart:
     worker_processes: int = gauge("Worker processes that the server runs itself.", None)
     workers_wanted: Sequence[int] = text("Lowest and highest number of the server's own workers.")
     consumer_count: int = gauge("Consumers that are connected.")
-    quarantine_snapshot: int = gauge("Number of the newest quarantine snapshot.")
-    quarantined: int = gauge("Quarantine entries in force.", "quarantined_sequences")
-
-
-@dataclass(frozen=True, slots=True)
-class CachePart:
-    """The cache of decoded clips."""
-
-    folder: str = text("Folder of the cache on this host; empty if only workers of other hosts have one.")
-    held_gib: float | None = gauge("Size of the cache.", "bytes", unit="GiB")
-    most_gib: float | None = gauge("Size limit of the cache.", "limit_bytes", unit="GiB")
-    hits: int = counter("Clips read from the cache.", is_routine=True)
-    misses: int = counter("Clips that were not in the cache.", is_routine=True)
-    trouble: str = text("Why a cache stores nothing more, as last reported; empty if it does.", default="")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,30 +128,8 @@ class ConsumerPart:
     quarantine: int = text("Number of the quarantine snapshot that its samples are made under.")
 
 
-@dataclass(frozen=True, slots=True)
-class RefusalPart:
-    """One of the last skipped candidates, newest first."""
-
-    time: str = text("Time, ISO 8601, UTC.")
-    video: str = text("Catalogue id of the video.")
-    frame: int | None = text("First frame; null if it is the whole video.")
-    reason: str = text("Why it was skipped.")
-    kind: str = text("Kind of refusal: failed, quarantined and others.")
-
-
-@dataclass(frozen=True, slots=True)
-class VerdictPart:
-    """One of the last quarantine entries in force, newest first."""
-
-    snapshot: int = text("Snapshot that it began.")
-    time: str = text("Time, ISO 8601, UTC.")
-    video: str = text("Catalogue id of the video.")
-    frame: int = text("First frame of the sequence.")
-    reason: str = text("What happened.")
-
-
 PARTS: Mapping[str, tuple[type, ...]] = {
-    "": (ServerPart, LoadPart),
+    "": (ServerPart, CorpusPart, LoadPart, QuarantinePart),
     "totals": (Counters, FaultTotal),
     "waiting": (Bottleneck,),
     "waiting.shares": (Shares,),
@@ -194,7 +159,7 @@ def events(status: Status) -> list[str]:
     """Name the unusual events since the start, those that happened: "2 refused candidates"."""
     named = meanings_at("totals").items()
     return [
-        f"{status['totals'][name]} {name.replace('_', ' ')}"
+        f"{status['totals'][name]} {meaning.words or name.replace('_', ' ')}"
         for name, meaning in named
         if meaning.is_event and status["totals"].get(name)
     ]

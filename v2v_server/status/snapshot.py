@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import platform
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from v2v_protocol import PROTOCOL_VERSION, __version__
@@ -26,24 +25,19 @@ from v2v_server.status.bottleneck import NOTICEABLE_SHARE, Bottleneck, Shares, f
 from v2v_server.status.history import TimeWindow
 from v2v_server.status.parts import (
     STATUS_VERSION,
-    CachePart,
     ConsumerPart,
     LoadPart,
-    RefusalPart,
     ServerPart,
     Status,
-    VerdictPart,
     WorkerPart,
 )
-from v2v_server.store.quota import used_bytes
+from v2v_server.store.quota import cache_part
 from v2v_server.supervise.pool import Pool
-from v2v_server.system.status_fields import GIB, values
+from v2v_server.system.status_fields import GIB, short, values
 
 MOST_SHOWN = 1000
 """Largest number of workers listed, and of consumers; the others are only counted."""
 _MOST_SPECS = 8
-_MOST_VERDICTS = 20
-_LONGEST_TEXT = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,24 +64,21 @@ class Service:
             is_attended: whether there are consumers, apart from moments between epochs.
         """
         counters, shares = self.dispatcher.counters, Shares.of(window)
-        cache = self._cache()
-        refusals, verdicts = reversed(self.dispatcher.candidates.latest), self._verdicts()[::-1]
+        cache = cache_part(
+            self.config.cache, self.config.cache_gib, counters.cache_hits, counters.cache_misses, counters.cache_trouble
+        )
         return {
             **values(self._server(time, uptime_seconds, is_ready=is_ready)),
+            **values(self.catalogue.part()),
             **values(self._load(window)),
+            **values(self.quarantine.part()),
             "waiting": values(self._bottleneck(shares, is_attended=is_attended)) | {"shares": values(shares)},
             "totals": values(counters) | values(FaultTotal(counters.faults)),
             "cache": None if cache is None else values(cache),
             "workers": self._workers(window),
             "consumers": [values(_consumer(each, window)) for each in list(self.dispatcher.sessions)[:MOST_SHOWN]],
-            "refusals": [
-                values(RefusalPart(when, _short(each.video), each.frame, _short(each.reason), str(each.kind)))
-                for when, each in refusals
-            ],
-            "verdicts": [
-                values(VerdictPart(each.snapshot, each.time, _short(each.path), each.frame, _short(each.reason)))
-                for each in verdicts[:_MOST_VERDICTS]
-            ],
+            "refusals": [values(each) for each in self.dispatcher.candidates.parts()],
+            "verdicts": [values(each) for each in self.quarantine.verdict_parts()],
         }
 
     def _server(self, time: str, uptime_seconds: float, *, is_ready: bool) -> ServerPart:
@@ -101,9 +92,6 @@ class Service:
             is_ready=is_ready,
             address=self.transport.address,
             worker_address=self.transport.worker_address,
-            videos=str(self.catalogue.source),
-            video_count=len(self.catalogue.videos),
-            unusable_count=len(self.catalogue.refusals),
             spec=self.config.spec.to_dict(),
         )
 
@@ -122,12 +110,7 @@ class Service:
             worker_processes=self.pool.running,
             workers_wanted=self.config.workers,
             consumer_count=dispatcher.consumers,
-            quarantine_snapshot=self.quarantine.latest,
-            quarantined=len(self._verdicts()),
         )
-
-    def _verdicts(self) -> list[Any]:
-        return self.quarantine.entries(self.quarantine.latest)
 
     def _bottleneck(self, shares: Shares, *, is_attended: bool) -> Bottleneck:
         dispatcher = self.dispatcher
@@ -139,13 +122,6 @@ class Service:
             trouble=dispatcher.blocked_reason or dispatcher.registry.trouble(self.config.workers_in_all),
             has_cache=bool(self.config.cache),
         )
-
-    def _cache(self) -> CachePart | None:
-        counters, folder = self.dispatcher.counters, self.config.cache
-        if not folder and not counters.cache_hits + counters.cache_misses:
-            return None
-        held, most = (used_bytes(Path(folder)) / GIB, self.config.cache_gib) if folder else (None, None)
-        return CachePart(folder, held, most, counters.cache_hits, counters.cache_misses, counters.cache_trouble)
 
     def _workers(self, window: TimeWindow) -> list[dict[str, Any]]:
         members, restarts = self.dispatcher.registry.members(), self.pool.restarts
@@ -181,7 +157,7 @@ def _worker(
         name=clean_name(member.name),
         host=member.host,
         state=state,
-        clip=_short(video),
+        clip=short(video),
         frame=frame,
         clip_seconds=now - since,
         leases=leases.held_by(identity),
@@ -191,7 +167,7 @@ def _worker(
         memory_gib=member.memory_bytes / GIB,
         silent_seconds=member.liveness.silence(now),
         restarts=restarts,
-        unreadable=_short(member.unreadable),
+        unreadable=short(member.unreadable),
     )
 
 
@@ -229,7 +205,3 @@ def _consumer(session: Session, window: TimeWindow) -> ConsumerPart:
         seed=session.seed,
         quarantine=session.quarantine,
     )
-
-
-def _short(text: str) -> str:
-    return text[:_LONGEST_TEXT]

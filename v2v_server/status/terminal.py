@@ -9,14 +9,13 @@ from rich.console import Console
 from rich.text import Text
 
 from v2v_server.corpus.sources.names import printable
-from v2v_server.status.parts import Status
+from v2v_server.status.parts import Status, meanings_at
 from v2v_server.status.text import figures
 from v2v_server.status.top import consumers_table
 from v2v_server.system.log import Log, write
 
 _TERMINAL_SECONDS, _LOG_SECONDS = 0.5, 10.0
 _MOST_CONSUMERS = 8
-_LOGGED = ("samples_per_second", "batches_per_second", "queue")
 
 
 class StatusView:
@@ -72,7 +71,7 @@ def _for_programs(status: Status) -> dict[str, Any]:
         "consumers": status["consumer_count"],
         "samples": totals["samples"],
         "faults": totals["faults"],
-        **{name: round(status[name], 3) for name in _LOGGED},
+        **{name: round(status[name], 3) for name, meaning in meanings_at("").items() if meaning.kind == "gauge"},
         "totals": totals,
     }
 

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from v2v_protocol.progress import format_duration
 from v2v_server.corpus.sources.names import printable
-from v2v_server.status.parts import Status
+from v2v_server.status.parts import Status, meanings_at
 from v2v_server.status.text import figures
 
 _MOST_ROWS = 30
@@ -26,15 +26,6 @@ _COLOURS = {
     "lost": "red",
     "gone": "red",
 }
-_SHARES = (
-    ("consumers wait", "consumers"),
-    ("workers idle", "idle"),
-    ("decode", "decode"),
-    ("simulate", "simulate"),
-    ("deliver", "handover"),
-    ("no core", "queued"),
-    ("server busy", "broker"),
-)
 
 
 def line(status: Status) -> str:
@@ -58,8 +49,11 @@ def draw(status: Status, note: str = "") -> RenderableType:
     if waiting["remedy"]:
         parts.append(_text(f"What helps: {waiting['remedy']}."))
     shares = Table.grid(padding=(0, 2))
-    shares.add_row(*(f"{name} {waiting['shares'][key]:.0%}" for name, key in _SHARES))
-    shares.add_row(*(ProgressBar(total=1.0, completed=waiting["shares"][key], width=16) for _, key in _SHARES))
+    named = {
+        meaning.words: waiting["shares"][key] for key, meaning in meanings_at("waiting.shares").items() if meaning.words
+    }
+    shares.add_row(*(f"{words} {share:.0%}" for words, share in named.items()))
+    shares.add_row(*(ProgressBar(total=1.0, completed=share, width=16) for share in named.values()))
     said = f"{figures(status)}  {status['bytes_per_second'] / 1e6:.1f} MB/s"
     parts += [shares, _text(said), consumers_table(status["consumer_count"], status["consumers"]), _workers(status)]
     if status["refusals"]:
@@ -86,7 +80,7 @@ def consumers_table(count: int, consumers: Sequence[Status]) -> Table:
             _text(f"{each['name'] or each['id'][:8]} on {each['host']}"),
             Text(each["state"], style=_COLOURS.get(each["state"], "")),
             str(each["epoch"]),
-            ProgressBar(total=1.0, completed=each["epoch_share"], width=20),
+            ProgressBar(total=1.0, completed=each.get("epoch_share", 0.0), width=20),  # servers before 0.2.0 lack it
             f"{each['position']}/{each['sequences']}",
             "" if each["eta_seconds"] is None else format_duration(each["eta_seconds"]),
             f"{each['batches_per_second']:.2f}",

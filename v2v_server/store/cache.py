@@ -29,10 +29,11 @@ import numpy.typing as npt
 from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnreadable
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
 from v2v_server.store.packing import QUICK
-from v2v_server.store.quota import GIB, LEAST_FREE_BYTES, PARTIAL, QuotaFolder
+from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter
 from v2v_server.system.private import make_private
+from v2v_server.system.status_fields import GIB
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import BIT_EXACT_CODECS, DecodedClip, stream_decoded
 from v2v_server.video.fingerprint import check_fingerprint

@@ -17,13 +17,25 @@ from pathlib import Path
 
 from v2v_server.system.locks import lock
 from v2v_server.system.private import open_private
+from v2v_server.system.status_fields import GIB, counter, gauge, text
 
-GIB = 1 << 30
 LEAST_FREE_BYTES = GIB
 """Always keep this much disk space free."""
 _USED, PARTIAL = "used", "partial"
 _KEPT_SHARE = 0.9
 """Share of the limit that is used after an eviction. Evicting lists every file, so it frees space for several."""
+
+
+@dataclass(frozen=True, slots=True)
+class CachePart:
+    """The cache of decoded clips."""
+
+    folder: str = text("Folder of the cache on this host; empty if only workers of other hosts have one.")
+    held_gib: float | None = gauge("Size of the cache.", "bytes", unit="GiB")
+    most_gib: float | None = gauge("Size limit of the cache.", "limit_bytes", unit="GiB")
+    hits: int = counter("Clips read from the cache.", is_routine=True)
+    misses: int = counter("Clips that were not in the cache.", is_routine=True)
+    trouble: str = text("Why a cache stores nothing more, as last reported; empty if it does.", default="")
 
 
 @dataclass(slots=True)
@@ -150,6 +162,19 @@ def used_bytes(folder: Path) -> int:
     except OSError:
         return 0
     return int(text) if text.isdigit() else 0
+
+
+def cache_part(folder: str, most_gib: float, hits: int, misses: int, trouble: str) -> CachePart | None:
+    """Return the status of the cache; None if there is none.
+
+    Args:
+        folder: its folder on this host; empty: only other hosts can have one.
+        most_gib: its size limit.
+        hits, misses, trouble: as workers of all hosts report.
+    """
+    if not folder:
+        return CachePart("", None, None, hits, misses, trouble) if hits + misses else None
+    return CachePart(folder, used_bytes(Path(folder)) / GIB, most_gib, hits, misses, trouble)
 
 
 def count_bytes(folder: Path) -> int:

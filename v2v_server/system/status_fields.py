@@ -13,6 +13,7 @@ from functools import cache
 from typing import Any
 
 GIB = 1 << 30
+_LONGEST_TEXT = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +26,7 @@ class Meaning:
         unit: "s", "bytes", "GiB", "cores", "/s", "0 to 1"; empty: a number of what the name says.
         metric: name of the metric without prefix and suffix; empty: it is no metric, None: the field's name.
         part: value of the label "part", where fields share a metric.
+        words: what people read in place of the field's name; empty: the name.
         states: every value that the field can have.
         merge: makes one value of the values of peers with the same name.
         is_event: whether it counts unusual events, which one-line views name once there are any.
@@ -36,6 +38,7 @@ class Meaning:
     unit: str = ""
     metric: str | None = ""
     part: str = ""
+    words: str = ""
     states: tuple[str, ...] = ()
     merge: Callable[[Iterable[float]], float] = sum
     is_event: bool = False
@@ -63,11 +66,12 @@ def gauge(
     *,
     unit: str = "",
     part: str = "",
+    words: str = "",
     merge: Callable[[Iterable[float]], float] = sum,
     **options: Any,
 ) -> Any:
     """Declare a value that rises and falls; ``options`` are those of ``dataclasses.field``. See :class:`Meaning`."""
-    return _field(Meaning(help, "gauge", unit, metric, part, merge=merge), **options)
+    return _field(Meaning(help, "gauge", unit, metric, part, words, merge=merge), **options)
 
 
 def states(help: str, metric: str, *values: str) -> Any:
@@ -90,6 +94,11 @@ def values(item: Any) -> dict[str, Any]:
     """Return the values of an instance's status fields, by name."""
     kind: Any = type(item)
     return {name: getattr(item, name) for name in meanings(kind)}
+
+
+def short(text: str) -> str:
+    """Cut a text, for instance the name of a file, to the length that a status holds of it."""
+    return text[:_LONGEST_TEXT]
 
 
 def _field(meaning: Meaning, **options: Any) -> Any:

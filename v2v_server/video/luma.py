@@ -122,7 +122,7 @@ def copy_luma(
 
 
 def stretch(frames: npt.NDArray[np.uint8], luma: LumaFormat) -> None:
-    """Map what :func:`copy_luma` has copied to grey, in place, where it is not grey yet.
+    """Convert frames of :func:`copy_luma` to grey levels in place, unless they are grey levels already.
 
     Args:
         frames: [n, h, w] uint8, neighbours of a row side by side.

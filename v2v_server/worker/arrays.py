@@ -92,6 +92,7 @@ def makes(name: str) -> Callable[[ArrayBuilder], ArrayBuilder]:
     """Register a function that fills the array of this name. It gets a C-contiguous output array.
 
     A function that cannot use a sidecar raises :class:`v2v_protocol.errors.SidecarError`, which reaches the consumer.
+    So does any other error while an array is made from a sidecar.
     """
 
     def register(builder: ArrayBuilder) -> ArrayBuilder:

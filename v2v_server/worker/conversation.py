@@ -1,12 +1,13 @@
 """The worker's side of the conversation with its server: a state machine without I/O. Time is passed in.
 
-    start, on_messages, on_kernels_loaded, on_sample, on_failure ──► [Send, Reconnect, Say ...] and one step
+    start, on_messages, on_inspected, on_kernels_loaded, on_sample, on_failure ──► [Send, Say ...] and one step
 
 Every event returns a list of actions. The last action is the next step, and the result of that step is the next event.
 So the caller, which has the socket and the kernels (:mod:`v2v_server.worker.process`), takes no decisions:
 
     Listen     receive the available messages, waiting for the first       ──► on_messages
-    Load       load the kernels of this lease                              ──► on_kernels_loaded
+    Inspect    see what the work on this lease needs                       ──► on_inspected
+    Load       load the kernels of this lease, and fetch its video         ──► on_kernels_loaded
     Make       make this lease's sample                                    ──► on_sample, or on_failure
     Leave      end
 
@@ -21,7 +22,7 @@ again or gives it to other workers; nothing here has to be undone.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -92,8 +93,15 @@ class Listen:
 
 
 @dataclass(frozen=True, slots=True)
+class Inspect:
+    """See what the work on this lease needs, and change nothing."""
+
+    lease: Lease
+
+
+@dataclass(frozen=True, slots=True)
 class Load:
-    """Load the kernels that this lease needs."""
+    """Load the kernels that this lease needs, and fetch its video."""
 
     lease: Lease
 
@@ -110,7 +118,7 @@ class Leave:
     """End the conversation."""
 
 
-Action: TypeAlias = Send | Reconnect | Say | Listen | Load | Make | Leave
+Action: TypeAlias = Send | Reconnect | Say | Listen | Inspect | Load | Make | Leave
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,18 +132,18 @@ class Timings:
 
 
 @dataclass(frozen=True, slots=True)
-class Callbacks:
-    """Questions of the conversation to its process. They must not change anything.
+class Readiness:
+    """What the work on a lease needs.
 
     Attributes:
-        is_ready: whether the kernels of a lease are loaded.
-        is_compiled: whether the kernels can be loaded without compiling.
-        is_decoded: whether a lease's sample needs no decoding, because a sibling's clip is available.
+        is_ready: nothing: its kernels are loaded, and its video is on this host.
+        is_soon_ready: a moment: its kernels need no compiling, and its video is small.
+        is_decoded: whether its sample needs no decoding, because a sibling's clip is available.
     """
 
-    is_ready: Callable[[Lease], bool]
-    is_compiled: Callable[[Lease], bool]
-    is_decoded: Callable[[Lease], bool]
+    is_ready: bool
+    is_soon_ready: bool
+    is_decoded: bool
 
 
 class WorkerConversation:
@@ -144,14 +152,12 @@ class WorkerConversation:
     Args:
         hello: its first message.
         address: address of the server, for log lines.
-        callbacks: questions to the process.
         is_watched: whether the server sees the lease in work in the worker's logbook.
     """
 
-    def __init__(self, hello: WorkerHello, address: str, callbacks: Callbacks, *, is_watched: bool) -> None:
+    def __init__(self, hello: WorkerHello, address: str, *, is_watched: bool) -> None:
         self._hello = hello
         self._address = address
-        self._callbacks = callbacks
         self._is_watched = is_watched
         self._leases: deque[Lease] = deque()
         self._at: Lease | None = None  # in work
@@ -163,6 +169,7 @@ class WorkerConversation:
         # Finished leases with their messages and timings.
         self._unsent: list[tuple[int, Frames, Timings]] = []
         self._unsent_since = 0.0
+        self._may_wait = False  # the latest of them may wait for its sibling's
         self._stopping = False
 
     def stop(self) -> None:
@@ -196,6 +203,28 @@ class WorkerConversation:
             actions.append(self._say_hello())
         return actions + self._next_actions(now)
 
+    def on_inspected(self, readiness: Readiness, now: float) -> list[Action]:
+        """Report finished samples together with the lease that is begun next, and begin it."""
+        if self._stopping:
+            return self._next_actions(now)
+        lease = self._leases[0]
+        if self._may_wait:
+            self._may_wait = False
+            if not readiness.is_decoded:
+                return [Listen(0.0)]
+            self._begun = lease.lease
+            return [self._make(now)]
+        actions = self._results(lease.lease if readiness.is_ready else 0)
+        if not readiness.is_ready:
+            # Compiling takes seconds, more on hosts with few cores. Meanwhile other workers get our leases, and neither
+            # a video nor this worker is blamed for the delay.
+            self._away = not readiness.is_soon_ready
+            return [*actions, *([Send(encode(Goodbye()))] if self._away else []), Load(lease)]
+        if self._begun != lease.lease:
+            self._begun = lease.lease
+            actions.append(Send(encode(Begun(lease.lease))))
+        return [*actions, self._make(now)]
+
     def on_kernels_loaded(self, now: float) -> list[Action]:
         """Continue after the kernels of the next lease are loaded."""
         self._restart_silence(now)
@@ -211,17 +240,14 @@ class WorkerConversation:
         """
         lease = self._done(now)
         self._unsent.append((lease.lease, frames, timings))
-        may_wait = (
+        self._may_wait = (
             len(frames) == 1  # arrays in the message should be sent at once
             and self._is_watched  # without a logbook the server blames the lease last announced
             and bool(self._leases)
-            and self._callbacks.is_decoded(self._leases[0])
+            and not self._stopping
             and now - self._unsent_since < _TOGETHER_SECONDS
         )
-        if may_wait and not self._stopping:
-            self._begun = self._leases[0].lease
-            return [self._make(now)]
-        return [Listen(0.0)]
+        return [Inspect(self._leases[0]) if self._may_wait else Listen(0.0)]
 
     def on_failure(self, error: VideoError | SidecarError, now: float) -> list[Action]:
         """Report at once that the video, or its sidecar, could not be used."""
@@ -289,22 +315,12 @@ class WorkerConversation:
         return Send(encode(self._hello))
 
     def _next_actions(self, now: float) -> list[Action]:
-        """Report finished samples, then choose the next step."""
-        actions = self._results()
+        """Choose the next step; report finished samples unless the next lease may be begun."""
         if self._stopping:
-            return [*actions, Send(encode(Goodbye())), Leave()]
+            return [*self._results(), Send(encode(Goodbye())), Leave()]
         if not self._leases:
-            return [*actions, Listen(min(_PING_SECONDS, self._silence.next_due(now)))]
-        lease = self._leases[0]
-        if self._begun != lease.lease:
-            if not self._callbacks.is_ready(lease):
-                # Compiling takes seconds, more on hosts with few cores. Meanwhile other workers get our leases, and
-                # neither a video nor this worker is blamed for the delay.
-                self._away = not self._callbacks.is_compiled(lease)
-                return [*actions, *([Send(encode(Goodbye()))] if self._away else []), Load(lease)]
-            self._begun = lease.lease
-            actions.append(Send(encode(Begun(lease.lease))))
-        return [*actions, self._make(now)]
+            return [*self._results(), Listen(min(_PING_SECONDS, self._silence.next_due(now)))]
+        return [Inspect(self._leases[0])]
 
     def _make(self, now: float) -> Make:
         self._at = self._leases.popleft()
@@ -319,13 +335,12 @@ class WorkerConversation:
         self._restart_silence(now)
         return lease
 
-    def _results(self) -> list[Action]:
-        """Report finished samples together with the lease that is begun next."""
+    def _results(self, begins: int = 0) -> list[Action]:
+        """Report finished samples together with the lease that is begun next; 0 begins none."""
         if not self._unsent:
             return []
-        may_go_on = self._leases and not self._stopping and self._callbacks.is_ready(self._leases[0])
-        self._begun = self._leases[0].lease if may_go_on else 0
-        begun = [*(number for number, *_ in self._unsent[1:]), self._begun]
+        self._begun = begins
+        begun = [*(number for number, *_ in self._unsent[1:]), begins]
         results = [
             Send([*encode(_result(number, next_one, timings)), *frames])
             for (number, frames, timings), next_one in zip(self._unsent, begun, strict=True)

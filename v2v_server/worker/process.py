@@ -40,10 +40,11 @@ from v2v_server.system.sandbox import confine
 from v2v_server.worker.conversation import (
     CREDIT,
     Action,
-    Callbacks,
+    Inspect,
     Listen,
     Load,
     Make,
+    Readiness,
     Reconnect,
     Say,
     Send,
@@ -53,7 +54,8 @@ from v2v_server.worker.conversation import (
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.logbook import IDLE, note
 from v2v_server.worker.output_buffer import open_output_buffer, sample_message
-from v2v_server.worker.produce import kernels_of, make_sample, open_sidecars, sample_layout, sidecar_files
+from v2v_server.worker.produce import kernels_of, make_sample, sample_layout
+from v2v_server.worker.sidecars import open_sidecars, sidecar_files
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 _SOON_FETCHED_BYTES = 32 << 20
@@ -117,14 +119,6 @@ class Worker:
         self._conversation = WorkerConversation(
             WorkerHello(name, NUMERICS_VERSION, CREDIT, socket.gethostname(), secrets.token_bytes(32)),
             address,
-            Callbacks(
-                is_ready=lambda lease: kernels_of(lease) <= self._kernels and self._has_video(lease),
-                is_compiled=lambda lease: (
-                    all(map(is_compiled, kernels_of(lease) - self._kernels))
-                    and (self._has_video(lease) or _size_bytes(lease) <= _SOON_FETCHED_BYTES)
-                ),
-                is_decoded=self._clips.has,
-            ),
             is_watched=logbook is not None,
         )
         try:
@@ -173,6 +167,8 @@ class Worker:
             case Listen(seconds):
                 messages = self._messages(seconds)
                 return conversation.on_messages(messages, time.monotonic())
+            case Inspect(lease):
+                return conversation.on_inspected(self._inspect(lease), time.monotonic())
             case Load(lease):
                 for variant in kernels_of(lease) - self._kernels:
                     load_in_turn(variant)
@@ -197,6 +193,13 @@ class Worker:
                 return conversation.on_sample(frames, now, timings)
             case _:
                 return []  # Leave
+
+    def _inspect(self, lease: Lease) -> Readiness:
+        """Return what the work on a lease needs."""
+        missing, has_video = kernels_of(lease) - self._kernels, self._has_video(lease)
+        is_ready = not missing and has_video
+        is_small = has_video or _size_bytes(lease) <= _SOON_FETCHED_BYTES
+        return Readiness(is_ready, is_small and all(map(is_compiled, missing)), self._clips.has(lease))
 
     def _note_wait(self, waits: bool) -> None:
         """Note that a wait for other processes, inside of decoding, is no decoding."""

@@ -5,8 +5,7 @@ Server workers and `v2v-simulate` both use this module, so they make equal sampl
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.resources.abc import Traversable
@@ -18,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
+from v2v_protocol.errors import ProtocolError, UsageError, VideoError
 from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal
@@ -31,11 +30,9 @@ from v2v_protocol.sample import (
     SampleParams,
     array_layout,
     new_arrays,
-    sidecar_endings,
 )
 from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.motion import MARGIN_PX, levels_of
@@ -53,6 +50,7 @@ from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, simulate
 from v2v_server.worker.scene_choice import FlowPlan, plan_flow
+from v2v_server.worker.sidecars import errors_of_sidecar, sidecar_files
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,40 +161,6 @@ def sample_layout(lease: Lease) -> Layout:
         raise ProtocolError(f"lease {lease.lease}: {error}") from error
 
 
-def sidecar_files(lease: Lease) -> dict[str, tuple[str, str]]:
-    """Return id and fingerprint of each sidecar that a lease's arrays are made from and that the video has, by ending.
-
-    Raises:
-        ProtocolError: the lease is malformed.
-    """
-    found = {}
-    for ending in sidecar_endings(lease.arrays):
-        fingerprint = lease.sidecars.get(ending)
-        if fingerprint is not None and not isinstance(fingerprint, str):
-            raise ProtocolError(f"lease {lease.lease}: fingerprint {fingerprint!r:.80} of the sidecar {ending}")
-        if fingerprint:
-            found[ending] = sidecar_id(lease.video, ending), fingerprint
-    return found
-
-
-@contextmanager
-def open_sidecars(lease: Lease, source: VideoSource) -> Iterator[dict[str, Traversable | None]]:
-    """Lend the sidecars that a lease's arrays are made from, by ending, until the end of the context.
-
-    Raises:
-        SidecarError: one cannot be had as catalogued.
-        ProtocolError: the lease is malformed.
-    """
-    opened: dict[str, Traversable | None] = dict.fromkeys(sidecar_endings(lease.arrays))
-    with ExitStack() as stack:
-        for ending, (id, fingerprint) in sidecar_files(lease).items():
-            try:
-                opened[ending] = stack.enter_context(open_sidecar(source, id, fingerprint))
-            except VideoError as error:
-                raise SidecarError(lease.video, ending, error.reason, here=True) from error
-        yield opened
-
-
 def make_sample(
     lease: Lease,
     decoded: Decoded,
@@ -209,7 +173,7 @@ def make_sample(
         lease: the work.
         decoded: its decoded clip.
         into: C-contiguous arrays of :func:`sample_layout` to fill; None allocates them.
-        sidecars: what :func:`open_sidecars` lends; needed if an array is made from one.
+        sidecars: what :func:`v2v_server.worker.sidecars.open_sidecars` lends; needed if an array is made from one.
 
     Raises:
         SidecarError: an array cannot be made from its sidecar.
@@ -218,10 +182,11 @@ def make_sample(
         ProtocolError: the lease is malformed.
     """
     plan, index = decoded.plan, lease.indices[0]
-    into = new_arrays(sample_layout(lease)) if into is None else into
-    context, irregular = _context(lease, decoded, into, sidecars)
+    arrays = new_arrays(sample_layout(lease)) if into is None else into
+    context, irregular = _context(lease, decoded, arrays, sidecars)
     for name, array in context.into.items():
-        ARRAY_BUILDERS[name](context, array)
+        with errors_of_sidecar(lease.video, name, sidecars):
+            ARRAY_BUILDERS[name](context, array)
     saturated = dict(context.saturated or {})
     saturated_bins = saturated.pop("voxels", 0)
     return Sample(
@@ -239,8 +204,8 @@ def make_sample(
             decoder=_decoder(decoded.clip),
             quarantine=lease.quarantine,
             scene="" if plan.flow_plan is None else plan.flow_plan.reason,
-            saturated={name: count for name, count in saturated.items() if count},
             sidecars={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
+            saturated={name: count for name, count in saturated.items() if count},
         ),
     )
 

@@ -22,12 +22,11 @@ def begun(record: Record, name: str, worker: int, loaded: ResumeState | None = N
 def test_the_epoch_ends_with_the_last_loader_worker() -> None:
     record = at(3)
     for epoch in (3, 4):
-        numbers = {begun(record, f"pass {epoch}", worker).number for worker in WORKERS}
-        assert len(numbers) == 1
+        (number,) = {begun(record, f"pass {epoch}", worker).number for worker in WORKERS}
         for worker in WORKERS:
             assert record.start.state.place == (epoch, 0, 0)
             for _ in range(2):  # a second time counts once
-                record.finish(*numbers, worker)
+                record.finish(number, worker)
     assert record.start.state.place == (5, 0, 0)
 
 
@@ -38,9 +37,9 @@ def test_workers_that_finish_what_was_left_early_do_not_end_the_epoch_that_was_s
 ) -> None:
     """It is the same epoch again, as a validation repeats it; they had prefetched its last batches."""
     record = at(3)
-    early = {begun(record, "early", worker).number for worker in WORKERS}
+    (early,) = {begun(record, "early", worker).number for worker in WORKERS}
     for worker in WORKERS[:finished_before]:
-        record.finish(*early, worker)
+        record.finish(early, worker)
     if state is None:
         record.set_epoch(3)
     else:
@@ -49,7 +48,7 @@ def test_workers_that_finish_what_was_left_early_do_not_end_the_epoch_that_was_s
     again = begun(record, "again", 0)
     assert again.start.state == start
     for worker in WORKERS[finished_before:]:
-        record.finish(*early, worker)
+        record.finish(early, worker)
     assert record.start.state == start
     assert begun(record, "again", 1) is again
     for worker in WORKERS:

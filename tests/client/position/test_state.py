@@ -5,11 +5,12 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from v2v_client.position.state import LoaderShare, ResumeState, StreamIdentity
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import StateMismatch, UsageError
 
 STATE = ResumeState(
     StreamIdentity({"recipe": {"gamma": 2.2}}, "s" * 64, "c" * 64, 1, 100), 3, 1, 0, 40, 2, LoaderShare(0, 2, 4, 5), 7
@@ -20,6 +21,17 @@ VALUES = st.recursive(SCALARS, lambda inner: st.lists(inner) | st.dictionaries(s
 
 def test_a_state_comes_back() -> None:
     assert ResumeState.from_dict(STATE).to_dict() == STATE
+
+
+def test_only_a_stream_with_sidecars_pins_them() -> None:
+    assert "sidecars" not in STATE
+    with_sidecars = STATE | {"sidecars": "d" * 32}
+    assert ResumeState.from_dict(with_sidecars).to_dict() == with_sidecars
+    one, other = (ResumeState.from_dict(state).stream for state in (STATE, with_sidecars))
+    assert one is not None
+    assert other is not None
+    with pytest.raises(StateMismatch, match=r"sidecars: the state has d+, the server has ;"):
+        other.require_same(one, ours="the state", theirs="the server")
 
 
 @given(st.dictionaries(st.sampled_from([*STATE, "more"]), VALUES), st.sets(st.sampled_from(list(STATE))))

@@ -21,7 +21,7 @@ VERDICTS = [QuarantineEntry(number, "v0.mp4", "f", 0, "crash", "t") for number i
 
 def admission(max_credit_bytes: int = 2**30, quarantine: Quarantine | None = None) -> Admission:
     videos = corpus(*(video(f"v{number}.mp4") for number in range(5)))
-    return Admission(videos, SMALL_SPEC, max_credit_bytes, 600.0, quarantine or Quarantine())
+    return Admission(videos.facts, SMALL_SPEC, max_credit_bytes, 600.0, quarantine or Quarantine())
 
 
 def hello(batch_size: int = 4, seed: int = 0, quarantine: int | None = None, **spec: Any) -> Hello:

@@ -6,7 +6,7 @@ import hypothesis.strategies as st
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from v2v_server.broker.session import FairQueue
+from v2v_server.broker.fair_queue import FairQueue
 
 QUANTUM_NS = 50_000_000
 

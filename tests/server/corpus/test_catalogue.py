@@ -191,7 +191,7 @@ def test_the_second_start_probes_only_what_changed(corpus: Path, opener: Opener)
     assert [video.frames for video in changed.videos] == [12, 30, 30]
     assert ids(moved) == ["a.mp4", "new.mp4", "sub/deep/c with space.MP4"]
     assert len({first.digest, changed.digest, moved.digest}) == 3
-    with pytest.raises(VideoChanged, match="catalogued anew"):
+    with pytest.raises(VideoChanged, match="has changed since this catalogue was opened"):
         first.frame_index("a.mp4")
     with pytest.raises(CorpusError, match="no video of this catalogue"):
         moved.frame_index("sub/b.mp4")
@@ -289,7 +289,7 @@ def test_a_start_says_what_it_looks_at(corpus: Path, opener: Opener, tmp_path: P
     opener(corpus, notice=notices.append)
     assert notices == [
         *(f"looking for videos in {corpus}: {done} so far" for done in (1, 2, 3)),
-        "looking at files: 3 of 3, 1 of them new or changed",
+        f"looking at files in {corpus}: 3 of 3, 1 of them new or changed",
     ]
     notices.clear()
     listed = tmp_path / "list.txt"
@@ -297,8 +297,8 @@ def test_a_start_says_what_it_looks_at(corpus: Path, opener: Opener, tmp_path: P
     opener(corpus, list_file=listed, notice=notices.append)
     assert notices == [
         f"looking for videos in {corpus}: 1 so far",
-        "looking at files: 1 of 1, 0 of them new or changed",
-        "looking for files that are gone: 2 of 2 that this corpus does not name",
+        f"looking at files in {corpus}: 1 of 1, 0 of them new or changed",
+        f"looking for files that are gone from {corpus}: 2 of 2 that are not listed",
     ]
     assert opener.probed == [3, 1, 0]
 

@@ -36,14 +36,14 @@ def test_a_changed_a_missing_and_an_unknown_file_are_found(tmp_path: Path, ids: 
 
     notices: list[str] = []
     assert refresh._changed(Folder(tmp_path), ids, states(), notices.append) == []
-    assert notices[-1] == f"looking at files: {COUNT} of {COUNT}, 0 of them new or changed"
+    assert notices[-1] == f"looking at files in {tmp_path}: {COUNT} of {COUNT}, 0 of them new or changed"
     known = states(300, 301)
     (tmp_path / ids[5]).write_bytes(b"x")
     (tmp_path / ids[130]).chmod(0o600)  # changes only the ctime
     (tmp_path / ids[301]).unlink()
     (tmp_path / ids[699]).unlink()
     assert refresh._changed(Folder(tmp_path), ids, known, notices.append) == [5, 130, 300, 301, 699]
-    assert notices[-1] == f"looking at files: {COUNT} of {COUNT}, 5 of them new or changed"
+    assert notices[-1] == f"looking at files in {tmp_path}: {COUNT} of {COUNT}, 5 of them new or changed"
 
 
 def test_a_record_that_another_process_removes_meanwhile_is_no_video(
@@ -69,7 +69,7 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Receives a line whenever the rows of an index are read."""
     lines: list[str] = []
     rows = Store.rows
-    monkeypatch.setattr(Store, "rows", lambda store: lines.append(os.fspath(store.path)) or rows(store))
+    monkeypatch.setattr(Store, "rows", lambda store, kind: lines.append(os.fspath(store.path)) or rows(store, kind))
     return lines
 
 

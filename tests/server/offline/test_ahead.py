@@ -243,5 +243,5 @@ def test_an_index_that_knows_something_already_keeps_it(tmp_path: Path) -> None:
         other.make_figures()
         other.put_figures(kind, [Figures("a", "new", b"summary", b"scene")])
         assert one.merge(tmp_path / "other") == 2
-        assert [(row[0], row[4]) for row in one.rows()] == [("a", "new"), ("b", "kept"), ("c", "")]
+        assert [(row[0], row[4]) for row in one.rows(None)] == [("a", "new"), ("b", "kept"), ("c", "")]
         assert one.figures("a", "new", kind) == b"scene"

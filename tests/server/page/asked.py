@@ -62,14 +62,14 @@ async def asked(
 
 
 class FakeClient:
-    """Looks at a published service without a wire; counts how often. Without one, nobody answers."""
+    """Gets the status of a published service without a wire, and counts the requests; None: it does not answer."""
 
     def __init__(self, service: Published | None) -> None:
         self.service = service
-        self.looks = 0
+        self.requests = 0
 
     def get_status(self, timeout_seconds: float) -> dict[str, Any]:
-        self.looks += 1
+        self.requests += 1
         if self.service is None:
             raise ServerLost("tcp://127.0.0.1:5555: no answer for 3 s; is v2v-serve running there?")
         return self.service.plain()

@@ -139,16 +139,16 @@ def test_the_server_is_asked_only_for_somebody_and_a_few_times_a_second_for_all(
     client, now = FakeClient(service), [0.0]
     source = Source(client, lambda: now[0])
     app = make_app(source)
-    assert client.looks == 0
+    assert client.requests == 0
 
     async def many() -> None:
         await asyncio.gather(*(asked(app, "/state") for _ in range(20)))
 
     asyncio.run(many())
-    assert client.looks == 1
+    assert client.requests == 1
     now[0] = FRESH_SECONDS
     ask(make_app(source), "/state")
-    assert client.looks == 2
+    assert client.requests == 2
 
 
 def test_health_does_not_wait_for_a_server_that_is_asked_again(service: Published) -> None:

@@ -89,7 +89,7 @@ def test_what_was_long_ago_counts_no_more() -> None:
     assert shares.seconds == pytest.approx(10.0, abs=1.1)
 
 
-def test_what_was_before_anybody_came_counts_for_nothing() -> None:
+def test_the_time_before_the_first_consumer_does_not_count() -> None:
     at = peers()
     service = published(at)
     at.join()

@@ -27,11 +27,12 @@ from v2v_protocol.messages import (
 from v2v_protocol.wire import Frames, decode, encode
 from v2v_server.worker.conversation import (
     Action,
-    Callbacks,
+    Inspect,
     Leave,
     Listen,
     Load,
     Make,
+    Readiness,
     Reconnect,
     Say,
     Send,
@@ -72,19 +73,14 @@ class Talk:
         self.unready: set[int] = set()
         self.compiled = True
         self.decoded: set[int] = set()
-        callbacks = Callbacks(
-            is_ready=lambda one: one.lease not in self.unready,
-            is_compiled=lambda one: self.compiled,
-            is_decoded=lambda one: one.lease in self.decoded,
-        )
-        self.conversation = WorkerConversation(HELLO, "tcp://there", callbacks, is_watched=is_watched)
+        self.conversation = WorkerConversation(HELLO, "tcp://there", is_watched=is_watched)
         self.step: Action = Leave()
         self._take(self.conversation.start(self.now))
         assert self.said() == [HELLO]
 
     def _take(self, actions: list[Action]) -> None:
         *before, self.step = actions
-        assert isinstance(self.step, Listen | Load | Make | Leave)
+        assert isinstance(self.step, Listen | Inspect | Load | Make | Leave)
         for action in before:
             if isinstance(action, Send):
                 self._said.append(decode(action.frames[0]))
@@ -93,6 +89,10 @@ class Talk:
             else:
                 assert isinstance(action, Say)
                 self.told.append(action.text)
+        if isinstance(self.step, Inspect):
+            number = self.step.lease.lease
+            readiness = Readiness(number not in self.unready, self.compiled, number in self.decoded)
+            self._take(self.conversation.on_inspected(readiness, self.now))
 
     def said(self) -> list[Message]:
         """What it said since the last call."""
@@ -233,7 +233,7 @@ def test_what_is_no_message_is_told_and_nothing_more() -> None:
     talk = at_work(1)
     talk.makes(1)
     actions = talk.conversation.on_messages([b"nonsense", encode(lease(2))[0]], talk.now)
-    assert [type(action) for action in actions] == [Say, Send, Make]
+    assert [type(action) for action in actions] == [Say, Inspect]
 
 
 def test_a_server_of_another_version_ends_the_worker() -> None:

@@ -25,7 +25,7 @@ CHUNK = 4096
 _LARGEST_RATE = 1e9
 _NUMBER_TYPES = "qqqqiidb"
 """Types of size, mtime, ctime, frames, width, height, rate and interlaced, in the letters of :mod:`array` and NumPy."""
-_UNREADABLE = (-1, 0, 0, "", 0, 0, 0, None, "", 0, "the index lost its record; start again to probe it")
+_UNREADABLE = (-1, 0, 0, "", 0, 0, 0, None, "", 0, "the index lost its record; start again to probe it", None)
 """The columns after the id where the index has no sound row. No file has a size of -1, so it is probed."""
 
 
@@ -33,17 +33,24 @@ class StringColumn(Sequence[str]):
     """Strings in one piece of memory.
 
     Args:
-        utf8: uint8, their UTF-8 one after the other, which sorts as the strings do.
-        ends: int64 [N + 1], 0 and the end of each.
+        utf8: their UTF-8 one after the other, which sorts as the strings do; or bytes that are never read as strings.
+        lengths: integers [N], the bytes of each.
     """
 
-    def __init__(self, utf8: npt.NDArray[np.uint8], ends: npt.NDArray[np.int64]) -> None:
-        self._utf8, self._ends = utf8, ends
+    def __init__(self, utf8: bytes | bytearray | memoryview, lengths: npt.NDArray[np.integer]) -> None:
+        self.utf8 = np.frombuffer(utf8, np.uint8)
+        self._ends = np.concatenate(([0], np.cumsum(lengths, dtype=np.int64)))
+
+    @property
+    def lengths(self) -> npt.NDArray[np.int64]:
+        """[N], the bytes of each."""
+        return np.diff(self._ends)
 
     def where(self, mask: npt.NDArray[np.bool_]) -> StringColumn:
         """Return the strings at which the mask is set."""
-        lengths = np.diff(self._ends)
-        return StringColumn(self._utf8[np.repeat(mask, lengths)], _ends(lengths[mask]))
+        if mask.all():
+            return self
+        return StringColumn(self.utf8[np.repeat(mask, self.lengths)].data, self.lengths[mask])
 
     def find(self, string: str) -> int | None:
         """Return the position of a string in a sorted column; None if it is missing."""
@@ -69,18 +76,17 @@ class StringColumn(Sequence[str]):
             if step != 1:
                 return [self[each] for each in range(start, end, step)]
             ends = self._ends[start : max(start, end) + 1].tolist()
-            utf8, offset = self._utf8[ends[0] : ends[-1]].tobytes(), ends[0]
+            utf8, offset = self.utf8[ends[0] : ends[-1]].tobytes(), ends[0]
             if utf8.isascii():
                 text = utf8.decode()
                 return [text[low - offset : high - offset] for low, high in pairwise(ends)]
             return [utf8[low - offset : high - offset].decode() for low, high in pairwise(ends)]
         if not 0 <= at < len(self):
             raise IndexError(f"string {at} of {len(self)}")
-        return self._utf8[self._ends[at] : self._ends[at + 1]].tobytes().decode()
+        return self.utf8[self._ends[at] : self._ends[at + 1]].tobytes().decode()
 
 
-def _ends(lengths: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
-    return np.concatenate(([0], np.cumsum(lengths, dtype=np.int64)))
+NO_STRINGS = StringColumn(b"", np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,6 +99,7 @@ class VideoTable:
         frames_per_second: float64 [N], NaN where unknown.
         interlaced: bool [N].
         codec, problem: objects [N], strings; no problem is None.
+        summaries: bytes [N], of the figures that were asked for; empty where there are none.
     """
 
     ids: StringColumn
@@ -104,6 +111,7 @@ class VideoTable:
     interlaced: npt.NDArray[np.bool_]
     codec: npt.NDArray[np.object_]
     problem: npt.NDArray[np.object_]
+    summaries: StringColumn
 
     @classmethod
     def read(cls, rows: Iterable[tuple[Any, ...]], count: int) -> tuple[VideoTable, npt.NDArray[np.int64]]:
@@ -118,24 +126,21 @@ class VideoTable:
         Returns:
             the table, and [N, 3] the size in bytes, mtime and ctime in ns of each file when it was probed.
         """
-        ids, fingerprints, start, left = bytearray(), bytearray(), 0, iter(rows)
+        strings, start, left = (bytearray(), bytearray(), bytearray()), 0, iter(rows)
         # Allocated once: arrays that grow leave holes in the heap, a third of their size.
-        columns = [np.empty(count, dtype) for dtype in ("i", "i", *_NUMBER_TYPES, "O", "O")]
+        columns = [np.empty(count, dtype) for dtype in ("i", "i", "i", *_NUMBER_TYPES, "O", "O")]
         while chunk := list(islice(left, CHUNK)):
-            for some_ids, some_fingerprints, *part in _converted(chunk):
-                ids += some_ids
-                fingerprints += some_fingerprints
+            for utf8, *part in _converted(chunk):
+                for string, more in zip(strings, utf8, strict=True):
+                    string += more
                 end = start + len(part[0])
                 for column, values in zip(columns, part, strict=True):
                     column[start:end] = values
                 start = end
-        id_lengths, lengths, size, mtime, ctime, frames, width, height, rate, interlaced, codec, problem = columns
-        table = cls(
-            StringColumn(np.asarray(ids), _ends(id_lengths)),
-            StringColumn(np.asarray(fingerprints), _ends(lengths)),
-            *(frames, width, height, rate, interlaced.view(np.bool_), codec, problem),
-        )
-        return table, np.stack((size, mtime, ctime), 1)
+        ids, fingerprints, summaries = map(StringColumn, strings, columns[:3])
+        size, mtime, ctime, frames, width, height, rate, interlaced, codec, problem = columns[3:]
+        numbers = frames, width, height, rate, interlaced.view(np.bool_)
+        return cls(ids, fingerprints, *numbers, codec, problem, summaries), np.stack((size, mtime, ctime), 1)
 
     def where(self, mask: npt.NDArray[np.bool_]) -> VideoTable:
         """Return the rows at which the mask is set."""
@@ -178,14 +183,14 @@ def _converted(rows: list[tuple[Any, ...]]) -> Iterator[tuple[Any, ...]]:
 
 
 def _columns(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
-    """Convert rows to columns: UTF-8 of ids and of fingerprints, the lengths of both, numbers, formats, problems.
+    """Convert rows to columns: the bytes of ids, fingerprints and summaries, their lengths, numbers, formats, problems.
 
     Raises:
         TypeError, ValueError, OverflowError: no probe writes such a row.
     """
-    ids, sizes, mtimes, ctimes, fingerprints, frames, widths, heights, rates, codecs, interlaced, problems = zip(
-        *rows, strict=True
-    )
+    columns = tuple(zip(*rows, strict=True))
+    ids, sizes, mtimes, ctimes, fingerprints, frames, widths, heights, rates = columns[:9]
+    codecs, interlaced, problems, summaries = columns[9:]
     if None in rates:
         rates = tuple(math.nan if rate is None else rate for rate in rates)
     values = sizes, mtimes, ctimes, frames, widths, heights, rates, interlaced
@@ -198,8 +203,10 @@ def _columns(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
             raise ValueError
     if not {str, type(None)}.issuperset(map(type, problems)):
         raise TypeError
-    (id_utf8, id_lengths), (utf8, lengths) = _utf8(ids), _utf8(fingerprints)
-    return id_utf8, utf8, id_lengths, lengths, *numbers, list(map(sys.intern, codecs)), problems
+    blobs = [b"" if summary is None else summary for summary in summaries]
+    strings = _utf8(ids), _utf8(fingerprints), (b"".join(blobs), array("i", map(len, blobs)))
+    utf8, lengths = zip(*strings, strict=True)
+    return utf8, *lengths, *numbers, list(map(sys.intern, codecs)), problems
 
 
 def _utf8(strings: Sequence[str]) -> tuple[bytes, array[int]]:

@@ -171,20 +171,29 @@ class Store:
     def _version(self) -> int:
         return int(self._database.execute("PRAGMA user_version").fetchone()[0])
 
-    def rows(self) -> Generator[tuple[Any, ...], None, None]:
-        """Yield all records by id, as the attributes of :class:`IndexRow` without their frame indices.
+    def rows(self, kind: FigureKind | None) -> Generator[tuple[Any, ...], None, None]:
+        """Yield all records by id: the attributes of :class:`IndexRow` without the frame index, and a summary.
 
         Another program may have put any type into any column but the id.
+
+        Args:
+            kind: figures whose summary is read. It is None where a video has none for its present fingerprint.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
-        query = f"SELECT {', '.join(_COLUMNS)} FROM video WHERE typeof(id) = 'text' ORDER BY id"
-        with closing(self._database.execute(query)) as rows:
+        names = ", ".join(f"video.{name}" for name in _COLUMNS)
+        join = (
+            "LEFT JOIN figures ON kind = ? AND version = ? AND figures.id = video.id "
+            "AND figures.fingerprint = video.fingerprint"
+        )
+        summary, join, values = ("summary", join, (kind.name, kind.version)) if kind else ("NULL", "", ())
+        query = f"SELECT {names}, {summary} FROM video {join} WHERE typeof(video.id) = 'text' ORDER BY video.id"
+        with closing(self._database.execute(query, values)) as rows:
             yield from rows
 
     def frame_index(self, id: str, fingerprint: str) -> bytes | None:
-        """The encoded frame index of a file; None if the index does not know that state of it.
+        """Return the encoded frame index of a file; None if the index does not know this state of it.
 
         Raises:
             sqlite3.Error: the file is damaged.
@@ -211,37 +220,18 @@ class Store:
         self._database.execute(_SUMMARIES)
         return _has_table(self._database, "scene")
 
-    def summaries(self, kind: FigureKind) -> Generator[tuple[str, bytes], None, None]:
-        """Yield (id, summary) of each video that has figures for its present fingerprint, sorted by id.
+    def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes, bytes], None, None]:
+        """Yield (id, summary, encoded figures) by id, of each video with figures for its present fingerprint.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
-        yield from self._figures("summary", kind)
-
-    def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes], None, None]:
-        """Yield (id, encoded figures) like :meth:`summaries`."""
-        yield from self._figures("data", kind)
-
-    def _figures(self, column: str, kind: FigureKind) -> Generator[tuple[str, bytes], None, None]:
         query = (
-            f"SELECT figures.id, {column} FROM figures JOIN video USING (id, fingerprint) WHERE kind = ? "
-            f"AND version = ? AND typeof({column}) = 'blob' ORDER BY figures.id"
+            "SELECT figures.id, summary, data FROM figures JOIN video USING (id, fingerprint) WHERE kind = ? "
+            "AND version = ? AND typeof(summary) = 'blob' AND typeof(data) = 'blob' ORDER BY figures.id"
         )
         with closing(self._database.execute(query, (kind.name, kind.version))) as rows:
             yield from rows
-
-    def without_figures(self, kind: FigureKind) -> list[str]:
-        """Return the usable videos that have no figures for their present fingerprint.
-
-        Raises:
-            sqlite3.Error: the file is damaged.
-        """
-        query = (
-            "SELECT id FROM video WHERE problem IS NULL AND NOT EXISTS (SELECT 1 FROM figures WHERE kind = ? "
-            "AND version = ? AND id = video.id AND fingerprint = video.fingerprint) ORDER BY id"
-        )
-        return [id for (id,) in self._database.execute(query, (kind.name, kind.version))]
 
     def figures(self, id: str, fingerprint: str, kind: FigureKind) -> bytes | None:
         """Return the encoded figures of a video; None if the index has none of this state of it.

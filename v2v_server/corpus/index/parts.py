@@ -56,7 +56,7 @@ class Shard:
 
 
 def make_folder(folder: Path) -> None:
-    """Makes a folder for parts, and sees that it can be written to: before hours of work, not after.
+    """Make a folder for parts and check that it is writable, before hours of work.
 
     Raises:
         CorpusError: it cannot.
@@ -71,7 +71,7 @@ def make_folder(folder: Path) -> None:
 
 
 def write_part(index: Path, folder: Path, shard: Shard) -> Path:
-    """Puts a copy of a shard's index into the folder, in one step.
+    """Copy a shard's index into the folder, in one step.
 
     Raises:
         CorpusError: it cannot be written.
@@ -90,7 +90,7 @@ def write_part(index: Path, folder: Path, shard: Shard) -> Path:
 
 
 def parts_in(folder: Path) -> list[Path]:
-    """The parts in a folder, one of each shard.
+    """Find the parts in a folder, one of each shard.
 
     Raises:
         CorpusError: there are none, some are missing, or they are of more than one division.
@@ -117,8 +117,8 @@ def parts_in(folder: Path) -> list[Path]:
     return [found[shard] for shard in sorted(found)]
 
 
-def take_in_parts(index: Path, parts: list[Path]) -> int:
-    """Puts parts into an index, which may know something already, and may be interrupted and begun again.
+def merge_parts(index: Path, parts: list[Path]) -> int:
+    """Merge parts into an index, which may have records already. An interrupted merge can be repeated.
 
     Returns:
         how many records they have.

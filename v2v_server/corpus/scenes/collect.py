@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import sqlite3
-from array import array
 from base64 import b64decode
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 
 import numpy as np
-import numpy.typing as npt
 import xxhash
 
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
@@ -35,7 +33,8 @@ from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import Window
 from v2v_server.video.rows import Rows
 
-_UNKNOWN_MARK = bytes(8)
+_PAIR_BYTES = 8
+"""Of the hash and of each run in a summary."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,54 +58,56 @@ class SceneCollection:
 
     def collect(
         self, store: Store, source: VideoSource, table: VideoTable, processes: int, progress: Progress | None
-    ) -> None:
-        """Make sure that the index has the scene of each usable video, if it can be had.
+    ) -> bool:
+        """Put the scene of each usable video that has none into the index, if it can be had.
+
+        Returns:
+            whether there were such videos.
 
         Raises:
             sqlite3.Error: the index cannot be written.
         """
-        has_earlier = store.make_figures()
-        places = (table.ids.find(id) for id in store.without_figures(self.kind))
-        missing = [place for place in places if place is not None]
-        with closing(self._found(store, source, table, missing, has_earlier, processes)) as found:
+        missing = np.flatnonzero((table.summaries.lengths == 0) & (table.problem == np.array(None))).tolist()
+        with closing(self._found(store, source, table, missing, processes)) as found:
             for batch in batches(found, len(missing), progress):
                 store.put_figures(self.kind, (figures(*each) for each in batch))
+        return bool(missing)
 
-    def read(
-        self, store: Store, ids: Sequence[str], frames: npt.NDArray[np.int64], unknown: set[str], digest: str
-    ) -> tuple[SplitVideos, str]:
+    def read(self, store: Store, table: VideoTable, unknown: set[str], digest: str) -> tuple[SplitVideos, str]:
         """Return the usable runs of videos, and a digest that names all that is known of them.
 
         Args:
-            ids, frames: of the videos of a snapshot, in its order.
+            table: the videos of a snapshot, with the summaries of their scenes.
             unknown: ids of videos of which nothing is known; receives those that the index has no scene of.
             digest: of the snapshot.
 
         Raises:
             sqlite3.Error: the index is damaged.
         """
-        encoded, lengths = bytearray(), array("q")
-        whole = np.stack((0 * frames, frames), 1).astype("<i4")
-        for number, (id, summary) in enumerate(joined(ids, store.summaries(self.kind), [], (None,))):
-            if summary is None or len(summary) < 8 or len(summary) % 8 or id in unknown:
-                unknown.add(id)
-                summary = _UNKNOWN_MARK + whole[number].tobytes()
-            encoded += summary
-            lengths.append(len(summary))
-        pairs, counts = np.frombuffer(encoded, "<i4").astype(np.int32).reshape(-1, 2), np.asarray(lengths) // 8
+        lengths = table.summaries.lengths
+        is_known = (lengths >= _PAIR_BYTES) & (lengths % _PAIR_BYTES == 0)
+        is_known[[place for id in unknown if (place := table.ids.find(id)) is not None]] = False
+        unknown.update(table.ids[place] for place in np.flatnonzero(~is_known).tolist())
+        summaries = table.summaries.where(is_known)
+        state = hashlib.sha256(is_known.data)
+        state.update(lengths.data)
+        state.update(summaries.utf8.data)
+        counts = (summaries.lengths // _PAIR_BYTES).astype(np.int32)
+        pairs = summaries.utf8.view("<i4").reshape(-1, 2)
         is_run = np.ones(len(pairs), bool)
-        is_run[np.cumsum(counts) - counts] = False  # the mark of each
-        split = SplitVideos.select(frames, pairs[is_run], counts - 1)
-        return split, self._digest(store, ids, unknown, digest, hashlib.sha256(encoded + lengths.tobytes()).hexdigest())
+        is_run[np.cumsum(counts) - counts] = False  # the hash at the beginning of each summary
+        split = SplitVideos.select(table.frames[is_known], pairs[is_run].astype(np.int32, copy=False), counts - 1)
+        split = replace(split, numbers=np.flatnonzero(is_known)[split.numbers].astype(np.int32))
+        return split, self._digest(store, table.ids, unknown, digest, state.hexdigest())
 
-    def _digest(self, store: Store, ids: Sequence[str], unknown: set[str], digest: str, summaries: str) -> str:
-        """Return the digest of all figures. To compute it takes reading them: it is kept for the same summaries."""
-        kept, key = FigureKind("scene digest", self.kind.version), f"{digest} {summaries}"
+    def _digest(self, store: Store, ids: Sequence[str], unknown: set[str], digest: str, state: str) -> str:
+        """Return the digest of all scenes. It takes reading them all, so the index keeps it for one state of them."""
+        kept, key = FigureKind("scene digest", self.kind.version), f"{digest} {state}"
         if (known := store.figures("", key, kept)) is not None:
             return known.decode()
         sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
         nothing = Scene.unknown().to_bytes()
-        for id, data in joined(ids, store.all_figures(self.kind), [], (nothing,)):
+        for id, _, data in joined(ids, store.all_figures(self.kind), [], (b"", nothing)):
             sha.update(nothing if id in unknown else data)
         with suppress(sqlite3.Error):  # a locked index costs the next start this time again
             store.put_figures(kept, [Figures("", key, b"", sha.hexdigest()[:32].encode())])
@@ -118,10 +119,9 @@ class SceneCollection:
         source: VideoSource,
         table: VideoTable,
         missing: list[int],
-        has_earlier: bool,
         processes: int,
     ) -> Generator[tuple[IndexRow | _Job, Scene], None, None]:
-        left = []
+        left, has_earlier = [], store.make_figures()
         for place in missing:
             record = table.row(place)
             data = self._prepared(record)

@@ -37,7 +37,7 @@ class SplitVideos:
         return cls.select(np.fromiter(frames, np.int64), flat, np.fromiter(map(len, each), np.int64))
 
     @classmethod
-    def select(cls, frames: npt.NDArray[np.int64], runs: _Int32, counts: npt.NDArray[np.int64]) -> SplitVideos:
+    def select(cls, frames: npt.NDArray[np.int64], runs: _Int32, counts: npt.NDArray[np.integer]) -> SplitVideos:
         """Make it from the runs of every video in columns.
 
         Args:
@@ -47,7 +47,8 @@ class SplitVideos:
         """
         is_whole = counts == 1
         ends = np.cumsum(counts)
-        is_whole[is_whole] = (runs[ends[is_whole] - 1] == np.stack((0 * frames, frames), 1)[is_whole]).all(1)
+        last = ends[is_whole] - 1
+        is_whole[is_whole] = (runs[last, 0] == 0) & (runs[last, 1] == frames[is_whole])
         numbers = np.flatnonzero(~is_whole)
         bounds = np.concatenate(([0], np.cumsum(counts[numbers])))
         first, end = runs[np.repeat(~is_whole, counts)].T.copy()

@@ -26,12 +26,12 @@ _IN_TURN = 256
 
 
 def is_said(done: int) -> bool:
-    """Whether progress is told after so many: to tell it a million times takes seconds."""
+    """Whether progress is reported after this number of files: a million reports take seconds."""
     return done <= _TOGETHER or done % _TOGETHER == 0
 
 
 def answers(question: Callable[[Q], A], files: Sequence[Q]) -> Generator[tuple[Q, A], None, None]:
-    """(file, answer) for each file, in their order.
+    """Yield (file, answer) for each file, in their order.
 
     Args:
         question: asked in threads; must not raise.
@@ -43,10 +43,10 @@ def answers(question: Callable[[Q], A], files: Sequence[Q]) -> Generator[tuple[Q
 
 
 def by_parts(question: Callable[[Sequence[Q]], A], files: Sequence[Q]) -> Generator[tuple[Sequence[Q], A], None, None]:
-    """(some of the files, answer) until all were asked about, in their order.
+    """Yield (some of the files, answer) until all were asked about, in their order.
 
-    One part after the other while they are answered at once, for threads that take turns cost more than a local disk's
-    answer. When one is waited for, many are asked at a time; whether that is still needed is tried again and again.
+    Parts are asked one after the other while answers come at once, because threads that take turns cost more than a
+    local disk's answer. After a slow answer many parts are asked at a time, and one alone is tried again later.
 
     Args:
         question: asked of a part of the files in threads; must not raise.

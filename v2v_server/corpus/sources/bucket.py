@@ -103,15 +103,18 @@ class Bucket:
         except VideoUnreadable as error:
             raise CorpusError(f"--videos {self.url}: cannot be listed: {error.reason}") from error
 
-    def find(self, below: str) -> dict[str, State]:
+    def find(self, below: str, tries: int = TRIES) -> dict[str, State]:
         """Return the states of all objects below a folder of the address, "" or ending in a slash, by relative path.
 
         Raises:
             VideoGone, VideoDenied, VideoUnreadable: they cannot be listed.
         """
         start = f"{self._prefix}/{below}"
-        found = self._ask(below, lambda: self._store.find(start.rstrip("/"), detail=True))
-        return {path[len(start) :]: _state(info) for path, info in found.items() if path.startswith(start)}
+        listed = self._ask(below, lambda: self._store.find(start.rstrip("/"), detail=True), tries)
+        found = {path[len(start) :]: _state(info) for path, info in listed.items() if path.startswith(start)}
+        if below and not found:
+            raise VideoGone(below, None, f"is not in {self.url} any more")
+        return found
 
     def state(self, id: str, tries: int = TRIES) -> State:
         """Ask for the state of one object: its size, and 63 bits that stand for its ETag or the store's equivalent.

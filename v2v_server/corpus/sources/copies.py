@@ -19,7 +19,7 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from itertools import islice, takewhile
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import IO
 from zipfile import Path as ZipPath
@@ -143,14 +143,15 @@ class Copies(VideoSource):
         return self.bucket.state(id)
 
     def verify(self, id: str, fingerprint: str, state: State | None) -> None:
-        """Check the object against its state, with one question. An answer that cannot be had is no error.
+        """Check an object, or a sidecar, against its state, with one question. If the store gives no answer, that is no
+        error.
 
         Raises:
             VideoGone, VideoChanged: the object is gone, or another one by now.
         """
         try:
             if is_sidecar(id):
-                found = self.bucket.find(id) if id.endswith("/") else {"": self.bucket.state(id, tries=1)}
+                found = self.bucket.find(id, tries=1) if id.endswith("/") else {"": self.bucket.state(id, tries=1)}
                 changed = state_text(sorted(found.items())) != self.sidecar_states([id])[0]
             else:
                 changed = self.bucket.state(id, tries=1) != state and state is not None
@@ -167,9 +168,9 @@ class Copies(VideoSource):
 
     def _below(self, id: str) -> Iterator[str]:
         """Yield the names of the listed objects of a sidecar, sorted."""
-        start = bisect_left(self._names, id)
         if id.endswith("/"):
-            yield from takewhile(lambda name: name.startswith(id), islice(self._names, start, None))
+            following = (self._names[at] for at in range(bisect_left(self._names, id), len(self._names)))
+            yield from takewhile(lambda name: name.startswith(id), following)
         elif id in self._objects:
             yield id
 

@@ -44,9 +44,6 @@ class Folder(VideoSource):
     def __init__(self, root: Path, listed: Callable[[], tuple[ListEntry, ...] | None] = lambda: None) -> None:
         super().__init__(str(root), listed)
 
-    def __reduce__(self) -> tuple[type[Folder], tuple[Path]]:
-        return type(self), (self.folder,)
-
     @property
     def folder(self) -> Path:
         """The folder that ids are relative to."""

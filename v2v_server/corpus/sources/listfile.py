@@ -43,7 +43,7 @@ class ListEntry:
 
 
 def read_list(path: str | os.PathLike[str]) -> tuple[ListEntry, ...]:
-    """The entries of a list file, in its order.
+    """Read the entries of a list file, in its order.
 
     Raises:
         CorpusError: the file cannot be read, is empty, or a line makes no sense; the message gives the line number.
@@ -90,7 +90,7 @@ def _space_columns(line: str) -> list[str]:
 
 
 def _words_from_the_right(line: str) -> Iterator[str]:
-    """The numbers that end the line, last first, each with the space in front of it; never the whole line."""
+    """Yield the numbers that end a line, last first, each with the space in front of it; never the whole line."""
     for _ in range(_MOST_COLUMNS - 1):
         match = re.search(r"\s+(\S+)$", line)
         if match is None or not _NUMBER.fullmatch(match[1]):

@@ -27,8 +27,7 @@ _STEERING = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066
 
 
 def printable(name: str) -> str:
-    """The name as it may be shown: what is not UTF-8 text, and what would steer a terminal or turn the text around it
-    (control and bidirectional characters), escaped."""
+    """Return a name that can be shown: bytes that are not UTF-8, and control and bidirectional characters, escaped."""
     if name.isascii() and name.isprintable():  # as nearly all are, and there may be a million of them
         return name
     text = os.fsencode(name).decode("utf-8", "backslashreplace")

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.sources.listfile import ListEntry, read_list
@@ -84,6 +84,10 @@ class VideoSource(ABC):
 
     def __init__(self, name: str, listed: Callable[[], tuple[ListEntry, ...] | None] = lambda: None) -> None:
         self.name, self._read_list = name, listed
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what only lists: it may be large."""
+        return {name: value for name, value in vars(self).items() if name not in ("_read_list", "listed", "manifest")}
 
     @cached_property
     def listed(self) -> tuple[ListEntry, ...] | None:

@@ -171,16 +171,8 @@ function show(state) {
   at("verdict").dataset.part = state.waiting.part;
   say(at("sentence"), state.waiting.sentence);
   say(at("remedy"), state.waiting.remedy);
-  const shares = state.waiting.shares;
-  list("shares", [
-    ["consumers wait", shares.consumers],
-    ["workers idle", shares.idle],
-    ["workers decode", shares.decode],
-    ["workers simulate", shares.simulate],
-    ["workers deliver", shares.handover],
-    ["workers wait for a core", shares.queued],
-    ["server's loop busy", shares.broker],
-  ], true);
+  const shares = fields.filter(({ place, unit }) => place === "waiting.shares" && unit === "0 to 1");
+  list("shares", shares.map(({ name, words }) => [words, state.waiting.shares[name]]), true);
   list("tiles", tiles(state), false);
   fill("consumers", state.consumers.map(consumer), "no consumers are connected");
   fill("workers", state.workers.map(worker), "no workers are connected");
@@ -258,13 +250,13 @@ function refusal(each) {
 
 /** Every number that is not of one peer, with its meaning. */
 function figures(state) {
-  return fields.flatMap(({ place, name, help, unit, kind }) => {
+  return fields.flatMap(({ place, name, words, help, unit, kind }) => {
     const part = place.split(".").reduce((found, key) => (key ? found && found[key] : found), state);
     if (kind === "text" || kind === "states" || Array.isArray(part) || !part || part[name] === null) return [];
     const known = part[name];
-    if (unit === "0 to 1") return [[name.replaceAll("_", " "), share(known), help]];
+    if (unit === "0 to 1") return [[words, share(known), help]];
     const value = Number.isInteger(known) || typeof known !== "number" ? known.toLocaleString("en") : number(known);
-    return [[name.replaceAll("_", " "), unit ? `${value} ${unit}` : value, help]];
+    return [[words, unit ? `${value} ${unit}` : value, help]];
   });
 }
 

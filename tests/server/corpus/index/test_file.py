@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from v2v_protocol.errors import IndexUnreadable
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.index.columns import VideoTable, joined
 from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Store
@@ -89,7 +90,7 @@ def test_damage_is_an_error_of_sqlite_or_costs_a_probe(tmp_path: Path, damage: l
         content[int(place * len(content))] = byte
     path.write_bytes(content)
     with suppress(sqlite3.Error, UnicodeDecodeError), closing(Store(path)) as store:
-        VideoTable.read(joined(list("abcd"), store.rows(), []), 4)
+        VideoTable.read(joined(list("abcd"), store.rows(KIND), []), 4)
         for name in "abcd":
             store.frame_index(name, name * 40)
         list(store.all_figures(KIND))
@@ -110,9 +111,10 @@ def test_figures_count_for_their_kind_version_and_fingerprint_only(corpus: Corpu
         store.put_figures(
             kinds[0], [Figures("000.mp4", "0-000.mp4", b"s", b"d"), Figures("002.mp4", "old", b"s", b"d")]
         )
-        assert list(store.summaries(kinds[0])) == [("000.mp4", b"s"), ("001.mp4", b"0")]
-        assert list(store.all_figures(kinds[3])) == [("001.mp4", b"data 3")]
-        assert store.without_figures(kinds[0]) == [name for name in corpus.names if name > "001.mp4"]
+        summaries = {row[0]: row[-1] for row in store.rows(kinds[0])}
+        assert summaries == dict.fromkeys(corpus.names) | {"000.mp4": b"s", "001.mp4": b"0"}
+        assert {row[-1] for row in store.rows(None)} == {None}
+        assert list(store.all_figures(kinds[3])) == [("001.mp4", b"3", b"data 3")]
         assert store.figures("001.mp4", "0-001.mp4", kinds[2]) == b"data 2"
         assert store.figures("001.mp4", "other", kinds[2]) is None
         assert store.figures("003.mp4", "0-003.mp4", kinds[2]) is None
@@ -179,3 +181,24 @@ def test_damaged_runs_count_as_unknown(corpus: Corpus) -> None:
     with closing(sqlite3.connect(corpus.index)) as database, database:
         database.execute("UPDATE figures SET summary = x'010203' WHERE id = '005.mp4'")
     assert dict(scenes(corpus)[1])["005.mp4"] == ((0, 300),)
+
+
+def test_an_index_that_fails_after_the_probes_blames_no_video(corpus: Corpus, monkeypatch: pytest.MonkeyPatch) -> None:
+    def locked(store: Store, kind: FigureKind) -> None:
+        raise sqlite3.OperationalError("database is locked")
+
+    put_scenes(corpus, *corpus.names)
+    monkeypatch.setattr(Store, "all_figures", locked)
+    with pytest.raises(IndexUnreadable, match="cannot be read: database is locked; start again"):
+        corpus.open(scene=True)
+
+
+def test_the_digest_of_scenes_is_computed_once(corpus: Corpus, monkeypatch: pytest.MonkeyPatch) -> None:
+    put_scenes(corpus, *corpus.names)
+    first, reads, all_figures = scenes(corpus), list[FigureKind](), Store.all_figures
+    monkeypatch.setattr(Store, "all_figures", lambda store, kind: reads.append(kind) or all_figures(store, kind))
+    assert scenes(corpus) == first
+    assert KIND not in reads
+    put_scenes(corpus, "007.mp4", boundary=100)
+    assert scenes(corpus)[0] != first[0]
+    assert KIND in reads

@@ -1,4 +1,4 @@
-"""The one model of the service: every number is right, plain, and bounded."""
+"""Test the status: every number is right, plain, and bounded."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def hello(at: Peers, identity: bytes = b"c", name: str = "rank 1 of 2", host: st
 # --- the model --------------------------------------------------------------------------------------------------------
 
 
-def test_a_service_without_anybody_says_what_it_serves() -> None:
+def test_a_service_without_peers_says_what_it_serves() -> None:
     state = published(peers(), workers="1:3").view()
     assert (state.version, state.protocol, state.time) == (STATUS_VERSION, PROTOCOL_VERSION, WALL)
     assert (state.video_count, state.unusable_count, state.videos) == (5, 0, "/corpus")
@@ -49,7 +49,7 @@ def test_a_service_without_anybody_says_what_it_serves() -> None:
     assert state.spec["recipe"]["bins"] == 5
 
 
-def test_a_worker_is_told_with_what_it_is_at_and_what_it_took() -> None:
+def test_a_row_says_what_a_worker_makes_and_what_it_took() -> None:
     at = peers()
     service = published(at)
     at.worker_says(b"w", WorkerHello("w", NUMERICS_VERSION, 2, "node-7"))
@@ -105,7 +105,7 @@ def test_the_servers_own_workers_have_a_number_of_restarts() -> None:
     assert (state.worker_processes, state.worker_count) == (2, 2)
 
 
-def test_a_consumer_is_told_with_its_place_in_the_epoch() -> None:
+def test_a_row_says_where_a_consumer_is_in_its_epoch() -> None:
     at = peers()
     service = published(at)
     hello(at)
@@ -262,7 +262,7 @@ def test_a_consumer_whose_connection_has_ended_is_not_counted() -> None:
     assert [consumer.id for consumer in service.view().consumers] == [state.consumers[0].id]
 
 
-def test_refusals_and_verdicts_are_told_newest_first() -> None:
+def test_refusals_and_verdicts_are_listed_newest_first() -> None:
     at = peers()
     service = published(at)
     hello(at)
@@ -282,7 +282,7 @@ def test_refusals_and_verdicts_are_told_newest_first() -> None:
     assert state.totals.refused_candidates == 2
 
 
-def test_of_many_refusals_the_last_few_are_told() -> None:
+def test_of_many_refusals_the_last_few_are_listed() -> None:
     at = peers()
     for number in range(100):
         at.dispatcher.candidates.latest.append((str(number), Refusal("v.mp4", None, "x" * 500)))
@@ -360,10 +360,10 @@ def test_names_that_are_no_text_and_very_long_ones_do_no_harm() -> None:
     assert (len(state.verdicts), state.quarantined, state.verdicts[0].snapshot) == (20, 100, 100)
 
 
-# --- looking ----------------------------------------------------------------------------------------------------------
+# --- requests ---------------------------------------------------------------------------------------------------------
 
 
-def test_whoever_looks_gets_the_next_state_without_a_session() -> None:
+def test_a_client_gets_the_next_status_without_a_session() -> None:
     at = peers()
     service = published(at)
     assert service.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now)) == []
@@ -374,7 +374,7 @@ def test_whoever_looks_gets_the_next_state_without_a_session() -> None:
     assert service.view().consumer_count == 0
 
 
-def test_the_workers_side_may_look_too_and_is_no_worker_for_it() -> None:
+def test_a_client_on_the_workers_side_is_no_worker() -> None:
     at = peers()
     service = published(at)
     service.ask(at.dispatcher.from_worker(b"page", encode(GetStatus()), at.now))
@@ -383,7 +383,7 @@ def test_the_workers_side_may_look_too_and_is_no_worker_for_it() -> None:
     assert json.loads(json_of(answer))["worker_count"] == 0
 
 
-def test_a_state_is_made_a_few_times_a_second_however_often_they_ask() -> None:
+def test_a_status_is_built_a_few_times_a_second_at_any_number_of_requests() -> None:
     at = peers()
     service = published(at)
     made = 0
@@ -397,7 +397,7 @@ def test_a_state_is_made_a_few_times_a_second_however_often_they_ask() -> None:
     assert made == 2.0 / ANSWER_SECONDS
 
 
-def test_a_state_that_takes_long_to_make_is_made_less_often() -> None:
+def test_a_status_that_takes_long_is_built_less_often() -> None:
     at = peers()
     service = published(at)
     worked = iter(range(1000))
@@ -411,7 +411,7 @@ def test_a_state_that_takes_long_to_make_is_made_less_often() -> None:
     assert made == pytest.approx([0.0, 5.0, 10.0, 15.0], abs=0.5)
 
 
-def test_all_who_look_at_once_get_the_same_state_and_a_crowd_is_sent_away() -> None:
+def test_clients_get_the_same_status_and_too_many_are_denied() -> None:
     at = peers()
     service = published(at)
     for number in range(MOST_WAITING):
@@ -425,7 +425,7 @@ def test_all_who_look_at_once_get_the_same_state_and_a_crowd_is_sent_away() -> N
     assert len({id(each.frames) for each in answers}) == 1
 
 
-def test_the_spec_of_the_server_is_told_resolved() -> None:
+def test_the_spec_of_the_server_is_complete() -> None:
     state = published(peers()).view()
     assert set(state.spec) == set(SMALL_SPEC.to_dict())
 

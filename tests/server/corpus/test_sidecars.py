@@ -1,0 +1,142 @@
+"""Files and folders beside videos: the same in a folder and in object storage, read once, and checked when opened."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.clips import panned_luma, write_clip
+from v2v_protocol import sample
+from v2v_protocol.errors import VideoChanged, VideoError, VideoGone
+from v2v_protocol.sample import FromSidecar
+from v2v_server.corpus import sidecars as collecting
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.sources.sidecar import fingerprint_of, open_sidecar, sidecar_id
+from v2v_server.corpus.sources.source import SourceOptions, open_source
+
+JSON, MASKS = ".boxes.json", ".masks/"
+ARRAYS = ("boxes", "masks")
+
+
+@pytest.fixture(autouse=True)
+def _arrays(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, ending in zip(ARRAYS, (JSON, MASKS), strict=True):
+        monkeypatch.setitem(sample.ARRAYS, name, FromSidecar(ending, lambda recipe, _: ("uint8", (1,))))
+
+
+@pytest.fixture
+def corpus(tmp_path: Path) -> Path:
+    folder = tmp_path / "videos"
+    (folder / "deep").mkdir(parents=True)
+    write_clip(folder / "a.mp4", panned_luma(12))
+    shutil.copy(folder / "a.mp4", folder / "deep" / "b.x.mp4")
+    (folder / "a.boxes.json").write_text("[1]")
+    masks = folder / "deep" / "b.x.masks"
+    (masks / "more").mkdir(parents=True)
+    for name in ("1.png", "2.png", "more/3.png", ".hidden"):
+        (masks / name).write_bytes(name.encode())
+    (folder / "a.masks").write_text("a file where a folder belongs is none")
+    return folder
+
+
+KINDS = ["folder", pytest.param("bucket", marks=pytest.mark.filterwarnings("ignore"))]
+
+
+def name_of(corpus: Path, kind: str) -> str:
+    if kind == "bucket":
+        pytest.importorskip("fsspec", reason="the extra 'cloud' is not installed")
+        return f"file://{corpus}"
+    return str(corpus)
+
+
+@contextmanager
+def opened(corpus: Path, kind: str) -> Iterator[Catalogue]:
+    with closing(open_catalogue(name_of(corpus, kind), cache_dir=corpus.parent / "cache", processes=0)) as catalogue:
+        yield catalogue
+
+
+def test_ids() -> None:
+    assert sidecar_id("deep/b.x.mp4", JSON) == "deep/b.x.boxes.json"
+    assert sidecar_id("a.mp4", MASKS) == "a.masks/"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_catalogue_knows_them_and_its_digest_does_not(
+    corpus: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with opened(corpus, kind) as catalogue:
+        facts = catalogue.facts
+        found = {video.id: facts.sidecars_of(video.id, ARRAYS) for video in catalogue.videos}
+        assert {id: list(each) for id, each in found.items()} == {"a.mp4": [JSON], "deep/b.x.mp4": [MASKS]}
+        assert found["deep/b.x.mp4"][MASKS].startswith("20-")
+        assert facts.sidecars_of("a.mp4", ("frames", "masks")) == {}
+        assert facts.sidecars_digest(("frames",)) == ""
+        digests = {facts.sidecars_digest(arrays) for arrays in (("boxes",), ("masks",), ARRAYS)}
+        assert len(digests) == 3
+        assert "1 of 2 videos have a sidecar .masks/" in catalogue.notes
+
+    read: list[object] = []
+    monkeypatch.setattr(collecting, "fingerprint_of", lambda opened: read.append(opened) or fingerprint_of(opened))
+    with opened(corpus, kind) as again:
+        assert {again.facts.sidecars_digest(arrays) for arrays in (("boxes",), ("masks",), ARRAYS)} == digests
+    assert not read, "what is unchanged is not read again"
+    (corpus / "deep/b.x.masks/2.png").write_bytes(b"2.pnG")
+    (corpus / "a.boxes.json").unlink()
+    with opened(corpus, kind) as changed:
+        assert changed.digest == catalogue.digest
+        assert changed.facts.sidecars_of("a.mp4", ARRAYS) == {}
+        assert changed.facts.sidecars_digest(("masks",)) not in digests
+    assert len(read) == 1
+
+
+def test_a_bucket_has_those_of_its_folder(corpus: Path) -> None:
+    with opened(corpus, "folder") as local, opened(corpus, "bucket") as remote:
+        assert remote.facts.sidecars_digest(ARRAYS) == local.facts.sidecars_digest(ARRAYS)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_opened_like_the_video(corpus: Path, kind: str) -> None:
+    with opened(corpus, kind) as catalogue:
+        boxes = catalogue.facts.sidecars_of("a.mp4", ARRAYS)[JSON]
+        masks = catalogue.facts.sidecars_of("deep/b.x.mp4", ARRAYS)[MASKS]
+    source = open_source(name_of(corpus, kind), SourceOptions(cache_dir=corpus.parent / "other"))
+    files = {"a.boxes.json": boxes, "deep/b.x.masks/": masks}
+    assert source.has(files) is source.is_local
+    source.fetch(files)
+    assert source.has(files)
+    with open_sidecar(source, "a.boxes.json", boxes) as file:
+        assert file.read_text() == "[1]"
+    with open_sidecar(source, "deep/b.x.masks/", masks) as folder:
+        assert (folder / "2.png").read_bytes() == b"2.png"
+        assert (folder / "more" / "3.png").read_bytes() == b"more/3.png"
+    source.release()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_changed_and_a_missing_one_are_told_apart(corpus: Path, kind: str) -> None:
+    with opened(corpus, kind) as catalogue:
+        boxes = catalogue.facts.sidecars_of("a.mp4", ARRAYS)[JSON]
+        masks = catalogue.facts.sidecars_of("deep/b.x.mp4", ARRAYS)[MASKS]
+        catalogue.check("a.mp4", boxes, JSON)
+        catalogue.check("deep/b.x.mp4", masks, MASKS)
+        (corpus / "a.boxes.json").write_text("[2]")
+        (corpus / "deep/b.x.masks/3.png").write_text("new")
+        for id, ending, mark in (("a.mp4", JSON, boxes), ("deep/b.x.mp4", MASKS, masks)):
+            with pytest.raises(VideoChanged, match="since it was catalogued"):
+                catalogue.check(id, mark, ending)
+        (corpus / "a.boxes.json").unlink()
+        shutil.rmtree(corpus / "deep/b.x.masks")
+        for id, ending, mark in (("a.mp4", JSON, boxes), ("deep/b.x.mp4", MASKS, masks)):
+            with pytest.raises(VideoGone):
+                catalogue.check(id, mark, ending)
+        for video in catalogue.videos:
+            catalogue.check(video.id, video.fingerprint)
+    fresh = open_source(name_of(corpus, kind), SourceOptions(cache_dir=corpus.parent / "other"))
+    with pytest.raises(VideoGone), open_sidecar(fresh, "a.boxes.json", boxes):
+        pass
+    with pytest.raises(VideoError), open_sidecar(fresh, "deep/b.x.masks/", masks):
+        pass

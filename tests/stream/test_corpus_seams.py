@@ -1,0 +1,215 @@
+"""An array from a sidecar and a kind of source, added to a copy of the packages as `docs/extending.md` says."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.clips import panned_luma, write_clip
+from tests.test_seams import add
+
+ROOT = Path(__file__).parents[2]
+
+LABEL = '''
+"""The label that a file beside the video states for each frame; -1 without one."""
+
+import json
+
+from v2v_protocol.errors import SidecarError
+from v2v_server.worker.arrays import makes
+
+ENDING = ".label.json"
+
+
+@makes("label")
+def label(context, out):
+    out[:], sidecar = -1, context.clip.sidecars[ENDING]
+    if sidecar is not None:
+        labels = json.loads(sidecar.read_text())
+        frames = context.clip.start_frame + context.source * context.recipe.frame_stride
+        for place, frame in enumerate(frames[list(context.recipe.target_steps)]):
+            if frame >= len(labels):
+                raise SidecarError(context.video, ENDING, f"has no frame {frame}")
+            out[place] = labels[frame]
+'''
+LABEL_LINES = (
+    ("v2v_protocol/sample.py", '    "flow_valid": lambda',
+     '    "label": FromSidecar(".label.json", lambda recipe, _: ("float32", (recipe.voxels_per_clip,))),\n'),
+    ("v2v_server/worker/produce.py", "from v2v_server.worker.arrays import",
+     "import v2v_server.worker.label  # noqa: F401\n"),
+)  # fmt: skip
+
+SOURCE = '''
+"""A folder by the name toy:PATH, whose videos have a prefix."""
+
+from contextlib import nullcontext
+from pathlib import Path
+
+from v2v_server.corpus.sources.folder import Folder
+from v2v_server.corpus.sources.source import VideoSource
+
+
+class Toy(VideoSource):
+    def __init__(self, name):
+        super().__init__(name)
+        self._below = Folder(Path(name.removeprefix("toy:")))
+
+    def videos(self, refused, left_out):
+        for id in self._below.videos(refused, left_out):
+            yield f"toys/{id}"
+
+    def states(self, ids):
+        return self._below.states([id.removeprefix("toys/") for id in ids])
+
+    def state(self, id):
+        return self._below.state(id.removeprefix("toys/"))
+
+    def open_local(self, id, fingerprint):
+        return self._below.open_local(id.removeprefix("toys/"), fingerprint)
+
+    def verify(self, id, fingerprint, state):
+        self._below.verify(id.removeprefix("toys/"), fingerprint, state)
+
+
+def open_source(name, options):
+    return Toy(name) if name.startswith("toy:") else None
+'''
+SOURCE_LINE = ("v2v_server/corpus/sources/source.py", '"copies", "prepared"', '"toy", ')
+
+USE_SIDECAR = """
+import json, sys
+from pathlib import Path
+import numpy as np
+from v2v_client import V2VStreamDataset
+from v2v_client.local_server import LocalServer
+from v2v_protocol.errors import SampleUnavailable, StateMismatch
+from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.offline.remake import remake
+
+folder, cache = Path(sys.argv[1]), sys.argv[2]
+small = dict(voxels_per_clip=4, bins=2, crop_height_px=16, crop_width_px=24, pause_probability=0.0)
+flags = ["--cache-dir", cache, *(f"--set={name}={value}" for name, value in small.items())]
+arrays = ("frames", "label")
+
+def stream(server, asked=arrays, **more):
+    return V2VStreamDataset(server.address, batch_size=2, arrays=asked, seed=1, timeout_seconds=30, **more)
+
+def labels(batches):
+    made = {}
+    for batch in batches:
+        made.update(zip(batch.indices, np.asarray(batch.arrays["label"]).tolist()))
+    return made
+
+with LocalServer(folder, workers=1, flags=flags) as server:
+    batches = list(stream(server))
+    made = labels(batches)
+    assert labels(stream(server, shared_memory=False)) == made, "in the message as in shared memory"
+    state, plain = batches[0].resume_state, next(iter(stream(server, ("frames",)))).resume_state
+    resumed = stream(server)
+    resumed.load_state_dict(state)
+    rest = labels(resumed)
+    assert rest == {index: made[index] for index in rest} and len(rest) == len(made) - 2
+    for batch in batches:
+        for row, origin in zip(np.asarray(batch.arrays["label"]), batch.provenance):
+            expected = [-1.0] * 4
+            if origin.video == "a.mp4":
+                expected = [10.0 * (origin.start_frame + 2 * step) for step in range(1, 5)]
+                assert list(origin.sidecars) == [".label.json"]
+            assert row.tolist() == expected, (origin, row)
+assert state["sidecars"] and "sidecars" not in plain
+
+with_labels = open_catalogue(folder, cache_dir=cache, processes=0)
+for index, expected in made.items():
+    sample = remake(with_labels, StreamSpec.from_dict(state["spec"]), seed=1, epoch=0, index=index, arrays=arrays)
+    assert sample.arrays["label"].tolist() == expected
+
+# A damaged label is an error of that sample in the consumer; an array without labels does not notice.
+(folder / "a.label.json").write_text("[1, 2]")
+with LocalServer(folder, workers=1, flags=flags) as server:
+    try:
+        list(stream(server))
+        raise AssertionError("no error")
+    except SampleUnavailable as error:
+        assert "a.mp4: its sidecar .label.json: has no frame" in str(error), error
+    resumed = stream(server)
+    resumed.load_state_dict(state)
+    try:
+        list(resumed)
+        raise AssertionError("no error")
+    except StateMismatch as error:
+        assert str(error).startswith("sidecars: "), error
+    resumed = stream(server, ("frames",))
+    resumed.load_state_dict(plain)
+    frames = list(resumed)
+    assert len(frames) == len(batches) - 1
+    # Changed under a running server, here and so everywhere: the consumer is told, and no video is refused.
+    (folder / "a.label.json").write_text("[1, 2, 3]")
+    try:
+        list(stream(server))
+        raise AssertionError("no error")
+    except SampleUnavailable as error:
+        assert "a.mp4: its sidecar .label.json: changed since it was catalogued" in str(error), error
+    assert not any(each.refusals for batch in stream(server, ("frames",)) for each in batch.provenance)
+again = open_catalogue(folder, cache_dir=cache, processes=0)
+assert again.digest == with_labels.digest
+assert again.sidecars[".label.json"].digest != with_labels.sidecars[".label.json"].digest
+again.close()
+with_labels.close()
+"""
+
+USE_SOURCE = """
+import sys
+from v2v_client import V2VStreamDataset
+from v2v_client.local_server import LocalServer
+
+small = dict(voxels_per_clip=4, bins=2, crop_height_px=16, crop_width_px=24)
+flags = ["--cache-dir", sys.argv[2], *(f"--set={name}={value}" for name, value in small.items())]
+made = {}
+for name in (sys.argv[1], f"toy:{sys.argv[1]}"):
+    with LocalServer(name, workers=1, flags=flags) as server:
+        batches = list(V2VStreamDataset(server.address, batch_size=2, seed=1, timeout_seconds=30))
+        made[name] = sorted(each.video for batch in batches for each in batch.provenance)
+plain, toys = made.values()
+assert plain and toys == [f"toys/{video}" for video in plain]
+"""
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the packages with both additions, and two clips."""
+    tmp_path = tmp_path_factory.mktemp("tree")
+    for package in ("v2v_protocol", "v2v_server", "v2v_client", "v2v_pictures"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "clips").mkdir()
+    for name in ("a.mp4", "b.mp4"):
+        write_clip(tmp_path / "clips" / name, panned_luma(30, 16, 24), gop=12)
+    (tmp_path / "v2v_server/worker/label.py").write_text(LABEL)
+    (tmp_path / "v2v_server/corpus/sources/toy.py").write_text(SOURCE)
+    add(tmp_path, (*LABEL_LINES, SOURCE_LINE))
+    return tmp_path
+
+
+def run(tree: Path, program: str) -> None:
+    environment = os.environ | {"PYTHONPATH": str(tree)}
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tree / "clips"), str(tree / "cache")], env=environment, cwd=tree,
+        capture_output=True, text=True, timeout=500, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_an_array_with_a_sidecar_is_a_file_and_two_lines(tree: Path) -> None:
+    (tree / "clips/a.label.json").write_text(str([10 * frame for frame in range(30)]))
+    run(tree, USE_SIDECAR)
+
+
+@pytest.mark.slow
+def test_a_kind_of_source_is_a_file_and_a_line(tree: Path) -> None:
+    run(tree, USE_SOURCE)
