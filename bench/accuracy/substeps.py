@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bench.accuracy.physics import VIDEO_SIDE_PX, liveliest
 from bench.frame import Column, Report, add_positive, add_whole, progress
 from tests.oracles.rendered import (
     NAMES,
@@ -56,7 +57,7 @@ BARS = {
     ("10 ms", 4.0): (0.38, 9.0), ("10 ms", 10.0): (0.50, 9.0),
 }  # fmt: skip
 SLOW_PX = 1.0
-EVERY = (4, 8)
+EVERY, VIDEO_STEPS = (4, 8), 8
 _COLUMNS: tuple[Column, ...] = (
     ("scene", "scene", "{}", 1),
     ("px_per_frame", "px a frame", "{:g}", 1),
@@ -119,20 +120,16 @@ def rendered(substep_px: float, side: int, steps: int) -> Iterator[dict[str, Any
                 } | compared(frames, seconds, edges, true, substep_px)  # fmt: skip
 
 
-def filmed(path: Path, substep_px: float, side: int, steps: int) -> Iterator[dict[str, Any]]:
-    """Yield one record for each n: every n-th frame against all of them, in bins of n frames.
+def filmed(path: Path, substep_px: float) -> Iterator[dict[str, Any]]:
+    """Yield one record for each n: every n-th frame against all of them, in bins of n frames, where most changes.
 
     Raises:
         V2VError: the video cannot be read, or is too short or too small.
     """
-    facts, count = probe(path), max(EVERY) * steps + 1
+    facts, count = probe(path), max(EVERY) * VIDEO_STEPS + 1
     if facts.frames < count:
         raise UsageError(f"--video {path}: {facts.frames} frames; give {count} or more")
-    whole = decode_luma(path, facts.index, 0, count).frames
-    if min(whole.shape[1:]) < side:
-        raise UsageError(f"--video {path}: {whole.shape[2]}x{whole.shape[1]} pixels; give {side}x{side} or more")
-    top, left = (whole.shape[1] - side) // 2, (whole.shape[2] - side) // 2
-    frames = np.ascontiguousarray(whole[:, top : top + side, left : left + side])
+    frames = liveliest(decode_luma(path, facts.index, 0, count).frames, VIDEO_SIDE_PX)
     seconds = np.arange(count) / facts.frames_per_second
     for every in EVERY:
         true = counts_of(log_levels(frames.reshape(count, -1) / 255.0), seconds, seconds[::every], THRESHOLD)
@@ -202,7 +199,7 @@ def add_flags(parser: Parser) -> None:
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
     scenes = list(rendered(asked.substep_px, asked.side, asked.steps))
-    films = [each for path in asked.video for each in filmed(path, asked.substep_px, asked.side, asked.steps)]
+    films = [each for path in asked.video for each in filmed(path, asked.substep_px)]
     spent = list(costs(asked.substep_px, asked.repeats))
     bars = missed(scenes) if asked.substep_px == 1.0 else []
     return Report([*scenes, *films, *spent], [(scenes + films, _COLUMNS), (spent, _COSTS)], missed=bars)

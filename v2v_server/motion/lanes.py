@@ -105,13 +105,29 @@ def warp_cell(
             short = ir.VectorType(_INT16, 32)
             total = builder.add(total, ir.Constant(short, [1 << (shift - 1)] * 32))
             total = builder.ashr(total, ir.Constant(short, [shift] * 32))
+            # Two taps at a time: neighbouring lanes are multiplied and added, which processors do in one instruction.
             column = None
-            for tap in range(4):
-                lanes = [(row + tap) * CELL_PX + each for row in range(CELL_PX) for each in range(CELL_PX)]
-                part = builder.sext(
-                    builder.shuffle_vector(total, total, ir.Constant(ir.VectorType(_INT32, 16), lanes)), pixels
-                )
-                part = builder.mul(part, spread(builder.sext(weight(y, tap), _INT32), _INT32, 16))
+            for tap in (0, 2):
+                odd_even = []
+                for each in (tap, tap + 1):
+                    lanes = [(row + each) * CELL_PX + place for row in range(CELL_PX) for place in range(CELL_PX)]
+                    part = builder.shuffle_vector(total, total, ir.Constant(ir.VectorType(_INT32, 16), lanes))
+                    odd_even.append((part, spread(weight(y, each), _INT16, 16)))
+                both = [
+                    builder.shuffle_vector(
+                        one, other, ir.Constant(ir.VectorType(_INT32, 32), [i // 2 + 16 * (i % 2) for i in range(32)])
+                    )
+                    for one, other in zip(*odd_even, strict=True)
+                ]
+                wide = ir.VectorType(_INT32, 32)
+                product = builder.mul(builder.sext(both[0], wide), builder.sext(both[1], wide))
+                halves = [
+                    builder.shuffle_vector(
+                        product, product, ir.Constant(ir.VectorType(_INT32, 16), list(range(first, 32, 2)))
+                    )
+                    for first in (0, 1)
+                ]
+                part = builder.add(*halves)
                 column = part if column is None else builder.add(column, part)
             return column
 

@@ -14,8 +14,9 @@ with half of the vector, rounded, on each side. The field is smoothed by the med
 minimum of the V through three sums gives 1/UNITS_PER_PX px (equiangular fit). Before the search, the second picture is
 scaled to the mean of the first, so that a lamp that flickers does not look like motion.
 
-A vector is zero where the evidence is for rest: it is shorter than the caller's limit, or a shift of less than half a
-pixel would explain the block as well. Along an edge, whole pixels often imitate such a shift.
+A picture that changes by no more than a coder's noise has no motion. A vector is zero where the evidence is for rest:
+it is shorter than the caller's limit, or a shift of less than half a pixel would explain the block as well. Along an
+edge, whole pixels often imitate such a shift.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls
@@ -38,6 +39,7 @@ PAD_PX = 16
 """Border of a level: its edge repeated."""
 COST_PER_PX = 4
 _LEVELS = 4
+_STILL_LEVEL = 2  # means of 4 x 4 px
 _TOP_RADIUS_PX = 3
 _SMALLEST_SIDE_PX = 16
 _AROUND_PX = (BLOCK_PX - CELL_PX) // 2
@@ -53,8 +55,10 @@ def motion(first: list[Picture], second: list[Picture], shortest: int) -> Vector
         first, second: of pictures of one size.
         shortest: length, in 1/UNITS_PER_PX px, below which a vector becomes zero.
     """
-    second = _scaled(first, second)
-    found = np.zeros((2, 1, 1), np.int16)
+    if _is_still(first, second):
+        height, width = (side - 2 * PAD_PX for side in first[0].shape)
+        return np.zeros((2, -(-height // CELL_PX), -(-width // CELL_PX)), np.int16)
+    second, found = _scaled(first, second), np.zeros((2, 1, 1), np.int16)
     for level in reversed(range(len(first))):
         radius = _TOP_RADIUS_PX if level == len(first) - 1 else 1
         found = _median(_search(first[level], second[level], found, radius))
@@ -69,6 +73,12 @@ def pyramid(picture: Picture) -> list[Picture]:
         picture = _halved(picture)
         levels.append(padded(picture))
     return levels
+
+
+def _is_still(first: list[Picture], second: list[Picture]) -> bool:
+    """Return whether no mean of a cell changes by more than a grey level: then only a coder's noise does."""
+    one, other = (levels[min(_STILL_LEVEL, len(levels) - 1)].astype(np.int16) for levels in (first, second))
+    return int(np.abs(one - other).max()) <= 1
 
 
 def _scaled(first: list[Picture], second: list[Picture]) -> list[Picture]:
