@@ -49,7 +49,7 @@ _MOST_UNFINISHED_BYTES = 6 * LARGEST_REQUEST_BYTES
 """Of one connection: more than ZeroMQ holds of whole messages (``router.MOST_UNREAD``) and of one on its way."""
 _MOST_UNFINISHED_IN_ALL_BYTES = 2 << 20
 """Of all connections: 64 MiB of empty parts. A request has at most 1 KB as a rule, so 2,000 may wait at a time."""
-_SLOW_BYTES, _MOST_SLOW_SECONDS = 4096, 20.0
+_SLOW_BYTES, _MOST_SLOW_SECONDS = 4096, 10.0
 """A message with more unfinished bytes must end within this time, in which this process runs."""
 _HANDSHAKE_BYTES, _CURVE_HANDSHAKE_BYTES = 128, 640
 _CURVE_FRAME_BYTES = 33
