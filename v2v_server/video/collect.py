@@ -87,7 +87,7 @@ class Stack:
         return self.taken == len(self._expected)
 
     def _after_a_gap(self, frame: VideoFrame) -> bool:
-        """Whether the decoder has left out a frame that the index lists in front of this one."""
+        """Whether the decoder skipped a frame that the index lists before this one."""
         pts, at = self._pts, self._cursor
         if not self.index.seekable or frame.pts is None or frame.pts < pts[0]:
             return False

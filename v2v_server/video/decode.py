@@ -196,8 +196,7 @@ def _from_keyframe_on(stack: Stack) -> Iterator[VideoFrame]:
     """Yield the frames from the last keyframe at or before the range, without unreferenced ones.
 
     Raises:
-        _SeekFailed, VideoError: it did not work out, or there is nothing to be saved; decoding from the beginning has
-            the last word.
+        _SeekFailed, VideoError: seeking failed or saves nothing: decode from the beginning instead.
     """
     wanted, index = stack.wanted, stack.wanted.index
     if not index.seekable or wanted.start == 0:
