@@ -16,6 +16,7 @@ _EDGE_PX = 8
 """Coded with few bits, this part of a bar beside the picture is not flat."""
 _LEAST_PX = 4
 _LEAST_FLAT_PX = 2
+_MOST_SPREAD_PX = 2
 _LEAST_SHARE = 50
 """Thinner ones than 1/50 of the picture's side do not count."""
 
@@ -50,13 +51,18 @@ def _depth(lines: npt.NDArray[np.uint8]) -> int:
 def common_bars(found: Sequence[tuple[int, int, int, int]], height: int, width: int) -> Sides | None:
     """Return the bars that three quarters of the pictures have; None without any.
 
+    Where they differ from picture to picture it is dark content, not a bar.
+
     Args:
         found: of each picture.
         height, width: of the pictures.
     """
     if not found:
         return None
-    depths = [sorted(side)[len(found) // 4] for side in zip(*found, strict=True)]
+    depths = []
+    for side in map(sorted, zip(*found, strict=True)):
+        depth, middle = side[len(found) // 4], side[len(found) // 2]
+        depths.append(depth if middle - depth <= _MOST_SPREAD_PX else 0)
     if depths[0] + depths[1] >= height or depths[2] + depths[3] >= width:
         return None  # flat pictures
     sizes = height, height, width, width

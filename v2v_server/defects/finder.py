@@ -71,7 +71,7 @@ def find_defects(pictures: Iterable[npt.NDArray[np.uint8]]) -> tuple[int, tuple[
         text = f"{_percent(share)} of the frames repeat the one before ({pattern_of(repeats)})"
         found.append(Defect(DUPLICATES, pairs, share, text))
     if cuts:
-        found.append(Defect(CUTS, cuts, 1000 * len(cuts) // (count - 1), f"{len(cuts)} hard cuts"))
+        found.append(Defect(CUTS, cuts, 1000 * len(cuts) // (count - 1), f"hard cuts or jumps: {len(cuts)}"))
     if (sides := common_bars(bars, *shape)) is not None:
         found.append(Defect(BARS, ((0, count),), 1000, f"bars: {_sides(sides)}", sides))
     found += [
