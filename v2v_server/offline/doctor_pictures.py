@@ -79,7 +79,7 @@ def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple
     text = f"looked at {len(found)} of {len(catalogue.videos)} videos, at most {SECONDS_OF_EACH} s and "
     text += f"{_MOST_FRAMES} frames of each: {len(sequences)} sequences"
     if failed := len(results) - len(found):
-        text += f"; {failed} others did not decode within {_LONGEST_VIDEO_SECONDS:.0f} s"
+        text += f"; {failed} more did not decode within {_LONGEST_VIDEO_SECONDS:.0f} s"
     yield "ok", "pictures", text, ""
     for kind, effect in _EFFECTS.items():
         having = [(excerpt, each) for excerpt, _, defects in found for each in defects if each.kind == kind]

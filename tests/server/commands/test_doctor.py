@@ -215,7 +215,7 @@ def test_a_video_that_does_not_decode_is_counted(
     damaged(tmp_path / "good.mp4", tmp_path / "spoiled.mp4", 30)
     _, said = told(capsys, "--videos", str(tmp_path), "--cache-dir", str(tmp_path))
     assert "looked at 1 of 2 videos" in said
-    assert "1 others did not decode" in said
+    assert "1 more did not decode" in said
 
 
 def with_clean_aperture(source: Path, target: Path, width: int, height: int) -> None:
