@@ -4,7 +4,8 @@ The change of a step is the sum of the squared changes of the means of 8 x 8 blo
 noise, and squares give most weight to moving edges. A step is a duplicate if its change is at most 1/25 (so 1/5 of the
 amplitude) of the largest one of the four steps before it, and of the four after it. Where motion comes to rest or
 begins, only one side is that large. Cuts have no weight: a side's largest change counts only as far as the other
-side's.
+side's. Coders with few bits blend a repeat with its neighbours; so 1/5 (almost half of the amplitude) suffices where
+repeats come in a regular pattern.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy.typing as npt
 from v2v_server.defects.defect import Spans
 
 _RATIO = 25
+_BLENDED_RATIO = 5
 _REACH = 4
 _CUT_REACH = 8
 _LEAST_CHANGE = 64**2 // 4
@@ -37,11 +39,15 @@ def duplicated(changes: Sequence[int], blocks: int) -> npt.NDArray[np.bool_]:
     Returns:
         [N]; all False where there are too few to be more than chance.
     """
-    flags = np.zeros(len(changes), bool)
-    for at, change in enumerate(changes):
+    moving = np.zeros(len(changes), np.int64)
+    for at in range(len(changes)):
         before, after = changes[max(0, at - _REACH) : at], changes[at + 1 : at + 1 + _REACH]
-        moving = min(max(before, default=0), max(after, default=0))
-        flags[at] = moving >= _LEAST_CHANGE * blocks and _RATIO * change <= moving
+        moving[at] = min(max(before, default=0), max(after, default=0))
+    is_moving, each = moving >= _LEAST_CHANGE * blocks, np.array(changes, np.int64)
+    blended = is_moving & (_BLENDED_RATIO * each <= moving)
+    if blended.sum() >= 2 * _LEAST_COUNT and _period(blended):
+        return blended
+    flags = is_moving & (_RATIO * each <= moving)
     count = int(flags.sum())
     return flags if count >= _LEAST_COUNT and 1000 * count >= _LEAST_PER_MILLE * len(flags) else np.zeros_like(flags)
 
@@ -61,12 +67,19 @@ def pattern_of(flags: npt.NDArray[np.bool_]) -> str:
     Args:
         flags: [N] of :func:`duplicated`, at least one of them True.
     """
+    if not (period := _period(flags)):
+        return "no regular pattern"
+    each = (period * int(flags.sum()) + len(flags) // 2) // len(flags)
+    return _NAMES.get((period, each), f"{each} of every {period}")
+
+
+def _period(flags: npt.NDArray[np.bool_]) -> int:
+    """Return the number of steps after which four fifths of the repeats come again; 0 without any."""
     for period in range(2, min(_LONGEST_PERIOD, len(flags) // 3) + 1):
         repeated, expected = int((flags[period:] & flags[:-period]).sum()), int(flags[period:].sum())
         if 5 * repeated >= 4 * expected > 0:
-            each = (period * int(flags.sum()) + len(flags) // 2) // len(flags)
-            return _NAMES.get((period, each), f"{each} of every {period}")
-    return "no regular pattern"
+            return period
+    return 0
 
 
 def runs_of(flags: npt.NDArray[np.bool_], least: int, most_gap: int = 0) -> Spans:
