@@ -10,7 +10,7 @@ import numpy.typing as npt
 from v2v_server.corpus.scenes.analysis import SceneAnalysis, block_sums
 from v2v_server.defects.bars import bars_of, common_bars
 from v2v_server.defects.defect import BARS, BLACK, CUTS, DUPLICATES, STILL, Defect, Sides, Spans
-from v2v_server.defects.steps import duplicated, is_cut, pattern_of, runs_of
+from v2v_server.defects.steps import change_of, duplicated, is_cut, pattern_of, runs_of
 
 _BARS_EVERY = 8
 """Frames."""
@@ -49,7 +49,7 @@ def find_defects(pictures: Iterable[npt.NDArray[np.uint8]]) -> tuple[int, tuple[
         blocks = block_sums(picture)
         shape = picture.shape[0], picture.shape[1]
         if recent:
-            changes.append(int(np.square(blocks - recent[-1]).sum()))
+            changes.append(change_of(recent[-1], blocks))
         recent = [*recent, blocks][-_STILL_LAG - 1 :]
         moved = int((np.abs(blocks - recent[0]) > _STILL_CHANGE).sum())
         is_still.append(moved * _STILL_SHARE <= blocks.size)

@@ -1,11 +1,12 @@
 """Duplicated frames and their pattern.
 
-The change of a step is the sum of the squared changes of the means of 8 x 8 blocks. Means of blocks hold little coder
-noise, and squares give most weight to moving edges. A step is a duplicate if its change is at most 1/25 (so 1/5 of the
-amplitude) of the largest one of the four steps before it, and of the four after it. Where motion comes to rest or
-begins, only one side is that large. Cuts have no weight: a side's largest change counts only as far as the other
-side's. Coders with few bits blend a repeat with its neighbours; so 1/5 (almost half of the amplitude) suffices where
-repeats come in a regular pattern.
+The change of a step is the sum of the squared changes of the means of 8 x 8 blocks, of those that change by more than a
+grey level. Means of blocks hold little coder noise, and squares give most weight to moving edges. A step is a duplicate
+if its change is at most 1/25 (so 1/5 of the amplitude) of the largest one of the four steps before it, and of the four
+after it. Where motion comes to rest or begins, only one side is that large; beside a cut, too.
+
+Coders with few bits blend a repeat with its neighbours. So 1/5 (almost half of the amplitude) suffices where repeats
+come in a regular pattern.
 """
 
 from __future__ import annotations
@@ -21,12 +22,24 @@ _RATIO = 25
 _BLENDED_RATIO = 5
 _REACH = 4
 _CUT_REACH = 8
-_LEAST_CHANGE = 64**2 // 4
-"""Mean square of a block's change, (1/64 grey level)^2: half a level; a change by less may be coder noise."""
+_NOISE = 64
+"""Change of a block that may be coder noise: a grey level, in 1/64."""
+_LEAST_CHANGE = (2 * 64) ** 2 // 100
+"""Of a block in the mean, (1/64 grey level)^2: one block in a hundred changes by two levels."""
 _LEAST_PER_MILLE = 30
 _LEAST_COUNT = 4
 _LONGEST_PERIOD = 12
 _NAMES = {(2, 1): "every picture twice", (5, 1): "24 in 30", (5, 3): "24 in 60, 3:2 pulldown", (6, 1): "25 in 30"}
+
+
+def change_of(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> int:
+    """Return the change from one picture to the next, (1/64 grey level)^2.
+
+    Args:
+        before, after: means of their blocks, 1/64 grey level.
+    """
+    difference = after - before
+    return int(np.square(difference, where=np.abs(difference) > _NOISE, out=np.zeros_like(difference)).sum())
 
 
 def duplicated(changes: Sequence[int], blocks: int) -> npt.NDArray[np.bool_]:

@@ -38,7 +38,7 @@ def test_a_cut_in_slow_motion_makes_no_repeats() -> None:
 
 
 def test_changes_below_coder_noise_are_no_motion() -> None:
-    assert not duplicated([MOVING // 5, 0] * 30, BLOCKS).any()
+    assert not duplicated([MOVING // 30, 0] * 30, BLOCKS).any()
 
 
 @pytest.mark.parametrize("repeats", [3, 4])
