@@ -125,6 +125,12 @@ def test_cuts(rate: str, tmp_path: Path) -> None:
     assert not defects[CUTS].touches(40, 70)  # a sequence may begin at a cut and end before the next
 
 
+def test_fast_motion_with_repeats_makes_no_cuts() -> None:
+    """Half of the steps are still, so the others stand out from the median."""
+    _, defects = find_defects(repeated(film(frames=4 * FRAMES)[::4], lambda at: at // 2))
+    assert [defect.kind for defect in defects] == [DUPLICATES]
+
+
 @pytest.mark.parametrize("rate", BIT_RATES)
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_still_stretches(noise: float, rate: str, tmp_path: Path) -> None:
