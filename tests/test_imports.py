@@ -22,7 +22,7 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 
 FLOORS = (
-    "system", "keys", "video", "config", "simulation", "flow", "store", "corpus", "schedule", "quarantine",
+    "system", "keys", "video", "config", "simulation", "motion", "flow", "store", "corpus", "schedule", "quarantine",
     "broker",
     "worker", "supervise", "status", "offline", "prepare", "tradeoff", "page", "corpus_actions", "serve", "commands",
 )  # fmt: skip
@@ -137,7 +137,7 @@ def test_server_folders_import_only_lower_folders() -> None:
     [
         "corpus/index",
         "corpus/sources",
-        *sorted(set(FLOORS) - {"config", "corpus_actions", "serve", "simulation", "flow", "offline"}),
+        *sorted(set(FLOORS) - {"config", "corpus_actions", "serve", "simulation", "motion", "flow", "offline"}),
     ],
 )
 def test_every_folder_documents_its_files(room: str) -> None:

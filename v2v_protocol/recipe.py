@@ -244,13 +244,16 @@ class Recipe:
         """
         return self.worst_events(1.0)
 
-    def worst_events(self, step_seconds: float, thresholds: tuple[float, float] | None = None) -> float:
+    def worst_events(
+        self, step_seconds: float, thresholds: tuple[float, float] | None = None, levels_per_step: int = 0
+    ) -> float:
         """Return the upper bound of :func:`most_events` for the worst draw.
 
         Args:
             step_seconds: time from one frame to the next, constant over the clip.
             thresholds: thresholds stated for the video, used if ``threshold_source`` is "video"; None if there are
                 none.
+            levels_per_step: largest number of levels between two frames (``substep_px`` of the spec).
         """
         low, high = self.smallest_and_largest_threshold
         if thresholds is not None and self.threshold_source == "video":
@@ -262,8 +265,9 @@ class Recipe:
         ends = math.log(self.log_eps[0]), math.log1p(self.log_eps[1])
         unit = step_seconds if self.noise_unit == "second" else 1.0
         leak = self.leak_hz[1] * largest * step_seconds
+        segments = self.most_segments + self.steps * levels_per_step
         return most_events(
-            self.most_segments, ends, (smallest, largest), self.steps * (sigma * math.sqrt(unit) + hot * unit + leak)
+            segments, ends, (smallest, largest), self.steps * (sigma * math.sqrt(unit) + hot * unit + leak)
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -11,8 +11,19 @@ from functools import lru_cache
 from typing import Any, Literal, TypedDict, get_args
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import LARGEST_SIDE_PX, LATER_FIELDS, Recipe, preset
-from v2v_protocol.settings import check_settings, format_value, nearest, require_known, settings_of, switch, whole, word
+from v2v_protocol.recipe import LARGEST_EVENTS, LARGEST_SIDE_PX, Recipe, preset
+from v2v_protocol.recipe import LATER_FIELDS as LATER_RECIPE_FIELDS
+from v2v_protocol.settings import (
+    check_settings,
+    format_value,
+    nearest,
+    number,
+    require_known,
+    settings_of,
+    switch,
+    whole,
+    word,
+)
 
 VoxelDtype = Literal["int8", "int16", "float32"]
 OnBadVideo = Literal["substitute", "raise"]
@@ -26,6 +37,10 @@ ON_BAD_VIDEO: tuple[OnBadVideo, ...] = get_args(OnBadVideo)
 FLOW_DIRECTIONS: tuple[FlowDirection, ...] = get_args(FlowDirection)
 SCENES: tuple[SceneChoice, ...] = get_args(SceneChoice)
 MOST_SAMPLES_PER_DECODE = 32
+MOST_SUBSTEPS = 16
+"""Largest number of sub-steps of a step between video frames."""
+LATER_FIELDS = ("substep_px",)
+"""Fields that the plain form leaves out at their defaults, so that older digests hold."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +66,12 @@ class StreamSpec:
         "int8 saturates at -127 .. 127 and int16 at -32767 .. 32767, and saturated bins are counted in the provenance; "
         "float32 is exact up to 2**24 events a bin",
         group="Stream",
+    )  # fmt: skip
+    substep_px: float = number(
+        0.0, 0.0, 64.0,
+        "longest motion that a pixel model sees as one step: a step in which the picture moves further is divided, at "
+        f"most {MOST_SUBSTEPS} times, by pictures made along the motion; 0: light changes evenly between two frames",
+        unit="px",
     )  # fmt: skip
     shuffle: bool = switch(True, "use another random order in every epoch; false keeps the catalogue's order")
     max_sequences_per_video: int = whole(10, 1, 1_000_000, "largest number of sequences from one video in an epoch")
@@ -98,6 +119,12 @@ class StreamSpec:
                 f"spec flow_from = {self.flow_from}: give a whole number from 0 to the recipe's voxels_per_clip "
                 f"= {self.recipe.voxels_per_clip}"
             )
+        most_events = self.recipe.worst_events(1.0, levels_per_step=MOST_SUBSTEPS - 1 if self.substep_px else 0)
+        if most_events > LARGEST_EVENTS:
+            raise UsageError(
+                f"spec substep_px = {self.substep_px:g}: a pixel may fire {most_events:.4g} events in a clip; the "
+                f"limit is {LARGEST_EVENTS:.4g}: raise the recipe's smallest threshold, or set substep_px to 0"
+            )
         if self.samples_per_decode == 1 and self.sibling_spacing:
             raise UsageError(
                 f"spec sibling_spacing = {self.sibling_spacing} applies only to samples_per_decode above 1, which is "
@@ -115,8 +142,9 @@ class StreamSpec:
         return dataclasses.replace(self, sibling_spacing=stride)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all fields as plain values."""
+        """Return all fields as plain values, without LATER_FIELDS that are at their defaults."""
         plain = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        plain = {name: value for name, value in plain.items() if value or name not in LATER_FIELDS}
         return plain | {"recipe": self.recipe.to_dict()}
 
     @classmethod
@@ -132,7 +160,8 @@ class StreamSpec:
         Raises:
             RecipeError, UsageError: an unknown key or a bad value.
         """
-        base = cls() if default is None else default
+        is_complete = settings_of(StreamSpec).keys() - set(LATER_FIELDS) <= values.keys()
+        base = cls() if default is None or is_complete else default
         if values.get("preset") is not None:
             base = speed_preset(values["preset"], base)
         require_known(values, SPEC_KEYS, "spec key")
@@ -160,6 +189,7 @@ class SpecOptions(TypedDict, total=False):
 
     preset: SpeedPreset | None
     voxel_dtype: VoxelDtype | None
+    substep_px: float | None
     shuffle: bool | None
     max_sequences_per_video: int | None
     on_bad_video: OnBadVideo | None
@@ -212,6 +242,6 @@ def _recipe(value: object, base: Recipe) -> Recipe:
         return value
     if isinstance(value, Mapping):
         named = {str(key): item for key, item in value.items()}
-        is_complete = settings_of(Recipe).keys() - set(LATER_FIELDS) <= named.keys()
+        is_complete = settings_of(Recipe).keys() - set(LATER_RECIPE_FIELDS) <= named.keys()
         return Recipe.from_dict(named) if "preset" in named or is_complete else base.replace(**named)
     return preset(value)

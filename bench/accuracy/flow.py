@@ -28,9 +28,10 @@ from v2v_protocol.command import Parser
 from v2v_protocol.errors import V2VError
 from v2v_protocol.recipe import preset
 from v2v_protocol.spec import StreamSpec
-from v2v_server.flow import FlowSettings, flow_for, flow_window
+from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.flow.methods import AUTO, METHODS, Estimator, choose, estimator
 from v2v_server.simulation.draw import draw
+from v2v_server.simulation.view import source_window
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
 
@@ -133,7 +134,7 @@ def largest_flow_of_a_still_clip_px() -> float:
     settings = FlowSettings()
     frames = np.repeat(photograph("camera")[None, :180, :300], recipe.frames_needed, axis=0)
     params = draw(recipe, seed=0, epoch=0, index=0, picture_height_px=180, picture_width_px=300, video_id="still")
-    top, left, height, width = flow_window(params, recipe, settings.margin_px, 0, 180, 300)
+    top, left, height, width = source_window(params, recipe, 0, 180, 300, settings.margin_px)
     seen = frames[:, top : top + height, left : left + width]
     return float(np.abs(flow_for(seen, params, recipe, settings).flow).max())
 

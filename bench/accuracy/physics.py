@@ -156,7 +156,7 @@ def filmed(path: Path) -> Records:
     count = (facts.frames - 1) // VIDEO_BIN_FRAMES * VIDEO_BIN_FRAMES + 1
     if count <= VIDEO_BIN_FRAMES:
         raise UsageError(f"--video {path}: {facts.frames} frames; give more than {VIDEO_BIN_FRAMES}")
-    frames = _liveliest(decode_luma(path, facts.index, 0, count).frames, VIDEO_SIDE_PX)
+    frames = liveliest(decode_luma(path, facts.index, 0, count).frames, VIDEO_SIDE_PX)
     levels = log_intensity(frames.reshape(count, -1) / 255.0)
     records: Records = []
     for threshold in THRESHOLDS:
@@ -171,7 +171,7 @@ def filmed(path: Path) -> Records:
     return records
 
 
-def _liveliest(frames: Frames, side: int) -> Frames:
+def liveliest(frames: Frames, side: int) -> Frames:
     """Return the square of that side whose grey levels change most."""
     if min(frames.shape[1:]) < side:
         raise UsageError(f"--video: {frames.shape[2]}x{frames.shape[1]} pixels; give at least {side}x{side}")

@@ -31,13 +31,13 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.flow import FlowSettings, flow_for, view_part
+from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.flow.methods import one_thread
 from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.variants import warm_up
-from v2v_server.simulation.view import apply_view
+from v2v_server.simulation.view import apply_view, without_margin
 from v2v_server.worker.produce import Decoded, decode_for
 from v2v_server.worker.scene_choice import TOLERANCE_PX
 
@@ -111,7 +111,7 @@ def _flow(decoded: Decoded, method: str | None = None) -> npt.NDArray[np.float16
 
 def _simulated(decoded: Decoded) -> object:
     params, spec = decoded.plan.params, decoded.plan.spec
-    view = view_part(decoded.clip.frames, params, spec.recipe, _settings(decoded).margin_px)
+    view = without_margin(decoded.clip.frames, params, spec.recipe, decoded.plan.margin_px)
     return simulate_clip(apply_view(view, params, spec.recipe), params, spec.recipe, spec.voxel_dtype, None)
 
 

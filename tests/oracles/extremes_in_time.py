@@ -13,7 +13,7 @@ from v2v_server.simulation import simulate
 from v2v_server.simulation.intensity import log_table_float64
 from v2v_server.simulation.kernels import KernelInput, fill
 from v2v_server.simulation.precision import AUTO, choose, error_bound
-from v2v_server.simulation.voxel import Levels, Moments
+from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
 
 Doubles = npt.NDArray[np.float64]
 HOUR, MICROSECOND = 3600.0, 1e-6
@@ -32,15 +32,18 @@ def excess_of_divided_steps(threshold: float, ratio: float, grids: int, bins: in
         grids_per_frame=grids, dtype="float32",
     )  # fmt: skip
     given, parts = made.given, grids * bins
-    ends = log_table_float64(2.2, 1e-3)[frames.reshape(steps + 1, -1)]
+    table = log_table_float64(2.2, 1e-3)
+    ends = table[frames.reshape(steps + 1, -1)]
     times = np.arange(steps + 1.0)
     if levels_per_step:
         step = np.repeat(np.arange(steps), levels_per_step)
         share = np.tile(np.arange(1, levels_per_step + 1) / (levels_per_step + 1), steps)
-        between = np.random.default_rng(3).uniform(-6.9, 0.0, (len(step), 4, 5)).astype(np.float32)
+        between = np.random.default_rng(3).integers(0, 255 * FINE_STEPS + 1, (len(step), 4, 5), np.uint16)
         given = dataclasses.replace(given, levels=Levels(Moments(step, share), between))
         order = np.argsort(np.r_[times, step + share], kind="stable")
-        ends = np.concatenate([ends, between.reshape(len(step), -1)])[order]
+        ends = np.concatenate([ends, np.interp(between.reshape(len(step), -1) / FINE_STEPS, np.arange(256), table)])[
+            order
+        ]
         times = np.r_[times, step + share][order]
     low, high = float(ends.min()), float(ends.max())
     events = most_events(given.segments, (low, high), (threshold, threshold * ratio), 0.0)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from hypothesis import strategies as st
 
 from v2v_protocol.errors import RecipeError
-from v2v_protocol.recipe import Recipe
-from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, ON_BAD_VIDEO, VOXEL_DTYPES, StreamSpec
+from v2v_protocol.recipe import LARGEST_EVENTS, Recipe
+from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, MOST_SUBSTEPS, ON_BAD_VIDEO, VOXEL_DTYPES, StreamSpec
 
 
 def _range(low: float, high: float) -> st.SearchStrategy[tuple[float, float]]:
@@ -73,9 +74,17 @@ recipes = st.builds(
     dead_pixel_share=_range(0.0, 1.0),
 )
 
+
+def _spec(recipe: Recipe, substep_px: float, **values: Any) -> StreamSpec:
+    if recipe.worst_events(1.0, levels_per_step=MOST_SUBSTEPS) > LARGEST_EVENTS:
+        substep_px = 0.0
+    return StreamSpec(recipe, substep_px=substep_px, **values)
+
+
 specs = st.builds(
-    StreamSpec,
+    _spec,
     recipe=recipes,
+    substep_px=st.just(0.0) | st.floats(0.01, 64.0),
     voxel_dtype=st.sampled_from(VOXEL_DTYPES),
     shuffle=st.booleans(),
     max_sequences_per_video=st.integers(1, 1_000_000),

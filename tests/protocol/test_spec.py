@@ -62,6 +62,7 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
     "flow_direction": "backward",
     "flow_from": 20,
     "flow_margin_px": -1,
+    "substep_px": 1.0,
     "scene": "auto",
 }
 
@@ -77,6 +78,19 @@ def test_a_complete_recipe_takes_nothing_from_the_server() -> None:
     server = StreamSpec(Recipe(grids_per_frame=4))
     assert StreamSpec.from_dict({"recipe": Recipe().to_dict()}, server).recipe == Recipe()
     assert StreamSpec.from_dict({"recipe": {"bins": 2}}, server).recipe == Recipe(grids_per_frame=4, bins=2)
+
+
+def test_a_complete_spec_takes_nothing_from_the_server() -> None:
+    """Also where a field is left out because it has its default."""
+    assert StreamSpec.from_dict(StreamSpec().to_dict(), StreamSpec(substep_px=1.0)) == StreamSpec()
+    assert StreamSpec.from_dict({"shuffle": False}, StreamSpec(substep_px=1.0)).substep_px == 1.0
+
+
+def test_more_events_than_can_be_counted_are_refused() -> None:
+    extreme = Recipe(threshold=(1e-6, 1e6))
+    assert StreamSpec(extreme).substep_px == 0.0
+    with pytest.raises(UsageError, match=r"substep_px = 1: a pixel may fire .* raise the recipe's smallest threshold"):
+        StreamSpec(extreme, substep_px=1.0)
 
 
 def test_canonical_form_of_the_default() -> None:

@@ -98,7 +98,7 @@ flags = ["--cache-dir", cache, *(f"--set={name}={value}" for name, value in smal
 arrays = ("frames", "label")
 
 def stream(server, asked=arrays, **more):
-    return V2VStreamDataset(server.address, batch_size=2, arrays=asked, seed=1, timeout_seconds=30, **more)
+    return V2VStreamDataset(server.address, batch_size=2, arrays=asked, seed=1, **more)
 
 def labels(batches):
     made = {}
@@ -170,13 +170,9 @@ from v2v_client.local_server import LocalServer
 
 small = dict(voxels_per_clip=4, bins=2, crop_height_px=16, crop_width_px=24)
 flags = ["--cache-dir", sys.argv[2], *(f"--set={name}={value}" for name, value in small.items())]
-made = {}
-for name in (sys.argv[1], f"toy:{sys.argv[1]}"):
-    with LocalServer(name, workers=1, flags=flags) as server:
-        batches = list(V2VStreamDataset(server.address, batch_size=2, seed=1, timeout_seconds=30))
-        made[name] = sorted(each.video for batch in batches for each in batch.provenance)
-plain, toys = made.values()
-assert plain and toys == [f"toys/{video}" for video in plain]
+with LocalServer(f"toy:{sys.argv[1]}", workers=1, flags=flags) as server:
+    batches = list(V2VStreamDataset(server.address, batch_size=2, seed=1))
+assert {each.video for batch in batches for each in batch.provenance} == {"toys/a.mp4", "toys/b.mp4"}
 """
 
 

@@ -204,7 +204,8 @@ def work_seconds(spec: StreamSpec, arrays: tuple[str, ...], video: VideoEntry) -
     """
     recipe, picture_px = spec.recipe, video.width_px * video.height_px
     seconds = _DECODE_SECONDS * picture_px * recipe.frames_needed
-    seconds += _SIMULATION_SECONDS * recipe.crop_height_px * recipe.crop_width_px * recipe.frames_needed
+    parts = max(recipe.frames_needed, recipe.most_segments)
+    seconds += _SIMULATION_SECONDS * recipe.crop_height_px * recipe.crop_width_px * parts
     if not {"flow", "flow_valid"}.isdisjoint(arrays):
         seconds += _FLOW_SECONDS * picture_px * (recipe.frames_needed - 1)
     return float(math.floor(seconds * spec.samples_per_decode))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -161,18 +162,21 @@ class Catalogue:
         return index
 
     def _stored_index(self, id: str) -> bytes:
-        fingerprint = self._fingerprint(id)
         if id in self._absent:
             video = self._absent[id]
             return unseekable(video.frames, (1, 1), video.height_px, video.width_px).to_bytes()
+        return self._stored(id, partial(self._store.frame_index, id))
+
+    def _stored(self, id: str, read: Callable[[str], bytes | None]) -> bytes:
+        """Return what the index has for the fingerprint of the file that was catalogued."""
+        fingerprint = self._fingerprint(id)
         try:
-            data = self._store.frame_index(id, self._files.get(id, fingerprint))
+            data = read(self._files.get(id, fingerprint))
         except sqlite3.Error as error:
             raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
         if data is None:
-            raise VideoChanged(
-                id, None, "has changed since this catalogue was opened; start again to serve it as it is now"
-            )
+            reason = "has changed since this catalogue was opened; start again to serve it as it is now"
+            raise VideoChanged(id, None, reason)
         return data
 
     def scene(self, id: str) -> Scene:
@@ -183,20 +187,12 @@ class Catalogue:
             IndexUnreadable: another process holds the index, or its storage fails.
             VideoChanged: another process has catalogued a changed file under this id since.
         """
-        fingerprint = self._fingerprint(id)
+        self._fingerprint(id)
         if self._scenes is None:
             raise CorpusError("this catalogue was opened without statistics of its videos")
         if id in self._unknown:
             return Scene.unknown()
-        try:
-            data = self._store.figures(id, self._files.get(id, fingerprint), self._scenes.kind)
-        except sqlite3.Error as error:
-            raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
-        if data is None:
-            raise VideoChanged(
-                id, None, "has changed since this catalogue was opened; start again to serve it as it is now"
-            )
-        return Scene.from_bytes(data)
+        return Scene.from_bytes(self._stored(id, partial(self._store.figures, id, kind=self._scenes.kind)))
 
     @property
     def facts(self) -> CorpusFacts:
@@ -294,11 +290,10 @@ def open_catalogue(
     try:
         with without_collections():
             return _snapshot(corpus, table, notes, store, scenes, notice)
-    except sqlite3.Error as error:
+    except BaseException as error:
         store.close()
-        raise IndexUnreadable(f"the catalogue's index {path} cannot be read: {error}; start again") from error
-    except BaseException:
-        store.close()
+        if isinstance(error, sqlite3.Error):
+            raise IndexUnreadable(f"the catalogue's index {path} cannot be read: {error}; start again") from error
         raise
 
 

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 
+from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.manifest import MANIFEST_NAME, Header, PreparedVideo
 
 
@@ -29,14 +30,11 @@ class ManifestWriter:
         self, root: Path, header: Header, videos: Iterable[PreparedVideo], aside: Iterable[PreparedVideo] = ()
     ) -> None:
         path = root / MANIFEST_NAME
-        fresh = path.with_name(f".{MANIFEST_NAME}.new")
-        with fresh.open("wb") as file:
+        aside_path = path.with_name(f".{MANIFEST_NAME}.new")  # one name, so that killed runs leave one file at most
+        with write_aside_and_rename(path, partial=aside_path, durable=True) as fresh, fresh.open("wb") as file:
             file.write(_line(header))
             file.writelines(map(_line, videos))
             file.writelines(_line(video, aside=True) for video in aside)
-            file.flush()
-            os.fsync(file.fileno())
-        fresh.replace(path)
         self._file = path.open("ab")
 
     def add(self, video: PreparedVideo) -> None:

@@ -7,6 +7,6 @@ x to the right and y down. Forward flow lies on the grid of the earlier picture,
     clip.py      the flow of a sample: which pictures, which part, and where it is reliable
 """
 
-from v2v_server.flow.clip import FlowClip, FlowSettings, flow_for, flow_window, view_part
+from v2v_server.flow.clip import FlowClip, FlowSettings, flow_for
 
-__all__ = ["FlowClip", "FlowSettings", "flow_for", "flow_window", "view_part"]
+__all__ = ["FlowClip", "FlowSettings", "flow_for"]

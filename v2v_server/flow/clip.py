@@ -19,7 +19,7 @@ from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.flow.methods import AUTO, STILL, Estimator, Field, Picture, choose, estimator, one_thread
 from v2v_server.simulation.draw import resized_size
-from v2v_server.simulation.view import Frames, Window
+from v2v_server.simulation.view import Frames, Window, crop_place, crop_region, resized
 from v2v_server.system.opencv import cv2
 
 SKIPPED = "skipped"
@@ -66,36 +66,6 @@ class FlowClip:
     methods: tuple[str, ...]
 
 
-def flow_window(
-    params: SampleParams,
-    recipe: Recipe,
-    margin_px: int | None,
-    picture_top_px: int,
-    picture_height_px: int,
-    picture_width_px: int,
-) -> Window:
-    """Return the part of the video picture that :func:`flow_for` needs; it contains the part that the view needs.
-
-    Args:
-        params, recipe: the draw and its recipe.
-        margin_px: of the :class:`FlowSettings`.
-        picture_top_px: first usable row of the upright video picture.
-        picture_height_px, picture_width_px: size of the usable picture.
-    """
-    if params.scale != 1.0:
-        return Window(picture_top_px, 0, picture_height_px, picture_width_px)
-    top, left, height, width = _region(params, recipe, margin_px, picture_height_px, picture_width_px)
-    return Window(picture_top_px + top, left, height, width)
-
-
-def view_part(frames: Frames, params: SampleParams, recipe: Recipe, margin_px: int | None) -> Frames:
-    """Return the part of the frames of a :func:`flow_window` that ``apply_view`` takes, as a view of them."""
-    if params.scale != 1.0:
-        return frames
-    top, left = _offset(params, margin_px)
-    return frames[:, top : top + recipe.crop_height_px, left : left + recipe.crop_width_px]
-
-
 def flow_for(
     frames: Frames,
     params: SampleParams,
@@ -110,7 +80,7 @@ def flow_for(
     A voxel whose two ends are the same frame of the video (the camera pauses) has exactly zero flow.
 
     Args:
-        frames: [n, h, w] uint8, the decoded frames in the window of :func:`flow_window`.
+        frames: [n, h, w] uint8, the decoded frames in the ``source_window`` of the view with the settings' margin.
         params, recipe: the draw and its recipe.
         settings: method, direction, first voxel and margin.
         validity: also compute the mask, which takes a second estimate of each pair.
@@ -194,17 +164,17 @@ class _Pictures:
         self._frames = frames
         self._scale = params.scale
         self._size: tuple[int, int] = (frames.shape[1], frames.shape[2])
-        self._top, self._left = _offset(params, margin_px)
+        self._top, self._left = crop_place(params, margin_px)
         self._height, self._width = recipe.crop_height_px, recipe.crop_width_px
         self._region = Window(0, 0, self._size[0], self._size[1])
         if params.scale != 1.0:
             self._size = resized_size(self._size[0], self._size[1], params.scale)
-            self._region = _region(params, recipe, margin_px, self._size[0], self._size[1])
+            self._region = crop_region(params, recipe, self._size[0], self._size[1], margin_px)
         self._made: dict[int, Picture] = {}
         if self._region.height_px < self._top + self._height or self._region.width_px < self._left + self._width:
             raise UsageError(
                 f"frames of {frames.shape[2]}x{frames.shape[1]} pixels at scale {params.scale} do not hold a crop of "
-                f"{self._width}x{self._height} with its margin: decode the window that flow_window() names"
+                f"{self._width}x{self._height} with its margin: decode the window that source_window() names"
             )
 
     def pair(self, earlier: int, later: int) -> tuple[Picture, Picture]:
@@ -216,10 +186,9 @@ class _Pictures:
     def _make(self, frame: Picture) -> Picture:
         if self._scale == 1.0:
             return np.ascontiguousarray(frame)
-        method = cv2.INTER_AREA if self._scale < 1.0 else cv2.INTER_LINEAR
-        resized = cv2.resize(frame, (self._size[1], self._size[0]), interpolation=method)
+        whole = resized(frame, self._size, self._scale)
         top, left, height, width = self._region
-        return np.ascontiguousarray(resized[top : top + height, left : left + width], np.uint8)
+        return np.ascontiguousarray(whole[top : top + height, left : left + width])
 
     def crop(self, field: npt.NDArray[Any], flip: bool) -> npt.NDArray[Any]:
         """Return the crop's part of an array on the grid of the pictures, mirrored if the view is; values are
@@ -227,20 +196,3 @@ class _Pictures:
         """
         part = field[self._top : self._top + self._height, self._left : self._left + self._width]
         return part[:, ::-1] if flip else part
-
-
-def _region(params: SampleParams, recipe: Recipe, margin_px: int | None, height_px: int, width_px: int) -> Window:
-    """Return the crop with its margin, in the resized picture."""
-    if margin_px is None:
-        return Window(0, 0, height_px, width_px)
-    top, left = max(0, params.crop_top_px - margin_px), max(0, params.crop_left_px - margin_px)
-    bottom = min(height_px, params.crop_top_px + recipe.crop_height_px + margin_px)
-    right = min(width_px, params.crop_left_px + recipe.crop_width_px + margin_px)
-    return Window(top, left, bottom - top, right - left)
-
-
-def _offset(params: SampleParams, margin_px: int | None) -> tuple[int, int]:
-    """Return row and column of the crop in its region."""
-    if margin_px is None:
-        return params.crop_top_px, params.crop_left_px
-    return min(params.crop_top_px, margin_px), min(params.crop_left_px, margin_px)

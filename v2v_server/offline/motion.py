@@ -18,7 +18,6 @@ from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.flow import view_part
 from v2v_server.offline.leases import lease_for
 from v2v_server.offline.remake import RemadeSample, Remaker
 from v2v_server.schedule.sequences import VideoSequence
@@ -55,10 +54,7 @@ def quiet_voxels(made: RemadeSample) -> npt.NDArray[Any]:
     Returns:
         [lead voxels + T, bins, H, W], signed event counts.
     """
-    plan, clip, lease = made.decoded.plan, made.decoded.clip, made.lease
-    if plan.flow is not None:
-        frames = view_part(clip.frames, plan.params, plan.spec.recipe, plan.flow.margin_px)
-        clip = replace(clip, frames=frames)
+    plan, lease = made.decoded.plan, made.lease
     spec = StreamSpec.from_dict({**plan.spec.to_dict(), "recipe": noise_free(plan.spec.recipe)})
     lease = replace(lease, spec=spec.canonical(), spec_digest=spec.digest, arrays=("voxels",))
     params = replace(
@@ -67,7 +63,7 @@ def quiet_voxels(made: RemadeSample) -> npt.NDArray[Any]:
         hot_pixel_count=0,
         effects={name: value for name, value in plan.params.effects.items() if name not in _NOISE},
     )
-    quiet = Decoded(replace(plan, spec=spec, params=params, flow=None), clip)
+    quiet = Decoded(replace(plan, spec=spec, params=params, flow=None), made.decoded.clip)
     return make_sample(lease, quiet).arrays["voxels"]
 
 
@@ -165,13 +161,14 @@ class WholePictures:
         width, height = recipe.crop_width_px / params.scale, recipe.crop_height_px / params.scale
         whole = self.camera(sequence).voxels
         bins = whole.reshape(-1, *whole.shape[2:])
-        seen = int(params.source_index(recipe.steps)[-1]) // recipe.frames_per_bin  # pauses leave the rest out
+        steps = recipe.voxels_per_clip * recipe.steps_per_frame
+        seen = int(params.source_index(recipe.steps)[-1]) * len(bins) // steps  # pauses leave the rest out
         scale = bins.shape[-1] / video.width_px
         rows, columns = (
             slice(int(at * scale), int((at + size) * scale)) for at, size in ((top, height), (left, width))
         )
         crop = bins[:, rows, columns]
-        events = float(np.abs(crop[:seen], dtype=np.float32).sum()) / crop.size / recipe.frames_per_bin
+        events = float(np.abs(crop[:seen], dtype=np.float32).sum()) / (crop[0].size * steps)
         seconds = recipe.frame_stride / video.frames_per_second if video.frames_per_second > 0 else 0.0
         return CropEstimate(
             (video.id, sequence.start_frame),

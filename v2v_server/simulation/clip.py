@@ -153,7 +153,7 @@ def simulate_clip(
         voxel_dtype: "int8", "int16" or "float32".
         step_seconds: [steps] duration of each step (``voxel.py``); given exactly when ``recipe.needs_seconds``.
         out: C-contiguous arrays to fill, by name (``kernels.ARRAYS``); None makes the voxels.
-        levels: log intensity between frames, by the gamma and log_eps of the draw; None: linear in time.
+        levels: grey levels between frames; None: log intensity is linear in time there.
 
     Returns:
         voxels [T + lead_voxels, bins, H, W], and the number of saturated bins.

@@ -11,9 +11,12 @@ from __future__ import annotations
 
 import decimal
 import functools
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from v2v_server.simulation.voxel import FINE_STEPS
 
 Doubles = npt.NDArray[np.float64]
 
@@ -49,6 +52,23 @@ def log_table_float64(gamma: float, log_eps: float) -> Doubles:
     table = np.array([float(level) for level in levels])
     table.setflags(write=False)
     return table
+
+
+def fine_table(table: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return L of grey levels in 1/FINE_STEPS, linear between grey levels.
+
+    Args:
+        table: [256] float32 or float64, L of grey levels; empty (no grey levels) gives an empty table.
+
+    Returns:
+        [255 FINE_STEPS + 1], of the same type.
+    """
+    if not len(table):
+        return table
+    grey, part = np.divmod(np.arange(255 * FINE_STEPS + 1), FINE_STEPS)
+    rise = np.append(np.diff(table), table.dtype.type(0))
+    fine: npt.NDArray[Any] = table[grey] + rise[grey] * (part.astype(table.dtype) / table.dtype.type(FINE_STEPS))
+    return fine
 
 
 def linear_light(gamma: float, log_eps: float) -> Doubles:

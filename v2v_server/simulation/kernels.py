@@ -17,7 +17,7 @@ from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import noise
 from v2v_server.simulation.effects import prepare
 from v2v_server.simulation.effects.kernel import Outputs, Segments, simulate_general
-from v2v_server.simulation.intensity import log_table, log_table_float64
+from v2v_server.simulation.intensity import fine_table, log_table, log_table_float64
 from v2v_server.simulation.pixel import simulate_pixels, words
 from v2v_server.simulation.precision import Real
 from v2v_server.simulation.voxel import (
@@ -116,6 +116,8 @@ def fill(
     arrays = {name: new_array(*given.form(name), array) for name, array in out.items()}
     if out.keys() == {"voxels"} and not given.needs_general:
         return arrays, {"voxels": _paper(given, real, arrays["voxels"])}
+    if not out:
+        return {}, {}
     general = _General(given, real)
     bilinear = None
     if "voxels_bilinear" in arrays:
@@ -232,10 +234,11 @@ class _General:
         )
         sigma = params.effects.get("threshold_mismatch_sigma", 0.0)
         smallest, _ = pixel_thresholds(min(params.threshold_pos, params.threshold_neg), 1.0, sigma)
-        between = np.empty((0, pixels), np.float32) if given.levels is None else given.levels.log_intensity
+        between = np.empty((0, pixels), np.uint16) if given.levels is None else given.levels.grey
+        table = _table(given.intensity, real)
         simulate_general(
             np.ascontiguousarray(given.frames).reshape(-1, pixels), between.reshape(-1, pixels),
-            _table(given.intensity, real), np.array(params.noise_key, np.uint32), self._segments,
+            table, fine_table(table), np.array(params.noise_key, np.uint32), self._segments,
             *_hot(params, pixels, real), real(params.threshold_pos), real(params.threshold_neg),
             real(rounding_tolerance(smallest, smallest)), given.start_residual is None,
             real(given.start_residual or 0.0), not params.effects, given.bins, real(LARGEST_COUNT[given.dtype]), out,

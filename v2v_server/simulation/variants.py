@@ -23,9 +23,12 @@ class Variant(NamedTuple):
     voxel_dtype: str
     is_general: bool
     precision: str
+    is_divided: bool = False
+    """Whether steps have sub-steps, whose levels the kernels of ``v2v_server.motion`` make."""
 
     def __str__(self) -> str:
-        return f"{self.voxel_dtype} voxels{' by the general kernel' if self.is_general else ''} in {self.precision}"
+        kind = f"{' by the general kernel' if self.is_general else ''}{' with sub-steps' if self.is_divided else ''}"
+        return f"{self.voxel_dtype} voxels{kind} in {self.precision}"
 
 
 USUAL = frozenset({*(Variant(dtype, False, "float32") for dtype in VOXEL_DTYPES), Variant("int8", True, "float32")})
@@ -38,6 +41,7 @@ def variants(
     step_seconds: float = 1.0,
     thresholds: tuple[float, float] | None = None,
     arrays: Collection[str] = ("voxels",),
+    levels_per_step: int = 0,
 ) -> frozenset[Variant]:
     """Return the variants that the draws of a recipe may need, as far as the recipe determines them.
 
@@ -50,11 +54,14 @@ def variants(
         step_seconds: time from one frame to the next; used only if something is stated per second.
         thresholds: thresholds that a list file states for the video; None if it states none.
         arrays: those that the kernel makes (``kernels.ARRAYS``), at least one.
+        levels_per_step: largest number of levels between two frames.
     """
-    events = recipe.worst_events(step_seconds, thresholds) * (EFFECTS_MARGIN if recipe.has_effects else 1.0)
+    events = recipe.worst_events(step_seconds, thresholds, levels_per_step) * (
+        EFFECTS_MARGIN if recipe.has_effects else 1.0
+    )
     precisions = ["float32"] if events <= LIMITS["float32"][1] else list(LIMITS)
-    is_general = recipe.has_effects or recipe.grids_per_frame > 0 or {"voxels"} != set(arrays)
-    return frozenset(Variant(voxel_dtype, is_general, precision) for precision in precisions)
+    is_general = recipe.has_effects or recipe.grids_per_frame > 0 or levels_per_step > 0 or {"voxels"} != set(arrays)
+    return frozenset(Variant(voxel_dtype, is_general, precision, levels_per_step > 0) for precision in precisions)
 
 
 def load(variant: Variant) -> None:

@@ -7,7 +7,7 @@ crop's border is interpolated from its true neighbours.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,12 @@ class Window(NamedTuple):
 
 
 def source_window(
-    params: SampleParams, recipe: Recipe, picture_top_px: int, picture_height_px: int, picture_width_px: int
+    params: SampleParams,
+    recipe: Recipe,
+    picture_top_px: int,
+    picture_height_px: int,
+    picture_width_px: int,
+    margin_px: int | None = 0,
 ) -> Window:
     """Return the part of the video picture that :func:`apply_view` needs.
 
@@ -40,14 +45,59 @@ def source_window(
         picture_top_px: first usable row of the upright video picture.
         picture_height_px, picture_width_px: size of the usable picture.
 
+        margin_px: margin around the crop; None: the whole picture.
+
     Returns:
-        the crop alone at scale 1, otherwise the whole usable picture.
+        the crop and its margin at scale 1, otherwise the whole usable picture.
     """
-    if params.scale == 1.0:
-        return Window(
-            picture_top_px + params.crop_top_px, params.crop_left_px, recipe.crop_height_px, recipe.crop_width_px
-        )
-    return Window(picture_top_px, 0, picture_height_px, picture_width_px)
+    if params.scale != 1.0:
+        return Window(picture_top_px, 0, picture_height_px, picture_width_px)
+    top, left, height, width = crop_region(params, recipe, picture_height_px, picture_width_px, margin_px)
+    return Window(picture_top_px + top, left, height, width)
+
+
+def crop_region(
+    params: SampleParams, recipe: Recipe, height_px: int, width_px: int, margin_px: int | None = 0
+) -> Window:
+    """Return the crop with its margin, as far as the picture reaches."""
+    if margin_px is None:
+        return Window(0, 0, height_px, width_px)
+    top, left = max(0, params.crop_top_px - margin_px), max(0, params.crop_left_px - margin_px)
+    bottom = min(height_px, params.crop_top_px + recipe.crop_height_px + margin_px)
+    right = min(width_px, params.crop_left_px + recipe.crop_width_px + margin_px)
+    return Window(top, left, bottom - top, right - left)
+
+
+def crop_place(params: SampleParams, margin_px: int | None) -> tuple[int, int]:
+    """Return row and column of the crop in the region that :func:`crop_region` returns for the margin."""
+    if margin_px is None:
+        return params.crop_top_px, params.crop_left_px
+    return min(params.crop_top_px, margin_px), min(params.crop_left_px, margin_px)
+
+
+def without_margin(
+    frames: Frames, params: SampleParams, recipe: Recipe, margin_px: int | None, kept_px: int | None = 0
+) -> Frames:
+    """Return the part of frames of a :func:`source_window` that a smaller margin needs, as a view of them.
+
+    Args:
+        frames: [n, h, w], the window with ``margin_px``.
+        params, recipe: the draw and its recipe.
+        margin_px, kept_px: the margin that the frames have, and the one to keep.
+    """
+    if params.scale != 1.0 or margin_px == kept_px:
+        return frames
+    (top, left), (kept_top, kept_left) = crop_place(params, margin_px), crop_place(params, kept_px)
+    below = 0 if kept_px is None else kept_px
+    rows = slice(top - kept_top, top + recipe.crop_height_px + below)
+    return frames[:, rows, left - kept_left : left + recipe.crop_width_px + below]
+
+
+def resized(frame: Frames, size: tuple[int, int], scale: float) -> Frames:
+    """Return a picture resized to (height, width)."""
+    method = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
+    whole: Frames = np.asarray(cv2.resize(frame, (size[1], size[0]), interpolation=method), np.uint8)
+    return whole
 
 
 def apply_view(frames: Frames, params: SampleParams, recipe: Recipe) -> Frames:
@@ -80,10 +130,8 @@ def apply_view(frames: Frames, params: SampleParams, recipe: Recipe) -> Frames:
         seen = frames[:, :height, :width]
     else:
         seen = np.empty((len(frames), height, width), np.uint8)
-        method = cv2.INTER_AREA if params.scale < 1.0 else cv2.INTER_LINEAR
         for frame, target in zip(frames, seen, strict=True):
-            resized = cv2.resize(frame, (seen_size[1], seen_size[0]), interpolation=method)
-            target[:] = resized[top : top + height, left : left + width]
+            target[:] = resized(frame, seen_size, params.scale)[top : top + height, left : left + width]
     if params.flip:
         seen = seen[:, :, ::-1]
     if params.contrast != 0.0:
@@ -91,7 +139,12 @@ def apply_view(frames: Frames, params: SampleParams, recipe: Recipe) -> Frames:
     return np.ascontiguousarray(seen)
 
 
-def contrast_table(contrast: float) -> Frames:
-    """Return clip((F - 127.5) s + 127.5, 0, 255) of every grey level F, rounded half up: [256] uint8."""
-    levels = [math.floor((level - 127.5) * contrast + 128.0) for level in range(256)]
-    return np.array([min(max(level, 0), 255) for level in levels], np.uint8)
+def contrast_table(contrast: float, parts: int = 1) -> npt.NDArray[Any]:
+    """Return clip((F - 127.5) s + 127.5, 0, 255) of every F in 1/``parts`` of a grey level, rounded half up.
+
+    Returns:
+        [255 parts + 1] uint8, or uint16 for more than one part.
+    """
+    most = 255 * parts
+    levels = [math.floor((level - most / 2) * contrast + (most + 1) / 2) for level in range(most + 1)]
+    return np.array([min(max(level, 0), most) for level in levels], np.uint8 if parts == 1 else np.uint16)

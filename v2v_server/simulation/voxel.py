@@ -56,17 +56,22 @@ class Moments(NamedTuple):
     share: Doubles
 
 
+FINE_STEPS = 16
+"""Parts of a grey level that levels between frames are known to."""
+
+
 class Levels(NamedTuple):
-    """Log intensity between frames, for instance along the motion.
+    """Grey levels between frames, for instance along the motion.
 
     Attributes:
         at: their K moments, ascending, none at a frame (share 0) and none in a step that shows the same frame twice.
-        log_intensity: [K, H, W] float32, natural logarithm: what ``log_table`` gives for a grey level. Between two
-            neighbouring levels, and between a level and a frame, log intensity is linear in time.
+        grey: [K, H, W] uint16, in 1/FINE_STEPS of a grey level, 0 .. 255 FINE_STEPS. Between two grey levels the
+            natural logarithm of the intensity is linear; between two neighbouring levels, and between a level and a
+            frame, it is linear in time.
     """
 
     at: Moments
-    log_intensity: npt.NDArray[np.float32]
+    grey: npt.NDArray[np.uint16]
 
 
 class Timeline(NamedTuple):

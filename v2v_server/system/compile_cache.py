@@ -24,7 +24,9 @@ from itertools import takewhile
 from pathlib import Path
 
 SOURCES = Path(__file__).parents[1] / "simulation"
-"""The folder of all files whose code or constants a kernel may use."""
+"""The folder of the pixel kernels; with the one beside it named "motion" it has all files that a kernel may use."""
+
+_FOLDERS = SOURCES, SOURCES.with_name("motion")
 
 PROCESSORS = Path("/proc/cpuinfo")
 """Linux's description of the processors. Asking LLVM, as numba does, would load it in every process."""
@@ -73,10 +75,10 @@ def compile_cache(environment: Mapping[str, str] = os.environ) -> tuple[Path, ..
     return (Path(chosen),) if chosen else ()
 
 
-def sources_digest(folder: Path = SOURCES) -> str:
+def sources_digest(*folders: Path) -> str:
     """Return a digest of the kernels' sources, the version of numba and the processor: 12 hexadecimal digits."""
     digest = hashlib.sha256(version("numba").encode() + _processor())
-    for path in sorted(folder.rglob("*.py")):
+    for path in [path for folder in folders or _FOLDERS for path in sorted(folder.rglob("*.py"))]:
         digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()[:12]
 

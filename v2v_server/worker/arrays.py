@@ -28,6 +28,7 @@ from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.kernels import ARRAYS
 from v2v_server.simulation.result import Voxels
 from v2v_server.simulation.view import Frames
+from v2v_server.simulation.voxel import Levels
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +60,7 @@ class SampleContext:
         view: [n, H, W] uint8, the decoded frames as the camera sees them.
         step_seconds: [steps] float64, duration of each step; None if the recipe does not use it.
         flow: flow of the clip; None if it was not requested.
+        levels: grey levels between frames (``substep_px``); None if there are none.
         into: the arrays to fill, by name.
         saturated: number of bins that were clipped, by array; None until the clip is simulated.
     """
@@ -71,6 +73,7 @@ class SampleContext:
     view: Frames
     step_seconds: npt.NDArray[np.float64] | None
     flow: FlowClip | None
+    levels: Levels | None
     into: Mapping[str, npt.NDArray[Any]]
     saturated: Mapping[str, int] | None = None
 
@@ -107,7 +110,13 @@ def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Vox
     """
     try:
         return simulate_clip(
-            context.view, context.params, context.recipe, context.spec.voxel_dtype, context.step_seconds, out
+            context.view,
+            context.params,
+            context.recipe,
+            context.spec.voxel_dtype,
+            context.step_seconds,
+            out,
+            context.levels,
         )
     except UsageError as error:
         # The recipe was checked before, so the values come from the corpus.

@@ -31,14 +31,15 @@ from v2v_protocol.sample import (
     array_layout,
     new_arrays,
 )
-from v2v_protocol.spec import StreamSpec
+from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
+from v2v_server.flow import FlowSettings, flow_for
+from v2v_server.motion import MARGIN_PX, levels_of
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.kernels import ARRAYS, list_events
 from v2v_server.simulation.variants import Variant, variants
-from v2v_server.simulation.view import apply_view, source_window
+from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache
 from v2v_server.store.clips import clips_of
@@ -61,7 +62,8 @@ class SamplePlan:
         params: the sample's draw.
         source: [steps + 1] int64, which decoded frame each position of the clip shows.
         cut: the frames to decode after pauses are removed, cropped as far as possible before the resize.
-        flow: settings of the flow if the lease asks for it; ``cut`` then includes its margin.
+        margin_px: margin around the crop that ``cut`` includes, for flow and sub-steps; None: the whole picture.
+        flow: settings of the flow if the lease asks for it.
         flow_plan: flow methods chosen from the statistics of the scene; None if the spec does not use them.
     """
 
@@ -69,6 +71,7 @@ class SamplePlan:
     params: SampleParams
     source: npt.NDArray[np.int64]
     cut: Cut
+    margin_px: int | None
     flow: FlowSettings | None
     flow_plan: FlowPlan | None
 
@@ -100,14 +103,16 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
         video_thresholds=_pair(lease.thresholds),
     )
     source = params.source_index(spec.recipe.steps)
-    window, flow = source_window(params, spec.recipe, top, bottom - top, lease.width_px), None
+    flow: FlowSettings | None = None
+    margin_px: int | None = MARGIN_PX if spec.substep_px else 0
     flow_plan = _flow_plan(lease, spec, params, bottom - top)
     if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
         if flow_plan is not None and flow_plan.still:
             flow = replace(flow, margin_px=0)
-        window = flow_window(params, spec.recipe, flow.margin_px, top, bottom - top, lease.width_px)
-    return SamplePlan(spec, params, source, Cut(int(source[-1]) + 1, window), flow, flow_plan)
+        margin_px = None if flow.margin_px is None else max(flow.margin_px, margin_px or 0)
+    window = source_window(params, spec.recipe, top, bottom - top, lease.width_px, margin_px)
+    return SamplePlan(spec, params, source, Cut(int(source[-1]) + 1, window), margin_px, flow, flow_plan)
 
 
 def decode_for(
@@ -225,15 +230,20 @@ def _context(
     """Return what the arrays are made from, and the number of irregular time stamps."""
     plan = decoded.plan
     params, recipe = plan.params, plan.spec.recipe
-    frames, flow = decoded.clip.frames, None
+    frames, flow, levels = decoded.clip.frames, None, None
     if plan.flow is not None:
         methods = () if plan.flow_plan is None else plan.flow_plan.methods
-        flow = flow_for(frames, params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods)
-        frames = view_part(frames, params, recipe, plan.flow.margin_px)
+        part = without_margin(frames, params, recipe, plan.margin_px, plan.flow.margin_px)
+        flow = flow_for(part, params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods)
+    if plan.spec.substep_px and not (into and into.keys().isdisjoint(ARRAYS)):
+        part = without_margin(frames, params, recipe, plan.margin_px, MARGIN_PX)
+        levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px)
     seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
-    view = apply_view(frames, params, recipe)
+    view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe)
     clip = SourceClip(lease.start_frame, decoded.clip.seconds, sidecars)
-    return SampleContext(lease.video, clip, plan.spec, params, plan.source, view, seconds, flow, into), irregular
+    return SampleContext(
+        lease.video, clip, plan.spec, params, plan.source, view, seconds, flow, levels, into
+    ), irregular
 
 
 def _step_seconds(lease: Lease, decoded: Decoded) -> tuple[npt.NDArray[np.float64], int]:
@@ -263,7 +273,8 @@ def _variants(
 ) -> frozenset[Variant]:
     spec = _spec(canonical)
     step_seconds = spec.recipe.frame_stride / frames_per_second
-    return variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds), arrays)
+    levels_per_step = MOST_SUBSTEPS - 1 if spec.substep_px else 0
+    return variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds), arrays, levels_per_step)
 
 
 @lru_cache(maxsize=16)

@@ -28,6 +28,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from v2v_server.motion import load as load_motion
 from v2v_server.simulation.pixel import simulate_pixels
 from v2v_server.simulation.variants import Variant, load, warm_up
 from v2v_server.system.compile_cache import sources_digest
@@ -50,14 +51,21 @@ def load_in_turn(variant: Variant) -> None:
     with one_compiles(*_place(variant)) as is_to_compile:
         if is_to_compile:
             print(f"compiling the kernel for {variant}, once on this host", file=sys.stderr, flush=True)
-            _compile_apart(*map(str, (variant.voxel_dtype, int(variant.is_general), variant.precision)))
-        load(variant)
+            kind = variant.voxel_dtype, int(variant.is_general), variant.precision, int(variant.is_divided)
+            _compile_apart(*map(str, kind))
+        _load(variant)
 
 
 def is_compiled(variant: Variant) -> bool:
     """Return whether a variant is known to be compiled, so that loading it is quick."""
     folder, key = _place(variant)
     return _mark(folder, key).exists()
+
+
+def _load(variant: Variant) -> None:
+    load(variant)
+    if variant.is_divided:
+        load_motion()
 
 
 def load_kernels() -> None:
@@ -136,6 +144,6 @@ def _lock(path: Path, longest_wait_seconds: float) -> Iterator[None]:
 if __name__ == "__main__":
     die_with_parent(int(sys.argv[1]))
     if asked := sys.argv[2:]:
-        load(Variant(asked[0], asked[1] == "1", asked[2]))
+        _load(Variant(asked[0], asked[1] == "1", asked[2], asked[3] == "1"))
     else:
         load_kernels()

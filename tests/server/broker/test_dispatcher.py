@@ -856,6 +856,8 @@ def test_a_slow_spec_gets_the_time_it_needs_and_does_not_count_against_others() 
     sequence = lone.schedule.candidate(0, 0, 0, 0)
     plain = work_seconds(lone.spec, ("voxels",), sequence.video)
     assert work_seconds(lone.spec, ("voxels", "flow"), sequence.video) > 10 * max(plain, 1.0)
+    divided = replace(lone.spec, recipe=lone.spec.recipe.replace(grids_per_frame=1024, bins=1024))
+    assert work_seconds(divided, ("voxels",), sequence.video) > 5 * max(plain, 1.0)
     verdict = QuarantineEntry(
         1, sequence.video.id, sequence.video.fingerprint, sequence.start_frame, "slow", "t", "one spec"
     )

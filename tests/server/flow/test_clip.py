@@ -20,10 +20,10 @@ from tests.server.flow.fields import RECIPE, camera_params, panned
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.flow import FlowSettings, flow_for, flow_window, view_part
+from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.flow.methods import STILL, Estimator, guarded
 from v2v_server.simulation.draw import draw, resized_size
-from v2v_server.simulation.view import apply_view, source_window
+from v2v_server.simulation.view import apply_view, source_window, without_margin
 
 HEIGHT, WIDTH = 110, 150
 
@@ -46,7 +46,7 @@ def video(frames: int = 9) -> np.ndarray:
 
 
 def window_of(frames: np.ndarray, params: SampleParams, recipe: Recipe, margin: int | None) -> np.ndarray:
-    top, left, height, width = flow_window(params, recipe, margin, 0, *frames.shape[1:])
+    top, left, height, width = source_window(params, recipe, 0, *frames.shape[1:], margin)
     return frames[:, top : top + height, left : left + width]
 
 
@@ -78,7 +78,7 @@ def test_flow_lies_on_the_pixels_of_the_view(
     with estimator(recording):
         made = flow_for(window, params, recipe, chosen).flow
     plain = replace(params, contrast=0.0)
-    seen = apply_view(view_part(window, params, recipe, margin), plain, recipe).astype(np.float16)
+    seen = apply_view(without_margin(window, params, recipe, margin), plain, recipe).astype(np.float16)
     source = params.source_index(recipe.steps)
     for voxel in range(4):
         start, end = source[2 * voxel], source[2 * voxel + 2]
@@ -108,8 +108,8 @@ def test_the_view_is_the_same_whichever_window_was_decoded(
         return picture[:, first : first + height, left : left + width]
 
     alone = apply_view(decoded(source_window(params, recipe, top, HEIGHT, WIDTH)), params, recipe)
-    window = decoded(flow_window(params, recipe, margin, top, HEIGHT, WIDTH))
-    np.testing.assert_array_equal(apply_view(view_part(window, params, recipe, margin), params, recipe), alone)
+    window = decoded(source_window(params, recipe, top, HEIGHT, WIDTH, margin))
+    np.testing.assert_array_equal(apply_view(without_margin(window, params, recipe, margin), params, recipe), alone)
 
 
 def test_flow_t_belongs_to_voxel_t_behind_a_lead_voxel() -> None:
@@ -158,7 +158,7 @@ def test_what_does_not_fit_is_refused() -> None:
         flow_for(video(), camera_params(), RECIPE, FlowSettings(first_voxel=5))
     with pytest.raises(UsageError, match="this draw shows 9"):
         flow_for(video(8), camera_params(), RECIPE, FlowSettings())
-    with pytest.raises(UsageError, match=r"150x60 pixels.*flow_window"):
+    with pytest.raises(UsageError, match=r"150x60 pixels.*source_window"):
         flow_for(video()[:, :60], camera_params(), RECIPE, FlowSettings())
 
 

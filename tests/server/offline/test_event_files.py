@@ -72,16 +72,28 @@ def test_a_name_that_says_no_form_is_refused(tmp_path: Path) -> None:
         write_events(tmp_path / "nowhere" / "events.npz", EVENTS)
 
 
-def test_the_program_writes_the_events_of_its_sample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(("grids", "bin_us"), [(0, 40_000.0), (3, 40_000 / 15)])
+def test_the_program_writes_the_events_of_its_sample(
+    grids: int, bin_us: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     clip = write_clip(tmp_path / "gliding.mp4", panned_luma(40, 48, 64))
     sample, events = tmp_path / "sample.npz", tmp_path / "events.h5"
-    small = ["--set", "voxels_per_clip=3", "--set", "crop_height_px=32", "--set", "crop_width_px=40"]
+    small = [
+        "--set",
+        "voxels_per_clip=3",
+        "--set",
+        "crop_height_px=32",
+        "--set",
+        "crop_width_px=40",
+        "--set",
+        f"grids_per_frame={grids}",
+    ]
     line = [str(clip), "--out", str(sample), "--cache-dir", str(tmp_path), *small, "--events"]
     assert command.main([*line, str(events)]) == 0
     assert " events written to " in capsys.readouterr().out
     with np.load(sample) as arrays:
         voxels = arrays["voxels"]
     assert voxels.any()
-    np.testing.assert_array_equal(read(events).voxels(*voxels.shape[:2], 1e6 / 25, "int8"), voxels)
+    np.testing.assert_array_equal(read(events).voxels(*voxels.shape[:2], bin_us, "int8"), voxels)
     assert command.main([*line, str(tmp_path / "events.csv")]) == 2
     assert "ends in .h5" in capsys.readouterr().err

@@ -19,7 +19,7 @@ from v2v_protocol.errors import UsageError
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.kernels import ARRAYS, fill, list_events
 from v2v_server.simulation.result import Voxels
-from v2v_server.simulation.voxel import Levels, Moments, bin_edges, rounding_tolerance, timeline
+from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, bin_edges, rounding_tolerance, timeline
 
 FPS = 25.0
 ALL = {
@@ -85,13 +85,15 @@ def test_kernel_equals_the_oracle(data: Any, precision: str, grids: int) -> None
         precision=precision, frames_per_second=FPS, **effects,
     )  # fmt: skip
     at = Moments(np.array([0, 0, 2, 3, 3, 3]), np.array([0.25, 0.7, 1 / 3, 0.1, 0.5, 0.9]))
-    levels = Levels(at, random.uniform(-6.9, 0.0, (6, 4, 6)).astype(np.float32))
+    levels = Levels(at, random.integers(0, 255 * FINE_STEPS + 1, (6, 4, 6), np.uint16))
     found = again(made, *ARRAYS, levels=levels)
     events = list_events(dataclasses.replace(made.given, levels=levels), made.real, np.full(steps, 1e6 / FPS))
 
-    table_levels = np.log(1e-3 + (made.given.frames.reshape(steps + 1, pixels) / 255) ** 2.2)
+    table = np.log(1e-3 + (np.arange(256) / 255) ** 2.2)
+    table_levels = table[made.given.frames.reshape(steps + 1, pixels)]
+    between = np.interp(levels.grey.reshape(6, pixels) / FINE_STEPS, np.arange(256), table)
     times = np.r_[np.arange(steps + 1.0), at.step + at.share]
-    known = np.concatenate([table_levels, levels.log_intensity.reshape(6, pixels)])[np.argsort(times)]
+    known = np.concatenate([table_levels, between])[np.argsort(times)]
     times = np.sort(times)
     key = made.given.params.noise_key
     added = np.zeros((steps, pixels))
@@ -323,7 +325,7 @@ from tests.server.simulation.test_pixel import moving_frames
 from tests.server.simulation.test_times import ALL, FPS
 from v2v_server.simulation import simulate
 from v2v_server.simulation.kernels import ARRAYS, fill
-from v2v_server.simulation.voxel import Levels, Moments
+from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
 
 levels = Levels(Moments(np.array([0, 2]), np.array([0.25, 1 / 3])), np.linspace(-6, 0, 80, dtype="f4").reshape(2, 5, 8))
 digest = hashlib.sha256()

@@ -52,6 +52,7 @@ def test_usual_ones_suffice_for_the_presets() -> None:
 def test_effects_and_dtypes() -> None:
     assert variants(Recipe(), "float32") == {Variant("float32", False, "float32")}
     assert variants(preset("davis346"), "int16", 0.1) == {Variant("int16", True, "float32")}
+    assert variants(Recipe(), "int8", levels_per_step=15) == {Variant("int8", True, "float32", True)}
 
 
 @pytest.mark.parametrize("step_seconds", [1 / 240, 1.0, 60.0])

@@ -70,6 +70,22 @@ def test_a_lease_that_leads_out_of_the_corpus_opens_nothing(catalogue: Catalogue
         decode_for(dataclasses.replace(lease, video=video), lease.indices, catalogue.source)
 
 
+def test_sub_steps_do_not_depend_on_the_arrays_that_are_asked_for(catalogue: Catalogue, lease: Lease) -> None:
+    """They change the voxels of what moves, and flow with its larger margin changes nothing in them."""
+    plain = make_sample(lease, decode_for(lease, lease.indices, catalogue.source)[0]).arrays
+    spec = dataclasses.replace(SMALL_SPEC, substep_px=0.5)
+    divided = dataclasses.replace(lease, spec=spec.canonical(), spec_digest=spec.digest)
+    alone, beside_flow = (
+        make_sample(each, decode_for(each, each.indices, catalogue.source)[0]).arrays
+        for each in (divided, dataclasses.replace(divided, arrays=("voxels", "event_counts", "frames", "flow")))
+    )
+    np.testing.assert_array_equal(alone["frames"], plain["frames"])
+    np.testing.assert_array_equal(beside_flow["voxels"], alone["voxels"])
+    on_and_off = beside_flow["event_counts"].astype(int)
+    np.testing.assert_array_equal(on_and_off[:, 1] - on_and_off[:, 0], alone["voxels"])
+    assert not np.array_equal(alone["voxels"], plain["voxels"])
+
+
 class TestASecondAttempt:
     """What a file does, it does again; storage may fail for a moment."""
 

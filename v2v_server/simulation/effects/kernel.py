@@ -124,7 +124,7 @@ _OWN_ROWS = sum(effect.ROWS for effect in EFFECTS)
 
 @compiled
 def _simulate(
-    frames, between_frames, table, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
+    frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
     tolerance, drawn_start, start_residual, drifts_first, bins, limit, out, tables, state, words, floats,
 ):  # fmt: skip
     """Run the kernel in memory of the caller, so that views of arrays need no reference counting."""
@@ -180,7 +180,7 @@ def _simulate(
                     look_up(table, frames[level, first:last], coming, levels[known])
                 else:
                     for i in range(last - first):
-                        levels[known, i] = between_frames[-1 - level, first + i]
+                        levels[known, i] = fine[between_frames[-1 - level, first + i]]
             if segments.reached[each] >= 1:
                 now = known
             elif known_before != known:
@@ -245,60 +245,83 @@ def _simulate(
 def _time(segments, each, block, old, first, last, bins, folds, out):
     """Give every event of a segment its time: list it, and share it between the two bins next to it.
 
-    Events that no change of intensity caused (shot noise) come at random times.
+    Crossings of one pixel come at equal distances, so their shares are summed in closed form, in float64. Events that
+    no change of intensity caused (shot noise) come at random times.
 
     Args:
         old: [block] real, the residual at the start of the segment.
         folds: of the noise's words for these times.
     """
-    zero = block.tolerance - block.tolerance
-    one = zero + np.float32(1)
+    start, length = np.float64(segments.start[each]), np.float64(segments.length[each])
     row = segments.bin[each] // bins * bins
     for i in range(last - first):
         for is_rising in range(2):
             events = int(block.rises[i] if is_rising else block.falls[i])
             if events == 0:
                 continue
-            signed = block.signed[i] if is_rising else zero - block.signed[i]
-            threshold = block.positive[i] if is_rising else block.negative[i]
-            begun = old[i] if is_rising else zero - old[i]
-            speed = abs(block.change[i])
-            for k in range(events):
-                if k >= signed:
-                    drawn = word((word(folds, first + i), np.uint32(each)), np.uint32(2 * k + is_rising))
-                    passed = zero + np.float32(np.int32(drawn >> np.uint32(8))) * _UNIT
-                elif speed > zero:
-                    passed = block.waited[i] + k * block.blind[i] + ((k + 1) * threshold - begun) / speed
-                    # An event may be due a rounding before or after the segment.
-                    passed = min(max(passed, zero), one)
-                else:
-                    passed = zero
-                sign = 2 * is_rising - 1
+            sign = 2 * is_rising - 1
+            crossings = min(events, max(sign * int(block.signed[i]), 0))
+            threshold = np.float64(block.positive[i] if is_rising else block.negative[i])
+            speed = abs(np.float64(block.change[i]))
+            passed, apart = 0.0, 0.0
+            if speed > 0.0:
+                apart = block.blind[i] + threshold / speed
+                # An event may be due a rounding before or after the segment.
+                passed = min(max(block.waited[i] + (threshold - sign * np.float64(old[i])) / speed, 0.0), 1.0)
+                apart = min(apart, (1.0 - passed) / max(crossings - 1, 1))
+            if len(out.bilinear) > 0:
+                _share(out.bilinear, row, first + i, bins, start + length * passed, length * apart, crossings, sign)
+            if out.is_listing:
+                for k in range(crossings):
+                    _list(out, first + i, each, sign, passed + k * apart)
+            for k in range(crossings, events):
+                drawn = word((word(folds, first + i), np.uint32(each)), np.uint32(2 * k + is_rising))
+                passed = np.float64(np.int64(drawn)) * 2.0**-32
                 if len(out.bilinear) > 0:
-                    place = segments.start[each] + segments.length[each] * passed
-                    lower = min(int(place), bins - 1)
-                    upper = np.float32(place - lower)
-                    out.bilinear[row + lower, first + i] += sign * (np.float32(1) - upper)
-                    if lower + 1 < bins:
-                        out.bilinear[row + lower + 1, first + i] += sign * upper
+                    _share(out.bilinear, row, first + i, bins, start + length * passed, 0.0, 1, sign)
                 if out.is_listing:
-                    listed = out.tally[2]
-                    if listed < len(out.passed):
-                        out.event[0, listed], out.event[1, listed], out.event[2, listed] = first + i, each, sign
-                        out.passed[listed] = passed
-                    out.tally[2] += 1
+                    _list(out, first + i, each, sign, passed)
+
+
+@hook
+def _share(bilinear, row, pixel, bins, place, apart, count, sign):
+    """Share events at ``place``, ``place + apart`` ... between the bins beside each; they span less than a bin."""
+    lower = min(int(place), bins - 1)
+    below = count
+    if place + (count - 1) * apart >= lower + 1:
+        below = min(int(np.ceil((lower + 1 - place) / apart)), count)
+    for _ in range(2):
+        upper = below * (place - lower) + apart * 0.5 * below * (below - 1)
+        bilinear[row + lower, pixel] += np.float32(sign * (below - upper))
+        if lower + 1 < bins:
+            bilinear[row + lower + 1, pixel] += np.float32(sign * upper)
+        place, count, lower = place + below * apart, count - below, lower + 1
+        below = count
+        if count == 0:
+            break
+
+
+@hook
+def _list(out, pixel, segment, sign, passed):
+    """List one event, if there is room; count it."""
+    place = out.tally[2]
+    if place < len(out.passed):
+        out.event[0, place], out.event[1, place], out.event[2, place] = pixel, segment, sign
+        out.passed[place] = passed
+    out.tally[2] += 1
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def simulate_general(
-    frames, between_frames, table, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg, tolerance,
-    drawn_start, start_residual, drifts_first, bins, limit, out, tables,
+    frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
+    tolerance, drawn_start, start_residual, drifts_first, bins, limit, out, tables,
 ):  # fmt: skip
     """Simulate every pixel of a clip.
 
     Args:
         frames: [n, pixels] uint8 grey levels, or real log intensities; C-contiguous. Row 0 is the clip's first frame.
-        between_frames: [K, pixels] float32, intermediate levels of log intensity.
+        between_frames: [K, pixels] uint16, intermediate levels: grey, in 1/FINE_STEPS.
+        fine: [255 FINE_STEPS + 1] real, their log intensity (``intensity.fine_table``).
         table, key, hot_position, hot_drift, limit: as in ``pixel.simulate_pixels``.
         segments: what is simulated, and when.
         threshold_pos, threshold_neg, tolerance: real, log units (``voxel.py``).
@@ -312,6 +335,6 @@ def simulate_general(
     words = aligned_rows(6, PITCH, np.uint32)
     floats = aligned_rows(6, PITCH, np.float32)
     _simulate(
-        frames, between_frames, table, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
+        frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
         tolerance, drawn_start, start_residual, drifts_first, bins, limit, out, tables, state, words, floats,
     )  # fmt: skip

@@ -1,0 +1,121 @@
+"""The levels between the frames of a clip: which steps are divided, into how many parts.
+
+A step has n sub-steps if the longest motion of its cells, apart from the fastest tenth, is n - 1 to n times
+``substep_px``; at most MOST_SUBSTEPS. A cell that moves by less than half of ``substep_px`` counts as still: its light
+changes evenly. A step in which less than 1/256 of the cells move is not divided.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import SampleParams
+from v2v_protocol.spec import MOST_SUBSTEPS
+from v2v_server.motion.lanes import CELL_PX
+from v2v_server.motion.matching import UNITS_PER_PX, Vectors, motion, pyramid
+from v2v_server.motion.warping import between
+from v2v_server.simulation.draw import resized_size
+from v2v_server.simulation.view import Frames, contrast_table, crop_place, crop_region, resized
+from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
+
+MARGIN_PX = 16
+"""Margin around the crop that motion is estimated on and warped from."""
+_LEAST_SHARE = 1 / 256
+_FASTEST_SHARE = 0.1
+
+
+def levels_of(
+    frames: Frames, params: SampleParams, recipe: Recipe, source_index: npt.NDArray[np.int64], substep_px: float
+) -> Levels | None:
+    """Return the levels between the frames of a sample, as its camera sees them.
+
+    Memory: at most (MOST_SUBSTEPS - 1) x steps x crop x 2 bytes, 94 MiB for 200 steps of 128 x 128 px.
+
+    Args:
+        frames: [n, h, w] uint8, the ``source_window`` of the view with MARGIN_PX.
+        params, recipe: the draw and its recipe.
+        source_index: [steps + 1], which frame each position of the clip shows.
+        substep_px: longest motion of a sub-step, above 0.
+
+    Returns:
+        the levels, for ``simulate_clip``; None if no step is divided.
+    """
+    top, left = crop_place(params, MARGIN_PX)
+    if params.scale != 1.0:
+        size = resized_size(frames.shape[1], frames.shape[2], params.scale)
+        row, column, height, width = crop_region(params, recipe, *size, MARGIN_PX)
+        frames = np.stack(
+            [resized(frame, size, params.scale)[row : row + height, column : column + width] for frame in frames]
+        )
+    part = top, left, recipe.crop_height_px, recipe.crop_width_px
+    levels = levels_between(frames, part, source_index, substep_px)
+    if levels is None:
+        return None
+    grey = levels.grey[:, :, ::-1] if params.flip else levels.grey
+    if params.contrast != 0.0:
+        grey = contrast_table(params.contrast, FINE_STEPS)[grey]
+    return Levels(levels.at, np.ascontiguousarray(grey))
+
+
+def levels_between(
+    pictures: Frames, part: tuple[int, int, int, int], source_index: npt.NDArray[np.int64], substep_px: float
+) -> Levels | None:
+    """Return the levels between pictures.
+
+    Args:
+        pictures: [n, h, w] uint8.
+        part: top, left, height and width of the part of them that is wanted.
+        source_index: [steps + 1], never decreasing, which picture each position of the clip shows.
+        substep_px: longest motion of a sub-step, above 0.
+
+    Returns:
+        the levels; None if no step is divided.
+    """
+    top, left, height, width = part
+    if min(height, width) < CELL_PX:
+        return None
+    shortest = math.ceil(substep_px * UNITS_PER_PX / 2)
+    steps, vectors, counts = [], [], []
+    later, pyramids = -1, [pyramid(np.ascontiguousarray(pictures[source_index[0]]))]
+    for step, (before, after) in enumerate(pairwise(source_index.tolist())):
+        if before == after:
+            continue
+        if later != before and later >= 0:
+            pyramids = [pyramid(np.ascontiguousarray(pictures[before]))]
+        pyramids, later = [*pyramids[-1:], pyramid(np.ascontiguousarray(pictures[after]))], after
+        found = motion(pyramids[0], pyramids[1], shortest)
+        if (count := substeps(found, substep_px)) > 1:
+            steps.append((step, pyramids[0][0], pyramids[1][0]))
+            vectors.append(found)
+            counts.append(count - 1)
+    if not steps:
+        return None
+    grey = np.empty((sum(counts), height, width), np.uint16)
+    first = 0
+    for (_, one, other), found, count in zip(steps, vectors, counts, strict=True):
+        between(one, other, found, top, left, grey[first : first + count])
+        first += count
+    at = np.repeat([step for step, _, _ in steps], counts)
+    share = np.concatenate([np.arange(1, count + 1) / (count + 1) for count in counts])
+    return Levels(Moments(at, share), grey)
+
+
+def substeps(vectors: Vectors, substep_px: float) -> int:
+    """Return the number of sub-steps of a step with this motion: 1 .. MOST_SUBSTEPS."""
+    squares = (vectors.astype(np.int64) ** 2).sum(axis=0)
+    moving = np.sort(squares[squares > 0])
+    if len(moving) < _LEAST_SHARE * squares.size or not len(moving):
+        return 1
+    longest = math.sqrt(int(moving[int(len(moving) * (1 - _FASTEST_SHARE))])) / UNITS_PER_PX
+    return min(1 + int(longest / substep_px), MOST_SUBSTEPS)
+
+
+def load() -> None:
+    """Load this folder's kernels from numba's cache, or compile them."""
+    first = (np.arange(32 * 32) * 37 % 251).astype(np.uint8).reshape(32, 32)
+    levels_between(np.stack([first, np.roll(first, 3, 1)]), (0, 0, 32, 32), np.arange(2), 1.0)

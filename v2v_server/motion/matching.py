@@ -1,0 +1,251 @@
+"""Block motion between two pictures, in integer arithmetic: the same vectors on every host.
+
+A vector belongs to a cell of CELL_PX x CELL_PX px and to the moment halfway between the pictures: what the cell shows
+then is half the vector back in the first picture and half the vector ahead in the second one. So one search gives the
+motion at every pixel between the pictures, those that a moving thing uncovers included.
+
+Vectors are searched from coarse to fine on a pyramid of rounded means of four. At each level, the block of
+BLOCK_PX x BLOCK_PX px around a cell tries zero and the vectors that the coarser level found for its cell and the four
+neighbours; then the places around the best. It minimises
+
+    sum of absolute differences + COST_PER_PX (|dx - px| + |dy - py|)        (px, py): the coarser level's vector
+
+with half of the vector, rounded, on each side. The field is smoothed by the median of nine. At the finest level, the
+minimum of the V through three sums gives 1/UNITS_PER_PX px (equiangular fit). Before the search, the second picture is
+scaled to the mean of the first, so that a lamp that flickers does not look like motion.
+
+A picture that changes by no more than a coder's noise has no motion. A vector is zero where the evidence is for rest:
+it is shorter than the caller's limit, or a shift of less than half a pixel would explain the block as well. Along an
+edge, whole pixels often imitate such a shift.
+"""
+
+# mypy: allow-untyped-defs, allow-untyped-calls
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from v2v_server.motion.lanes import BLOCK_PX, CELL_PX, block_difference
+
+Picture = npt.NDArray[np.uint8]
+Vectors = npt.NDArray[np.int16]
+"""[2, ceil(h / CELL_PX), ceil(w / CELL_PX)] int16: x (right) and y (down), in 1/UNITS_PER_PX px."""
+
+UNITS_PER_PX = 16
+PAD_PX = 16
+"""Border of a level: its edge repeated."""
+COST_PER_PX = 4
+_LEVELS = 4
+_STILL_LEVEL = 2  # means of 4 x 4 px
+_TOP_RADIUS_PX = 3
+_SMALLEST_SIDE_PX = 16
+_AROUND_PX = (BLOCK_PX - CELL_PX) // 2
+_LARGEST_SHIFT = 1 << 14
+compiled: Any = numba.njit(nogil=True, cache=True, error_model="numpy")
+"""Decorator of this folder's compiled functions."""
+
+
+def motion(first: list[Picture], second: list[Picture], shortest: int) -> Vectors:
+    """Return the motion between two pictures, given by their :func:`pyramid`.
+
+    Args:
+        first, second: of pictures of one size.
+        shortest: length, in 1/UNITS_PER_PX px, below which a vector becomes zero.
+    """
+    if _is_still(first, second):
+        height, width = (side - 2 * PAD_PX for side in first[0].shape)
+        return np.zeros((2, -(-height // CELL_PX), -(-width // CELL_PX)), np.int16)
+    second, found = _scaled(first, second), np.zeros((2, 1, 1), np.int16)
+    for level in reversed(range(len(first))):
+        radius = _TOP_RADIUS_PX if level == len(first) - 1 else 1
+        found = _median(_search(first[level], second[level], found, radius))
+    _refine(first[0], second[0], found, shortest * shortest)
+    return found
+
+
+def pyramid(picture: Picture) -> list[Picture]:
+    """Return the padded levels of a [h, w] uint8 picture, the finest first."""
+    levels = [padded(picture)]
+    while len(levels) < _LEVELS and min(picture.shape) >= 2 * _SMALLEST_SIDE_PX:
+        picture = _halved(picture)
+        levels.append(padded(picture))
+    return levels
+
+
+def _is_still(first: list[Picture], second: list[Picture]) -> bool:
+    """Return whether no mean of a cell changes by more than a grey level: then only a coder's noise does."""
+    one, other = (levels[min(_STILL_LEVEL, len(levels) - 1)].astype(np.int16) for levels in (first, second))
+    return int(np.abs(one - other).max()) <= 1
+
+
+def _scaled(first: list[Picture], second: list[Picture]) -> list[Picture]:
+    """Return the second pyramid with the brightness of the first."""
+    within = slice(PAD_PX, -PAD_PX)
+    mine, other = (int(levels[-1][within, within].sum(dtype=np.int64)) for levels in (first, second))
+    if other == 0 or abs(mine - other) * 64 < other:
+        return second
+    grey = np.minimum((2 * np.arange(256) * mine + other) // (2 * other), 255).astype(np.uint8)
+    return [grey[level] for level in second]
+
+
+@compiled
+def padded(picture):
+    """Return a picture with PAD_PX more on each side."""
+    height, width = picture.shape
+    larger = np.empty((height + 2 * PAD_PX, width + 2 * PAD_PX), np.uint8)
+    for row in range(height):
+        line = larger[row + PAD_PX]
+        line[PAD_PX : PAD_PX + width] = picture[row]
+        line[:PAD_PX] = picture[row, 0]
+        line[PAD_PX + width :] = picture[row, width - 1]
+    for row in range(PAD_PX):
+        larger[row] = larger[PAD_PX]
+        larger[PAD_PX + height + row] = larger[PAD_PX + height - 1]
+    return larger
+
+
+@compiled
+def _halved(picture):
+    height, width = picture.shape[0] // 2, picture.shape[1] // 2
+    half = np.empty((height, width), np.uint8)
+    for y in range(height):
+        above, below = picture[2 * y], picture[2 * y + 1]
+        for x in range(width):
+            total = np.uint16(above[2 * x]) + np.uint16(above[2 * x + 1])
+            total += np.uint16(below[2 * x]) + np.uint16(below[2 * x + 1])
+            half[y, x] = np.uint8((total + 2) >> 2)
+    return half
+
+
+@numba.njit(nogil=True, inline="always")
+def _fits(place, ahead, most):
+    back = ahead >> 1
+    return 0 <= place - back <= most and 0 <= place + (ahead - back) <= most
+
+
+@compiled
+def _search(first, second, coarser, radius):
+    pitch = first.shape[1]
+    lowest, rightmost = first.shape[0] - BLOCK_PX, first.shape[1] - BLOCK_PX
+    a, b = first.ravel(), second.ravel()
+    rows = (first.shape[0] - 2 * PAD_PX + CELL_PX - 1) // CELL_PX
+    columns = (first.shape[1] - 2 * PAD_PX + CELL_PX - 1) // CELL_PX
+    found = np.empty((2, rows, columns), np.int16)
+    last_row, last_column = coarser.shape[1] - 1, coarser.shape[2] - 1
+    for row in range(rows):
+        for column in range(columns):
+            top, left = PAD_PX + CELL_PX * row - _AROUND_PX, PAD_PX + CELL_PX * column - _AROUND_PX
+            parent_row, parent_column = min(row // 2, last_row), min(column // 2, last_column)
+            expected_x = 2 * np.int64(coarser[0, parent_row, parent_column])
+            expected_y = 2 * np.int64(coarser[1, parent_row, parent_column])
+            x, y = np.int64(0), np.int64(0)
+            at = top * pitch + left
+            best = block_difference(a, at, b, at, pitch) + COST_PER_PX * (abs(expected_x) + abs(expected_y))
+            for candidate in range(5 + (2 * radius + 1) ** 2):
+                if candidate < 5:
+                    r = min(max(parent_row + (candidate == 1) - (candidate == 2), 0), last_row)
+                    c = min(max(parent_column + (candidate == 3) - (candidate == 4), 0), last_column)
+                    dx, dy = 2 * np.int64(coarser[0, r, c]), 2 * np.int64(coarser[1, r, c])
+                    if dx == x and dy == y:
+                        continue
+                else:
+                    if candidate == 5:
+                        middle_x, middle_y = x, y
+                    dx = middle_x + (candidate - 5) % (2 * radius + 1) - radius
+                    dy = middle_y + (candidate - 5) // (2 * radius + 1) - radius
+                    if dx == middle_x and dy == middle_y:
+                        continue
+                if _fits(top, dy, lowest) and _fits(left, dx, rightmost):
+                    back = (dy >> 1) * pitch + (dx >> 1)
+                    cost = block_difference(a, at - back, b, at + dy * pitch + dx - back, pitch)
+                    cost += COST_PER_PX * (abs(dx - expected_x) + abs(dy - expected_y))
+                    if cost < best:
+                        best, x, y = cost, dx, dy
+            found[0, row, column], found[1, row, column] = x, y
+    return found
+
+
+@numba.njit(nogil=True, inline="always")
+def _ordered(a, b, c):
+    low, high = min(a, b), max(a, b)
+    middle = max(low, min(high, c))
+    return min(low, c), middle, max(high, c)
+
+
+@compiled
+def _median(found):
+    """Return the median of each value and its eight neighbours; the edge is repeated."""
+    rows, columns = found.shape[1], found.shape[2]
+    smooth = np.empty_like(found)
+    lines = np.empty((3, columns + 2), np.int16)
+    for axis in range(2):
+        for row in range(rows):
+            for near in range(3):
+                values = found[axis, min(max(row + near - 1, 0), rows - 1)]
+                lines[near, 1 : columns + 1] = values
+                lines[near, 0], lines[near, columns + 1] = values[0], values[columns - 1]
+            above, here, below, into = lines[0], lines[1], lines[2], smooth[axis, row]
+            for c in range(columns):
+                low0, mid0, high0 = _ordered(above[c], here[c], below[c])
+                low1, mid1, high1 = _ordered(above[c + 1], here[c + 1], below[c + 1])
+                low2, mid2, high2 = _ordered(above[c + 2], here[c + 2], below[c + 2])
+                _, middle, _ = _ordered(mid0, mid1, mid2)
+                _, into[c], _ = _ordered(max(low0, low1, low2), middle, min(high0, high1, high2))
+    return smooth
+
+
+@compiled
+def _refine(first, second, found, shortest_squared):
+    """Make vectors of whole pixels finer, and those without evidence zero."""
+    pitch = first.shape[1]
+    lowest, rightmost = first.shape[0] - BLOCK_PX, first.shape[1] - BLOCK_PX
+    a, b = first.ravel(), second.ravel()
+    for row in range(found.shape[1]):
+        for column in range(found.shape[2]):
+            top, left = PAD_PX + CELL_PX * row - _AROUND_PX, PAD_PX + CELL_PX * column - _AROUND_PX
+            dx, dy = np.int64(found[0, row, column]), np.int64(found[1, row, column])
+            found[0, row, column], found[1, row, column] = 0, 0
+            if (dx == 0 and dy == 0) or abs(dx) + abs(dy) >= _LARGEST_SHIFT // UNITS_PER_PX:
+                continue
+            at = top * pitch + left
+            _, _, rest = _fit(a, at, b, at, pitch)
+            back = (dy >> 1) * pitch + (dx >> 1)
+            inside = (
+                _fits(top, dy - 1, lowest) and _fits(top, dy + 1, lowest)
+                and _fits(left, dx - 1, rightmost) and _fits(left, dx + 1, rightmost)
+            )  # fmt: skip
+            if not inside:
+                continue
+            difference = block_difference(a, at - back, b, at + dy * pitch + dx - back, pitch)
+            if 4 * difference >= rest:
+                continue
+            x, y, _ = _fit(a, at - back, b, at + dy * pitch + dx - back, pitch)
+            x, y = UNITS_PER_PX * dx + x, UNITS_PER_PX * dy + y
+            if x * x + y * y >= shortest_squared:
+                found[0, row, column], found[1, row, column] = x, y
+
+
+@numba.njit(nogil=True, inline="always")
+def _fit(a, at, b, to, pitch):
+    """Return the minimum about a place, x and y in 1/UNITS_PER_PX px, and four times the sum that is expected there."""
+    here = block_difference(a, at, b, to, pitch)
+    x, gain_x = _lowest(block_difference(a, at, b, to - 1, pitch), here, block_difference(a, at, b, to + 1, pitch))
+    y, gain_y = _lowest(
+        block_difference(a, at, b, to - pitch, pitch), here, block_difference(a, at, b, to + pitch, pitch)
+    )
+    return x, y, max(4 * here - gain_x - gain_y, 0)
+
+
+@numba.njit(nogil=True, inline="always")
+def _lowest(before, here, after):
+    """Return the place of the minimum of a V through three sums, at most half a step away, and four times its gain."""
+    apart = abs(before - after)
+    steepest = 2 * (max(before, after) - here)
+    if steepest <= 0:
+        return np.int64(0), np.int64(0)
+    offset = np.int64(UNITS_PER_PX * (before - after) // steepest)
+    half = np.int64(UNITS_PER_PX // 2)
+    return min(max(offset, -half), half), 2 * apart if here <= min(before, after) else apart
