@@ -155,7 +155,7 @@ class Catalogue:
         return self._slices[key]
 
     def _keep_long(self, id: str, index: FrameIndex) -> FrameIndex:
-        """Keep a few large indexes decoded: to decode that of a day takes a tenth of a second of the loop."""
+        """Keep a few large indexes decoded: decoding that of a day-long video blocks the loop for 0.1 s."""
         while self._long and len(index) + sum(map(len, self._long.values())) > _KEPT_LONG_FRAMES:
             del self._long[next(iter(self._long))]
         self._long[id] = index

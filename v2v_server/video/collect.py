@@ -112,7 +112,7 @@ class Stack:
         return False
 
     def _is_passed_over(self, pts: int) -> bool:
-        """Whether a frame that presents before the next one to take is one that the stride leaves out."""
+        """Whether a frame before the next one to take is one that the stride skips."""
         return self._stride > 1 and pts in self._pts
 
     def _copy(self, frame: VideoFrame) -> None:

@@ -36,7 +36,7 @@ class VideoFacts:
     """What a video file holds.
 
     Attributes:
-        frames: how many frames there are to decode; the container's own count is not believed.
+        frames: number of decodable frames; the container's own count is ignored.
         height_px, width_px: size of the upright picture.
         codec: FFmpeg's name of the format ("h264", "vp9"), whichever decoder is used.
         pixel_format: FFmpeg's name of the decoded format ("yuv420p10le").

@@ -122,7 +122,7 @@ def open_sidecar(source: VideoSource, id: str, fingerprint: str) -> Iterator[Tra
 
 
 def _files(opened: Traversable, name: str = "") -> list[tuple[str, Traversable]]:
-    """Return the files below a folder with their paths, sorted; a file alone has the path ""."""
+    """Return the files below a folder, sorted, with their relative paths; a single file has the path ""."""
     if not opened.is_dir():
         return [(name, opened)]
     entries = sorted(opened.iterdir(), key=lambda entry: entry.name)
