@@ -44,7 +44,7 @@ from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_server.motion import levels_between
-from v2v_server.motion.prediction import SUBSTEP_PX, Loss, predict
+from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, predict
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.voxel import FINE_STEPS, Levels
@@ -82,7 +82,7 @@ _PREDICTED: tuple[Column, ...] = (
     ("frames_per_second", "frames/s", "{:g}", 1),
     ("predicted_px_per_frame", "found", "{:.1f}", 1),
     ("explained", "explained", "{:.0%}", 1),
-    *((f"{key}_{name}", f"{key}{title}", "{}", 1) for name, title in SETTINGS for key in Loss._fields),
+    *((f"{key}_{name}", f"{key}{title}", "{}", 1) for name, title in SETTINGS for key in PredictedErrors._fields),
 )
 _COSTS: tuple[Column, ...] = (
     ("px_per_frame", "px a frame", "{:g}", 1),
@@ -131,7 +131,7 @@ def side_by_side(record: Mapping[str, Any]) -> dict[str, Any]:
     return {**record} | {
         f"{key}_{name}": f"{100 * record[f'predicted_{key}_{name}']:.0f} / {100 * measured_loss(record, key, name):.0f}"
         for name, _ in SETTINGS
-        for key in Loss._fields
+        for key in PredictedErrors._fields
     }
 
 
@@ -147,7 +147,7 @@ def fits(records: Records) -> Iterator[str]:
     for which, some in (("fitted", fitted), ("held out", [record for record in framed if record not in fitted])):
         for name, _ in SETTINGS:
             texts = []
-            for key in Loss._fields:
+            for key in PredictedErrors._fields:
                 true = [measured_loss(record, key, name) for record in some]
                 wrong = np.subtract(true, [record[f"predicted_{key}_{name}"] for record in some])
                 texts.append(f"{key} {100 * np.sqrt(np.mean(wrong**2)):.1f} (most {100 * np.abs(wrong).max():.0f})")

@@ -6,8 +6,8 @@ The true errors, without and with sub-steps, are linear in these *apparent* erro
 counts; the frame rate has no influence beyond it.
 
 A prediction holds where the motion can be followed. As a check, each frame is predicted along the motion from its two
-neighbours. Where that is hardly better than their mean, as with vibration and flicker, sub-steps restore little. What
-motion blur took from the frames is not counted.
+neighbours. Where that is hardly better than their mean, as with vibration and flicker, sub-steps restore little. Motion
+blur hides losses from the prediction.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _LEAST_EXPLAINED = 0.25
 _SLIGHT_LOSS = 0.05
 
 
-class Loss(NamedTuple):
+class PredictedErrors(NamedTuple):
     """Shares of the events: lost, of signed bins that are wrong, of bins of both polarities that are wrong."""
 
     lost: float
@@ -54,7 +54,7 @@ FITS = {
     "linear": (Fit(0.026, 1.088), Fit(0.085, 0.411), Fit(0.094, 0.922)),
     "divided": (Fit(0.020, 0.220), Fit(0.088, -0.279), Fit(0.104, 0.130)),
 }
-"""By setting, in the order of Loss: moving photographs, as printed by ``python -m bench substeps``."""
+"""By setting, in the order of PredictedErrors: moving photographs, as printed by ``python -m bench substeps``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,10 +93,10 @@ class Prediction:
         return max(0.0, 1.0 - self.along_apart / self.mean_apart) if self.mean_apart else 0.0
 
     @property
-    def apparent(self) -> Loss:
+    def apparent(self) -> PredictedErrors:
         """Return the errors of the frames alone if the levels along the motion were true."""
         events, net = max(self.divided, 1.0), max(self.net, 1.0)
-        return Loss(
+        return PredictedErrors(
             1.0 - self.linear / events if self.divided else 0.0, self.signed_apart / net, self.split_apart / events
         )
 
@@ -110,14 +110,14 @@ class Prediction:
         """Return whether the motion explains the change of the picture, so that the predicted errors hold."""
         return self.explained >= _LEAST_EXPLAINED
 
-    def errors(self, setting: str) -> Loss:
+    def errors(self, setting: str) -> PredictedErrors:
         """Return the predicted errors in bins of a frame.
 
         Args:
             setting: "linear", without sub-steps, or "divided", with sub-steps of SUBSTEP_PX.
         """
         found = zip(FITS[setting], self.apparent, strict=True)
-        return Loss(*(min(max(fit.start + fit.slope * share, 0.0), 1.0) for fit, share in found))
+        return PredictedErrors(*(min(max(fit.start + fit.slope * share, 0.0), 1.0) for fit, share in found))
 
 
 def predict(pictures: Frames) -> Prediction:

@@ -95,7 +95,7 @@ def describe_loss(found: Prediction) -> str:
     return (
         f"fast motion: {found.px_per_frame:.2g} px a frame at the median of what moves; about {off} % of the events "
         f"are lost within steps, {on} % with substep_px = {SUBSTEP_PX:g} "
-        "(prediction, without what motion blur took from the frames)"
+        "(prediction; motion blur hides further losses)"
     )
 
 
