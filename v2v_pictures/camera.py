@@ -151,7 +151,7 @@ class Camera:
         return max(0.0, 1.0 - quiet / events) if events else 0.0
 
     def warning(self, grids: Sequence[int]) -> str:
-        """Say why most of what these voxel grids show is no motion; "" where motion makes most events."""
+        """Return a warning with the reason if most events come from something other than motion, else ""."""
         share = self.noise_share(grids)
         if self.quiet is None or share is None:
             return ""

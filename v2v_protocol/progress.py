@@ -77,7 +77,7 @@ class Progress:
             self._show(now, what or self._what, self._text(done, total, note, now), done, total)
 
     def notice(self, text: str) -> None:
-        """Show a step of the task of which the amount is not known."""
+        """Show a step whose total is not known."""
         if (now := self._clock()) >= self._due:
             self._show(now, text, "", 0.0, None)
 

@@ -53,7 +53,7 @@ TIME_UNITS = ("Hz", "s")
 """An effect in one of these needs the time between frames."""
 _LARGEST_FRAMES = 1_000_001
 SMALLEST_THRESHOLD_SHARE = 0.25
-"""No pixel's threshold lies below this share of the nominal one, however large the mismatch."""
+"""Lower limit of a pixel's threshold under mismatch, as a share of the nominal threshold."""
 LARGEST_NORMAL = 6.56
 """No noise deviates by more standard deviations (``v2v_server.simulation.noise``)."""
 LATER_FIELDS = ("grids_per_frame",)

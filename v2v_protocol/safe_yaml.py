@@ -117,7 +117,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _whole_or_text(loader: _Loader, node: yaml.ScalarNode) -> Any:
-    """Construct a whole number, or text. 8:32 is text here, not 512 as a number of base 60 in YAML 1.1."""
+    """Construct an integer, or text. 8:32 stays text; YAML 1.1 would read the base-60 number 512."""
     return loader.construct_scalar(node) if ":" in node.value else loader.construct_yaml_int(node)
 
 

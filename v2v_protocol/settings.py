@@ -73,7 +73,7 @@ class Setting:
 
     @property
     def single(self) -> Setting:
-        """For a range: the setting of one number drawn from it."""
+        """Setting of one number drawn from this range."""
         return dataclasses.replace(self, kind="number")
 
     def check(self, name: str, value: object, error: type[UsageError] = UsageError) -> Any:

@@ -67,12 +67,6 @@ class StreamSpec:
         "float32 is exact up to 2**24 events a bin",
         group="Stream",
     )  # fmt: skip
-    substep_px: float = number(
-        0.0, 0.0, 64.0,
-        "longest motion that a pixel model sees as one step: a step in which the picture moves further is divided, at "
-        f"most {MOST_SUBSTEPS} times, by pictures made along the motion; 0: light changes evenly between two frames",
-        unit="px",
-    )  # fmt: skip
     shuffle: bool = switch(True, "use another random order in every epoch; false keeps the catalogue's order")
     max_sequences_per_video: int = whole(10, 1, 1_000_000, "largest number of sequences from one video in an epoch")
     on_bad_video: OnBadVideo = word(
@@ -110,6 +104,13 @@ class StreamSpec:
         "auto decodes all videos once, leaves out sequences with a shot boundary or with nothing to see, and skips "
         "flow where nothing moves (if flow_method is auto)",
         group="Scene",
+    )  # fmt: skip
+    substep_px: float = number(
+        0.0, 0.0, 64.0,
+        "longest motion that a pixel model sees as one step: a step in which the picture moves further is divided, at "
+        f"most {MOST_SUBSTEPS} times, by pictures made along the motion; 0: light changes evenly between two frames",
+        unit="px",
+        group="Motion",
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -189,7 +190,6 @@ class SpecOptions(TypedDict, total=False):
 
     preset: SpeedPreset | None
     voxel_dtype: VoxelDtype | None
-    substep_px: float | None
     shuffle: bool | None
     max_sequences_per_video: int | None
     on_bad_video: OnBadVideo | None
@@ -200,6 +200,7 @@ class SpecOptions(TypedDict, total=False):
     flow_from: int | None
     flow_margin_px: int | None
     scene: SceneChoice | None
+    substep_px: float | None
 
 
 SPEC_KEYS = ("preset", "recipe", *settings_of(StreamSpec))

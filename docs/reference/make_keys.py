@@ -56,6 +56,7 @@ _SHORTER = {
     "a whole number": "integer",
     "one number, or a pair [lowest, highest], from ": "number or range, ",
     "a number from ": "number, ",
+    "true or false": "bool",
 }
 
 

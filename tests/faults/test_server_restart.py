@@ -87,7 +87,7 @@ def test_a_server_restarted_over_other_videos_is_refused_naming_both(clips: Path
             with LocalServer(videos, workers=1, flags=same_address(address)):
                 after = _catalogue(address)
                 assert before != after
-                expected = rf"catalogue_digest: this dataset has {before}, {address} has {after}; serve the folder"
+                expected = rf"catalogue_digest: this dataset has {before}, {address} has {after}; serve the same folder"
                 with pytest.raises(StateMismatch, match=expected):
                     client.result()
 

@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     out.add_argument(
         "--out", required=True, metavar="PATH", help="folder for the new files, or (one SRC) a file ending in .h5"
     )
-    recordings.add_argument("--form", choices=tuple(FORMS), help="form of the recordings (default: recognised)")
+    recordings.add_argument("--form", choices=tuple(FORMS), help="form of the recordings (default: detected)")
     recordings.add_argument("--size", metavar="WxH", help="size of the sensor in px, if a recording does not state it")
     recordings.add_argument(
         "--time-unit", choices=tuple(NS_PER_UNIT),

@@ -109,7 +109,7 @@ def _parser() -> Parser:
     )
     how.add_argument("--size", metavar="WxH", help="size of the sensor in px, for recordings without pictures")
     how.add_argument("--device", metavar="D", help="PyTorch device (default: cuda if available, else cpu)")
-    out.add_argument("--out", metavar="DIR", help="folder for a picture of each sequence")
+    out.add_argument("--out", metavar="DIR", help="folder to write a picture of each sequence to")
     out.add_argument("--rows", type=int, default=6, metavar="N", help="rows of each picture (default 6)")
     out.add_argument("--video", action="store_true", help="also write a video of each sequence to --out")
     out.add_argument("--json", metavar="FILE", help="also write the scores as flat records to this file")

@@ -147,8 +147,8 @@ class Recording:
         for name, column in columns.items():
             if column.ndim != 1 or (name in ("xs", "ys") and column.dtype.kind not in "iu"):
                 raise UsageError(
-                    f"{self.path}: events/{name} is {column.dtype} {list(column.shape)}, not a column [N], which for "
-                    "coordinates is of integers"
+                    f"{self.path}: events/{name} is {column.dtype} {list(column.shape)}, not a column [N]; "
+                    "coordinates must be integers"
                 )
         lengths = {len(column) for column in columns.values()}
         if lengths == {0} or len(lengths) > 1:

@@ -50,7 +50,9 @@ class ReconstructionLoss(nn.Module):
         if lpips_weight and lpips is None:
             raise UsageError(f"lpips_weight = {lpips_weight} without a network: give the LPIPS weight files, or 0")
         if temporal_weight and temporal is None:
-            raise UsageError(f"temporal_weight = {temporal_weight} without the loss: give it, or 0")
+            raise UsageError(
+                f"temporal_weight = {temporal_weight} without a temporal loss: give one, or set the weight to 0"
+            )
         self.lpips = lpips
         self.temporal = temporal
         self.lpips_weight = lpips_weight

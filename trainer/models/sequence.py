@@ -103,7 +103,7 @@ class VoxelNetwork(nn.Module):
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], settings: Settings) -> dict[str, Any]:
-        """Return the constructor's arguments for which a file's weights fit.
+        """Return the constructor arguments that match a file's weights.
 
         Args:
             state: the file's tensors, under the names of this implementation.

@@ -174,7 +174,7 @@ def require_fresh(out: Path) -> None:
     except OSError as error:
         raise _unusable(out, error) from error
     if holds_run:
-        raise UsageError(f"{out} holds a run: go on with --resume {out / LAST}, or give another folder with --out")
+        raise UsageError(f"{out} holds a run: continue with --resume {out / LAST}, or give another folder with --out")
 
 
 def require_writable(out: Path) -> None:

@@ -99,7 +99,7 @@ class Reconstruction(Task):
 
     @property
     def asked(self) -> Asked:
-        """Frames, and flow if the stream estimates it."""
+        """Arrays to request: frames, and flow if the stream estimates it."""
         if not self.settings.temporal_weight or self._raft is not None:
             return Asked(arrays=("voxels", "frames"))
         # The loss needs to know where each pixel was; the released code takes negated forward flow for that.

@@ -115,7 +115,7 @@ class Position:
         """Return the state after the last batch that this process took.
 
         Raises:
-            UsageError: loader workers took the batches, so this process does not know.
+            UsageError: loader workers took the batches; only they know the position.
         """
         if self._here is not None and get_worker_info() is not None:
             return self._here

@@ -1,4 +1,4 @@
-"""Define what a consumer saves: which stream, and where it stands in it. Pure.
+"""Define the state that a consumer saves: the stream, and the position in it. Pure.
 
 A state is a plain dict, so a trainer's checkpoint can hold it. It pins everything that determines a sample's bytes; a
 server of another stream is refused before the first batch.
@@ -112,7 +112,7 @@ def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class LoaderShare:
-    """Hold how far one loader worker came, for a loader that saves each of its workers.
+    """Hold the progress of one loader worker, for a loader that saves the state of each worker.
 
     Attributes:
         worker, workers: number of the worker, and how many there are.

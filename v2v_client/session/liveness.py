@@ -96,7 +96,7 @@ class WorkerShortage:
         self._since = now
 
     def check(self, address: str, trouble: str, now: float) -> None:
-        """Take note of what a server says about its workers; log it after 5 s.
+        """Record the trouble that a server reports with its workers; log it after 5 s.
 
         Args:
             address: of the server.

@@ -43,13 +43,13 @@ from v2v_protocol.wire import LARGEST_REQUEST_BYTES
 
 CHECK_SECONDS, _HURRIED_CHECK_SECONDS = 0.05, 0.01
 IDLE_SECONDS = 30.0
-"""A connection without a message for this long ends: at once if it never sent one, else if another needs its place."""
+"""End a connection that sent its last message this long ago if another needs its place, or that never sent one."""
 MOST_CONNECTIONS = 4096 + 256
 _MOST_UNFINISHED_BYTES = 6 * LARGEST_REQUEST_BYTES
 """Of one connection: more than ZeroMQ holds of whole messages (``router.MOST_UNREAD``) and of one on its way."""
 _MOST_UNFINISHED_IN_ALL_BYTES = 2 << 20
 """Of all connections: 64 MiB of empty parts. A request has at most 1 KB as a rule, so 2,000 may wait at a time."""
-_SLOW_BYTES, _MOST_SLOW_SECONDS = 4096, 20.0
+_SLOW_BYTES, _MOST_SLOW_SECONDS = 4096, 10.0
 """A message with more unfinished bytes must end within this time, in which this process runs."""
 _HANDSHAKE_BYTES, _CURVE_HANDSHAKE_BYTES = 128, 640
 _CURVE_FRAME_BYTES = 33
@@ -170,7 +170,7 @@ class ConnectionGuard:
                 self._cut(descriptor)
 
     def take_ended(self) -> list[bytes]:
-        """Return the peers whose connection has ended since the last call; b"" for some that never sent a message."""
+        """Return the peers whose connection ended since the last call; b"" if one never sent a message."""
         with self._lock:
             ended, self._ended = self._ended, []
         return ended

@@ -212,7 +212,7 @@ class Router:
             self.guard.disconnect(identity)
 
     def take_ended(self) -> list[bytes]:
-        """Return the peers whose connection has ended since the last call; b"" for some that never sent a message.
+        """Return the peers whose connection ended since the last call; b"" if one never sent a message.
         Disconnect peers whose key was revoked.
         """
         ended = [] if self.guard is None else self.guard.take_ended()

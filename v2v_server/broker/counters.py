@@ -49,7 +49,7 @@ def bounded_seconds(said: float) -> float:
 
 @dataclass(slots=True)
 class Counters(WorkDone):
-    """Totals since the start. Fields without a meaning are no status by themselves."""
+    """Totals since the start. The status leaves out fields without a meaning text."""
 
     samples: int = counter("Samples sent to consumers.", is_routine=True)
     batches: float = counter("Batches sent to consumers, in each consumer's own batch size.", is_routine=True)

@@ -221,8 +221,8 @@ class LeaseBook:
         return released
 
     def debt(self, number: int, worker: bytes, now: float) -> tuple[bytes, float] | None:
-        """Return which consumer abandoned the sample of this lease, and how long it took, seconds; None if it is
-        still wanted.
+        """Return the consumer that abandoned this lease's sample, and the seconds of work on it; None if it is still
+        wanted.
         """
         lease = self._leases.get(number)
         if lease is None or lease.worker != worker or lease.debtor is None or lease.begun_at is None:

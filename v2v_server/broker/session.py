@@ -233,8 +233,8 @@ class Sessions:
             slots: where each may be put, in the order of ``indices``; empty: no slots.
 
         Raises:
-            LimitExceeded: more than its credit would be unanswered; no request is taken.
-            IndexError: an index is outside the epoch; no request is taken.
+            LimitExceeded: the credit would be exceeded; nothing is queued.
+            IndexError: an index is outside the epoch; nothing is queued.
         """
         places: dict[int, Slot | None] = dict(zip(indices, slots, strict=True)) if slots else dict.fromkeys(indices)
         new = [index for index in places if (epoch, index) not in session.unanswered]
@@ -268,7 +268,7 @@ class Sessions:
         return request
 
     def _requeue(self, session: Session) -> None:
-        """Note whether a session has waiting requests and credit that its abandoned requests do not use up."""
+        """Queue a session if it has waiting requests, and credit beyond its abandoned ones; else dequeue it."""
         at_work = len(session.unanswered) - len(session.waiting) + self._leases.abandoned(session.identity)
         self._queue.set_waiting(session.identity, waits=bool(session.waiting) and at_work < session.credit)
 

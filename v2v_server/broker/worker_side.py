@@ -98,7 +98,7 @@ class WorkerSide:
                 return []
 
     def lost(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
-        """Take back the leases of a worker that died, was given up, or cannot be reached any more."""
+        """Reassign the leases of a worker that died, was given up, or is unreachable."""
         self._counters.workers_lost += 1
         return self._take_back(identity, loss, now)
 
@@ -233,7 +233,7 @@ class WorkerSide:
 
 
 def owner_digest(user: str, secret: bytes) -> bytes:
-    """Name who may take a session or a worker's name over: a key, if there are keys, and a secret.
+    """Return a digest of the owner of a session or worker name: its key, if there are keys, and its secret.
 
     Raises:
         LimitExceeded: the secret is too long.

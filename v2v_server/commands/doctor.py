@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_server.offline.doctor import BAD, look_around
+from v2v_server.offline.doctor import BAD, NOTE, look_around
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -33,13 +33,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: argparse.Namespace) -> int:
     if not 1 <= arguments.port <= 65535:
         raise UsageError(f"--port {arguments.port}: give 1 to 65535")
-    found_bad = False
+    found_bad = has_defects = False
     for finding in look_around(arguments.port, arguments.videos, arguments.recipe, arguments.rows, arguments.cache_dir):
         found_bad = found_bad or finding.level == BAD
+        has_defects = has_defects or (finding.level, finding.about) == (NOTE, "pictures")
         print(f"{finding.level:4}  {finding.about:12}  {finding.text}", flush=True)
         if finding.change:
             print(f"{'':20}-> {finding.change}", flush=True)
-    print("problems found: see the lines that begin with bad" if found_bad else "no problems found")
+    if found_bad:
+        print("problems found: see the lines that begin with bad")
+    elif has_defects:
+        print("the videos can be served, but their pictures have defects: see the notes about pictures")
+    else:
+        print("no problems found")
     return FAILED if found_bad else 0
 
 

@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cameras.add_argument("--seeds", type=int, default=4, metavar="N", help="virtual cameras to draw (default 4)")
     cameras.add_argument(
         "--seed", type=int, metavar="S",
-        help="seed of the first camera; the others count on (default: seeds whose crops show motion)",
+        help="seed of the first camera; the others have the next seeds (default: seeds whose crops show motion)",
     )  # fmt: skip
     cameras.add_argument(
         "--compare", nargs="+", metavar="NAME", help="show the same clip under these recipes instead, one camera each"

@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     what.add_argument("--videos", required=True, metavar="DIR", help="the corpus, as for v2v-serve")
     what.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     what.add_argument("--clear", action="store_true", help="start a new, empty snapshot; old ones stay available")
-    what.add_argument("--json", metavar="FILE", help="also write all lines to a file, each with whether it is in force")
+    what.add_argument("--json", metavar="FILE", help="also write all entries to a file, and whether each is in force")
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
 
 

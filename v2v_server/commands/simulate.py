@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         type=int,
         default=0,
         metavar="N",
-        help="quarantine snapshot that it was made under (see its provenance)",
+        help="number of the quarantine snapshot in the sample's provenance",
     )
     which.add_argument("--cache-dir", metavar="DIR", help="folder of catalogue index and quarantine, as for the server")
     which.add_argument("--list", metavar="FILE", help="list file that restricts a folder")

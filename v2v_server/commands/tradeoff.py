@@ -68,7 +68,7 @@ def _parser() -> Parser:
     wish.add_argument("--target-rate", type=float, metavar="X", help="samples a core second to reach")
     wish.add_argument("--max-error", type=float, metavar="X", help="largest voxel error, for example 0.05")
     wishes.add_argument(
-        "--most-samples-per-decode", type=int, default=4, choices=(1, 2, 4), help="of the best setting (default 4)"
+        "--most-samples-per-decode", type=int, default=4, choices=(1, 2, 4), help="at most this K (default 4)"
     )
     out = parser.group("Output")
     out.add_argument("--preset-out", type=Path, metavar="FILE.yaml", help="write the best setting for v2v-serve")

@@ -27,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     work.add_argument(
         "--videos", required=True, metavar="DIR", help="the corpus on this host, the same as the server's, or s3://..."
     )
-    work.add_argument("--name", help="prefix of its name in logs (default: host and process id)")
+    work.add_argument("--name", help="prefix of the worker's name in logs (default: host and process id)")
     work.add_argument("--cache", metavar="DIR", help="folder of this host that caches decoded frames for later epochs")
     work.add_argument(
         "--cache-gib", type=float, default=100.0, metavar="N", help="size limit of --cache, GiB (default 100)"

@@ -155,7 +155,7 @@ class Catalogue:
         return self._slices[key]
 
     def _keep_long(self, id: str, index: FrameIndex) -> FrameIndex:
-        """Keep a few large indexes decoded: to decode that of a day takes a tenth of a second of the loop."""
+        """Keep a few large indexes decoded: decoding that of a day-long video blocks the loop for 0.1 s."""
         while self._long and len(index) + sum(map(len, self._long.values())) > _KEPT_LONG_FRAMES:
             del self._long[next(iter(self._long))]
         self._long[id] = index
@@ -208,11 +208,11 @@ class Catalogue:
         return self.facts.digest_under(scene)
 
     def fail_fast(self) -> None:
-        """Report a locked index at once, not after half a minute: a server's loop must not wait."""
+        """Report a locked index at once instead of waiting 30 s, because a server's loop must not block."""
         self._store.fail_fast()
 
     def mark_stale(self, id: str) -> None:
-        """Let the next start probe a video again: it differs from the catalogue, whatever its size and times say.
+        """Probe a video again at the next start, although its size and times are those of the index.
 
         Does nothing where the index cannot be written now.
         """
@@ -227,7 +227,7 @@ class Catalogue:
     def _fingerprint(self, id: str) -> str:
         number = self.videos.find(id)
         if number is None:
-            raise CorpusError(f"{id!r} is no video of this catalogue ({len(self.videos)} videos below {self.source})")
+            raise CorpusError(f"{id!r} is not in this catalogue ({len(self.videos)} videos below {self.source})")
         return self.videos.fingerprints[number]
 
 
@@ -279,8 +279,7 @@ def open_catalogue(
         notice: called with a line of text as the search for files advances.
 
     Raises:
-        CorpusError: there is no such folder or list, it cannot be read, it makes no sense, or not one video of it can
-            be used.
+        CorpusError: the folder or list is missing, unreadable or malformed, or has no usable video.
         IndexUnreadable: the index cannot be read any more after the probes.
     """
     opened = open_source(source, SourceOptions(list_file, copies, copies_gib, cache_dir))
@@ -316,7 +315,7 @@ def _snapshot(
         rows = ((*manifest.as_source(record).columns, None) for record in records)
         table = replace(VideoTable.read(rows, len(records))[0], summaries=on_disk.summaries)
     else:
-        table.problem[table.codec == STORE_FORMAT] = "is a file of a lossless corpus by itself: serve the whole folder"
+        table.problem[table.codec == STORE_FORMAT] = "is one file of a lossless corpus: serve the whole folder"
     usable = table.problem == np.array(None)
     problems.update((table.ids[at], table.problem[at]) for at in np.flatnonzero(~usable).tolist())
     table = table.where(usable)

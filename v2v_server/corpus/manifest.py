@@ -1,12 +1,12 @@
 """The manifest of a prepared folder: what was made of which source video, and how.
 
-One JSON object a line. The first describes the folder, each of the others one video, failed ones too. Lines are only
-ever appended; a last line that a killed process left unfinished counts as not written, and where an id comes twice, the
-later line holds.
+The file has one JSON object per line. The first line describes the folder; every other line describes one video, failed
+ones included. Lines are only appended. An unfinished last line, which a killed process leaves, is ignored. Of two lines
+with the same id the later one counts.
 
-A folder stands for the corpus of the run that wrote its first line last. What earlier runs made of videos that this
-corpus does not have (a list left them out, their folder could not be read that day) is set aside: its lines stay, so
-that a run that asks for it again need not make it again, but it is not served.
+The folder serves the corpus of the latest run that wrote a first line. Videos of earlier runs that this corpus lacks
+(a list left them out, or their folder could not be read) are set aside: they are not served, but their lines stay, so
+that a later run can use them without preparing them again.
 """
 
 from __future__ import annotations
@@ -122,24 +122,23 @@ class Manifest:
 
     @property
     def lossless(self) -> bool:
-        """Whether its files give the very pixels of their sources: the folder is then served as the source is."""
+        """Whether its files have exactly the pixels of their sources; the folder is then served like the source."""
         return self.header.encoding.is_lossless
 
     def served_rows(self, rows: Rows | None) -> Rows:
-        """Which rows of its pictures a corpus of this folder has: all of a lossy one.
+        """Return the rows that a corpus of this folder may use: of a lossy folder, all rows of its pictures.
 
-        A lossless one has pictures of the source's size, of which those rows may be used that are kept, or others
-        where all are kept.
+        A lossless folder that stores all rows may be served with any rows, another one only with its stored rows.
 
         Args:
-            rows: that are asked for.
+            rows: the requested rows.
 
         Raises:
-            CorpusError: it is not finished, or other rows are asked for than it holds.
+            CorpusError: the folder is not finished, or lacks requested rows.
         """
         if len(self.videos) != self.header.videos:
             raise CorpusError(
-                f"{self.root}: prepared are {len(self.videos)} of {self.header.videos} videos; run v2v-prepare again "
+                f"{self.root}: {len(self.videos)} of {self.header.videos} videos are prepared; run v2v-prepare again "
                 "to finish (what is done is kept)"
             )
         asked = None if rows is None or str(rows) == "full" else rows
@@ -185,7 +184,7 @@ class Manifest:
     def as_source(self, record: IndexRow) -> IndexRow:
         """Return the record of a prepared file with the facts that have to agree with its source.
 
-        They do even where there is no sound file: the sequences of all others keep their places only if the source's
+        This includes videos without a usable file: the sequences of the others keep their places only if the source's
         frames are counted.
         """
         video = self.videos[record.id]
@@ -285,7 +284,7 @@ def _record(kind: type[_Record], data: dict[str, Any]) -> _Record:
 def _object(line: bytes) -> dict[str, Any]:
     data = parse_json(line)
     if not isinstance(data, dict):
-        raise ValueError("is no JSON object")
+        raise ValueError("is not a JSON object")
     return data
 
 

@@ -18,7 +18,7 @@ from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.probe import VideoFacts
 
 LONGEST_SECONDS = 3600.0
-"""Limit for reading a file from end to end on slow storage; beyond it the file is taken for one that never ends."""
+"""Limit for reading a whole file, also on slow storage; beyond it the file is treated as endless."""
 
 LARGEST_MEMORY_BYTES = 2 << 30
 """Memory that a process may allocate to probe a file: enough for 16 pictures of the largest size, or a list of 2**24
@@ -73,7 +73,7 @@ def _facts(path: Path) -> VideoFacts:
 
     Raises:
         VideoUnreadable: the system reported an error twice.
-        VideoError: the file is no video that this program serves.
+        VideoError: the file is not a supported video.
     """
     try:
         return facts_of(path)

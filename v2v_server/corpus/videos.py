@@ -136,7 +136,7 @@ class Videos(Sequence[VideoEntry]):
 
 @dataclass(frozen=True, slots=True)
 class CorpusFacts:
-    """What is known of a corpus in memory: no part of it reads the index on disk.
+    """Facts about a corpus, all in memory: using them never reads the index on disk.
 
     Attributes:
         videos: the videos that can be used, by id.

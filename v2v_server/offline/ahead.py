@@ -58,7 +58,7 @@ def catalogue_ahead(asked: Ahead, parts: Path | None, progress: Progress | None,
         progress, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
 
     Raises:
-        CorpusError: as there; or parts are missing or cannot be read.
+        CorpusError: as for ``open_catalogue``; or parts are missing or cannot be read.
     """
     if parts is not None:
         complete = parts_in(parts)

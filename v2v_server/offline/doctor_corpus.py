@@ -15,6 +15,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.config import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.offline.aperture import clean_aperture
+from v2v_server.offline.doctor_pictures import look_at_pictures
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.rows import Rows
@@ -67,6 +68,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
     for note in catalogue.notes:
         yield "note", "corpus", note, ""
     yield from _how_videos_are_stored(catalogue)
+    yield from look_at_pictures(catalogue, spec.recipe.frames_needed)
     table = SequenceTable(found, catalogue.rows, spec)
     useless = len(found) - table.videos
     if useless:

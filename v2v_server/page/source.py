@@ -19,7 +19,7 @@ KNOWN_SECONDS = 15.0
 
 
 class GetsStatus(Protocol):
-    """Where statuses come from: a :class:`v2v_server.status.client.StatusClient`."""
+    """Source of statuses, such as :class:`v2v_server.status.client.StatusClient`."""
 
     def get_status(self, timeout_seconds: float) -> dict[str, Any]:
         """See :meth:`v2v_server.status.client.StatusClient.get_status`."""

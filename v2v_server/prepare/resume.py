@@ -54,7 +54,7 @@ def refuse_overlap(catalogue: Catalogue, target: Path, single: bool = False) -> 
 
 @contextlib.contextmanager
 def locked(target: Path) -> Iterator[None]:
-    """Keep other processes out of the folder; the system releases the lock however this process ends.
+    """Lock the folder against other processes. The system releases the lock when this process ends in any way.
 
     Raises:
         CorpusError: another process works there.

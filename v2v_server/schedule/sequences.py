@@ -67,7 +67,7 @@ class Columns:
 
 
 def _sizes(height_px: npt.NDArray[np.integer], width_px: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
-    """Return a number for each picture size."""
+    """Return height and width packed into one integer per video, so that equal sizes are equal integers."""
     return height_px.astype(np.int64) << 32 | width_px
 
 

@@ -6,8 +6,8 @@
     workers work       decoding, simulating, delivering: each result says how long
     the broker works   time in which its loop did not wait for a message
 
-If consumers hardly wait, they are the bottleneck themselves. If they do, it is the broker if that has no time left;
-the network if workers have time left; else what takes most of the workers' time.
+If consumers hardly wait, they are the bottleneck. Otherwise the first of these that holds decides: the broker has no
+idle time (the broker); workers have idle time (the network); else the activity that takes most of the workers' time.
 """
 
 from __future__ import annotations

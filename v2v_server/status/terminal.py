@@ -19,11 +19,11 @@ _MOST_CONSUMERS = 8
 
 
 class StatusView:
-    """Show the status when it is due. On a terminal a few lines are replaced in place.
+    """Show the status at intervals. A terminal gets a few lines, replaced in place.
 
     Args:
-        log: for programs, if it is JSON.
-        stream: for people.
+        log: gets the status if it writes JSON lines.
+        stream: gets it as text.
     """
 
     def __init__(self, log: Log, stream: TextIO) -> None:

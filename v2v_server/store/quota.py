@@ -40,7 +40,7 @@ class CachePart:
 
 @dataclass(slots=True)
 class Used:
-    """The number of bytes, for the holder of the lock."""
+    """Count the folder's bytes. Only the holder of the lock may use it."""
 
     bytes: int
 
@@ -53,8 +53,7 @@ class QuotaFolder:
     """A folder with a limit. Can be pickled.
 
     Args:
-        folder: the folder. It is created by :meth:`make` and never later: if a disk is unmounted, the disk below must
-            not be filled.
+        folder: the folder. Only :meth:`make` creates it, so that an unmounted disk does not fill the disk below.
         most_bytes: its limit, bytes.
         wait_seconds: longest wait for the lock; other processes hold it for less than a millisecond, or while they
             evict files.
@@ -94,7 +93,7 @@ class QuotaFolder:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[Used]:
-        """Lock the number of bytes for one process at a time.
+        """Lock the byte count, and write it back at the end.
 
         Raises:
             BlockingIOError: another process keeps the lock for longer than an update takes. Callers continue without

@@ -96,7 +96,7 @@ class StoreWriter:
         """
         with self._file as file:
             if self._frames != self._head.count:
-                raise UsageError(f"{self._frames} frames of {self._head.count} were written")
+                raise UsageError(f"{self._frames} of {self._head.count} frames were written")
             file.seek(len(self._front))
             file.write(b"".join(self._table))
             file.flush()

@@ -62,7 +62,7 @@ def command(address: str, root: str, name: str) -> list[str]:
 
 
 def post_mortem(returncode: int, *, short_of_memory: bool) -> Loss:
-    """Return what the unexpected end of a worker means."""
+    """Return the cause of a worker's unexpected end."""
     if returncode >= 0:
         # An unhandled exception or a broken installation. The trace is on stderr; the cause is not known.
         return Loss(Cause.UNEXPLAINED, f"exited with status {returncode}")

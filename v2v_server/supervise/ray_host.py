@@ -217,7 +217,7 @@ class RayPlace:
         self._actor.signal.remote(self._name, number)
 
     def release(self) -> None:
-        """End the actor, and the worker's process with it. This skips what a worker does when it is told to stop."""
+        """Kill the actor and the worker's process, without the orderly shutdown."""
         self._host.forget(self)
         ray.kill(self._actor, no_restart=True)
 

@@ -1,4 +1,4 @@
-"""Files that other users of the host cannot open: reading is enough to hold a lock."""
+"""Open files that only this user can read or write, because read access is enough to hold a lock."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def open_private(path: Path, flags: int) -> int:
     """Open a regular file of ours with mode 0600, and return its descriptor. Never blocks.
 
     Args:
-        path: the file; one that an earlier release made readable by others is so no more.
+        path: the file. Other users lose access to an existing file.
         flags: of ``os.open``; with ``O_CREAT`` a missing file is made.
 
     Raises:
@@ -32,7 +32,7 @@ def open_private(path: Path, flags: int) -> int:
 
 
 def make_private(path: Path) -> None:
-    """Make an empty file with mode 0600; leave the content of one that is there.
+    """Make an empty file with mode 0600; an existing file keeps its content.
 
     Raises:
         OSError: the file cannot be made, or is not a regular one.

@@ -87,7 +87,7 @@ class Stack:
         return self.taken == len(self._expected)
 
     def _after_a_gap(self, frame: VideoFrame) -> bool:
-        """Whether the decoder has left out a frame that the index lists in front of this one."""
+        """Whether the decoder skipped a frame that the index lists before this one."""
         pts, at = self._pts, self._cursor
         if not self.index.seekable or frame.pts is None or frame.pts < pts[0]:
             return False
@@ -112,7 +112,7 @@ class Stack:
         return False
 
     def _is_passed_over(self, pts: int) -> bool:
-        """Whether a frame that presents before the next one to take is one that the stride leaves out."""
+        """Whether a frame before the next one to take is one that the stride skips."""
         return self._stride > 1 and pts in self._pts
 
     def _copy(self, frame: VideoFrame) -> None:

@@ -79,7 +79,7 @@ def decode_cuts(
     *,
     stride: int = 1,
 ) -> tuple[DecodedClip, ...]:
-    """Several cuts of the frames from ``start`` on, from one pass of the decoder.
+    """Return several cuts of the frames from ``start`` on, from one pass of the decoder.
 
     Memory: the cuts themselves (frames x height x width bytes each) and what the decoder holds.
 
@@ -93,8 +93,7 @@ def decode_cuts(
     Raises:
         UsageError: a range outside the index, or a window outside the picture.
         VideoError: a frame of the longest cut is missing or damaged, the file is shorter than its index, or the
-            picture's size or format is not the same all along. Its ``frame`` is the ordinal of the first frame that
-            could not be had.
+            picture's size or format changes. Its ``frame`` is the ordinal of the first frame that was not delivered.
     """
     for cut in cuts:
         index.position(start, (cut.count - 1) * stride + 1)
@@ -196,8 +195,7 @@ def _from_keyframe_on(stack: Stack) -> Iterator[VideoFrame]:
     """Yield the frames from the last keyframe at or before the range, without unreferenced ones.
 
     Raises:
-        _SeekFailed, VideoError: it did not work out, or there is nothing to be saved; decoding from the beginning has
-            the last word.
+        _SeekFailed, VideoError: seeking failed or saves nothing: decode from the beginning instead.
     """
     wanted, index = stack.wanted, stack.wanted.index
     if not index.seekable or wanted.start == 0:

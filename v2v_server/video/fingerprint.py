@@ -21,14 +21,14 @@ def fingerprint(path: str | os.PathLike[str]) -> str:
     """Size in bytes and a hash of the first and last 64 KiB: ``"<size>-<32 hexadecimal digits>"``.
 
     Raises:
-        VideoUnreadable: the file cannot be read, or is no regular file.
+        VideoUnreadable: the file cannot be read, or is not a regular file.
     """
     try:
         # An ordinary open of a named pipe would wait for somebody at its other end.
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
             status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode):
-                raise VideoUnreadable(os.fspath(path), None, "is no regular file")
+                raise VideoUnreadable(os.fspath(path), None, "is not a regular file")
             digest = hashlib.sha256(b"v2v fingerprint 1\n" + file.read(_BLOCK_BYTES))
             file.seek(max(0, status.st_size - _BLOCK_BYTES))
             digest.update(file.read(_BLOCK_BYTES))
@@ -58,7 +58,7 @@ def check_fingerprint(path: str | os.PathLike[str], expected: str) -> None:
 
     Raises:
         VideoChanged: it is another one now.
-        VideoUnreadable: it cannot be read, or is no regular file.
+        VideoUnreadable: it cannot be read, or is not a regular file.
     """
     found = fingerprint(path)
     if not is_same_file(found, expected):

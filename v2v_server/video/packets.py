@@ -238,7 +238,7 @@ def behind_lengths(packet: memoryview, length_bytes: int) -> Iterator[memoryview
 
 
 def _behind_start_codes(packet: memoryview) -> Iterator[memoryview]:
-    """Each from behind its start code to the end of the packet: what is read of it ends by itself."""
+    """Yield each unit, from after its start code to the end of the packet; its reader finds where it ends."""
     for code in _START_CODE.finditer(packet):
         if code.end() < len(packet):
             yield packet[code.end() :]

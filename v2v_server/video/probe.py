@@ -36,7 +36,7 @@ class VideoFacts:
     """What a video file holds.
 
     Attributes:
-        frames: how many frames there are to decode; the container's own count is not believed.
+        frames: number of decodable frames; the container's own count is ignored.
         height_px, width_px: size of the upright picture.
         codec: FFmpeg's name of the format ("h264", "vp9"), whichever decoder is used.
         pixel_format: FFmpeg's name of the decoded format ("yuv420p10le").
@@ -88,7 +88,7 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
     orientation = Orientation.of(head)
     height, width = orientation.size(head.height, head.width)
     if not (1 <= height <= LARGEST_SIDE_PX and 1 <= width <= LARGEST_SIDE_PX):
-        raise VideoError(name, None, f"its picture of {width}x{height} px is larger than {LARGEST_SIDE_PX} px a side")
+        raise VideoError(name, None, f"its pictures of {width}x{height} px are larger than {LARGEST_SIDE_PX} px a side")
     uncounted = unseekable(1, base, height, width, orientation)
     index = _index(shown, head, uncounted) if stores_pts or not reorders else None
     if index is None or _is_doubtful(shown, reorders) or not is_confirmed(name, index):

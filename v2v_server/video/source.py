@@ -65,13 +65,13 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
 
     Raises:
         VideoError: the file cannot be opened, has no video track, or is of a format or size that is not read.
-        VideoUnreadable: it is no regular file.
+        VideoUnreadable: it is not a regular file.
     """
     name = os.fspath(path)
     try:
         # To open a named pipe waits for somebody to write into it, and a device may not end.
         if not stat.S_ISREG(os.stat(name).st_mode):
-            raise VideoUnreadable(name, None, "is no regular file")
+            raise VideoUnreadable(name, None, "is not a regular file")
         container = _open(name)
     except av.ArgumentError as error:
         why = f"is of no format that is read here, or damaged ({reason(error)}); these are read: {', '.join(FORMATS)}"

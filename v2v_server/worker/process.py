@@ -202,7 +202,7 @@ class Worker:
         return Readiness(is_ready, is_small and all(map(is_compiled, missing)), self._clips.has(lease))
 
     def _note_wait(self, waits: bool) -> None:
-        """Note that a wait for other processes, inside of decoding, is no decoding."""
+        """Exclude a wait for other processes from the decoding time."""
         note(self._logbook, self._at, decodes=not waits)
 
     def _has_video(self, lease: Lease) -> bool:

@@ -36,7 +36,7 @@ def open_sidecars(lease: Lease, source: VideoSource) -> Iterator[dict[str, Trave
     """Lend the sidecars that a lease's arrays are made from, by ending, until the end of the context.
 
     Raises:
-        SidecarError: one cannot be had as catalogued.
+        SidecarError: one cannot be read, or differs from the catalogue.
         ProtocolError: the lease is malformed.
     """
     opened: dict[str, Traversable | None] = dict.fromkeys(sidecar_endings(lease.arrays))

@@ -9,17 +9,19 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from tests.clips import panned_luma, write_clip
+from tests.clips import damaged, panned_luma, write_clip
 from v2v_server.commands import doctor as command
-from v2v_server.offline import doctor, doctor_corpus
+from v2v_server.offline import doctor, doctor_corpus, doctor_pictures
 from v2v_server.offline.doctor import BAD, NOTE, OK, Finding, control_group_memory
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a process that loads torch, and whatever this machine's memory is."""
+    """Without a process that loads torch, or processes that decode, and whatever this machine's memory is."""
+    monkeypatch.setattr(doctor_pictures, "usable_cores", lambda: 0)
     monkeypatch.setattr(doctor, "_torch", lambda: Finding(OK, "torch", "here"))
     monkeypatch.setattr(doctor, "_memory", lambda: Finding(OK, "memory", "enough"))
 
@@ -171,6 +173,49 @@ def test_how_videos_are_stored_is_said_where_it_matters(tmp_path: Path, capsys: 
     assert "run v2v-prepare once" in said
     assert "1 videos state a clean aperture" in said
     assert "(framed.mp4: 150x130 px): it is not applied" in said
+
+
+def test_defects_of_pictures_are_said_with_what_can_be_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    moving = panned_luma(60, 140, 160)
+    boxed = moving.copy()
+    boxed[:, :14] = boxed[:, -28:] = boxed[:, :, :10] = 0
+    cut = np.concatenate((moving[:30], 255 - np.flip(moving[30:], (1, 2))))
+    frozen = moving[np.minimum(np.arange(60), 30)]
+    black = moving.copy()
+    black[20:40] = 0
+    films = {"boxed": boxed, "cut": cut, "twos": moving[np.arange(60) // 2], "frozen": frozen, "black": black}
+    for name, luma in films.items():
+        write_clip(tmp_path / f"{name}.mp4", luma, full_range=True)
+    (tmp_path / "recipe.yaml").write_text("voxels_per_clip: 4\n")
+    flags = ["--videos", str(tmp_path), "--cache-dir", str(tmp_path), "--recipe", str(tmp_path / "recipe.yaml")]
+    status, said = told(capsys, *flags)
+    assert status == 0
+    assert "looked at 5 of 5 videos, at most 8 s and 400 frames of each: 10 sequences\n" in said
+    assert "2 of 10 sequences (20%) have bars at the sides of the picture (boxed.mp4: bars: top 14 px" in said
+    assert "--rows 0.1:0.8 leaves them out; crop bars at the left and right once" in said
+    assert "2 of 10 sequences (20%) have duplicated frames (twos.mp4: " in said
+    assert "every picture twice" in said
+    assert "have hard cuts or jumps (" in said
+    assert "cut.mp4: hard cuts or jumps: 1" in said
+    assert "--scene auto" in said
+    assert "(10%) have still stretches (frozen.mp4" in said
+    assert "have black stretches (black.mp4" in said
+    assert "no problems found" not in said
+    status, said = told(capsys, *flags, "--rows", "0.1:0.8")
+    assert "have bars at the sides of the picture (boxed.mp4: bars: left 10 px" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("processes", [0, 2])
+def test_a_video_that_does_not_decode_is_counted(
+    processes: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor_pictures, "usable_cores", lambda: processes)
+    write_clip(tmp_path / "good.mp4", panned_luma(60, 140, 160))
+    damaged(tmp_path / "good.mp4", tmp_path / "spoiled.mp4", 30)
+    _, said = told(capsys, "--videos", str(tmp_path), "--cache-dir", str(tmp_path))
+    assert "looked at 1 of 2 videos" in said
+    assert "1 more did not decode" in said
 
 
 def with_clean_aperture(source: Path, target: Path, width: int, height: int) -> None:

@@ -104,7 +104,7 @@ def test_the_corpus_is_found_as_a_server_finds_it(
     ("damage", "status", "text"),
     [
         ("missing corpus", 2, "there is no such folder, video or list file"),
-        ("corpus that cannot be looked at", 2, "cannot be looked at: File name too long"),
+        ("corpus that cannot be read", 2, "cannot be read: File name too long"),
         ("damaged line", 2, "line 1 is damaged"),
         ("json is a folder", 2, "--json"),
         ("unwritable", 1, "nothing was cleared"),
@@ -122,7 +122,7 @@ def test_failures_end_in_one_line_and_a_status(
     more = ["--clear"]
     if damage == "missing corpus":
         corpus.rmdir()
-    elif damage == "corpus that cannot be looked at":
+    elif damage == "corpus that cannot be read":
         corpus = corpus / ("x" * 300)
     elif damage == "damaged line":
         file.write_text("damaged\n")

@@ -101,7 +101,7 @@ def test_a_link_in_a_circle_costs_only_itself(corpus: Path, opener: Opener) -> N
     catalogue = opener(corpus)
     assert len(ids(catalogue)) == 3
     assert [(refusal.video, refusal.reason) for refusal in catalogue.refusals] == [
-        ("circle.mp4", "cannot be looked at: Too many levels of symbolic links")
+        ("circle.mp4", "cannot be read: Too many levels of symbolic links")
     ]
 
 
@@ -144,7 +144,7 @@ def test_a_corpus_that_cannot_be_looked_at_is_one_line(
     corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
     denied_at(corpus / where, monkeypatch)
-    with pytest.raises(CorpusError, match=rf"^{corpus}: cannot be looked at: Permission denied$"):
+    with pytest.raises(CorpusError, match=rf"^{corpus}: cannot be read: Permission denied$"):
         opener(corpus)
 
 
@@ -193,7 +193,7 @@ def test_the_second_start_probes_only_what_changed(corpus: Path, opener: Opener)
     assert len({first.digest, changed.digest, moved.digest}) == 3
     with pytest.raises(VideoChanged, match="has changed since this catalogue was opened"):
         first.frame_index("a.mp4")
-    with pytest.raises(CorpusError, match="no video of this catalogue"):
+    with pytest.raises(CorpusError, match="is not in this catalogue"):
         moved.frame_index("sub/b.mp4")
 
 
@@ -259,7 +259,7 @@ def test_a_video_that_is_a_pipe_for_a_moment_is_not_condemned(
     with monkeypatch.context() as patch:
         patch.setattr(probe_module, step, in_that_moment)
         (problem,) = opener(corpus).refusals
-    assert (problem.video, problem.reason) == ("a.mp4", "is no regular file")
+    assert (problem.video, problem.reason) == ("a.mp4", "is not a regular file")
     assert len(opener(corpus).videos) == 3
 
 
@@ -324,9 +324,9 @@ def test_what_a_list_names_is_not_opened_unless_it_is_a_file(corpus: Path, opene
     assert ids(catalogue) == ["a.mp4"]
     reasons = {refusal.video: refusal.reason for refusal in catalogue.refusals}
     assert reasons.pop("gone.mp4").startswith("cannot be read: No such file")
-    assert reasons == dict.fromkeys(("pipe.mp4", "endless.mp4", "folder.mp4"), "is no regular file")
+    assert reasons == dict.fromkeys(("pipe.mp4", "endless.mp4", "folder.mp4"), "is not a regular file")
     listed.write_text("pipe.mp4\n")
-    with pytest.raises(CorpusError, match=r"no video found.*pipe\.mp4: is no regular file"):
+    with pytest.raises(CorpusError, match=r"no video found.*pipe\.mp4: is not a regular file"):
         opener(listed)
 
 

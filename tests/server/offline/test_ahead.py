@@ -151,7 +151,7 @@ def test_parts_that_cannot_be_put_together_are_said(tmp_path: Path, run: Run) ->
     said = run("server", "--merge", str(parts))[2]
     assert said.endswith("2 of 3 parts are missing; run v2v-catalogue --shard for 1/3, 3/3\n")
     run("host", "--shard", "1/1", "--out", str(parts))
-    assert "holds parts of 1 and of 3" in run("server", "--merge", str(parts))[2]
+    assert "holds parts of splits into 1 and 3" in run("server", "--merge", str(parts))[2]
     (parts / "part-2-of-3.sqlite3").unlink()
     with closing(sqlite3.connect(parts / "part-1-of-1.sqlite3")) as old:
         old.execute("PRAGMA user_version = 1")

@@ -149,7 +149,7 @@ def test_a_damaged_file_keeps_its_place(pair: tuple[Path, Path], tmp_path: Path)
     assert all("the store file is corrupt" in refusal.reason for refusal in refusals)
     (tmp_path / "plain").mkdir()
     shutil.copy(pair[1] / "444.mp4", tmp_path / "plain")
-    with pytest.raises(CorpusError, match="is a file of a lossless corpus by itself: serve the whole folder"):
+    with pytest.raises(CorpusError, match="is one file of a lossless corpus: serve the whole folder"):
         open_catalogue(tmp_path / "plain", cache_dir=tmp_path, processes=0)
 
 

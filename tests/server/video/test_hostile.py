@@ -146,5 +146,5 @@ def test_a_list_of_frames_that_never_ends_is_given_up(tmp_path: Path, monkeypatc
 
 def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.mp4")
-    with pytest.raises(VideoError, match="is no regular file"):
+    with pytest.raises(VideoError, match="is not a regular file"):
         probe(tmp_path / "pipe.mp4")

@@ -142,7 +142,7 @@ def test_a_malformed_address_is_refused(tmp_path: Path) -> None:
 
 def test_a_corpus_that_cannot_be_looked_at_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     assert worker_command(["--connect", "tcp://127.0.0.1:1", "--videos", "x" * 300]) == 2
-    assert "cannot be looked at: File name too long" in capsys.readouterr().err
+    assert "cannot be read: File name too long" in capsys.readouterr().err
 
 
 def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ def test_a_folder_with_a_run_is_not_overwritten(
     server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trained(tmp_path, server.address, "run", run__steps=1)
-    assert "holds a run: go on with --resume" in refused(tmp_path, server.address, capsys)
+    assert "holds a run: continue with --resume" in refused(tmp_path, server.address, capsys)
 
 
 @pytest.mark.parametrize("out", ["file", "file/run"])

@@ -1,4 +1,4 @@
-"""The index of a corpus on disk: what probing each file has found, so that the next start need not do it again.
+"""The index of a corpus on disk: the result of probing each file, so that the next start can skip it.
 
 One SQLite file per corpus. A row is believed as long as the file's size and the times of its last modification and
 change of status stay the same: the latter is set by the system whatever a program does to the former. Writes are

@@ -20,7 +20,7 @@ _NAME = re.compile(r"part-(\d+)-of-(\d+)\.sqlite3")
 
 @dataclass(frozen=True, slots=True, order=True)
 class Shard:
-    """Some of the files of a corpus: which, depends on their ids alone, so hosts need not agree on anything else.
+    """A share of a corpus's files. Ids alone decide it, so hosts need no coordination.
 
     Attributes:
         count: shards in all.
@@ -105,7 +105,8 @@ def parts_in(folder: Path) -> list[Path]:
         raise CorpusError(f"--merge {folder}: holds no part; v2v-catalogue --shard 1/N --out {folder} writes the first")
     if len(counts) > 1:
         raise CorpusError(
-            f"--merge {folder}: holds parts of {' and of '.join(map(str, sorted(counts)))}; remove those of the other"
+            f"--merge {folder}: holds parts of splits into {' and '.join(map(str, sorted(counts)))}; "
+            "keep those of one split"
         )
     (count,) = counts
     missing = [number for number in range(1, count + 1) if Shard(count, number) not in found]

@@ -75,7 +75,7 @@ class SceneAnalysis:
 
     def _add(self, picture: Picture) -> None:
         number, self._frames = self._frames, self._frames + 1
-        blocks = _block_sums(picture)
+        blocks = block_sums(picture)
         self._means.append(float(blocks.mean()) / 64)
         self._variances.append(float(blocks.var()) / 64**2)
         if self._blocks:
@@ -147,7 +147,7 @@ class SceneAnalysis:
         return tuple(boundaries)
 
 
-def _block_sums(picture: Picture) -> npt.NDArray[np.int64]:
+def block_sums(picture: Picture) -> npt.NDArray[np.int64]:
     """Return the means of the 8 x 8 blocks of a picture in 1/64 grey level, without partial blocks."""
     height, width = picture.shape
     rows, columns = max(1, height // _BLOCK_PX), max(1, width // _BLOCK_PX)

@@ -59,7 +59,7 @@ class SceneCollection:
     def collect(
         self, store: Store, source: VideoSource, table: VideoTable, processes: int, progress: Progress | None
     ) -> bool:
-        """Put the scene of each usable video that has none into the index, if it can be had.
+        """Analyse each usable video without a scene in the index, and store the scene unless the analysis fails.
 
         Returns:
             whether there were such videos.
@@ -74,11 +74,11 @@ class SceneCollection:
         return bool(missing)
 
     def read(self, store: Store, table: VideoTable, unknown: set[str], digest: str) -> tuple[SplitVideos, str]:
-        """Return the usable runs of videos, and a digest that names all that is known of them.
+        """Return the usable runs of videos, and a digest of all scenes.
 
         Args:
             table: the videos of a snapshot, with the summaries of their scenes.
-            unknown: ids of videos of which nothing is known; receives those that the index has no scene of.
+            unknown: ids of videos without a known scene; those that have none in the index are added.
             digest: of the snapshot.
 
         Raises:

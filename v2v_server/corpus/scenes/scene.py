@@ -52,13 +52,13 @@ class Scene:
         shot_boundaries: ordinals of the frames at which another shot begins, increasing.
         segments: [n, 37] uint16, one row a segment, :data:`UNKNOWN` where a number could not be measured. Of each tile:
 
-            MOTION    95 % of it moves less; the most of the segment's quarters; 1/64 px a frame
-            CHANGE    largest change of the mean of a block of 8 x 8 pixels over four frames, the last of which is one
-                      of the segment but its first, or the next segment's first; 1/64 grey level
+            MOTION    95th percentile of its motion, the largest of the segment's quarters; 1/64 px a frame
+            CHANGE    largest change of the mean of a block of 8 x 8 pixels over four frames; the fourth is any frame
+                      of the segment after its first, or the next segment's first; 1/64 grey level
 
             and of the whole picture:
 
-            CONTRAST  standard deviation of the block means, the most of its frames; 1/64 grey level
+            CONTRAST  standard deviation of the block means, the largest of all frames; 1/64 grey level
             DARK      share of the pixels below grey level 16; 1/1000
             CLIPPED   share of the pixels from grey level 250 on; 1/1000
             FLICKER   mean distance of a frame's mean from that of its two neighbours; 1/64 grey level

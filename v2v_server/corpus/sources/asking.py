@@ -19,7 +19,7 @@ Notice = Callable[[str], None]
 
 _AT_ONCE = 16
 _TOGETHER, _MOST_TOGETHER = 64, 1024
-"""Files that a thread asks about in one go: to hand them over one by one takes longer than a local disk's answer."""
+"""Files per task of a thread: passing them one by one takes longer than a local disk's answer."""
 _SOON_SECONDS = 0.05
 _IN_TURN = 256
 """Parts that are asked many at a time before one alone is tried again."""
@@ -45,8 +45,8 @@ def answers(question: Callable[[Q], A], files: Sequence[Q]) -> Generator[tuple[Q
 def by_parts(question: Callable[[Sequence[Q]], A], files: Sequence[Q]) -> Generator[tuple[Sequence[Q], A], None, None]:
     """Yield (some of the files, answer) until all were asked about, in their order.
 
-    Parts are asked one after the other while answers come at once, because threads that take turns cost more than a
-    local disk's answer. After a slow answer many parts are asked at a time, and one alone is tried again later.
+    While answers are fast, one part is asked at a time, because switching threads costs more than a local disk's
+    answer. After a slow answer many parts are asked at a time; later a single one is tried again.
 
     Args:
         question: asked of a part of the files in threads; must not raise.
@@ -62,7 +62,7 @@ def by_parts(question: Callable[[Sequence[Q]], A], files: Sequence[Q]) -> Genera
                     at += len(part)
                     try:
                         asked.append((part, threads.submit(question, part)))
-                    except RuntimeError:  # the system has no room for another thread: then one after the other
+                    except RuntimeError:  # no further thread can be started: continue without threads
                         threads.shutdown(cancel_futures=True)
                         asked.append((part, None))
                 part, answer = asked[0]

@@ -120,7 +120,7 @@ class Bucket:
         """Ask for the state of one object: its size, and 63 bits that stand for its ETag or the store's equivalent.
 
         Raises:
-            VideoGone, VideoDenied, VideoUnreadable: it cannot be had.
+            VideoGone, VideoDenied, VideoUnreadable: the store does not deliver it.
         """
         return self._ask(id, lambda: _state(self._store.info(self._path(id))), tries)
 
@@ -128,7 +128,7 @@ class Bucket:
         """Write an object to a file.
 
         Raises:
-            VideoGone, VideoDenied, VideoUnreadable: it cannot be had.
+            VideoGone, VideoDenied, VideoUnreadable: the store does not deliver it.
         """
         self._ask(id, lambda: self._store.get_file(self._path(id), str(to)))
 

@@ -138,7 +138,7 @@ class Copies(VideoSource):
         """Ask the store for the state of one object.
 
         Raises:
-            VideoUnreadable: it cannot be had.
+            VideoUnreadable: the store does not answer, or has no such object.
         """
         return self.bucket.state(id)
 
@@ -193,7 +193,7 @@ class Copies(VideoSource):
         """Fetch the copies that are missing; afterwards :meth:`has` returns True.
 
         Raises:
-            VideoUnreadable: one cannot be had.
+            VideoUnreadable: one cannot be fetched.
             VideoChanged: an object is another one by now.
         """
         self.release()

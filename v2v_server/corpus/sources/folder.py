@@ -75,7 +75,7 @@ class Folder(VideoSource):
         """Ask for the state of one file.
 
         Raises:
-            VideoUnreadable: it cannot be had.
+            VideoUnreadable: the file is missing or cannot be read.
         """
         try:
             status = (self.folder / id).stat()
@@ -133,7 +133,7 @@ class Folder(VideoSource):
             if is_regular:
                 yield id
             else:
-                refused[id] = "is no regular file"
+                refused[id] = "is not a regular file"
 
     def _refuse_prepared(self, below: set[str]) -> None:
         """Check that no video comes from a prepared folder, whose rows are cut already.
@@ -156,8 +156,8 @@ class Folder(VideoSource):
         for folder, refused in answers(is_prepared, sorted(folders)):
             if refused:
                 raise CorpusError(
-                    f"{self.folder / folder} is a prepared folder and cannot be a part of another corpus: name it "
-                    "itself, or move it out"
+                    f"{self.folder / folder} is a prepared folder and cannot be a part of another corpus: serve it "
+                    "alone, or move it out"
                 )
 
 
@@ -262,7 +262,7 @@ class _Walk:
                 is_folder = not is_file and entry.is_dir()
                 is_pseudo = is_file and entry.is_symlink() and entry.stat().st_dev in self._pseudo
             except OSError as error:  # a link that leads in a circle, or where this user may not look
-                refused[printable(relative)] = f"cannot be looked at: {error.strerror or error}"
+                refused[printable(relative)] = f"cannot be read: {error.strerror or error}"
                 continue
             if is_folder:
                 yield found
@@ -273,7 +273,7 @@ class _Walk:
                 if printable(relative) != relative:
                     refused[printable(relative)] = UNPRINTABLE
                 elif not is_file:
-                    refused[relative] = "is no regular file, or a link that leads nowhere"
+                    refused[relative] = "is not a regular file, or is a broken link"
                 elif is_pseudo:
                     refused[relative] = PSEUDO
                 else:

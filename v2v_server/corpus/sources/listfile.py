@@ -53,7 +53,7 @@ def read_list(path: str | os.PathLike[str]) -> tuple[ListEntry, ...]:
     except OSError as error:
         raise CorpusError(f"list {path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
-        raise CorpusError(f"list {path}: is not UTF-8 text ({error.reason} at byte {error.start})") from error
+        raise CorpusError(f"list {path} is not UTF-8 text ({error.reason} at byte {error.start})") from error
     columns = _comma_columns if Path(path).suffix.lower() == ".csv" else _space_columns
     entries: dict[str, int] = {}
     found: list[ListEntry] = []

@@ -74,7 +74,7 @@ def local_state(path: Path, id: str) -> str:
 
 
 def state_text(states: list[tuple[str, tuple[int, int, int]]]) -> str:
-    """Return a text that stands for the states of a sidecar's files; "" if there are none."""
+    """Return a digest of the states of a sidecar's files; "" without files."""
     return hashlib.sha256(repr(states).encode()).hexdigest()[:32] if states else ""
 
 
@@ -111,7 +111,7 @@ def open_sidecar(source: VideoSource, id: str, fingerprint: str) -> Iterator[Tra
         fingerprint: as catalogued; "" takes what is there now.
 
     Raises:
-        VideoUnreadable, VideoChanged: it cannot be had.
+        VideoUnreadable, VideoChanged: it cannot be read, or differs.
     """
     with source.open_local(id, fingerprint) as path:
         if id.endswith("/") and path.is_file():  # a copy from object storage
@@ -122,7 +122,7 @@ def open_sidecar(source: VideoSource, id: str, fingerprint: str) -> Iterator[Tra
 
 
 def _files(opened: Traversable, name: str = "") -> list[tuple[str, Traversable]]:
-    """Return the files below a folder with their paths, sorted; a file alone has the path ""."""
+    """Return the files below a folder, sorted, with their relative paths; a single file has the path ""."""
     if not opened.is_dir():
         return [(name, opened)]
     entries = sorted(opened.iterdir(), key=lambda entry: entry.name)

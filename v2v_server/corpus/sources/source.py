@@ -108,11 +108,11 @@ class VideoSource(ABC):
         Raises:
             CorpusError: there is no such folder on this host.
         """
-        raise CorpusError(f"{self}: is no folder of this host, which this needs: copy the videos to one first")
+        raise CorpusError(f"{self}: not a folder of this host; copy the videos to one first")
 
     @property
     def manifest(self) -> Manifest | None:
-        """What a prepared corpus says of itself; None for any other."""
+        """Manifest of a prepared corpus; None for any other."""
         return None
 
     @abstractmethod
@@ -120,7 +120,7 @@ class VideoSource(ABC):
         """List the ids of the files that may be videos: those that the list names, or else all of them.
 
         Args:
-            refused: receives, by id, why a file, folder or entry of the list cannot be taken in.
+            refused: receives, by id, why a file, folder or list entry is refused.
             left_out: counts, by suffix, files that may be videos of other endings.
 
         Raises:
@@ -129,8 +129,8 @@ class VideoSource(ABC):
 
     @abstractmethod
     def states(self, ids: Sequence[str]) -> array[int]:
-        """Return the states of many files, three numbers each, as they are cheapest to have: those of a listing will
-        do. Of a file without one it is :data:`GONE` or :data:`NO_STATE`. Called in threads.
+        """Return the states of many files, three numbers each. States from a listing suffice. A file without a state
+        has :data:`GONE` or :data:`NO_STATE`. Called in threads.
         """
 
     @abstractmethod
@@ -138,7 +138,7 @@ class VideoSource(ABC):
         """Ask for the state of one file now.
 
         Raises:
-            VideoUnreadable: it cannot be had.
+            VideoUnreadable: the file is missing or cannot be read.
         """
 
     @abstractmethod
@@ -149,7 +149,7 @@ class VideoSource(ABC):
             fingerprint: as catalogued; "" takes what is there now.
 
         Raises:
-            VideoUnreadable, VideoChanged: it cannot be had. A video that is on this host anyway may be lent unchecked:
+            VideoUnreadable, VideoChanged: the file cannot be read, or differs. A local video may be lent unchecked:
                 reading it reports the same errors.
         """
 
@@ -183,7 +183,7 @@ class VideoSource(ABC):
         """Do the part of :meth:`open_local` that needs the network, so that :meth:`has` returns True.
 
         Raises:
-            VideoUnreadable, VideoChanged: it cannot be had.
+            VideoUnreadable, VideoChanged: a file cannot be fetched, or differs.
         """
 
     def release(self) -> None:  # noqa: B027 - a local source keeps nothing
@@ -209,7 +209,7 @@ def open_source(name: str | os.PathLike[str], options: SourceOptions = SourceOpt
     """Open the source that a user names: a folder, a video, a list file, or an address in object storage.
 
     Raises:
-        CorpusError: there is no such source, or this user may not look at it.
+        CorpusError: there is no such source, or this user may not read it.
         UsageError: an address or a setting is malformed.
     """
     name = os.fspath(name)
@@ -219,5 +219,5 @@ def open_source(name: str | os.PathLike[str], options: SourceOptions = SourceOpt
             if source is not None:
                 return source
     except OSError as error:  # a folder that this user may not enter, a share that has gone
-        raise CorpusError(f"{name}: cannot be looked at: {error.strerror or error}") from error
+        raise CorpusError(f"{name}: cannot be read: {error.strerror or error}") from error
     raise CorpusError(f"{name}: no kind of source takes this name")

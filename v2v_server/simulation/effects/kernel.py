@@ -127,9 +127,7 @@ def _simulate(
     frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
     tolerance, drawn_start, start_residual, drifts_first, bins, limit, out, tables, state, words, floats,
 ):  # fmt: skip
-    """Run the kernel without reference counting, which every view of an array would cost; the caller provides all
-    memory.
-    """
+    """Run the kernel in memory of the caller, so that views of arrays need no reference counting."""
     use_widest_vectors()  # type: ignore[call-arg]
     count, pixels = len(segments.step), frames.shape[1]
     noisy = len(segments.noise_scale) > 0

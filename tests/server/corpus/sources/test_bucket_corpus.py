@@ -64,7 +64,7 @@ def test_it_is_the_catalogue_of_the_folder(store: Path, fetched: list[str]) -> N
         assert remote.digest == local.digest
         assert list(remote.videos) == list(local.videos)
         assert not remote.source.is_local
-        with pytest.raises(CorpusError, match="is no folder of this host"):
+        with pytest.raises(CorpusError, match="not a folder of this host"):
             remote.path("a.mp4")
     assert sorted(fetched) == ["a.mp4", "deep/b.mkv"]
 

@@ -185,7 +185,7 @@ def test_links_to_files_of_the_kernel_are_refused(tmp_path: Path) -> None:
     assert refused == {"proc": PSEUDO, "x.mp4": PSEUDO}
     refused.clear()
     assert not list(Folder(tmp_path, lambda: (ListEntry("x.mp4"),)).videos(refused, Counter()))
-    assert refused == {"x.mp4": "is no regular file"}
+    assert refused == {"x.mp4": "is not a regular file"}
 
 
 def test_other_endings_are_counted_but_for_those_of_no_videos(tmp_path: Path) -> None:
