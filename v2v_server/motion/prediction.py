@@ -29,6 +29,8 @@ from v2v_server.simulation.voxel import FINE_STEPS
 
 SUBSTEP_PX, THRESHOLD = 1.0, 0.2
 """``substep_px`` and contrast threshold that predictions are for."""
+MOST_FRAMES = 33
+"""Frames that a prediction is made from: a fraction of a second's work."""
 _SHORTEST = math.ceil(SUBSTEP_PX * UNITS_PER_PX / 2)
 _GAMMA, _LOG_EPS = 2.2, 1e-3
 _LEAST_EXPLAINED = 0.25
@@ -126,8 +128,11 @@ def predict(pictures: Frames) -> Prediction:
     Memory: about 4 bytes a pixel for each frame and each level between frames, at most 16 a frame.
 
     Args:
-        pictures: [n, h, w] uint8, n >= 2 consecutive frames as a camera sees them.
+        pictures: [n, h, w] uint8, n >= 2 consecutive frames as a camera sees them; of more than MOST_FRAMES those in
+            the middle are used.
     """
+    first_used = max(0, (len(pictures) - MOST_FRAMES) // 2)
+    pictures = pictures[first_used : first_used + MOST_FRAMES]
     count, height, width = pictures.shape
     levels = levels_between(pictures, (0, 0, height, width), np.arange(count), SUBSTEP_PX)
     fine = pictures.astype(np.uint16) * np.uint16(FINE_STEPS)

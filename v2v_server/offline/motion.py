@@ -42,8 +42,6 @@ _MOST_CLIPS = 4
 _ENOUGH = 0.25
 """A camera is worth showing that has this share of the events of the best one."""
 _STORED_FRAMES = 16
-_PREDICTED_FRAMES = 33
-"""Frames of a sample that its loss is predicted from: a fraction of a second's work."""
 _NOISE = ("noise_sigma", "hot_pixel_share", "shot_noise_hz", "leak_hz")
 
 
@@ -72,12 +70,10 @@ def quiet_voxels(made: RemadeSample) -> npt.NDArray[Any]:
 
 
 def predicted_loss(made: RemadeSample) -> Prediction:
-    """Predict what a sample loses between its frames: from _PREDICTED_FRAMES frames in the middle of its clip."""
-    plan, frames = made.decoded.plan, made.decoded.clip.frames
-    first = max(0, (len(frames) - _PREDICTED_FRAMES) // 2)
-    part = frames[first : first + _PREDICTED_FRAMES]
-    recipe = plan.spec.recipe
-    return predict(apply_view(without_margin(part, plan.params, recipe, plan.margin_px), plan.params, recipe))
+    """Predict what a sample loses between its frames."""
+    plan, recipe = made.decoded.plan, made.decoded.plan.spec.recipe
+    frames = without_margin(made.decoded.clip.frames, plan.params, recipe, plan.margin_px)
+    return predict(apply_view(frames, plan.params, recipe))
 
 
 def describe_loss(found: Prediction) -> str:
