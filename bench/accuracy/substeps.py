@@ -9,13 +9,16 @@ is then all of its frames, and every n-th one is seen.
 Bars: moving photographs (mean of three) at substep_px 1: 10 % signed and 30 % split in bins of a frame at 4.8 and 12 px
 a frame; in bins of 10 ms at 30 frames a second 45, 38 and 50 % signed at 2, 4 and 10 px, and never worse than linear at
 0.3 and 0.8 px.
+
+"predicted" is what ``v2v_server/motion/prediction.py`` predicts from the frames, in bins of a frame, beside what is
+measured. Its constants (FITS) are least squares over the moving photographs; the other scenes and films check it.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -41,6 +44,7 @@ from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_server.motion import levels_between
+from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, predict
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.voxel import FINE_STEPS, Levels
@@ -58,6 +62,7 @@ BARS = {
 }  # fmt: skip
 SLOW_PX = 1.0
 EVERY, VIDEO_STEPS = (4, 8), 8
+SETTINGS = (("linear", ""), ("divided", ", sub-steps"))
 _COLUMNS: tuple[Column, ...] = (
     ("scene", "scene", "{}", 1),
     ("px_per_frame", "px a frame", "{:g}", 1),
@@ -70,6 +75,14 @@ _COLUMNS: tuple[Column, ...] = (
     ("count_divided", "count", "{:+.0%}", 1),
     ("signed_divided", "signed", "{:.1%}", 1),
     ("split_divided", "split", "{:.1%}", 1),
+)
+_PREDICTED: tuple[Column, ...] = (
+    ("scene", "predicted / measured", "{}", 1),
+    ("px_per_frame", "px a frame", "{:g}", 1),
+    ("frames_per_second", "frames/s", "{:g}", 1),
+    ("predicted_px_per_frame", "found", "{:.1f}", 1),
+    ("explained", "explained", "{:.0%}", 1),
+    *((f"{key}_{name}", f"{key}{title}", "{}", 1) for name, title in SETTINGS for key in PredictedErrors._fields),
 )
 _COSTS: tuple[Column, ...] = (
     ("px_per_frame", "px a frame", "{:g}", 1),
@@ -103,6 +116,47 @@ def compared(frames: Frames, seconds: Reals, edges: Reals, true: Counts, substep
     return found
 
 
+def predicted(frames: Frames) -> dict[str, float]:
+    """Return the apparent and predicted errors of a clip."""
+    found = predict(frames)
+    record = {"predicted_px_per_frame": found.px_per_frame, "explained": found.explained}
+    record |= {f"apparent_{key}": value for key, value in found.apparent._asdict().items()}
+    for name, _ in SETTINGS:
+        record |= {f"predicted_{key}_{name}": value for key, value in found.errors(name)._asdict().items()}
+    return record
+
+
+def side_by_side(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record with a text of each predicted and measured error, per cent."""
+    return {**record} | {
+        f"{key}_{name}": f"{100 * record[f'predicted_{key}_{name}']:.0f} / {100 * measured_loss(record, key, name):.0f}"
+        for name, _ in SETTINGS
+        for key in PredictedErrors._fields
+    }
+
+
+def measured_loss(record: Mapping[str, Any], key: str, name: str) -> float:
+    """Return a measured error under the name of a predicted one: events lost are positive."""
+    return -float(record[f"count_{name}"]) if key == "lost" else float(record[f"{key}_{name}"])
+
+
+def fits(records: Records) -> Iterator[str]:
+    """Yield the least-squares fit of each true error of the photographs, and how far the predictions are off."""
+    framed = [record for record in records if "explained" in record]
+    fitted = [record for record in framed if record["scene"] in PHOTOGRAPHS]
+    for which, some in (("fitted", fitted), ("held out", [record for record in framed if record not in fitted])):
+        for name, _ in SETTINGS:
+            texts = []
+            for key in PredictedErrors._fields:
+                true = [measured_loss(record, key, name) for record in some]
+                wrong = np.subtract(true, [record[f"predicted_{key}_{name}"] for record in some])
+                texts.append(f"{key} {100 * np.sqrt(np.mean(wrong**2)):.1f} (most {100 * np.abs(wrong).max():.0f})")
+                if which == "fitted":
+                    slope, start = np.polyfit([record[f"apparent_{key}"] for record in some], true, 1)
+                    yield f"FITS {name} {key}: Fit({start:.3f}, {slope:.3f})"
+            yield f"predictions off by, {which}, {name}, points rms: {', '.join(texts)}"
+
+
 def rendered(substep_px: float, side: int, steps: int) -> Iterator[dict[str, Any]]:
     """Yield one record for each scene, speed and bin."""
     seconds = np.arange(steps + 1) / FRAMES_PER_SECOND
@@ -114,10 +168,12 @@ def rendered(substep_px: float, side: int, steps: int) -> Iterator[dict[str, Any
             frames = scene.frames(FRAMES_PER_SECOND, steps + 1)
             for size, edges in bins.items():
                 true = scene.counts(edges, THRESHOLD, FRAMES_PER_SECOND * max(24, round(8 * px)))
+                found = compared(frames, seconds, edges, true, substep_px)
                 yield {
                     "measure": "rendered", "scene": name, "px_per_frame": px, "bin": size,
                     "frames_per_second": FRAMES_PER_SECOND, "substep_px": substep_px,
-                } | compared(frames, seconds, edges, true, substep_px)  # fmt: skip
+                    **found, **(predicted(frames) if size == "frame" else {}),
+                }  # fmt: skip
 
 
 def filmed(path: Path, substep_px: float) -> Iterator[dict[str, Any]]:
@@ -133,10 +189,11 @@ def filmed(path: Path, substep_px: float) -> Iterator[dict[str, Any]]:
     seconds = np.arange(count) / facts.frames_per_second
     for every in EVERY:
         true = counts_of(log_levels(frames.reshape(count, -1) / 255.0), seconds, seconds[::every], THRESHOLD)
+        found = compared(frames[::every], seconds[::every], seconds[::every], true, substep_px)
         yield {
             "measure": "film", "scene": path.name, "bin": "frame", "substep_px": substep_px,
-            "frames_per_second": facts.frames_per_second / every,
-        } | compared(frames[::every], seconds[::every], seconds[::every], true, substep_px)  # fmt: skip
+            "frames_per_second": facts.frames_per_second / every, **found, **predicted(frames[::every]),
+        }  # fmt: skip
 
 
 def costs(substep_px: float, repeats: int) -> Iterator[dict[str, Any]]:
@@ -201,5 +258,11 @@ def measure(asked: argparse.Namespace) -> Report:
     scenes = list(rendered(asked.substep_px, asked.side, asked.steps))
     films = [each for path in asked.video for each in filmed(path, asked.substep_px)]
     spent = list(costs(asked.substep_px, asked.repeats))
-    bars = missed(scenes) if asked.substep_px == 1.0 else []
-    return Report([*scenes, *films, *spent], [(scenes + films, _COLUMNS), (spent, _COSTS)], missed=bars)
+    tables: list[tuple[Records, tuple[Column, ...]]] = [(scenes + films, _COLUMNS), (spent, _COSTS)]
+    if asked.substep_px != SUBSTEP_PX:
+        return Report([*scenes, *films, *spent], tables)
+    held_out = [
+        side_by_side(each) for each in scenes + films if "explained" in each and each["scene"] not in PHOTOGRAPHS
+    ]
+    tables.append((held_out, _PREDICTED))
+    return Report([*scenes, *films, *spent], tables, list(fits(scenes + films)), missed(scenes))

@@ -19,9 +19,10 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
 from v2v_protocol.spec import StreamSpec
 from v2v_server.config import recipe_setting
+from v2v_server.motion.prediction import SUBSTEP_PX, Prediction
 from v2v_server.simulation.variants import warm_up
 from v2v_server.system.process import keep_freed_memory
-from v2v_server.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, accuracy, spurious
+from v2v_server.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, accuracy, predicted_loss, spurious
 from v2v_server.tradeoff.diversity import diversity
 from v2v_server.tradeoff.forms import DEFAULT_FORMS, ENCODINGS, SOURCE, CorpusForm, forms
 from v2v_server.tradeoff.front import best
@@ -135,6 +136,11 @@ def _measured(
     for setting in chosen:
         root, leases = sources[setting.form]
         works[setting.name] = making(root, leases, setting.samples_per_decode)
+    with_substeps = dataclasses.replace(spec, substep_px=SUBSTEP_PX)
+    for name, form in corpus.items():
+        works[_substeps_name(name, SUBSTEP_PX)] = making(
+            form.clips.folder, leases_of(form.clips, with_substeps, places)
+        )
     speeds = measure(works, until=begun + budget)
     records = [
         _record(setting, speeds[setting.name], speeds[EXACT.name], corpus)
@@ -144,7 +150,33 @@ def _measured(
     ]
     name_dominated(records)
     scale = [{"measure": "scale", "name": name, **error_fields(tallies[name])} for name in (NOISE_ROW, DRAW_ROW)]
-    return records + scale + alike
+    between = _substeps(corpus, speeds, predicted_loss(*sources[SOURCE]))
+    return records + between + scale + alike
+
+
+def _substeps_name(form: str, substep_px: float) -> str:
+    return f"{form}, substep_px = {substep_px:g}"
+
+
+def _substeps(corpus: Mapping[str, CorpusForm], speeds: Mapping[str, Speed], loss: Prediction) -> list[dict[str, Any]]:
+    """Return the cost of each form without and with sub-steps, one sample a decode, beside the predicted errors."""
+    records: list[dict[str, Any]] = []
+    for form in corpus:
+        for substep_px, key in ((0.0, "linear"), (SUBSTEP_PX, "divided")):
+            name = _substeps_name(form, substep_px)
+            seconds = speeds[name if substep_px else ServeSetting(form).name].fastest
+            records.append(
+                {
+                    "measure": "substeps", "name": name, "form": form, "substep_px": substep_px,
+                    "samples_per_core_second": 1.0 / seconds, "cpu_seconds_per_sample": seconds,
+                    "px_per_frame": loss.px_per_frame,
+                }
+                | {
+                    f"predicted_{error}": share if loss.can_be_followed or loss.is_slow else None
+                    for error, share in loss.errors(key)._asdict().items()
+                }
+            )  # fmt: skip
+    return records
 
 
 def _record(setting: ServeSetting, speed: Speed, exact: Speed, corpus: Mapping[str, CorpusForm]) -> dict[str, Any]:

@@ -18,10 +18,12 @@ from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.motion.prediction import SUBSTEP_PX, Prediction, predict
 from v2v_server.offline.leases import lease_for
 from v2v_server.offline.remake import RemadeSample, Remaker
 from v2v_server.schedule.sequences import VideoSequence
 from v2v_server.simulation.draw import draw
+from v2v_server.simulation.view import apply_view, without_margin
 from v2v_server.store.format import is_store_file
 from v2v_server.store.reader import StoreFile
 from v2v_server.system.opencv import cv2
@@ -65,6 +67,32 @@ def quiet_voxels(made: RemadeSample) -> npt.NDArray[Any]:
     )
     quiet = Decoded(replace(plan, spec=spec, params=params, flow=None), made.decoded.clip)
     return make_sample(lease, quiet).arrays["voxels"]
+
+
+def predicted_loss(made: RemadeSample) -> Prediction:
+    """Predict what a sample loses between its frames."""
+    plan, recipe = made.decoded.plan, made.decoded.plan.spec.recipe
+    frames = without_margin(made.decoded.clip.frames, plan.params, recipe, plan.margin_px)
+    return predict(apply_view(frames, plan.params, recipe))
+
+
+def describe_loss(found: Prediction) -> str:
+    """Return one line for the user about what the motion between frames costs and whether sub-steps help."""
+    if found.is_slow:
+        return (
+            f"motion: {found.px_per_frame:.2g} px a frame at the median of what moves; substep_px would change little"
+        )
+    if not found.can_be_followed:
+        return (
+            "fast changes that motion does not explain, such as flicker or vibration: events between frames are lost, "
+            "and substep_px restores few of them; take videos with more frames a second"
+        )
+    off, on = (max(5, 5 * round(20 * found.errors(setting).lost)) for setting in ("linear", "divided"))
+    return (
+        f"fast motion: {found.px_per_frame:.2g} px a frame at the median of what moves; about {off} % of the events "
+        f"are lost within steps, {on} % with substep_px = {SUBSTEP_PX:g} "
+        "(prediction; motion blur hides further losses)"
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,8 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.offline.motion import WholePictures, moving_seeds, quiet_voxels
+from v2v_server.motion.prediction import Prediction
+from v2v_server.offline.motion import WholePictures, describe_loss, moving_seeds, predicted_loss, quiet_voxels
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.store.clips import clips_of
@@ -92,7 +93,7 @@ def preview(
         raise UsageError(f"--out {out}: there is no folder {out.parent}; create it first")
     catalogue = open_shown(source, list_file=list_file, rows=rows, cache_dir=cache_dir)
     cameras: list[Camera] = []
-    notes: dict[str, list[str]] = {}
+    loss, notes = Prediction(), dict[str, list[str]]()
     try:
         first = _fitted_stream(catalogue, spec, shots[0].recipe)
         wholes = WholePictures(catalogue, first)
@@ -101,13 +102,16 @@ def preview(
             say(note)
         with Progress("simulating", "cameras") as progress:
             for shot in shots:
-                cameras.append(_camera(catalogue, shot, spec, with_flow, notes))
+                camera, lost = _camera(catalogue, shot, spec, with_flow, notes)
+                cameras.append(camera)
+                loss += lost
                 progress(len(cameras), len(shots))  # the first may include compiling; the estimate begins after it
         whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
     finally:
         catalogue.close()
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
+    say(describe_loss(loss))
     write(out, _content(out.suffix, whole, cameras, title, moments))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
 
@@ -148,8 +152,11 @@ def _content(kind: str, whole: Camera, cameras: Sequence[Camera], title: str, mo
 
 def _camera(
     catalogue: Catalogue, shot: Shot, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
-) -> Camera:
-    """Make one camera's clip; add the titles of the cameras that a note is about to ``notes``, by its text."""
+) -> tuple[Camera, Prediction]:
+    """Make one camera's clip and predict what it loses between frames.
+
+    Adds the titles of the cameras that a note is about to ``notes``, by its text.
+    """
     title = shot.title or f"seed {shot.seed}"
     asked, stream = StreamSpec.from_dict({**spec, "recipe": shot.recipe}), _fitted_stream(catalogue, spec, shot.recipe)
     if stream != asked:
@@ -167,7 +174,7 @@ def _camera(
     camera = Camera.of(made.sample.arrays, provenance, title, stream.recipe, whole)
     quiet_grids = quiet_voxels(made).reshape(-1, *camera.voxels.shape[1:])
     quiet = dataclasses.replace(camera, voxels=quiet_grids[camera.lead_voxels :])
-    return dataclasses.replace(camera, quiet=quiet.rates)
+    return dataclasses.replace(camera, quiet=quiet.rates), predicted_loss(made)
 
 
 def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[np.uint8]:

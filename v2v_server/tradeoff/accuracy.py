@@ -20,6 +20,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.sources.folder import Folder
+from v2v_server.motion.prediction import Prediction, predict
 from v2v_server.simulation.clip import simulate, simulate_clip
 from v2v_server.simulation.view import apply_view
 from v2v_server.store.clips import clips_of
@@ -107,6 +108,11 @@ def accuracy(works: Mapping[str, tuple[Path, Sequence[Lease]]], reference: str, 
             for name, changed in scale.items():
                 tallies[name][threshold] += compare(exact.voxels(changed), truth)
     return tallies
+
+
+def predicted_loss(root: Path, leases: Sequence[Lease]) -> Prediction:
+    """Predict what the first sample of each lease loses between its frames."""
+    return sum((predict(seen(root, lease).frames) for lease in leases), Prediction())
 
 
 def spurious(stills: Catalogue, crop_px: tuple[int, int]) -> dict[float, float]:

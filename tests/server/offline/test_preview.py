@@ -13,6 +13,7 @@ import pytest
 from PIL import Image as Pictures
 
 from tests.clips import panned_luma, write_clip
+from tests.oracles.rendered import rendered_scene
 from v2v_pictures.camera import Camera
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_server.commands import preview as command
@@ -48,7 +49,7 @@ def test_a_video_too_short_or_too_small_is_shown_all_the_same_and_said(clip: Pat
     preview(str(clip), tmp_path / "p.png", looks, {}, title="t", cache_dir=str(tmp_path), say=said.append)
     # 40 frames: 7 grids of 5 bins; 96 rows: a crop of 128 shrinks by quarters.
     assert "all cameras: shown with 7 voxel grids of 96 x 96 instead of 40 of 128 x 128" in said[0]
-    assert said[1] == f"{tmp_path / 'p.png'}: 1 camera"
+    assert said[-1] == f"{tmp_path / 'p.png'}: 1 camera"
 
 
 def test_a_video_of_one_frame_is_refused(tmp_path: Path) -> None:
@@ -89,7 +90,7 @@ def test_the_command_compares_recipes_on_one_clip(
     )
     assert seen == [("paper", 0), ("noise-free", 0), ("own", 0)]
     assert np.asarray(Pictures.open(out)).ndim == 3
-    chosen, said = capsys.readouterr().out.splitlines()
+    chosen, _, said = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"seed \d+: chosen because their crops show motion; --seed 0 takes what chance gives", chosen)
     assert said == f"{out}: 3 cameras"
 
@@ -158,3 +159,32 @@ def test_the_share_of_noise_is_measured(clip: Path, tmp_path: Path, monkeypatch:
     assert _shares(still, tmp_path, monkeypatch, loud) == [1.0]
     quiet = {"preset": "noise-free"}
     assert _shares(clip, tmp_path, monkeypatch, quiet) == [0.0]
+
+
+def _said(source: Path, tmp_path: Path) -> str:
+    said: list[str] = []
+    shots = [Shot("a", {"preset": "noise-free", "voxels_per_clip": 3, "crop_height_px": 64, "crop_width_px": 64}, 0)]
+    preview(str(source), tmp_path / "a.png", shots, {}, title="t", cache_dir=str(tmp_path), say=said.append)
+    return said[-2]
+
+
+def test_a_preview_says_what_fast_motion_costs(tmp_path: Path) -> None:
+    fast = rendered_scene("coffee", 96, 96, 180.0).frames(30.0, 20)
+    line = _said(write_clip(tmp_path / "fast.mp4", fast), tmp_path)
+    found = re.match(
+        r"fast motion: ([\d.]+) px a frame .*; about (\d+) % .* lost .*, (\d+) % with substep_px = 1", line
+    )
+    assert found is not None, line
+    assert 4.0 < float(found[1]) < 8.0
+    assert int(found[2]) > int(found[3])
+
+
+def test_a_preview_promises_nothing_where_sub_steps_do_not_help(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    light = rendered_scene("coffee", 96, 96, 300.0).light
+    shaken = np.stack([np.rint(255 * light(0.05 * rng.random())) for _ in range(20)]).astype(np.uint8)
+    line = _said(write_clip(tmp_path / "shaken.mp4", shaken), tmp_path)
+    assert line.startswith("fast changes that motion does not explain")
+    assert "%" not in line
+    still = np.repeat(shaken[:1], 20, axis=0)
+    assert _said(write_clip(tmp_path / "still.mp4", still), tmp_path).endswith("substep_px would change little")

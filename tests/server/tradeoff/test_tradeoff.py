@@ -23,11 +23,13 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.commands import tradeoff
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.motion.prediction import Prediction
 from v2v_server.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, spurious
 from v2v_server.tradeoff.diversity import diversity, effective_samples, overlap
 from v2v_server.tradeoff.errors import Tally, compare, correlation
 from v2v_server.tradeoff.forms import ENCODINGS, SOURCE
 from v2v_server.tradeoff.front import best, dominates, dominators
+from v2v_server.tradeoff.report import tables
 from v2v_server.tradeoff.settings import EXACT, ServeSetting, settings, write_preset
 from v2v_server.tradeoff.speed import Speed, TimedWork, leases_of, measure
 
@@ -263,6 +265,18 @@ def test_a_corpus_without_videos_is_status_2(tmp_path: Path, capsys: pytest.Capt
     assert error.count("\n") == 1
 
 
+def test_no_error_is_predicted_where_motion_explains_nothing() -> None:
+    speeds = {name: Speed(0.5, 0.5, 1) for name in (EXACT.name, "source, substep_px = 1")}
+    form: Any = None
+    unexplained = Prediction((8.0,), 60.0, 100.0, 60.0, 10.0, 40.0, along_apart=9.0, mean_apart=10.0)
+    for loss, is_predicted in ((unexplained, False), (dataclasses.replace(unexplained, along_apart=2.0), True)):
+        off, on = tradeoff._substeps({SOURCE: form}, speeds, loss)
+        assert [off["name"], on["name"]] == ["source, substep_px = 0", "source, substep_px = 1"]
+        assert (on["predicted_lost"] is not None) == is_predicted
+    assert off["predicted_lost"] > on["predicted_lost"]
+    assert "source, substep_px = 1" in tables([off, on])
+
+
 @pytest.mark.slow
 def test_a_short_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, picture, chosen = tmp_path / "tradeoff.json", tmp_path / "tradeoff.png", tmp_path / "chosen.yaml"
@@ -293,6 +307,10 @@ def test_a_short_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     scale = {item["name"]: item["voxel_error_at_0.2"] for item in found if item["measure"] == "scale"}
     assert set(scale) == {NOISE_ROW, DRAW_ROW}
     assert min(scale.values()) > 0
+    between = {(item["form"], item["substep_px"]): item for item in found if item["measure"] == "substeps"}
+    assert set(between) == {(form, px) for form in (SOURCE, "lossless fast", "h264 23") for px in (0.0, 1.0)}
+    assert between[SOURCE, 0.0]["cpu_seconds_per_sample"] == exact["cpu_seconds_per_sample"]
+    assert {0.0 < item["predicted_signed"] < 1.0 for item in between.values()} == {True}
     alike = {item["name"]: item for item in found if item["measure"] == "diversity"}
     assert set(alike) == {"siblings", "batch"}
     assert 1 <= alike["siblings"]["effective_samples_of_2"] <= alike["siblings"]["effective_samples_of_4"] <= 4
