@@ -20,6 +20,7 @@ from v2v_client import notebook
 from v2v_client.batch import Batch
 from v2v_client.options import require_arguments
 from v2v_protocol.errors import UsageError
+from v2v_protocol.events import EventList
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample
 from v2v_protocol.settings import require_whole
@@ -123,12 +124,20 @@ class V2VDataset(Dataset[Sample]):
             IndexError: ``index`` is outside -len .. len - 1.
             SampleUnavailable: no candidate video could give it.
         """
-        place = index + self._length if index < 0 else index
-        if not 0 <= place < self._length:
-            raise IndexError(f"index {index}: the epoch has {self._length} samples")
+        place = self._place(index)
         sample: Sample = self._open().sample(self.seed, self.epoch, place)
         title = f"Sample {place} of {self._length}"
         return ShownSample(sample.arrays, sample.provenance, self.spec.recipe, title)
+
+    def events(self, index: int) -> EventList:
+        """List the events of the sample at ``index``, each with the time of its threshold crossing.
+
+        Raises:
+            IndexError, SampleUnavailable: as for ``dataset[index]``.
+            VideoError: the video's frame rate is unknown.
+        """
+        events: EventList = self._open().events(self.seed, self.epoch, self._place(index))
+        return events
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, which selects other cameras and another order. Call it before a DataLoader starts workers."""
@@ -149,6 +158,12 @@ class V2VDataset(Dataset[Sample]):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_maker": None}
+
+    def _place(self, index: int) -> int:
+        place = index + self._length if index < 0 else index
+        if not 0 <= place < self._length:
+            raise IndexError(f"index {index}: the epoch has {self._length} samples")
+        return place
 
     def _open(self) -> Any:
         """Return this process's own remaker: an index file that was opened before a fork must not be read."""

@@ -48,6 +48,18 @@ def test_a_sample_is_that_of_the_stream(
     assert sample.provenance == batch.provenance[0]
 
 
+def test_events_add_up_to_the_voxels(dataset: V2VDataset) -> None:
+    sample, events = dataset[0], dataset.events(0)
+    assert sample.provenance.saturated_bins == 0
+    sums = np.zeros((events.height_px, events.width_px), int)
+    np.add.at(sums, (events.y, events.x), np.where(events.p, 1, -1))
+    np.testing.assert_array_equal(sums, sample.arrays["voxels"].astype(int).sum(axis=(0, 1)))
+    assert len(events) > 0
+    assert (np.diff(events.t) >= 0).all()
+    with pytest.raises(IndexError, match="the epoch has"):
+        dataset.events(len(dataset))
+
+
 _RANGES = {
     "threshold": st.sampled_from(([0.1, 0.1], [0.2, 1.0])),
     "noise_sigma": st.sampled_from(([0, 0], [0.01, 0.05])),

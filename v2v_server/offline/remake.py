@@ -14,6 +14,7 @@ from v2v_pictures.camera import Camera, check_drawable
 from v2v_pictures.files import write_png
 from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError, VideoUnreadable
+from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
 from v2v_protocol.progress import Progress
 from v2v_protocol.refusal import Refusal, RefusalKind
@@ -87,6 +88,11 @@ class Remaker:
     def sample(self, seed: int, epoch: int, index: int) -> Sample:
         """Make the sample of this name, candidates and refusals included: see :meth:`made`."""
         return self.made(seed, epoch, index).sample
+
+    def events(self, seed: int, epoch: int, index: int) -> EventList:
+        """List the events of a sample with the times of their crossings. Errors: :meth:`made`."""
+        remade = self.made(seed, epoch, index)
+        return list_sample_events(remade.lease, remade.decoded)
 
     def made(self, seed: int, epoch: int, index: int) -> RemadeSample:
         """Make the sample of this name, and return what it was made of too.

@@ -327,7 +327,8 @@ from v2v_server.simulation import simulate
 from v2v_server.simulation.kernels import ARRAYS, fill
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
 
-levels = Levels(Moments(np.array([0, 2]), np.array([0.25, 1 / 3])), np.linspace(-6, 0, 80, dtype="f4").reshape(2, 5, 8))
+grey = np.linspace(0, 255 * FINE_STEPS, 80).astype(np.uint16).reshape(2, 5, 8)
+levels = Levels(Moments(np.array([0, 2]), np.array([0.25, 1 / 3])), grey)
 digest = hashlib.sha256()
 for effects in ({}, ALL):
     for precision in ("float32", "float64"):
