@@ -355,7 +355,7 @@ def test_an_unfinished_line_counts_as_not_written(source: Path, tmp_path: Path) 
     run(source, out)
     manifest = (out / MANIFEST_NAME).read_bytes()
     (out / MANIFEST_NAME).write_bytes(manifest[:-25])
-    with pytest.raises(CorpusError, match="4 of 5 videos; run v2v-prepare again"):
+    with pytest.raises(CorpusError, match="4 of 5 videos are prepared; run v2v-prepare again"):
         opened(out)
     assert run(source, out).kept == 4
     assert len(opened(out).videos) == 5

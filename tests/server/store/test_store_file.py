@@ -187,7 +187,7 @@ def test_an_unclosed_file_is_not_a_store_file(tmp_path: Path) -> None:
     with StoreWriter(tmp_path / "x", head_of(luma), QUICK) as writer:
         for picture in luma[:40]:
             writer.add(picture)
-        with pytest.raises(UsageError, match="40 frames of 64"):
+        with pytest.raises(UsageError, match="40 of 64 frames were written"):
             writer.close()
     assert not is_store_file(tmp_path / "x")
     with StoreWriter(tmp_path / "x", head_of(luma), QUICK) as writer:

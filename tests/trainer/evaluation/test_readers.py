@@ -310,7 +310,7 @@ def broken(path: Path, kind: str) -> Path:
         ("columns", r"columns of events have \[2, 6\]"),
         ("rows", r"events/xs is int64 \[6, 1\], not a column"),
         ("scalar", r"events/xs is int64 \[\], not a column"),
-        ("fractions", r"events/xs is float64 \[6\], not a column \[N\], which for coordinates"),
+        ("fractions", r"events/xs is float64 \[6\], not a column \[N\]; coordinates must be integers"),
         ("raw", r"no events/ts.*v2v-convert"),
         ("no images or size", "give the sensor.s size with --size WxH"),
         ("no index", "without the attribute event_idx"),
