@@ -6,7 +6,7 @@ import errno
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice
 
 from v2v_protocol.errors import CorpusError, V2VError
@@ -72,8 +72,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
     table = SequenceTable(found, catalogue.rows, spec)
     useless = len(found) - table.videos
     if useless:
-        shortest = min(table.longest_clips, default=0)
-        change = _remedy(shortest, spec.recipe.voxels_per_clip)
+        change = _remedy(table.longest_clips, spec.recipe.voxels_per_clip)
         why = "; ".join(str(table.refusals[place]) for place in range(min(shown, useless)))
         level = "note" if table.count else "bad"
         yield level, "corpus", f"{useless} videos give no sequence of the recipe {recipe}: {why}", change
@@ -115,22 +114,23 @@ def _how_videos_are_stored(catalogue: Catalogue) -> Iterator[Line]:
         yield "note", "corpus", text, change
 
 
-def _remedy(longest: int, wanted: int) -> str:
-    """Say what to do about videos that are too short; "" if no clip length admits them.
+def _remedy(longest: Sequence[int], wanted: int) -> str:
+    """Say what to do about videos that are too short; "" if no clip length admits any.
 
     Args:
-        longest: ``voxels_per_clip`` that admits all of them; 0: none does.
+        longest: largest ``voxels_per_clip`` of each of them.
         wanted: that of the recipe.
     """
     if not longest:
         return ""
-    least = (wanted + 1) // 2
-    if longest >= least:
+    least, for_all = (wanted + 1) // 2, min(longest)
+    if for_all >= least:
         return (
-            f"leave them out, or --set voxels_per_clip={longest} admits all that are only too short; a recurrent "
+            f"leave them out, or --set voxels_per_clip={for_all} admits all that are only too short; a recurrent "
             "network then learns from shorter clips"
         )
-    return (
-        f"leave the short ones out: clips of {longest} voxel grids, which all are long enough for, are too short to "
-        f"train a recurrent network (the recipe has {wanted}); --set voxels_per_clip={least} admits some"
+    text = (
+        f"leave the short ones out: clips of {for_all} voxel grids, the most that the shortest gives, are too short to "
+        f"train a recurrent network (the recipe has {wanted})"
     )
+    return text + (f"; --set voxels_per_clip={least} admits some" if max(longest) >= least else "")

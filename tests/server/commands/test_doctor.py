@@ -117,10 +117,20 @@ def test_a_server_without_torch_is_whole(monkeypatch: pytest.MonkeyPatch, capsys
     assert "no problems found" in said
 
 
-@pytest.mark.parametrize(("longest", "said"), [(0, ""), (1, "leave the short ones out"), (30, "voxels_per_clip=30")])
-def test_short_clips_are_not_advised_without_their_cost(longest: int, said: str) -> None:
+@pytest.mark.parametrize(
+    ("longest", "said", "admits"),
+    [
+        ((), "", ""),
+        ((1, 15), "leave the short ones out", ""),
+        ((1, 30), "leave the short ones out", "voxels_per_clip=20 admits some"),
+        ((30, 35), "leave them out", "voxels_per_clip=30 admits all"),
+    ],
+)
+def test_short_clips_are_not_advised_without_their_cost(longest: tuple[int, ...], said: str, admits: str) -> None:
     remedy = doctor_corpus._remedy(longest, 40)
     assert said in remedy
+    assert admits in remedy
+    assert ("admits" in remedy) == bool(admits)
     assert "voxels_per_clip=1 " not in remedy
     assert not remedy or "recurrent network" in remedy
 
