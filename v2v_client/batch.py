@@ -121,6 +121,26 @@ class Batch:
         return self._array("voxels")
 
     @property
+    def event_counts(self) -> torch.Tensor:
+        """Return the events of each polarity: [B, T, 2, bins, H, W], T as for :attr:`voxels`; OFF (0) before ON (1).
+
+        Raises:
+            UsageError: the dataset did not request this array.
+        """
+        return self._array("event_counts")
+
+    @property
+    def voxels_bilinear(self) -> torch.Tensor:
+        """Return the voxel grids with each event shared between the two bins next to its time, shaped like voxels.
+
+        float16, or float32 if the spec's ``voxel_dtype`` is float32.
+
+        Raises:
+            UsageError: the dataset did not request this array.
+        """
+        return self._array("voxels_bilinear")
+
+    @property
     def frames(self) -> torch.Tensor:
         """Return the simulated pixels: [B, T + lead_frames, 1, H, W] uint8.
 

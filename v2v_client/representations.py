@@ -1,8 +1,8 @@
 """Convert arrays of a batch to the inputs of other networks; leading dimensions, such as [B, T], are kept.
 
-stacked_histogram(batch["event_counts"])        # [B, T, 2 bins, H, W]
-event_count_image(batch["event_counts"])        # [B, T, 2, H, W]
-normalised(batch.voxels)                        # [B, T, bins, H, W]
+stacked_histogram(batch.event_counts)  # [B, T, 2 bins, H, W]
+event_count_image(batch.event_counts)  # [B, T, 2, H, W]
+normalised(batch.voxels)  # [B, T, bins, H, W]
 """
 
 from __future__ import annotations

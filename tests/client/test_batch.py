@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from v2v_client import Batch
+from v2v_protocol.errors import UsageError
+from v2v_protocol.sample import ARRAYS
 
 
 class Somewhere:
@@ -28,8 +30,12 @@ class Somewhere:
 
 
 def of(voxels: Any) -> Batch:
+    return with_arrays(voxels=voxels)
+
+
+def with_arrays(**arrays: Any) -> Batch:
     return Batch(
-        arrays={"voxels": voxels}, indices=(0,), epoch=0, provenance=(), resume_state={}, wait_seconds=0.0,
+        arrays=arrays, indices=(0,), epoch=0, provenance=(), resume_state={}, wait_seconds=0.0,
         cpu_seconds=0.0, decodes=1,
     )  # fmt: skip
 
@@ -56,3 +62,11 @@ def test_a_batch_gives_tensors_by_name_but_is_not_a_mapping() -> None:
     assert not isinstance(batch, abc.Mapping | abc.Iterable)
     with pytest.raises(TypeError, match="not iterable"):
         iter(batch)
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_every_array_is_an_attribute_and_says_how_to_get_it(name: str) -> None:
+    with pytest.raises(UsageError, match=rf"batch.{name}: .*arrays=\('depth', '{name}'\)"):
+        getattr(with_arrays(depth=torch.ones(1)), name)
+    tensor = torch.ones(1, 2)
+    assert getattr(with_arrays(**{name: tensor}), name) is tensor
