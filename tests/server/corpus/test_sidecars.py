@@ -104,6 +104,7 @@ def test_it_is_opened_like_the_video(corpus: Path, kind: str) -> None:
         boxes = catalogue.facts.sidecars_of("a.mp4", ARRAYS)[JSON]
         masks = catalogue.facts.sidecars_of("deep/b.x.mp4", ARRAYS)[MASKS]
     source = open_source(name_of(corpus, kind), SourceOptions(cache_dir=corpus.parent / "other"))
+    source.make()
     files = {"a.boxes.json": boxes, "deep/b.x.masks/": masks}
     assert source.has(files) is source.is_local
     source.fetch(files)
@@ -136,6 +137,7 @@ def test_a_changed_and_a_missing_one_are_told_apart(corpus: Path, kind: str) -> 
         for video in catalogue.videos:
             catalogue.check(video.id, video.fingerprint)
     fresh = open_source(name_of(corpus, kind), SourceOptions(cache_dir=corpus.parent / "other"))
+    fresh.make()
     with pytest.raises(VideoGone), open_sidecar(fresh, "a.boxes.json", boxes):
         pass
     with pytest.raises(VideoError), open_sidecar(fresh, "deep/b.x.masks/", masks):
