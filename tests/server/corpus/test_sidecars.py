@@ -15,6 +15,7 @@ from v2v_protocol.errors import VideoChanged, VideoError, VideoGone
 from v2v_protocol.sample import FromSidecar
 from v2v_server.corpus import sidecars as collecting
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.sources import asking
 from v2v_server.corpus.sources.sidecar import fingerprint_of, open_sidecar, sidecar_id
 from v2v_server.corpus.sources.source import SourceOptions, open_source
 
@@ -91,6 +92,25 @@ def test_a_catalogue_knows_them_and_its_digest_does_not(
         assert changed.facts.sidecars_of("a.mp4", ARRAYS) == {}
         assert changed.facts.sidecars_digest(("masks",)) not in digests
     assert len(read) == 1
+
+
+def test_an_interrupted_start_keeps_what_it_has_read(corpus: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (corpus / "deep/b.x.boxes.json").write_text("[2]")
+    monkeypatch.setattr(asking, "_TOGETHER", 1)
+    read: list[str] = []
+
+    def interrupted(opened: Path) -> str:
+        if read:
+            raise KeyboardInterrupt
+        read.append(opened.name)
+        return fingerprint_of(opened)
+
+    monkeypatch.setattr(collecting, "fingerprint_of", interrupted)
+    with pytest.raises(KeyboardInterrupt), opened(corpus, "folder"):
+        pass
+    monkeypatch.setattr(collecting, "fingerprint_of", lambda opened: read.append(opened.name) or fingerprint_of(opened))
+    with opened(corpus, "folder"):
+        assert read == ["a.boxes.json", "b.x.boxes.json", "b.x.masks"]
 
 
 def test_a_bucket_has_those_of_its_folder(corpus: Path) -> None:
