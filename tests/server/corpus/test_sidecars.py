@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -111,6 +112,23 @@ def test_an_interrupted_start_keeps_what_it_has_read(corpus: Path, monkeypatch: 
     monkeypatch.setattr(collecting, "fingerprint_of", lambda opened: read.append(opened.name) or fingerprint_of(opened))
     with opened(corpus, "folder"):
         assert read == ["a.boxes.json", "b.x.boxes.json", "b.x.masks"]
+
+
+@pytest.mark.parametrize("name", ["a.boxes.json", "deep/b.x.masks/2.png"])
+def test_a_fifo_is_not_opened(corpus: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (corpus / name).unlink()
+    os.mkfifo(corpus / name)
+
+    def read(opened: Path) -> str:
+        """Fail before opening it, which would wait for a writer."""
+        assert not any(map(Path.is_fifo, (opened, *opened.glob("*"))))
+        return fingerprint_of(opened)
+
+    monkeypatch.setattr(collecting, "fingerprint_of", read)
+    with opened(corpus, "folder") as catalogue:
+        notes = [note for note in catalogue.notes if "not a regular file" in note]
+    assert len(notes) == 1
+    assert notes[0].startswith("1 sidecars cannot be read and count as missing (")
 
 
 def test_a_bucket_has_those_of_its_folder(corpus: Path) -> None:

@@ -9,8 +9,10 @@ Its fingerprint is ``<size in bytes>-<32 hexadecimal digits>``, from the names a
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -62,7 +64,7 @@ def local_state(path: Path, id: str) -> str:
     """Return a text that changes with the files' sizes and times; "" if there is no such sidecar, or no file in it.
 
     Raises:
-        OSError: it cannot be told.
+        OSError: it cannot be told, or one is not a regular file: opening a FIFO blocks until there is a writer.
     """
     if path.is_dir() != id.endswith("/"):
         return ""
@@ -70,6 +72,9 @@ def local_state(path: Path, id: str) -> str:
         found = [(name, os.stat(str(file))) for name, file in _files(path)]
     except (FileNotFoundError, NotADirectoryError):
         return ""
+    for _, each in found:
+        if not stat.S_ISREG(each.st_mode):
+            raise OSError(errno.EINVAL, "not a regular file")
     return state_text([(name, (each.st_size, each.st_mtime_ns, each.st_ctime_ns)) for name, each in found])
 
 
@@ -79,14 +84,14 @@ def state_text(states: list[tuple[str, tuple[int, int, int]]]) -> str:
 
 
 def check_local(path: Path, id: str, fingerprint: str) -> None:
-    """Check a sidecar of this host against its fingerprint.
+    """Check a sidecar of this host against its fingerprint; "" takes what is there now.
 
     Raises:
         VideoGone, VideoDenied, VideoChanged, VideoUnreadable: it is gone, another one by now, or cannot be read.
     """
     try:
         state = local_state(path, id)
-        found = _fingerprint_at(path, state) if state else ""
+        found = _fingerprint_at(path, state) if state and fingerprint else ""
     except OSError as error:
         raise unreadable(id, error) from error
     if not state:
