@@ -131,6 +131,14 @@ def test_a_fifo_is_not_opened(corpus: Path, name: str, monkeypatch: pytest.Monke
     assert notes[0].startswith("1 sidecars cannot be read and count as missing (")
 
 
+def test_links_in_circles_are_not_followed_by_all_paths(corpus: Path) -> None:
+    for name in ("here", "there"):
+        (corpus / "deep/b.x.masks" / name).symlink_to(".")
+    with opened(corpus, "folder") as catalogue:
+        assert catalogue.facts.sidecars_of("deep/b.x.mp4", ARRAYS) == {}
+        assert any("a link that leads nowhere" in note for note in catalogue.notes)
+
+
 def test_a_bucket_has_those_of_its_folder(corpus: Path) -> None:
     with opened(corpus, "folder") as local, opened(corpus, "bucket") as remote:
         assert remote.facts.sidecars_digest(ARRAYS) == local.facts.sidecars_digest(ARRAYS)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -64,17 +63,14 @@ def local_state(path: Path, id: str) -> str:
     """Return a text that changes with the files' sizes and times; "" if there is no such sidecar, or no file in it.
 
     Raises:
-        OSError: it cannot be told, or one is not a regular file: opening a FIFO blocks until there is a writer.
+        OSError: it cannot be told.
     """
-    if path.is_dir() != id.endswith("/"):
+    if path.is_dir() != id.endswith("/") or not path.exists():
         return ""
     try:
         found = [(name, os.stat(str(file))) for name, file in _files(path)]
     except (FileNotFoundError, NotADirectoryError):
         return ""
-    for _, each in found:
-        if not stat.S_ISREG(each.st_mode):
-            raise OSError(errno.EINVAL, "not a regular file")
     return state_text([(name, (each.st_size, each.st_mtime_ns, each.st_ctime_ns)) for name, each in found])
 
 
@@ -127,9 +123,16 @@ def open_sidecar(source: VideoSource, id: str, fingerprint: str) -> Iterator[Tra
 
 
 def _files(opened: Traversable, name: str = "") -> list[tuple[str, Traversable]]:
-    """Return the files below a folder, sorted, with their relative paths; a single file has the path ""."""
-    if not opened.is_dir():
+    """Return the files below a folder, sorted, with their relative paths; a single file has the path "".
+
+    Raises:
+        OSError: one is not a regular file: opening a FIFO blocks until there is a writer. A link that leads in a circle
+            ends as such a file, after about 40 folders.
+    """
+    if opened.is_file():
         return [(name, opened)]
+    if not opened.is_dir():
+        raise OSError(errno.EINVAL, "not a regular file, or a link that leads nowhere")
     entries = sorted(opened.iterdir(), key=lambda entry: entry.name)
     return [
         file for entry in entries if not entry.name.startswith(".") for file in _files(entry, f"{name}/{entry.name}")
