@@ -63,6 +63,7 @@ def _work(arguments: argparse.Namespace) -> None:
     # A server names its own workers, and recognises them by these names.
     name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
     source = open_source(arguments.videos, SourceOptions(copies=arguments.copies, copies_gib=arguments.copies_gib))
+    source.make()
     cache = None
     if arguments.cache is not None:
         if not arguments.cache_gib >= 0:

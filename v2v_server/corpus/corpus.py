@@ -40,8 +40,10 @@ def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice | None) -
         rows, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
 
     Raises:
-        CorpusError: the source cannot be listed, makes no sense, or has no video.
+        CorpusError: the source cannot be listed, makes no sense, or has no video; or its folder of copies cannot be
+            written to.
     """
+    source.make()
     rows = source.rows(rows)
     refused: dict[str, str] = {}
     left_out = Counter[str]()

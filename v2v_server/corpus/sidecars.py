@@ -66,10 +66,11 @@ def collect_sidecars(
                         continue
                     fresh.append(Figures(video, videos[video], b"", f"{state} {mark}".encode()))
                 fingerprints[video] = mark
+            with suppress(sqlite3.Error):
+                store.put_figures(kind, fresh)  # now, so that an interrupted start keeps them
+                fresh = []
             if notice is not None:
                 notice(f"looking for sidecars {ending} in {source}: {done} of {len(ids)} videos")
-    with suppress(sqlite3.Error):
-        store.put_figures(kind, fresh)
     notes = [f"{len(fingerprints)} of {len(ids)} videos have a sidecar {ending}"]
     if unreadable:
         notes.append(f"{len(unreadable)} sidecars cannot be read and count as missing ({unreadable[0]})")

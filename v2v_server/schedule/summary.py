@@ -32,9 +32,9 @@ def corpus_summary(
             f"scene {spec.scene}: {split} videos have shot boundaries or empty parts; {table.spoilt} sequences are "
             "left out or moved"
         )
-    if table.refusals:
-        lines.append(f"{len(table.refusals)} videos give none under the server's own recipe:")
-        lines += _listed(table.refusals, list_refused)
+    if refusals := table.refusals:
+        lines.append(f"{len(refusals)} videos give none under the server's own recipe:")
+        lines += _listed(refusals, list_refused)
         lines += _shorter_clips(table)
     if catalogue.refusals:
         lines.append(f"{len(catalogue.refusals)} files cannot be used at all:")

@@ -40,6 +40,13 @@ def test_nothing_is_in_quarantine_at_first(corpus: Path, capsys: pytest.CaptureF
     assert not (corpus.parent / "cache").exists()
 
 
+def test_of_object_storage_nothing_is_asked_or_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--videos", "s3://bucket/videos/", "--cache-dir", str(tmp_path / "cache")]) == 0
+    file = quarantine_path("s3://bucket/videos", tmp_path / "cache")
+    assert capsys.readouterr().out == f"snapshot 0 holds 0 entries ({file})\n"
+    assert not (tmp_path / "cache").exists()
+
+
 def test_verdicts_are_listed_with_whether_they_hold(corpus: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = fill(corpus, 40)
     run(corpus, "--clear")

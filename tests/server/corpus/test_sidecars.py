@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -15,6 +16,7 @@ from v2v_protocol.errors import VideoChanged, VideoError, VideoGone
 from v2v_protocol.sample import FromSidecar
 from v2v_server.corpus import sidecars as collecting
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.sources import asking
 from v2v_server.corpus.sources.sidecar import fingerprint_of, open_sidecar, sidecar_id
 from v2v_server.corpus.sources.source import SourceOptions, open_source
 
@@ -93,6 +95,50 @@ def test_a_catalogue_knows_them_and_its_digest_does_not(
     assert len(read) == 1
 
 
+def test_an_interrupted_start_keeps_what_it_has_read(corpus: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (corpus / "deep/b.x.boxes.json").write_text("[2]")
+    monkeypatch.setattr(asking, "_TOGETHER", 1)
+    read: list[str] = []
+
+    def interrupted(opened: Path) -> str:
+        if read:
+            raise KeyboardInterrupt
+        read.append(opened.name)
+        return fingerprint_of(opened)
+
+    monkeypatch.setattr(collecting, "fingerprint_of", interrupted)
+    with pytest.raises(KeyboardInterrupt), opened(corpus, "folder"):
+        pass
+    monkeypatch.setattr(collecting, "fingerprint_of", lambda opened: read.append(opened.name) or fingerprint_of(opened))
+    with opened(corpus, "folder"):
+        assert read == ["a.boxes.json", "b.x.boxes.json", "b.x.masks"]
+
+
+@pytest.mark.parametrize("name", ["a.boxes.json", "deep/b.x.masks/2.png"])
+def test_a_fifo_is_not_opened(corpus: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (corpus / name).unlink()
+    os.mkfifo(corpus / name)
+
+    def read(opened: Path) -> str:
+        """Fail before opening it, which would wait for a writer."""
+        assert not any(map(Path.is_fifo, (opened, *opened.glob("*"))))
+        return fingerprint_of(opened)
+
+    monkeypatch.setattr(collecting, "fingerprint_of", read)
+    with opened(corpus, "folder") as catalogue:
+        notes = [note for note in catalogue.notes if "not a regular file" in note]
+    assert len(notes) == 1
+    assert notes[0].startswith("1 sidecars cannot be read and count as missing (")
+
+
+def test_links_in_circles_are_not_followed_by_all_paths(corpus: Path) -> None:
+    for name in ("here", "there"):
+        (corpus / "deep/b.x.masks" / name).symlink_to(".")
+    with opened(corpus, "folder") as catalogue:
+        assert catalogue.facts.sidecars_of("deep/b.x.mp4", ARRAYS) == {}
+        assert any("a link that leads nowhere" in note for note in catalogue.notes)
+
+
 def test_a_bucket_has_those_of_its_folder(corpus: Path) -> None:
     with opened(corpus, "folder") as local, opened(corpus, "bucket") as remote:
         assert remote.facts.sidecars_digest(ARRAYS) == local.facts.sidecars_digest(ARRAYS)
@@ -104,6 +150,7 @@ def test_it_is_opened_like_the_video(corpus: Path, kind: str) -> None:
         boxes = catalogue.facts.sidecars_of("a.mp4", ARRAYS)[JSON]
         masks = catalogue.facts.sidecars_of("deep/b.x.mp4", ARRAYS)[MASKS]
     source = open_source(name_of(corpus, kind), SourceOptions(cache_dir=corpus.parent / "other"))
+    source.make()
     files = {"a.boxes.json": boxes, "deep/b.x.masks/": masks}
     assert source.has(files) is source.is_local
     source.fetch(files)
@@ -136,6 +183,7 @@ def test_a_changed_and_a_missing_one_are_told_apart(corpus: Path, kind: str) -> 
         for video in catalogue.videos:
             catalogue.check(video.id, video.fingerprint)
     fresh = open_source(name_of(corpus, kind), SourceOptions(cache_dir=corpus.parent / "other"))
+    fresh.make()
     with pytest.raises(VideoGone), open_sidecar(fresh, "a.boxes.json", boxes):
         pass
     with pytest.raises(VideoError), open_sidecar(fresh, "deep/b.x.masks/", masks):

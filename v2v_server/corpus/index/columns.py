@@ -203,7 +203,7 @@ def _columns(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
             raise ValueError
     if not {str, type(None)}.issuperset(map(type, problems)):
         raise TypeError
-    blobs = [b"" if summary is None else summary for summary in summaries]
+    blobs = [summary if isinstance(summary, bytes) else b"" for summary in summaries]
     strings = _utf8(ids), _utf8(fingerprints), (b"".join(blobs), array("i", map(len, blobs)))
     utf8, lengths = zip(*strings, strict=True)
     return utf8, *lengths, *numbers, list(map(sys.intern, codecs)), problems

@@ -13,6 +13,7 @@ from pathlib import Path
 import xxhash
 
 from v2v_protocol.errors import CorpusError, UsageError
+from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.index.file import Store
 
 _NAME = re.compile(r"part-(\d+)-of-(\d+)\.sqlite3")
@@ -77,13 +78,9 @@ def write_part(index: Path, folder: Path, shard: Shard) -> Path:
         CorpusError: it cannot be written.
     """
     path = folder / shard.file_name
-    partial = folder / f".{shard.file_name}.{os.getpid()}"
     try:
-        try:
+        with write_aside_and_rename(path) as partial:
             shutil.copyfile(index, partial)
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
     except OSError as error:
         raise CorpusError(f"{path}: cannot be written: {error.strerror or error}") from error
     return path

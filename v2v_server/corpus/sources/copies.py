@@ -113,7 +113,7 @@ class Copies(VideoSource):
                 yield name
 
     def make(self) -> None:
-        """Create the folder.
+        """Create the folder of copies.
 
         Raises:
             CorpusError: it cannot be created or written to.
@@ -333,16 +333,14 @@ def open_source(name: str, options: SourceOptions) -> Copies | None:
     """Open an address in object storage; None for any other name.
 
     Raises:
-        UsageError, CorpusError: the address, the list or the folder of copies cannot be used.
+        UsageError, CorpusError: the address or a setting is malformed, or there is no folder for copies.
     """
     if not is_url(name):
         return None
     if not options.copies_gib > 0:
         raise UsageError(f"--copies-gib {options.copies_gib:g}: give more than 0")
     folder = Path(options.copies or cache_folder(options.cache_dir) / "copies").absolute()
-    copies = Copies(Bucket(name), folder, int(options.copies_gib * (1 << 30)), options.listed)
-    copies.make()
-    return copies
+    return Copies(Bucket(name), folder, int(options.copies_gib * (1 << 30)), options.listed)
 
 
 def _close(held: Mapping[tuple[str, str], IO[bytes]]) -> None:

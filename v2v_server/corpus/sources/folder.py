@@ -89,7 +89,7 @@ class Folder(VideoSource):
         Raises:
             VideoUnreadable, VideoChanged: a sidecar cannot be read, or is another one by now.
         """
-        if fingerprint and is_sidecar(id):
+        if is_sidecar(id):
             check_local(self.folder / id, id, fingerprint)
         return nullcontext(self.folder / id)
 

@@ -9,6 +9,7 @@ Its fingerprint is ``<size in bytes>-<32 hexadecimal digits>``, from the names a
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 from collections.abc import Iterator
@@ -64,7 +65,7 @@ def local_state(path: Path, id: str) -> str:
     Raises:
         OSError: it cannot be told.
     """
-    if path.is_dir() != id.endswith("/"):
+    if path.is_dir() != id.endswith("/") or not path.exists():
         return ""
     try:
         found = [(name, os.stat(str(file))) for name, file in _files(path)]
@@ -79,14 +80,14 @@ def state_text(states: list[tuple[str, tuple[int, int, int]]]) -> str:
 
 
 def check_local(path: Path, id: str, fingerprint: str) -> None:
-    """Check a sidecar of this host against its fingerprint.
+    """Check a sidecar of this host against its fingerprint; "" takes what is there now.
 
     Raises:
         VideoGone, VideoDenied, VideoChanged, VideoUnreadable: it is gone, another one by now, or cannot be read.
     """
     try:
         state = local_state(path, id)
-        found = _fingerprint_at(path, state) if state else ""
+        found = _fingerprint_at(path, state) if state and fingerprint else ""
     except OSError as error:
         raise unreadable(id, error) from error
     if not state:
@@ -122,9 +123,16 @@ def open_sidecar(source: VideoSource, id: str, fingerprint: str) -> Iterator[Tra
 
 
 def _files(opened: Traversable, name: str = "") -> list[tuple[str, Traversable]]:
-    """Return the files below a folder, sorted, with their relative paths; a single file has the path ""."""
-    if not opened.is_dir():
+    """Return the files below a folder, sorted, with their relative paths; a single file has the path "".
+
+    Raises:
+        OSError: one is not a regular file: opening a FIFO blocks until there is a writer. A link that leads in a circle
+            ends as such a file, after about 40 folders.
+    """
+    if opened.is_file():
         return [(name, opened)]
+    if not opened.is_dir():
+        raise OSError(errno.EINVAL, "not a regular file, or a link that leads nowhere")
     entries = sorted(opened.iterdir(), key=lambda entry: entry.name)
     return [
         file for entry in entries if not entry.name.startswith(".") for file in _files(entry, f"{name}/{entry.name}")

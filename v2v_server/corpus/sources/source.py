@@ -115,6 +115,13 @@ class VideoSource(ABC):
         """Manifest of a prepared corpus; None for any other."""
         return None
 
+    def make(self) -> None:  # noqa: B027 - a local source writes nothing
+        """Create what opening files needs on this host. Listing and opening files come after it.
+
+        Raises:
+            CorpusError: it cannot be created or written to.
+        """
+
     @abstractmethod
     def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
         """List the ids of the files that may be videos: those that the list names, or else all of them.

@@ -183,6 +183,16 @@ def test_damaged_runs_count_as_unknown(corpus: Corpus) -> None:
     assert dict(scenes(corpus)[1])["005.mp4"] == ((0, 300),)
 
 
+def test_a_summary_of_another_type_is_missing_and_refuses_no_video(corpus: Corpus) -> None:
+    put_scenes(corpus, *corpus.names)
+    with closing(sqlite3.connect(corpus.index)) as database, database:
+        database.execute("UPDATE figures SET summary = 'text' WHERE id = '005.mp4'")
+    with closing(Store(corpus.index)) as store:
+        table, _ = VideoTable.read(store.rows(KIND), len(corpus.names))
+    assert table.row(5).problem is None
+    assert table.summaries.lengths[4:7].tolist() == [table.summaries.lengths[4], 0, table.summaries.lengths[4]]
+
+
 def test_an_index_that_fails_after_the_probes_blames_no_video(corpus: Corpus, monkeypatch: pytest.MonkeyPatch) -> None:
     def locked(store: Store, kind: FigureKind) -> None:
         raise sqlite3.OperationalError("database is locked")
