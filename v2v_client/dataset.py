@@ -222,7 +222,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
             raise UsageError("this dataset is closed: iterate inside its with block, or create another dataset")
 
     def __getstate__(self) -> dict[str, Any]:
-        # A spawned loader worker has no process group. A copy, even a shallow one, gets its own position.
+        # A spawned loader worker has no process group. A shallow copy shares the record of the position, and iterates
+        # on its own.
         own = {"_position": copy.copy(self._position), "_buffers": BatchBuffers(), "_stop_server": None}
         return self.__dict__ | {"_ambient": _distributed() or self._ambient} | own
 
