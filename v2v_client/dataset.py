@@ -69,7 +69,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
             separated by commas. Each rank uses its own server (:mod:`v2v_client.session.brokers`). If that one is lost,
             it continues with another: no sample is lost or repeated.
         batch_size: samples in one rank's batch.
-        arrays: which of "voxels", "frames", "flow" and "flow_valid" to receive. It does not affect their content.
+        arrays: which arrays to receive, of ``v2v_protocol.sample.ARRAYS``. It does not affect their content.
         recipe: the virtual cameras: name of a preset, a mapping of fields, or a Recipe; None takes the server's.
         seed: determines all random draws and the order of the samples.
         epoch: the first epoch.
@@ -222,7 +222,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
             raise UsageError("this dataset is closed: iterate inside its with block, or create another dataset")
 
     def __getstate__(self) -> dict[str, Any]:
-        # A spawned loader worker has no process group. A copy, even a shallow one, gets its own position.
+        # A spawned loader worker has no process group. A shallow copy shares the record of the position, and iterates
+        # on its own.
         own = {"_position": copy.copy(self._position), "_buffers": BatchBuffers(), "_stop_server": None}
         return self.__dict__ | {"_ambient": _distributed() or self._ambient} | own
 

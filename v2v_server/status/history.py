@@ -14,7 +14,7 @@ from v2v_server.system.status_fields import values
 WINDOW_SECONDS = 10.0
 NOTE_SECONDS = 1.0
 _LEAST_SECONDS = 1.0
-"""Shortest time that the rate of a new peer is of."""
+"""Shortest time that the rates of a new consumer are measured over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +26,9 @@ class Moment:
         totals: the counters; and, of the time in which there was a consumer, ``attended``, ``broker`` (the loop did not
             wait for a message), ``worker`` and ``consumer`` (times their number), ``idle`` (of ``worker``, without a
             lease), in seconds.
-        peers: totals of each peer, the first of them the seconds that it was there; then busy and processor seconds of
-            a worker, by routing id, or samples, seconds waited and indices passed of a consumer, by number.
+        peers: totals of each peer, the first of them a clock: ``now`` for a worker, the seconds that it was there for a
+            consumer. Then busy and processor seconds of a worker, by routing id, or samples, seconds waited and indices
+            passed of a consumer, by number.
     """
 
     now: float
@@ -60,7 +61,7 @@ class TimeWindow:
         return min(1.0, max(0.0, self.change(part) / self.change(whole))) if self.change(whole) > 0.0 else 0.0
 
     def rates_of(self, peer: bytes | int) -> list[float]:
-        """Return the rates of a peer's totals, over the time within the window that it was there."""
+        """Return the rates of a peer's totals: a worker's over the window, a consumer's over its time in the window."""
         present, *totals = self.last.peers[peer]
         before_present, *before = self.before.peers.get(peer, (0.0,) * (1 + len(totals)))
         seconds = min(self.seconds, max(_LEAST_SECONDS, present - before_present))

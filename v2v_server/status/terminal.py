@@ -65,13 +65,14 @@ class StatusView:
 
 def _for_programs(status: Status) -> dict[str, Any]:
     totals = status["totals"]
+    gauges = {name: status[name] for name, meaning in meanings_at("").items() if meaning.kind == "gauge"}
     return {
         "slow_part": status["waiting"]["part"],
         "workers": status["worker_count"],
         "consumers": status["consumer_count"],
         "samples": totals["samples"],
         "faults": totals["faults"],
-        **{name: round(status[name], 3) for name, meaning in meanings_at("").items() if meaning.kind == "gauge"},
+        **{name: round(value, 3) if isinstance(value, float) else value for name, value in gauges.items()},
         "totals": totals,
     }
 

@@ -147,12 +147,14 @@ def test_a_server_that_is_gone_is_said_and_one_that_comes_back_is_shown(
         browser.open(f"http://127.0.0.1:{port}/")
         browser.until("document.querySelectorAll('#workers tbody tr').length === 1")
         assert browser.value("document.getElementById('lost').hidden")
+        browser.value("fields = []")  # as if they had not arrived
         assert server.pid is not None
         psutil.Process(server.pid).kill()
         browser.until("!document.getElementById('lost').hidden")
         assert "does not answer" in browser.value("document.getElementById('lost').textContent")
     with LocalServer(clips, workers=1, flags=flags):
         browser.until("document.getElementById('lost').hidden")
+        browser.until("document.querySelectorAll('#shares .bar').length > 1")
 
 
 def test_a_page_that_is_left_open_does_not_grow(served: LocalServer, port: int, browser: Browser) -> None:

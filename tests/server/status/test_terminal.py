@@ -67,6 +67,7 @@ def test_programs_get_the_same_as_json(capsys: pytest.CaptureFixture[str]) -> No
     names = ("samples_per_second", "batches_per_second", "workers", "consumers", "queue", "faults", "samples")
     assert [line[name] for name in names] == [0] * 7
     assert line["slow_part"] == "no_consumers"
+    assert line["is_ready"] is status["is_ready"]
     assert line["totals"] == status["totals"]
 
 

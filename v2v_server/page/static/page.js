@@ -281,6 +281,9 @@ function trouble(text) {
 
 function listen() {
   const events = new EventSource("/events");
+  events.addEventListener("open", async () => {
+    fields = await (await fetch("/fields")).json();
+  });
   events.addEventListener("state", (event) => {
     heard = Date.now();
     trouble("");
@@ -299,7 +302,6 @@ function listen() {
 
 drawCharts();
 listen();
-fetch("/fields").then((answer) => answer.json()).then((known) => (fields = known));
 setInterval(() => {
   if (Date.now() - heard > SILENT_MS) trouble("The server does not answer. The state shown is old; this page retries.");
 }, 1000);
