@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -117,7 +116,7 @@ class CorpusActions:
             return False
         except (VideoError, CorpusError):
             return False
-        now = time.monotonic()
+        now = self._clock()
         if now >= self._warned + REST_SECONDS:
             self._warned = now
             name = clean_name(self._dispatcher.registry.name_of(missing.identity))
