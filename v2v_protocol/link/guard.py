@@ -75,7 +75,7 @@ def most_connections(files_for_others: int) -> int:
 @dataclass(slots=True)
 class _Connection:
     peer: tuple[Any, ...] | None  # its address, which identifies it; None if it has no TCP address
-    heard_at: float  # time of the check before its last message; at first the time of its accept
+    heard_at: float  # the guard's time at the check before its last message; at first before its accept
     identity: bytes | None = None
     is_heard: bool = False  # since the last check
     delivered: int = 0  # bytes on the wire of its handshake and of the messages that were delivered
@@ -113,8 +113,9 @@ class ConnectionGuard:
         self._to_check: set[int] = set()
         self._unfinished: dict[int, int] = {}  # bytes of messages that were not delivered
         self._ended: list[bytes] = []
-        self._now, self._elapsed_seconds = time.monotonic(), 0.0
-        self._turn_at = self._now
+        # The guard's time: seconds in which the loop has read, until the last check and in the interval before it.
+        self._now = self._elapsed_seconds = 0.0
+        self._checked_at = self._turn_at = time.monotonic()
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._monitor: zmq.Socket[bytes] | None = None
@@ -224,9 +225,7 @@ class ConnectionGuard:
                 self._accept(descriptor)
 
     def _accept(self, descriptor: int) -> None:
-        self._connections[descriptor] = _Connection(
-            _peer(descriptor), time.monotonic(), delivered=self._handshake_bytes
-        )
+        self._connections[descriptor] = _Connection(_peer(descriptor), self._now, delivered=self._handshake_bytes)
         self._silent[descriptor] = None
         self._to_check.add(descriptor)  # what it sent before it is registered below is not reported
         if self._most_queued_bytes is not None:
@@ -244,7 +243,7 @@ class ConnectionGuard:
         if silent == newcomer:
             for descriptor, connection in self._connections.items():
                 if not connection.is_cut:
-                    is_idle = time.monotonic() - connection.heard_at >= IDLE_SECONDS
+                    is_idle = self._now - connection.heard_at >= IDLE_SECONDS
                     return descriptor if is_idle else newcomer
         return silent
 
@@ -271,9 +270,12 @@ class ConnectionGuard:
         """
         # Time in which this process was stopped, or its loop was held up, does not count.
         is_reading = now - self._turn_at < _LONGEST_TURN_SECONDS
-        self._elapsed_seconds = min(now - self._now, 2 * CHECK_SECONDS) if is_reading else 0.0
-        self._now = now
-        while self._silent and now - self._connections[oldest := next(iter(self._silent))].heard_at > IDLE_SECONDS:
+        self._elapsed_seconds = min(now - self._checked_at, 2 * CHECK_SECONDS) if is_reading else 0.0
+        self._checked_at = now
+        self._now += self._elapsed_seconds
+        while (
+            self._silent and self._now - self._connections[oldest := next(iter(self._silent))].heard_at > IDLE_SECONDS
+        ):
             self._cut(oldest)
         self._to_check.update(descriptor for descriptor, _ in self._received.poll(0, MOST_CONNECTIONS))
         to_check, self._to_check = self._to_check, set()
