@@ -81,6 +81,10 @@ class CorpusActions:
         """
         entry, now = record.entry, self._clock()
         until = now + _RECORD_SECONDS if until is None else until
+        latest = self._quarantine.latest
+        if self._quarantine.refusal(latest, entry.path, entry.fingerprint, entry.frame, entry.spec) is not None:
+            # Another worker ended over it while the file was locked. A second entry would refuse the whole video.
+            return self._dispatcher.quarantine_recorded(record, [], now)
         written: list[QuarantineEntry] = []
         try:
             written = write_entry(self._quarantine_file, entry, self._quarantine, wait_seconds=0.0)
