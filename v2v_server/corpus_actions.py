@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -82,6 +81,10 @@ class CorpusActions:
         """
         entry, now = record.entry, self._clock()
         until = now + _RECORD_SECONDS if until is None else until
+        latest = self._quarantine.latest
+        if self._quarantine.refusal(latest, entry.path, entry.fingerprint, entry.frame, entry.spec) is not None:
+            # Another worker ended over it while the file was locked. A second entry would refuse the whole video.
+            return self._dispatcher.quarantine_recorded(record, [], now)
         written: list[QuarantineEntry] = []
         try:
             written = write_entry(self._quarantine_file, entry, self._quarantine, wait_seconds=0.0)
@@ -117,7 +120,7 @@ class CorpusActions:
             return False
         except (VideoError, CorpusError):
             return False
-        now = time.monotonic()
+        now = self._clock()
         if now >= self._warned + REST_SECONDS:
             self._warned = now
             name = clean_name(self._dispatcher.registry.name_of(missing.identity))

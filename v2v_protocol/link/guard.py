@@ -50,7 +50,9 @@ _MOST_UNFINISHED_BYTES = 6 * LARGEST_REQUEST_BYTES
 _MOST_UNFINISHED_IN_ALL_BYTES = 2 << 20
 """Of all connections: 64 MiB of empty parts. A request has at most 1 KB as a rule, so 2,000 may wait at a time."""
 _SLOW_BYTES, _MOST_SLOW_SECONDS = 4096, 10.0
-"""A message with more unfinished bytes must end within this time, in which this process runs."""
+"""A message with more unfinished bytes must end within this time, in which the loop reads."""
+_LONGEST_TURN_SECONDS = 1.0
+"""The loop is held up if its last turn began longer ago; whole messages that wait for it look unfinished."""
 _HANDSHAKE_BYTES, _CURVE_HANDSHAKE_BYTES = 128, 640
 _CURVE_FRAME_BYTES = 33
 _SLACK_BYTES = 64 << 20
@@ -73,7 +75,7 @@ def most_connections(files_for_others: int) -> int:
 @dataclass(slots=True)
 class _Connection:
     peer: tuple[Any, ...] | None  # its address, which identifies it; None if it has no TCP address
-    heard_at: float  # time of the check before its last message; at first the time of its accept
+    heard_at: float  # the guard's time at the check before its last message; at first before its accept
     identity: bytes | None = None
     is_heard: bool = False  # since the last check
     delivered: int = 0  # bytes on the wire of its handshake and of the messages that were delivered
@@ -111,7 +113,9 @@ class ConnectionGuard:
         self._to_check: set[int] = set()
         self._unfinished: dict[int, int] = {}  # bytes of messages that were not delivered
         self._ended: list[bytes] = []
-        self._now, self._elapsed_seconds = time.monotonic(), 0.0
+        # The guard's time: seconds in which the loop has read, until the last check and in the interval before it.
+        self._now = self._elapsed_seconds = 0.0
+        self._checked_at = self._turn_at = time.monotonic()
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._monitor: zmq.Socket[bytes] | None = None
@@ -170,8 +174,11 @@ class ConnectionGuard:
                 self._cut(descriptor)
 
     def take_ended(self) -> list[bytes]:
-        """Return the peers whose connection ended since the last call; b"" if one never sent a message."""
+        """Return the peers whose connection ended since the last call; b"" if one never sent a message. Call it in each
+        turn of the loop.
+        """
         with self._lock:
+            self._turn_at = time.monotonic()
             ended, self._ended = self._ended, []
         return ended
 
@@ -218,9 +225,7 @@ class ConnectionGuard:
                 self._accept(descriptor)
 
     def _accept(self, descriptor: int) -> None:
-        self._connections[descriptor] = _Connection(
-            _peer(descriptor), time.monotonic(), delivered=self._handshake_bytes
-        )
+        self._connections[descriptor] = _Connection(_peer(descriptor), self._now, delivered=self._handshake_bytes)
         self._silent[descriptor] = None
         self._to_check.add(descriptor)  # what it sent before it is registered below is not reported
         if self._most_queued_bytes is not None:
@@ -238,7 +243,7 @@ class ConnectionGuard:
         if silent == newcomer:
             for descriptor, connection in self._connections.items():
                 if not connection.is_cut:
-                    is_idle = time.monotonic() - connection.heard_at >= IDLE_SECONDS
+                    is_idle = self._now - connection.heard_at >= IDLE_SECONDS
                     return descriptor if is_idle else newcomer
         return silent
 
@@ -263,9 +268,14 @@ class ConnectionGuard:
         """Measure the connections on which something happened, and end those beyond a limit; return the unfinished
         bytes of all.
         """
-        # Time in which this process was stopped does not count.
-        self._now, self._elapsed_seconds = now, min(now - self._now, 2 * CHECK_SECONDS)
-        while self._silent and now - self._connections[oldest := next(iter(self._silent))].heard_at > IDLE_SECONDS:
+        # Time in which this process was stopped, or its loop was held up, does not count.
+        is_reading = now - self._turn_at < _LONGEST_TURN_SECONDS
+        self._elapsed_seconds = min(now - self._checked_at, 2 * CHECK_SECONDS) if is_reading else 0.0
+        self._checked_at = now
+        self._now += self._elapsed_seconds
+        while (
+            self._silent and self._now - self._connections[oldest := next(iter(self._silent))].heard_at > IDLE_SECONDS
+        ):
             self._cut(oldest)
         self._to_check.update(descriptor for descriptor, _ in self._received.poll(0, MOST_CONNECTIONS))
         to_check, self._to_check = self._to_check, set()

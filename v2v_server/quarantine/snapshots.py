@@ -23,8 +23,6 @@ from v2v_server.system.status_fields import gauge, short, text
 VERDICTS_PER_VIDEO = 2
 _MOST_VERDICTS = 20
 
-_MOST_VERDICTS = 20
-
 
 @dataclass(frozen=True, slots=True)
 class QuarantineEntry:

@@ -36,6 +36,5 @@ def make_pool(
             f"--engine {name} needs the Python package {name}, which is not installed; the extra '{name}' brings it: "
             f"pip install '.[server,{name}]' in a checkout of v2v-stream, here and on every node of the cluster"
         ) from error
-    is_remote = keys is not None and name != "local"
-    key = keys.lend(f"{name}-{label}", "worker") if keys is not None and is_remote else None
+    key = None if keys is None or name == "local" else keys.lend(f"{name}-{label}", "worker")
     return Pool(engine.make_host(config, source.name, label, flags, key), label)

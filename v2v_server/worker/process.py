@@ -156,7 +156,9 @@ class Worker:
             self._link.send(action.frames)
             self._handover_seconds += time.monotonic() - began
         elif isinstance(action, Reconnect):
-            self._link.connect(again=True)
+            # Always with the same IP version: at most 320 s pass until the next connection, and "localhost" and most
+            # names have two, of which the server listens on one.
+            self._link.connect()
         elif isinstance(action, Say):
             self._log.say(f"{self._name}: {action.text}", "warning", worker=self._name)
 

@@ -202,7 +202,11 @@ def test_an_idle_connection_makes_room_although_it_once_sent_a_message(
     until(said(b"0", b"1", b"2", b"3"))
     watched = sockets._consumers.guard
     assert watched is not None
-    until(lambda: watched._now - watched._connections[watched._descriptors[b"0"]].heard_at > 0.5)
+    until(
+        lambda: (
+            not sockets.receive(0.05) and watched._now - watched._connections[watched._descriptors[b"0"]].heard_at > 0.5
+        )
+    )
     heard.clear()
     peers[0].send_multipart(encode(Ping()))  # the others are idle
     until(said(b"0"))
@@ -283,11 +287,49 @@ def test_a_message_that_does_not_end_in_time_ends_its_connection(
     with raw(sockets.address) as peer, raw(sockets.address) as small:
         assert not push(small, b"\x01\x00" * 1000)  # less than the smallest that counts
         assert not push(peer, b"\x01\x00" * 4000)
-        while peer.recv(4096):
-            pass
         watched = sockets._consumers.guard
         assert watched is not None
-        until(lambda: len(watched._connections) == 1)
+        until(lambda: not sockets.receive(0.05) and len(watched._connections) == 1)
+        while peer.recv(4096):
+            pass
+
+
+def test_messages_that_wait_for_the_loop_end_no_connection(
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loop may be held up for longer than a message may take, for instance by storage that does not answer."""
+    monkeypatch.setattr(guard, "_MOST_SLOW_SECONDS", 0.2)
+    monkeypatch.setattr(guard, "IDLE_SECONDS", 0.3)  # of a peer that sends its first message
+    monkeypatch.setattr(guard, "_LONGEST_TURN_SECONDS", 0.1)
+    sockets = serve()
+    watched = sockets._consumers.guard
+    assert watched is not None
+    peer = consumer(sockets, b"c")
+    peer.send_multipart([bytes(20_000)])
+    until(lambda: sum(watched._unfinished.values()) > 19_000)
+    began = watched._checked_at
+    until(lambda: watched._checked_at - began > 0.6)
+    next_from(sockets, FromConsumer)
+    assert sockets.send(ToConsumer(b"c", encode(Pong())))
+    assert peer.poll(5000)
+
+
+def test_a_worker_may_send_a_large_sample_slowly(
+    serve: Callable[..., Sockets], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sample of 4 MB takes half a minute at 1 Mbit/s."""
+    monkeypatch.setattr(guard, "_MOST_SLOW_SECONDS", 0.1)
+    sockets = serve()
+    watched = sockets._workers.guard
+    assert watched is not None
+    with raw(sockets.worker_address) as worker:
+        assert not push(worker, b"\x02" + (MIB).to_bytes(8, "big") + bytes(MIB - 1))
+        began = watched._now
+        until(lambda: not sockets.receive(0.05) and watched._now - began > 0.5)
+        assert not push(worker, b"\x00")
+        arrival = next_from(sockets, FromWorker)
+        assert isinstance(arrival, FromWorker)
+        assert len(arrival.frames[0]) == MIB
 
 
 @pytest.mark.parametrize("keyed", [False, True])

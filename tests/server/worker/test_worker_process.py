@@ -135,6 +135,18 @@ def test_a_new_connection_has_a_new_routing_id(tmp_path: Path) -> None:
     assert all(len(identity) == 16 and identity != b"w" for identity in found)
 
 
+def test_a_worker_whose_server_is_away_keeps_to_the_ip_version(tmp_path: Path) -> None:
+    """With the other one it would not find the server again until its next new connection, minutes later."""
+    worker = Worker("w", Folder(tmp_path), "tcp://localhost:1")
+    try:
+        for _ in range(3):
+            worker._do(Reconnect())
+            assert worker._link._socket is not None
+            assert worker._link._socket.getsockopt(zmq.IPV6) == 0
+    finally:
+        worker._link.close()
+
+
 def test_a_malformed_address_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"--connect: address 'nowhere': .*; give tcp://host:port"):
         Worker("w", Folder(tmp_path), "nowhere")
