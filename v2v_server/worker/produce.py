@@ -231,7 +231,7 @@ def _context(
     plan = decoded.plan
     params, recipe = plan.params, plan.spec.recipe
     frames, flow, levels = decoded.clip.frames, None, None
-    if plan.flow is not None:
+    if plan.flow is not None and into:
         methods = () if plan.flow_plan is None else plan.flow_plan.methods
         part = without_margin(frames, params, recipe, plan.margin_px, plan.flow.margin_px)
         flow = flow_for(part, params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods)
