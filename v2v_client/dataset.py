@@ -69,7 +69,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
             separated by commas. Each rank uses its own server (:mod:`v2v_client.session.brokers`). If that one is lost,
             it continues with another: no sample is lost or repeated.
         batch_size: samples in one rank's batch.
-        arrays: which arrays to receive, of ``v2v_protocol.sample.ARRAYS``. It does not affect their content.
+        arrays: names in ``v2v_protocol.sample.ARRAYS`` to receive. The choice does not affect their content.
         recipe: the virtual cameras: name of a preset, a mapping of fields, or a Recipe; None takes the server's.
         seed: determines all random draws and the order of the samples.
         epoch: the first epoch.

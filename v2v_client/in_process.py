@@ -79,7 +79,7 @@ class V2VDataset(Dataset[Sample]):
     Args:
         videos: folder tree of videos, a single video, or a list file.
         recipe: the virtual cameras: name of a preset, a mapping of fields, or a Recipe.
-        arrays: which arrays to make: "voxels", "frames" and others of ``v2v_protocol.sample.ARRAYS``.
+        arrays: names in ``v2v_protocol.sample.ARRAYS`` to make.
         seed: the stream's seed, which determines all draws and the order.
         epoch: the stream's epoch, which selects other cameras and another order.
         rows: rows of each picture to use, as for ``v2v-serve --rows``.

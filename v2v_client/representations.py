@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import torch
 
+_ROUNDING = 1e-5
+"""Deviation, as a share of the mean, that the rounding of float32 may give equal values."""
+
 
 def stacked_histogram(event_counts: torch.Tensor, cutoff: int | None = None) -> torch.Tensor:
     """Return RVT's stacked histogram: the negative bins, then the positive ones, as channels.
@@ -56,4 +59,4 @@ def normalised(voxels: torch.Tensor) -> torch.Tensor:
     mean = values.sum(grid, keepdim=True) / count
     centred = torch.where(is_set, values - mean, 0.0)
     deviation = (centred.square().sum(grid, keepdim=True) / count).sqrt()
-    return torch.where(deviation > 0, centred / deviation, 0.0)
+    return torch.where(deviation > _ROUNDING * mean.abs(), centred / deviation, 0.0)

@@ -40,3 +40,8 @@ def test_normalised_voxels_have_mean_0_and_deviation_1_where_they_are_not_zero()
         if rest.size and rest.std() > 0:
             expected[grid != 0] = (rest - rest.mean()) / rest.std()
         np.testing.assert_allclose(result, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(5, 9, 7), (5, 64, 64)])
+def test_equal_voxels_that_are_not_whole_become_0(shape: tuple[int, int, int]) -> None:
+    assert not normalised(torch.full(shape, 0.1)).any()

@@ -112,7 +112,7 @@ def substeps(vectors: Vectors, substep_px: float) -> int:
     if len(moving) < _LEAST_SHARE * squares.size or not len(moving):
         return 1
     longest = math.sqrt(int(moving[int(len(moving) * (1 - _FASTEST_SHARE))])) / UNITS_PER_PX
-    return min(1 + int(longest / substep_px), MOST_SUBSTEPS)
+    return 1 + int(min(longest / substep_px, MOST_SUBSTEPS - 1))  # the quotient may be infinite
 
 
 def load() -> None:

@@ -125,7 +125,7 @@ class Prediction:
 def predict(pictures: Frames) -> Prediction:
     """Predict the loss of a clip.
 
-    Memory: about 4 bytes a pixel for each frame and each level between frames, at most 16 a frame.
+    Memory: about 6 bytes a pixel for each frame and each level between frames, at most 16 a frame.
 
     Args:
         pictures: [n, h, w] uint8, n >= 2 consecutive frames as a camera sees them; of more than MOST_FRAMES those in
@@ -142,7 +142,9 @@ def predict(pictures: Frames) -> Prediction:
         return Prediction((), events, events, events)
     along = _signed_counts(np.insert(fine, levels.at.step + 1, levels.grey, axis=0))
     first = np.arange(count - 1) + np.searchsorted(levels.at.step, np.arange(count - 1))
-    rising, falling = (np.add.reduceat(np.maximum(sign * along, 0), first) for sign in (1, -1))
+    # Without the dtype NumPy makes a copy in int64.
+    rising = np.add.reduceat(np.maximum(along, 0), first, dtype=np.int16)
+    falling = -np.add.reduceat(np.minimum(along, 0), first, dtype=np.int16)
     apart = [np.abs(np.maximum(sign * alone, 0) - true).sum() for sign, true in ((1, rising), (-1, falling))]
     pyramids = [pyramid(np.ascontiguousarray(picture)) for picture in pictures]
     moving = [_moving(motion(one, other, _SHORTEST)) for one, other in pairwise(pyramids)]
@@ -158,18 +160,18 @@ def predict(pictures: Frames) -> Prediction:
     )
 
 
-def _signed_counts(fine: npt.NDArray[np.uint16]) -> npt.NDArray[np.float32]:
+def _signed_counts(fine: npt.NDArray[np.uint16]) -> npt.NDArray[np.int16]:
     """Return the events between grey levels in 1/FINE_STEPS: [n - 1, h, w], signed.
 
     In NumPy, since the kernel that would do it takes longer to compile than all of these clips take.
     """
-    log_levels = fine_table(log_table(_GAMMA, _LOG_EPS))[fine]
-    counts = np.empty((len(fine) - 1, *fine.shape[1:]), np.float32)
+    table = fine_table(log_table(_GAMMA, _LOG_EPS))
+    counts = np.empty((len(fine) - 1, *fine.shape[1:]), np.int16)
     residual = np.zeros(fine.shape[1:], np.float32)
-    for before, after, fired in zip(log_levels, log_levels[1:], counts, strict=False):
-        residual += after - before
-        np.trunc(residual / THRESHOLD, out=fired)
-        residual -= fired * THRESHOLD
+    for (before, after), fired in zip(pairwise(fine), counts, strict=True):
+        residual += table[after] - table[before]
+        fired[...] = np.trunc(residual / THRESHOLD)
+        residual -= fired * np.float32(THRESHOLD)
     return counts
 
 

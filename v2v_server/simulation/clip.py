@@ -156,7 +156,7 @@ def simulate_clip(
         levels: grey levels between frames; None: log intensity is linear in time there.
 
     Returns:
-        voxels [T + lead_voxels, bins, H, W], and the number of saturated bins.
+        voxels [recipe.voxel_grids, bins, H, W], and the number of saturated bins.
 
     Raises:
         UsageError: too few frames, ``step_seconds`` missing, unwanted or of the wrong length, or a draw beyond what
@@ -233,9 +233,10 @@ def _simulate_array(
     _check_whole("hot_pixel_count", hot_pixel_count, 0, height * width)
     steps, span = count - 1, 1 if grids_per_frame else bins * frames_per_bin
     if height * width == 0 or count < 2 or steps % span:
+        needed = f"k x bins x frames_per_bin + 1 frames, k > 0 (k x {span} + 1)"
         raise UsageError(
-            f"{count} frames of {width}x{height} pixels: give k x bins x frames_per_bin + 1 frames, "
-            f"k > 0 (k x {span} + 1), of at least one pixel"
+            f"{count} frames of {width}x{height} pixels: give {'2 frames or more' if grids_per_frame else needed}, "
+            "of at least one pixel"
         )
     params = _params(threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma, seed, effects)
     ends = (float(frames.min()), float(frames.max())) if intensity is None else _log_ends(*intensity)

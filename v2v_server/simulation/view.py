@@ -44,7 +44,6 @@ def source_window(
         params, recipe: the draw and its recipe.
         picture_top_px: first usable row of the upright video picture.
         picture_height_px, picture_width_px: size of the usable picture.
-
         margin_px: margin around the crop; None: the whole picture.
 
     Returns:

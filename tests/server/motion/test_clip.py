@@ -71,6 +71,7 @@ def test_the_number_of_sub_steps_follows_the_motion() -> None:
         MOST_SUBSTEPS,
     ]
     assert [substeps(vectors(4.0, cells), 2.0) for cells in (0, 1, 2, 100)] == [1, 3, 3, 3]
+    assert substeps(vectors(4.0, 256), 5e-324) == MOST_SUBSTEPS
 
 
 @pytest.mark.parametrize("frames", [np.zeros((3, 20, 20)), np.full((3, 3, 50), 7), np.full((2, 4, 4), 255)])

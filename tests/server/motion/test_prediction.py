@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from tests.oracles.rendered import rendered_scene
-from tests.server.motion.test_clip import HERTZ, compared
+from tests.server.motion.test_clip import HERTZ, compared, sub_steps
 from v2v_server.motion.prediction import Prediction, predict
 
 
@@ -66,3 +68,17 @@ def test_predictions_add_up() -> None:
     both = slow + fast
     assert slow.apparent.lost < both.apparent.lost < fast.apparent.lost
     assert Prediction() + fast == fast
+
+
+def test_the_memory_is_that_of_the_docstring() -> None:
+    frames = rendered_scene("coffee", 96, 96, 12 * HERTZ).frames(HERTZ, 9)
+    levels = sub_steps(frames)
+    assert levels is not None
+    pictures = len(frames) + len(levels.grey)
+    del levels
+    tracemalloc.start()
+    try:
+        predict(frames)
+        assert tracemalloc.get_traced_memory()[1] < 8 * pictures * 96 * 96
+    finally:
+        tracemalloc.stop()

@@ -314,6 +314,8 @@ def test_timeline_by_hand() -> None:
 def test_what_is_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         simulate(moving_frames(7, 4, 5), threshold_pos=0.2, bins=3, **change)
+    with pytest.raises(UsageError, match="1 frames of 5x4 pixels: give 2 frames or more"):
+        simulate(moving_frames(1, 4, 5), threshold_pos=0.2, bins=3, grids_per_frame=2)
     with pytest.raises(UsageError, match="'counts'"):
         simulate(moving_frames(4, 4, 5), threshold_pos=0.2, bins=3).array("counts")
 

@@ -26,6 +26,7 @@ from v2v_server.quarantine.snapshots import QuarantineEntry
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.worker import decode_cache as clips
+from v2v_server.worker import produce
 from v2v_server.worker.produce import Decoded, decode_for, make_sample
 
 CHANGED = ("voxels_per_clip", "bins", "crop_height_px", "crop_width_px")
@@ -84,6 +85,17 @@ def test_sub_steps_do_not_depend_on_the_arrays_that_are_asked_for(catalogue: Cat
     on_and_off = beside_flow["event_counts"].astype(int)
     np.testing.assert_array_equal(on_and_off[:, 1] - on_and_off[:, 0], alone["voxels"])
     assert not np.array_equal(alone["voxels"], plain["voxels"])
+
+
+def test_events_need_no_flow(catalogue: Catalogue, lease: Lease, monkeypatch: pytest.MonkeyPatch) -> None:
+    with_flow = dataclasses.replace(lease, arrays=("voxels", "flow"))
+    decoded = decode_for(with_flow, lease.indices, catalogue.source)[0]
+    voxels = make_sample(with_flow, decoded).arrays["voxels"]
+    monkeypatch.delattr(produce, "flow_for")
+    events = produce.list_sample_events(with_flow, decoded)
+    signs = np.where(events.p, 1, -1)
+    assert len(events) > 0
+    assert signs.sum() == voxels.sum()
 
 
 class TestASecondAttempt:
