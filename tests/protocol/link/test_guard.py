@@ -88,8 +88,21 @@ def push(peer: socket.socket, data: bytes) -> bool:
 
 
 def is_cut_off(peer: socket.socket, part: bytes) -> bool:
-    """Return whether the connection ends when 8 MiB of parts are sent."""
-    return any(push(peer, part) for _ in range(8 * MIB // len(part)))
+    """Return whether the connection ends, while 8 MiB of parts are sent or once they are read."""
+    return any(push(peer, part) for _ in range(8 * MIB // len(part))) or is_ended(peer)
+
+
+def is_ended(peer: socket.socket) -> bool:
+    """Return whether the other end ends the connection within 5 s, before it is idle or slow."""
+    peer.settimeout(5.0)
+    try:
+        while peer.recv(1 << 16):
+            pass
+    except ConnectionError:
+        pass
+    except TimeoutError:
+        return False
+    return True
 
 
 def next_from(sockets: Sockets, kind: type) -> Arrival:
