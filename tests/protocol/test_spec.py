@@ -64,6 +64,8 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
     "flow_margin_px": -1,
     "substep_px": 1.0,
     "scene": "auto",
+    "keep_defects": "bars,cuts",
+    "still_share": 0.5,
 }
 
 

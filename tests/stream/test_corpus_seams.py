@@ -31,7 +31,7 @@ def label(context, out):
     out[:], sidecar = -1, context.clip.sidecars[ENDING]
     if sidecar is not None:
         labels = json.loads(sidecar.read_text())
-        frames = context.clip.start_frame + context.source * context.recipe.frame_stride
+        frames = context.clip.numbers[context.source]
         for place, frame in enumerate(frames[list(context.recipe.target_steps)]):
             if frame >= len(labels):
                 raise SidecarError(context.video, ENDING, f"has no frame {frame}")

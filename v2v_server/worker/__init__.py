@@ -7,6 +7,7 @@ arrays         functions that fill each array; additional arrays are files besid
 sidecars       files beside the video that arrays are made from
 decode_cache   one decode for siblings
 output_buffer  memory for a sample, shared with its consumer or private
+cleaning       which frames and which part of the picture are used
 scene_choice   which flow method a clip needs
 warm_up        compiled kernels, compiled once on a host
 logbook        a record of the lease in work that outlives the worker

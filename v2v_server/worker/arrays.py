@@ -36,16 +36,17 @@ class SourceClip:
     """Where a sample's frames lie in their video, and what lies beside it.
 
     Attributes:
-        start_frame: number of the clip's first frame in the video, in presentation order from 0. Frame ``n`` of the
-            clip is frame ``start_frame + n * recipe.frame_stride`` of the video.
+        start_frame: number of the clip's first frame in the video, in presentation order from 0.
         seconds: [n] float64, presentation time of each frame of the clip; NaN where unknown.
         sidecars: the opened sidecars by ending, see :class:`v2v_protocol.sample.FromSidecar`: a file, or a folder in
             the manner of ``pathlib``; None if the video has none.
+        numbers: [steps + 1] int64, number in the video of each frame of the clip and of those that pauses leave out.
     """
 
     start_frame: int
     seconds: npt.NDArray[np.float64]
     sidecars: Mapping[str, Traversable | None]
+    numbers: npt.NDArray[np.int64]
 
 
 @dataclass(slots=True)

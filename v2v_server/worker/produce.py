@@ -32,14 +32,14 @@ from v2v_protocol.sample import (
     new_arrays,
 )
 from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
-from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.corpus.scenes.scene import Scene, Sides
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.motion import MARGIN_PX, levels_of
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.kernels import ARRAYS, list_events
 from v2v_server.simulation.variants import Variant, variants
-from v2v_server.simulation.view import apply_view, source_window, without_margin
+from v2v_server.simulation.view import Window, apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache
 from v2v_server.store.clips import clips_of
@@ -49,6 +49,7 @@ from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, simulate
+from v2v_server.worker.cleaning import CleanFrames
 from v2v_server.worker.scene_choice import FlowPlan, plan_flow
 from v2v_server.worker.sidecars import errors_of_sidecar, sidecar_files
 
@@ -61,6 +62,7 @@ class SamplePlan:
         spec: the stream's spec.
         params: the sample's draw.
         source: [steps + 1] int64, which decoded frame each position of the clip shows.
+        frames: the frames of the sequence, and the part of the picture that is used.
         cut: the frames to decode after pauses are removed, cropped as far as possible before the resize.
         margin_px: margin around the crop that ``cut`` includes, for flow and sub-steps; None: the whole picture.
         flow: settings of the flow if the lease asks for it.
@@ -70,6 +72,7 @@ class SamplePlan:
     spec: StreamSpec
     params: SampleParams
     source: npt.NDArray[np.int64]
+    frames: CleanFrames
     cut: Cut
     margin_px: int | None
     flow: FlowSettings | None
@@ -91,28 +94,38 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
         ProtocolError: the lease is malformed.
     """
     spec = _spec(lease.spec)
-    top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
+    scene = None if spec.scene == "off" else Scene.from_bytes(lease.scene)
+    frames = CleanFrames.of(scene, lease.start_frame, spec)
+    picture = usable_window(lease, frames.sides)
     params = draw(
         spec.recipe,
         seed=lease.seed,
         epoch=lease.epoch,
         index=index,
-        picture_height_px=bottom - top,
-        picture_width_px=lease.width_px,
+        picture_height_px=picture.height_px,
+        picture_width_px=picture.width_px,
         video_id=lease.video,
         video_thresholds=_pair(lease.thresholds),
     )
     source = params.source_index(spec.recipe.steps)
     flow: FlowSettings | None = None
     margin_px: int | None = MARGIN_PX if spec.substep_px else 0
-    flow_plan = _flow_plan(lease, spec, params, bottom - top)
+    flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture)
     if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
         if flow_plan is not None and flow_plan.still:
             flow = replace(flow, margin_px=0)
         margin_px = None if flow.margin_px is None else max(flow.margin_px, margin_px or 0)
-    window = source_window(params, spec.recipe, top, bottom - top, lease.width_px, margin_px)
-    return SamplePlan(spec, params, source, Cut(int(source[-1]) + 1, window), margin_px, flow, flow_plan)
+    window = source_window(params, spec.recipe, picture, margin_px)
+    cut = Cut(frames.count(int(source[-1]) + 1), window)
+    return SamplePlan(spec, params, source, frames, cut, margin_px, flow, flow_plan)
+
+
+def usable_window(lease: Lease, sides: Sides) -> Window:
+    """Return the part of a lease's upright picture that may be used: its rows without these bars."""
+    top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
+    height, width = bottom - top - sides.top - sides.bottom, lease.width_px - sides.left - sides.right
+    return Window(top + sides.top, sides.left, height, width)
 
 
 def decode_for(
@@ -131,11 +144,11 @@ def decode_for(
         ProtocolError: the lease is malformed.
     """
     plans = [plan_sample(lease, index) for index in indices]
-    spec = plans[0].spec
+    frames = plans[0].frames
     _refuse_outside(lease.video)
     try:
-        index, cuts = _frame_index(lease, spec.recipe.frames_needed), [plan.cut for plan in plans]
-        what = index, lease.start_frame, cuts, spec.recipe.frame_stride
+        index, cuts = _frame_index(lease, frames.span), [plan.cut for plan in plans]
+        what = index, lease.start_frame, cuts, frames.stride or 1
         clips = None
         with source.open_local(lease.video, lease.fingerprint) as path:
             if cache is not None and not is_store_file(path):
@@ -146,7 +159,9 @@ def decode_for(
     except VideoError as error:
         # Consumer and log identify videos by id; a path of this host means nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
-    return tuple(Decoded(plan, clip) for plan, clip in zip(plans, clips, strict=True))
+    return tuple(
+        Decoded(plan, frames.pick(clip, int(plan.source[-1]) + 1)) for plan, clip in zip(plans, clips, strict=True)
+    )
 
 
 def sample_layout(lease: Lease) -> Layout:
@@ -240,7 +255,7 @@ def _context(
         levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px)
     seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
     view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe)
-    clip = SourceClip(lease.start_frame, decoded.clip.seconds, sidecars)
+    clip = SourceClip(lease.start_frame, decoded.clip.seconds, sidecars, plan.frames.numbers)
     return SampleContext(
         lease.video, clip, plan.spec, params, plan.source, view, seconds, flow, levels, into
     ), irregular
@@ -289,13 +304,6 @@ def _spec(canonical: bytes) -> StreamSpec:
 def _layout(canonical: bytes, arrays: tuple[str, ...]) -> Layout:
     spec = _spec(canonical)
     return array_layout(spec.recipe, spec.voxel_dtype, arrays)
-
-
-def _flow_plan(lease: Lease, spec: StreamSpec, params: SampleParams, height_px: int) -> FlowPlan | None:
-    if spec.scene == "off":
-        return None
-    scene = Scene.from_bytes(lease.scene)
-    return plan_flow(scene, lease.start_frame, params, spec, height_px, lease.width_px)
 
 
 def _pair(thresholds: tuple[float, ...]) -> tuple[float, float] | None:

@@ -18,7 +18,7 @@ from v2v_protocol.spec import MOST_SUBSTEPS
 from v2v_server.motion import MARGIN_PX, levels_between, levels_of, substeps
 from v2v_server.motion.matching import UNITS_PER_PX
 from v2v_server.simulation.draw import draw
-from v2v_server.simulation.view import apply_view, source_window, without_margin
+from v2v_server.simulation.view import Window, apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import FINE_STEPS, Levels
 
 HERTZ, THRESHOLD = 30.0, 0.2
@@ -110,7 +110,7 @@ def test_a_wider_window_changes_nothing() -> None:
 
 
 def _window(video: np.ndarray, params: SampleParams, margin: int | None) -> np.ndarray:
-    top, left, height, width = source_window(params, RECIPE, 0, *video.shape[1:], margin)
+    top, left, height, width = source_window(params, RECIPE, Window(0, 0, *video.shape[1:]), margin)
     return np.ascontiguousarray(video[:, top : top + height, left : left + width])
 
 
