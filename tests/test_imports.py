@@ -22,9 +22,8 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 
 FLOORS = (
-    "system", "keys", "video", "config", "simulation", "motion", "flow", "store", "corpus", "defects", "schedule",
-    "quarantine",
-    "broker",
+    "system", "keys", "video", "config", "simulation", "labels", "motion", "flow", "store", "corpus", "defects",
+    "schedule", "quarantine", "broker",
     "worker", "supervise", "status", "offline", "prepare", "tradeoff", "page", "corpus_actions", "serve", "commands",
 )  # fmt: skip
 """The rooms of the server, from the ground up: each imports only from itself and from those before it."""
