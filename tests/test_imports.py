@@ -42,7 +42,7 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 
 FLOORS = (
-    "system", "keys", "video", "config", "simulation", "motion", "flow", "store", "corpus", "schedule",
+    "system", "keys", "video", "config", "simulation", "labels", "motion", "flow", "store", "corpus", "schedule",
     "quarantine",
     "broker",
     "worker", "supervise", "status", "offline", "prepare", "tradeoff", "page", "corpus_actions", "serve", "commands",

@@ -55,7 +55,7 @@ ARRAY_DTYPES = ("int8", "uint8", "int16", "float16", "float32")
 _DTYPE_NAMES = {np.dtype(name): name for name in ARRAY_DTYPES}
 _ENCRYPTION_BYTES = 64
 """Bytes added to a frame by encryption; CURVE adds 33."""
-_MOST_ARRAYS = 8
+_MOST_ARRAYS = 16
 _MOST_DIMENSIONS = 8
 _DEEPEST_NESTING = 16
 """Containers within containers. Deeper ones could not even be shown in an error message (RecursionError)."""

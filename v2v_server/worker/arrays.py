@@ -27,7 +27,7 @@ from v2v_server.flow import FlowClip
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.kernels import ARRAYS
 from v2v_server.simulation.result import Voxels
-from v2v_server.simulation.view import Frames
+from v2v_server.simulation.view import Frames, Window
 from v2v_server.simulation.voxel import Levels
 
 
@@ -41,12 +41,18 @@ class SourceClip:
         sidecars: the opened sidecars by ending, see :class:`v2v_protocol.sample.FromSidecar`: a file, or a folder in
             the manner of ``pathlib``; None if the video has none.
         numbers: [steps + 1] int64, number in the video of each frame of the clip and of those that pauses leave out.
+        fingerprints: of the sidecars that the video has, by ending.
+        picture_px: height and width of the upright picture.
+        usable: the part of it that the camera sees, see :mod:`v2v_server.video.rows`.
     """
 
     start_frame: int
     seconds: npt.NDArray[np.float64]
     sidecars: Mapping[str, Traversable | None]
     numbers: npt.NDArray[np.int64]
+    fingerprints: Mapping[str, str]
+    picture_px: tuple[int, int]
+    usable: Window
 
 
 @dataclass(slots=True)
@@ -64,6 +70,7 @@ class SampleContext:
         levels: grey levels between frames (``substep_px``); None if there are none.
         into: the arrays to fill, by name.
         saturated: number of bins that were clipped, by array; None until the clip is simulated.
+        boxes_dropped: boxes left out because of ``max_boxes``.
     """
 
     video: str
@@ -77,11 +84,17 @@ class SampleContext:
     levels: Levels | None
     into: Mapping[str, npt.NDArray[Any]]
     saturated: Mapping[str, int] | None = None
+    boxes_dropped: int = 0
 
     @property
     def recipe(self) -> Recipe:
         """The spec's recipe."""
         return self.spec.recipe
+
+    @property
+    def target_frames(self) -> list[int]:
+        """Number, in the video, of the frame at the end of each voxel, and of the lead frame."""
+        return [int(frame) for frame in self.clip.numbers[self.source[list(self.recipe.target_steps)]]]
 
 
 ArrayBuilder = Callable[[SampleContext, npt.NDArray[Any]], None]
@@ -92,8 +105,8 @@ ARRAY_BUILDERS: dict[str, ArrayBuilder] = {}
 def makes(name: str) -> Callable[[ArrayBuilder], ArrayBuilder]:
     """Register a function that fills the array of this name. It gets a C-contiguous output array.
 
-    A function that cannot use a sidecar raises :class:`v2v_protocol.errors.SidecarError`, which reaches the consumer.
-    So does any other error while an array is made from a sidecar.
+    A function that cannot use a sidecar raises :class:`v2v_protocol.errors.SidecarError`. The sample then states the
+    reason and has no labels. So does any other error while an array is made from a sidecar.
     """
 
     def register(builder: ArrayBuilder) -> ArrayBuilder:

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+import v2v_server.worker.labels  # noqa: F401  # registers its arrays
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.errors import ProtocolError, UsageError, VideoError
+from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
 from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal
@@ -29,6 +30,7 @@ from v2v_protocol.sample import (
     SampleId,
     SampleParams,
     array_layout,
+    empty_value,
     new_arrays,
 )
 from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
@@ -191,7 +193,7 @@ def make_sample(
         sidecars: what :func:`v2v_server.worker.sidecars.open_sidecars` lends; needed if an array is made from one.
 
     Raises:
-        SidecarError: an array cannot be made from its sidecar.
+        SidecarError: this host cannot read a sidecar.
         VideoError: the video's frame rate is unknown and the recipe needs it, or its stated thresholds or time stamps
             are beyond what can be simulated.
         ProtocolError: the lease is malformed.
@@ -199,9 +201,16 @@ def make_sample(
     plan, index = decoded.plan, lease.indices[0]
     arrays = new_arrays(sample_layout(lease)) if into is None else into
     context, irregular = _context(lease, decoded, arrays, sidecars)
+    unlabelled = dict[str, str]()
     for name, array in context.into.items():
-        with errors_of_sidecar(lease.video, name, sidecars):
-            ARRAY_BUILDERS[name](context, array)
+        try:
+            with errors_of_sidecar(lease.video, name, sidecars):
+                ARRAY_BUILDERS[name](context, array)
+        except SidecarError as error:
+            if error.here:
+                raise
+            array[...] = empty_value(name)
+            unlabelled[name] = str(error)
     saturated = dict(context.saturated or {})
     saturated_bins = saturated.pop("voxels", 0)
     return Sample(
@@ -219,7 +228,9 @@ def make_sample(
             decoder=_decoder(decoded.clip),
             quarantine=lease.quarantine,
             scene="" if plan.flow_plan is None else plan.flow_plan.reason,
-            sidecars={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
+            sidecars=dict(context.clip.fingerprints),
+            unlabelled=unlabelled,
+            boxes_dropped=context.boxes_dropped,
             saturated={name: count for name, count in saturated.items() if count},
         ),
     )
@@ -255,7 +266,15 @@ def _context(
         levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px)
     seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
     view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe)
-    clip = SourceClip(lease.start_frame, decoded.clip.seconds, sidecars, plan.frames.numbers)
+    clip = SourceClip(
+        lease.start_frame,
+        decoded.clip.seconds,
+        sidecars,
+        fingerprints={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
+        numbers=plan.frames.numbers,
+        picture_px=(lease.height_px, lease.width_px),
+        usable=usable_window(lease, plan.frames.sides),
+    )
     return SampleContext(
         lease.video, clip, plan.spec, params, plan.source, view, seconds, flow, levels, into
     ), irregular
