@@ -23,7 +23,7 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 FLOORS = (
     "system", "keys", "video", "config", "simulation", "motion", "flow", "store", "corpus", "defects", "schedule",
-    "quarantine",
+    "quarantine", "sharing",
     "broker",
     "worker", "supervise", "status", "offline", "prepare", "tradeoff", "page", "corpus_actions", "serve", "commands",
 )  # fmt: skip
