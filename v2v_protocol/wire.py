@@ -86,6 +86,7 @@ _NAMES = {cls: name for name, cls in _TYPES.items()}
 _LATER: dict[type[Any], dict[str, Any]] = {
     Welcome: {"sidecars": ""},
     LeaseFailed: {"sidecar": ""},
+    SampleHeader: {"arena": ""},
     Lease: {"sidecars": {}},
 }
 """Fields that were added within a protocol version, with their defaults: a header leaves them out at the default."""

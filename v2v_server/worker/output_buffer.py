@@ -9,7 +9,6 @@ from __future__ import annotations
 import mmap
 import os
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, TypeAlias
@@ -22,6 +21,7 @@ from v2v_protocol.arena import NO_SLOT, ArenaName, Slot, array_offsets
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import Form, Layout, new_arrays
+from v2v_protocol.shared_memory import open_memory
 from v2v_protocol.wire import Buffer, Frames, encode_sample
 
 
@@ -106,11 +106,14 @@ def slot_arrays(slot: Slot, layout: Layout) -> dict[str, npt.NDArray[Any]] | Non
         if not 0 < slot.number <= name.slots:
             return None
         places, total = _places(tuple(layout.items()), name.slots)
-        with closing(_OpenArena(name, total)) as arena:
+        descriptor = open_memory(name, total, writable=True)
+        try:
             return {
-                array: arena.map(offset + (slot.number - 1) * size, size).view(dtype).reshape(shape)
+                array: _map(descriptor, offset + (slot.number - 1) * size, size).view(dtype).reshape(shape)
                 for array, dtype, shape, size, offset in places
             }
+        finally:
+            os.close(descriptor)
     except (OSError, ProtocolError):
         return None
 
@@ -132,47 +135,10 @@ def _places(layout: tuple[tuple[str, tuple[str, tuple[int, ...]]], ...], slots: 
     return places, total
 
 
-class _OpenArena:
-    """An open arena.
-
-    Raises:
-        OSError: it does not exist, has another size, or its size is not sealed.
-    """
-
-    def __init__(self, name: ArenaName, size: int) -> None:
-        # Read the link first: opening another file type, such as a device or a pipe, may have side effects.
-        if os.readlink(name.path) != name.link:
-            raise FileNotFoundError(name.path)
-        self._descriptor = os.open(name.path, os.O_RDWR | os.O_CLOEXEC | os.O_NONBLOCK)
-        try:
-            if os.readlink(f"/proc/self/fd/{self._descriptor}") != name.link:
-                raise FileNotFoundError(name.path)
-            _require_sealed(self._descriptor, size)
-        except BaseException:
-            self.close()
-            raise
-
-    def map(self, offset: int, size: int) -> npt.NDArray[np.uint8]:
-        """Map bytes of the arena; they are unmapped when nothing refers to them any more."""
-        begin = offset // mmap.ALLOCATIONGRANULARITY * mmap.ALLOCATIONGRANULARITY
-        # Map all pages at once: faulting them in one by one costs more than copying the sample.
-        flags = mmap.MAP_SHARED | mmap.MAP_POPULATE
-        mapping = mmap.mmap(self._descriptor, offset - begin + size, flags, offset=begin)
-        return np.frombuffer(mapping, np.uint8, size, offset - begin)
-
-    def close(self) -> None:
-        os.close(self._descriptor)
-
-
-def _require_sealed(descriptor: int, size: int) -> None:
-    """Check that the file cannot shrink. Writing to a page beyond the end of a file would kill this process.
-
-    Raises:
-        OSError: it can shrink, or has another size.
-    """
-    from fcntl import F_GET_SEALS, F_SEAL_SHRINK, fcntl  # only on Linux, like arenas
-
-    if not fcntl(descriptor, F_GET_SEALS) & F_SEAL_SHRINK:
-        raise OSError("its size is not sealed")
-    if os.fstat(descriptor).st_size != size:
-        raise OSError(f"it does not have {size} bytes")
+def _map(descriptor: int, offset: int, size: int) -> npt.NDArray[np.uint8]:
+    """Map bytes of an arena; they are unmapped when nothing refers to them any more."""
+    begin = offset // mmap.ALLOCATIONGRANULARITY * mmap.ALLOCATIONGRANULARITY
+    # Map all pages at once: faulting them in one by one costs more than copying the sample.
+    flags = mmap.MAP_SHARED | mmap.MAP_POPULATE
+    mapping = mmap.mmap(descriptor, offset - begin + size, flags, offset=begin)
+    return np.frombuffer(mapping, np.uint8, size, offset - begin)
