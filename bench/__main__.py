@@ -36,6 +36,7 @@ BENCHES = {
     "sessions": "speed.sessions",
     "physics": "accuracy.physics",
     "substeps": "accuracy.substeps",
+    "fit": "accuracy.fit",
     "extremes": "accuracy.extremes",
     "sensor": "accuracy.sensor",
     "scene": "accuracy.scene",
