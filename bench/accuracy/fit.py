@@ -1,9 +1,9 @@
 """Fit cameras with known parameters, and count what is told and what holds the truth.
 
 Cameras of random parameters record rendered scenes, and films of a high rate (``--film``), event by event
-(``tests/oracles/cameras.py``), with frames at 30 a second: two seconds that move, three that stand still. Each recording
-is fitted. "told" counts the cameras whose recording can tell a parameter, "held" those of them whose 90 % interval holds
-the truth; "width" is the median half width of the intervals, as a share.
+(``tests/oracles/cameras.py``), with frames at 30 a second: two seconds that move, three that stand still. Each
+recording is fitted. "told" counts the cameras whose recording can tell a parameter, "held" those of them whose 90 %
+interval holds the truth; "width" is the median half width of the intervals, as a share.
 
 Bars: 85 % of all intervals told hold the truth; both thresholds are told in two of three cameras, with a median half
 width of at most 15 %; every other parameter in one of three.
@@ -51,11 +51,11 @@ def measure(asked: argparse.Namespace) -> Report:
     """Fit all cameras."""
     records = list(fits(asked.cameras, asked.first_seed, asked.film))
     rows, missed, told, held = [], [], 0, 0
-    for name in dict.fromkeys(record["parameter"] for record in records):
-        mine = [record for record in records if record["parameter"] == name]
-        some = [record for record in mine if record["told"]]
-        inside = sum(record["held"] for record in some)
-        present = [record for record in some if record["true"] > 0]
+    for name in dict.fromkeys(entry["parameter"] for entry in records):
+        mine = [entry for entry in records if entry["parameter"] == name]
+        some = [entry for entry in mine if entry["told"]]
+        inside = sum(entry["held"] for entry in some)
+        present = [entry for entry in some if entry["true"] > 0]
         rows.append(
             {
                 "parameter": name, "cameras": len(mine), "told": len(some), "held": inside,
