@@ -33,6 +33,7 @@ BENCHES = {
     "link": "speed.link",
     "physics": "accuracy.physics",
     "substeps": "accuracy.substeps",
+    "fit": "accuracy.fit",
     "extremes": "accuracy.extremes",
     "sensor": "accuracy.sensor",
     "scene": "accuracy.scene",

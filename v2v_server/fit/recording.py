@@ -1,0 +1,175 @@
+"""Read a recording once, and keep what a fit needs: the events and frames of some pixels, and counts of all pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.errors import UsageError
+from v2v_recordings.forms import FORMS, recognise
+from v2v_recordings.items import ConvertOptions, EventChunk, Picture, Progress, SensorSize
+
+MOST_PIXELS = 1 << 16
+"""Pixels whose events and frames are kept."""
+MOST_EVENTS = 12_000_000
+"""Events of these pixels; reading stops there."""
+TILE_PX = 16
+Longs = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Events and frames of P pixels of a sensor.
+
+    Attributes:
+        height_px, width_px: size of the sensor.
+        pixels: [P] int64, places of the pixels in row order, ascending.
+        first: [P + 1] int64; the events of pixel i are ``first[i] : first[i + 1]``, in order of time.
+        t_us: [N] int64, microseconds.
+        p: [N] bool, True for brighter.
+        frames: [n, P] uint8 grey levels; n is 0 without frames.
+        frame_us: [n] int64, time of each frame, ascending.
+        counts: [2, H, W] int64, darker and brighter events of the whole sensor.
+        seconds: time from the first to the last event or frame.
+    """
+
+    height_px: int
+    width_px: int
+    pixels: Longs
+    first: Longs
+    t_us: Longs
+    p: npt.NDArray[np.bool_]
+    frames: npt.NDArray[np.uint8]
+    frame_us: Longs
+    counts: Longs
+    seconds: float
+
+    @property
+    def begin_us(self) -> int:
+        """Time of the first event or frame."""
+        times = [int(column.min()) for column in (self.t_us, self.frame_us) if len(column)]
+        return min(times)
+
+    def blocks(self, side: int = 8) -> Longs:
+        """Return the block of each pixel, 0 .. side * side - 1: the sensor in rows and columns of equal parts."""
+        y, x = np.divmod(self.pixels, self.width_px)
+        return np.asarray((y * side // self.height_px) * side + x * side // self.width_px)
+
+    def part(self, chosen: npt.NDArray[np.bool_]) -> Recorded:
+        """Return the recording of some of the pixels, chosen by a mask [P]."""
+        lengths = np.diff(self.first)
+        events = np.repeat(chosen, lengths)
+        first = np.concatenate([[0], np.cumsum(lengths[chosen])])
+        frames = np.ascontiguousarray(self.frames[:, chosen])
+        return Recorded(
+            self.height_px, self.width_px, self.pixels[chosen], first, self.t_us[events], self.p[events], frames,
+            self.frame_us, self.counts, self.seconds,
+        )  # fmt: skip
+
+
+def chosen_pixels(height_px: int, width_px: int) -> Longs:
+    """Return the pixels that a fit looks at: all of a small sensor, or tiles spread evenly over a large one."""
+    if height_px * width_px <= MOST_PIXELS:
+        return np.arange(height_px * width_px)
+    y, x = np.mgrid[0:height_px, 0:width_px]
+    rows, columns = -(-height_px // TILE_PX), -(-width_px // TILE_PX)
+    stride = max(1.0, rows * columns * TILE_PX**2 / MOST_PIXELS)
+    kept = np.unique((np.arange(int(rows * columns / stride)) * stride).astype(np.int64))
+    # A step of tiles that has no common factor with the rows spreads them like a shuffle, the same on every host.
+    scattered = (kept * 7919) % (rows * columns) if (rows * columns) % 7919 else kept
+    return np.flatnonzero(np.isin(((y // TILE_PX) * columns + x // TILE_PX).ravel(), scattered))
+
+
+def recorded(
+    height_px: int, width_px: int, t_us: Longs, place: Longs, p: npt.NDArray[np.bool_],
+    frames: npt.NDArray[np.uint8], frame_us: Longs, counts: Longs | None = None,
+) -> Recorded:  # fmt: skip
+    """Build a recording from events in any order.
+
+    Args:
+        t_us, place, p: [N] time, pixel in row order, polarity.
+        frames: [n, H, W], or [n, P] of the pixels of :func:`chosen_pixels`.
+        counts: see :class:`Recorded`; None counts the events given.
+
+    Raises:
+        UsageError: there are no events.
+    """
+    if not len(t_us):
+        raise UsageError("the recording has no events: a fit needs at least some seconds of them")
+    if counts is None:
+        counts = np.stack([np.bincount(place[p == sign], minlength=height_px * width_px) for sign in (False, True)])
+        counts = counts.reshape(2, height_px, width_px)
+    pixels = chosen_pixels(height_px, width_px)
+    index = np.full(height_px * width_px, -1)
+    index[pixels] = np.arange(len(pixels))
+    kept = index[place] >= 0
+    t_us, of_pixel, p = t_us[kept], index[place[kept]], p[kept]
+    order = np.lexsort((t_us, of_pixel))
+    if frames.ndim == 3:
+        frames = frames.reshape(len(frames), height_px * width_px)[:, pixels]
+    in_time = np.argsort(frame_us, kind="stable")
+    in_time = in_time[np.concatenate([[True], np.diff(frame_us[in_time]) > 0])] if len(in_time) else in_time
+    times = np.concatenate([t_us, frame_us])
+    return Recorded(
+        height_px, width_px, pixels, np.searchsorted(of_pixel[order], np.arange(len(pixels) + 1)), t_us[order],
+        p[order], np.ascontiguousarray(frames[in_time]), frame_us[in_time], counts,
+        float(times.max() - times.min()) * 1e-6,
+    )  # fmt: skip
+
+
+def read_recording(
+    path: str | Path, options: ConvertOptions | None = None, progress: Progress = lambda _done, _total: None
+) -> Recorded:
+    """Read a recording of any form that ``v2v-convert`` reads, chunk by chunk.
+
+    Raises:
+        UsageError: the form is not known, the file is damaged or has no events, or its sensor's size is not known.
+    """
+    path, options = Path(path), options or ConvertOptions()
+    size, index, counts = options.size, np.empty(0, np.int64), np.empty(0, np.int64)
+    events: list[tuple[npt.NDArray[Any], ...]] = []
+    frames: list[npt.NDArray[np.uint8]] = []
+    frame_us: list[int] = []
+    kept = 0
+    for item in FORMS[recognise(path)].read(path, options, progress):
+        if isinstance(item, SensorSize):
+            size = size or item
+        elif isinstance(item, Picture):
+            size = size or SensorSize(item.pixels.shape[1], item.pixels.shape[0])
+        if size is not None and not len(index):
+            pixels = chosen_pixels(size.height, size.width)
+            index = np.full(size.height * size.width, -1, np.int32)
+            index[pixels] = np.arange(len(pixels))
+            counts = np.zeros(2 * size.height * size.width, np.int64)
+        if isinstance(item, Picture):
+            if size is None or item.pixels.shape != (size.height, size.width):
+                raise UsageError(f"{path}: a frame is {list(item.pixels.shape)}, not the size of the sensor, {size}")
+            frames.append(item.pixels.reshape(-1)[index >= 0])
+            frame_us.append(item.t_ns // 1000)
+        elif isinstance(item, EventChunk) and len(item):
+            if size is None:
+                raise UsageError(f"{path} does not state the size of the sensor: give --size WIDTHxHEIGHT")
+            if max(int(item.x.max()) - size.width, int(item.y.max()) - size.height) >= 0:
+                raise UsageError(f"{path}: an event lies outside {size.width}x{size.height} px: correct --size")
+            if kept >= MOST_EVENTS:
+                continue
+            place = item.y.astype(np.int64) * size.width + item.x
+            counts += np.bincount(place + item.p * size.height * size.width, minlength=len(counts))
+            mine = index[place] >= 0
+            events.append((item.t_ns[mine] // 1000, place[mine].astype(np.int32), item.p[mine]))
+            kept += int(mine.sum())
+    if size is None or not kept:
+        raise UsageError(f"{path} has no events")
+    t_us, place, p = (np.concatenate(column) for column in zip(*events, strict=True))
+    begun = int(t_us.min())
+    shown = np.array(frame_us, np.int64) - begun
+    stack = np.stack(frames) if frames else np.empty((0, int((index >= 0).sum())), np.uint8)
+    within = shown <= int(t_us.max()) - begun
+    return recorded(
+        size.height, size.width, t_us - begun, place.astype(np.int64), p, stack[within], shown[within],
+        counts.reshape(2, size.height, size.width),
+    )  # fmt: skip
