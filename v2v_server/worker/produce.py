@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+import v2v_server.worker.colour  # registers its arrays
 import v2v_server.worker.labels  # noqa: F401  # registers its arrays
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
@@ -47,6 +48,7 @@ from v2v_server.store.cache import Cache
 from v2v_server.store.clips import clips_of
 from v2v_server.store.format import is_store_file
 from v2v_server.video.collect import Cut
+from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
@@ -114,7 +116,19 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
             flow = replace(flow, margin_px=0)
         margin_px = None if flow.margin_px is None else max(flow.margin_px, margin_px or 0)
     window = source_window(params, spec.recipe, top, bottom - top, lease.width_px, margin_px)
-    return SamplePlan(spec, params, source, Cut(int(source[-1]) + 1, window), margin_px, flow, flow_plan)
+    chroma = _chroma_cut(params, spec, source, Window(top, 0, bottom - top, lease.width_px), lease.arrays)
+    return SamplePlan(spec, params, source, Cut(int(source[-1]) + 1, window, chroma), margin_px, flow, flow_plan)
+
+
+def _chroma_cut(
+    params: SampleParams, spec: StreamSpec, source: npt.NDArray[np.int64], usable: Window, arrays: tuple[str, ...]
+) -> ChromaCut | None:
+    """Return which colour to decode: that of the delivered frames, in the crop; None without ``frames_rgb``."""
+    if "frames_rgb" not in arrays:
+        return None
+    frames = tuple(np.unique(source[list(spec.recipe.target_steps)]).tolist())
+    window = source_window(params, spec.recipe, usable.top_px, usable.height_px, usable.width_px)
+    return ChromaCut(frames, window, usable.top_px)
 
 
 def decode_for(
@@ -140,7 +154,8 @@ def decode_for(
         what = index, lease.start_frame, cuts, spec.recipe.frame_stride
         clips = None
         with source.open_local(lease.video, lease.fingerprint) as path:
-            if cache is not None and not is_store_file(path):
+            # The cache keeps no colour.
+            if cache is not None and not is_store_file(path) and plans[0].cut.chroma is None:
                 rows = Rows.parse(lease.rows).bounds(lease.height_px)
                 clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what)
             if clips is None:
@@ -255,6 +270,7 @@ def _context(
     clip = SourceClip(
         lease.start_frame,
         decoded.clip.seconds,
+        None if plan.cut.chroma is None or decoded.clip.chroma is None else (decoded.clip.chroma, plan.cut.chroma),
         sidecars,
         fingerprints={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
         picture_px=(lease.height_px, lease.width_px),
