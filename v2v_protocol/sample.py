@@ -63,6 +63,10 @@ ARRAYS: dict[str, ArrayForm] = {
         "float32" if voxel_dtype == "float32" else "float16", (recipe.voxel_grids, recipe.bins, *recipe.crop_px)
     ),
     "frames": lambda recipe, _: ("uint8", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
+    "frames_rgb": lambda recipe, _: (
+        "uint8", (recipe.voxels_per_clip + recipe.lead_frames, 3, *recipe.crop_px)
+    ),
+    "frames_all": lambda recipe, _: ("uint8", (recipe.steps + 1, 1, *recipe.crop_px)),
     "flow": lambda recipe, _: ("float16", (recipe.voxels_per_clip, 2, *recipe.crop_px)),
     "flow_valid": lambda recipe, _: ("uint8", (recipe.voxels_per_clip, 1, *recipe.crop_px)),
     "boxes": FromSidecar(
@@ -88,7 +92,8 @@ RVT's stacked histogram and the input of a spiking network are then views of it,
 is that of the voxels, so that ``counts[:, 1] - counts[:, 0]`` does not wrap. voxels_bilinear shares each event between
 the two bins next to its time (Zhu et al. 2019).
 
-boxes and masks belong to the frames of the same number. masks hold classes; 255 marks a sample without labels."""
+frames_rgb are the frames in colour; frames_all are all frames that are simulated, the first included. boxes and masks
+belong to the frames of the same number. masks hold classes; 255 marks a sample without labels."""
 DEFAULT_ARRAYS = ("voxels", "frames")
 Layout: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
 """dtype and shape of each array of one sample, by name, in the order of the headers."""

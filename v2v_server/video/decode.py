@@ -29,6 +29,7 @@ from av.video.stream import VideoStream
 
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.video.collect import Cut, FrameRange, LastFrame, Stack
+from v2v_server.video.colour.chroma import Chroma
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.orientation import Window
 from v2v_server.video.packets import is_unreferenced, length_bytes
@@ -51,6 +52,7 @@ class DecodedClip:
         codec: FFmpeg's name of the format.
         bit_exact: whether every host decodes these very bytes.
         origin: "" where they were decoded just now; "store" or "cache" where they were read from there.
+        chroma: colour of the frames that the cut names; None without.
     """
 
     frames: npt.NDArray[np.uint8]
@@ -58,6 +60,7 @@ class DecodedClip:
     codec: str
     bit_exact: bool
     origin: str = ""
+    chroma: Chroma | None = None
 
 
 class _SeekFailed(Exception):
@@ -98,12 +101,16 @@ def decode_cuts(
     for cut in cuts:
         index.position(start, (cut.count - 1) * stride + 1)
     checked = [replace(cut, window=_checked(cut.window, index)) for cut in cuts]
-    taken, codec = _decode(FrameRange(os.fspath(path), index, start, stride), checked)
+    stack = _filled(FrameRange(os.fspath(path), index, start, stride), checked)
     return tuple(
         DecodedClip(
-            grey, index.seconds(start, (cut.count - 1) * stride + 1)[::stride], codec, codec in BIT_EXACT_CODECS
+            grey,
+            index.seconds(start, (cut.count - 1) * stride + 1)[::stride],
+            stack.codec,
+            stack.codec in BIT_EXACT_CODECS,
+            chroma=chroma,
         )
-        for grey, cut in zip(taken, checked, strict=True)
+        for grey, chroma, cut in zip(stack.grey(), stack.chroma(), checked, strict=True)
     )
 
 
@@ -118,12 +125,6 @@ def _checked(window: Window | None, index: FrameIndex) -> Window:
             f"{index.width_px}x{index.height_px} px"
         )
     return window
-
-
-def _decode(wanted: FrameRange, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
-    """Return the cuts, [count, h, w] uint8 each, and the codec's name."""
-    stack = _filled(wanted, cuts)
-    return list(stack.grey()), stack.codec
 
 
 def _filled(wanted: FrameRange, cuts: Sequence[Cut]) -> Stack:

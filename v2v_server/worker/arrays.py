@@ -29,6 +29,7 @@ from v2v_server.simulation.kernels import ARRAYS
 from v2v_server.simulation.result import Voxels
 from v2v_server.simulation.view import Frames, Window
 from v2v_server.simulation.voxel import Levels
+from v2v_server.video.colour.chroma import Chroma, ChromaCut
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +39,7 @@ class SourceClip:
     Attributes:
         start_frame: number of the clip's first frame in the video, in presentation order from 0.
         seconds: [n] float64, presentation time of each frame of the clip; NaN where unknown.
+        colour: colour of the delivered frames, and how it was cut; None if no array needs it.
         sidecars: the opened sidecars by ending, see :class:`v2v_protocol.sample.FromSidecar`: a file, or a folder in
             the manner of ``pathlib``; None if the video has none.
         numbers: [steps + 1] int64, number in the video of each frame of the clip and of those that pauses leave out.
@@ -48,6 +50,7 @@ class SourceClip:
 
     start_frame: int
     seconds: npt.NDArray[np.float64]
+    colour: tuple[Chroma, ChromaCut] | None
     sidecars: Mapping[str, Traversable | None]
     numbers: npt.NDArray[np.int64]
     fingerprints: Mapping[str, str]
@@ -152,6 +155,12 @@ def frames(context: SampleContext, out: npt.NDArray[Any]) -> None:
     """Fill in the frame at the end of each voxel, and the lead frame."""
     # The indices are valid; checking them again would cost a copy.
     np.take(context.view, context.source[list(context.recipe.target_steps)], axis=0, out=out[:, 0], mode="clip")
+
+
+@makes("frames_all")
+def frames_all(context: SampleContext, out: npt.NDArray[Any]) -> None:
+    """Fill in the frame at the beginning of the clip and at the end of each step."""
+    np.take(context.view, context.source, axis=0, out=out[:, 0], mode="clip")
 
 
 @makes("flow")

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+import v2v_server.worker.colour  # registers its arrays
 import v2v_server.worker.labels  # noqa: F401  # registers its arrays
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
@@ -47,6 +48,7 @@ from v2v_server.store.cache import Cache
 from v2v_server.store.clips import clips_of
 from v2v_server.store.format import is_store_file
 from v2v_server.video.collect import Cut
+from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
@@ -119,7 +121,8 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
             flow = replace(flow, margin_px=0)
         margin_px = None if flow.margin_px is None else max(flow.margin_px, margin_px or 0)
     window = source_window(params, spec.recipe, picture, margin_px)
-    cut = Cut(frames.count(int(source[-1]) + 1), window)
+    chroma = _chroma_cut(lease, params, spec, frames, source) if "frames_rgb" in lease.arrays else None
+    cut = Cut(frames.count(int(source[-1]) + 1), window, chroma)
     return SamplePlan(spec, params, source, frames, cut, margin_px, flow, flow_plan)
 
 
@@ -128,6 +131,18 @@ def usable_window(lease: Lease, sides: Sides) -> Window:
     top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
     height, width = bottom - top - sides.top - sides.bottom, lease.width_px - sides.left - sides.right
     return Window(top + sides.top, sides.left, height, width)
+
+
+def _chroma_cut(
+    lease: Lease, params: SampleParams, spec: StreamSpec, frames: CleanFrames, source: npt.NDArray[np.int64]
+) -> ChromaCut:
+    """Return which colour to decode: that of the delivered frames, in the crop."""
+    delivered = np.unique(source[list(spec.recipe.target_steps)])
+    if not frames.stride:
+        delivered = frames.numbers[delivered] - frames.numbers[0]
+    top, _ = Rows.parse(lease.rows).bounds(lease.height_px)
+    window = source_window(params, spec.recipe, usable_window(lease, frames.sides))
+    return ChromaCut(tuple(delivered.tolist()), window, top)
 
 
 def decode_for(
@@ -153,7 +168,8 @@ def decode_for(
         what = index, lease.start_frame, cuts, frames.stride or 1
         clips = None
         with source.open_local(lease.video, lease.fingerprint) as path:
-            if cache is not None and not is_store_file(path):
+            # The cache keeps no colour.
+            if cache is not None and not is_store_file(path) and plans[0].cut.chroma is None:
                 rows = Rows.parse(lease.rows).bounds(lease.height_px)
                 clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what)
             if clips is None:
@@ -269,6 +285,7 @@ def _context(
     clip = SourceClip(
         lease.start_frame,
         decoded.clip.seconds,
+        None if plan.cut.chroma is None or decoded.clip.chroma is None else (decoded.clip.chroma, plan.cut.chroma),
         sidecars,
         fingerprints={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
         numbers=plan.frames.numbers,
