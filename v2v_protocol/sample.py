@@ -49,6 +49,7 @@ ARRAYS: dict[str, ArrayForm] = {
         "float32" if voxel_dtype == "float32" else "float16", (recipe.voxel_grids, recipe.bins, *recipe.crop_px)
     ),
     "frames": lambda recipe, _: ("uint8", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
+    "frames_u16": lambda recipe, _: ("uint16", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
     "flow": lambda recipe, _: ("float16", (recipe.voxels_per_clip, 2, *recipe.crop_px)),
     "flow_valid": lambda recipe, _: ("uint8", (recipe.voxels_per_clip, 1, *recipe.crop_px)),
 }  # fmt: skip
