@@ -67,6 +67,7 @@ ARRAYS: dict[str, ArrayForm] = {
         "uint8", (recipe.voxels_per_clip + recipe.lead_frames, 3, *recipe.crop_px)
     ),
     "frames_all": lambda recipe, _: ("uint8", (recipe.steps + 1, 1, *recipe.crop_px)),
+    "frames_u16": lambda recipe, _: ("uint16", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
     "flow": lambda recipe, _: ("float16", (recipe.voxels_per_clip, 2, *recipe.crop_px)),
     "flow_valid": lambda recipe, _: ("uint8", (recipe.voxels_per_clip, 1, *recipe.crop_px)),
     "boxes": FromSidecar(

@@ -42,6 +42,7 @@ SOURCES = dict.fromkeys(
     "contrast_scale": "V2V's ablation LDR",
     "gamma": "V2V's released code",
     "log_eps": "V2V's released code",
+    "light": _OURS,
     "threshold_source": "V2V's ablation with fixed thresholds",
     "noise_scales_with_threshold": "an option of V2V's released code",
     "frame_stride": _OURS,

@@ -59,6 +59,7 @@ recipes = st.builds(
     contrast_scale=_range(0.0, 100.0),
     gamma=st.floats(0.05, 20.0),
     log_eps=_range(1e-12, 1.0),
+    light=st.sampled_from(["sdr", "declared"]),
     threshold=_range(1e-6, 1e6),
     threshold_ratio=_range(1e-6, 1e6),
     threshold_source=st.sampled_from(("sample", "video")),

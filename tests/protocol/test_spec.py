@@ -36,6 +36,7 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "contrast_scale": [1.0, 2.0],
     "gamma": 1.0,
     "log_eps": [0.002, 0.1],
+    "light": "declared",
     "threshold": [0.05, 1.0],
     "threshold_ratio": [1.0, 1.6],
     "threshold_source": "video",

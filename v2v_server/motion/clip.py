@@ -58,7 +58,7 @@ def levels_of(
         return None
     grey = levels.grey[:, :, ::-1] if params.flip else levels.grey
     if params.contrast != 0.0:
-        grey = contrast_table(params.contrast, FINE_STEPS)[grey]
+        grey = contrast_table(params.contrast, 255 * FINE_STEPS)[grey]
     return Levels(levels.at, np.ascontiguousarray(grey))
 
 

@@ -31,9 +31,11 @@ from v2v_server.store.format import Head, group_frames_for
 from v2v_server.store.packing import SIZES
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter
-from v2v_server.video.decode import BIT_EXACT_CODECS, decode_luma, stream_luma
+from v2v_server.video.collect import Cut
+from v2v_server.video.decode import BIT_EXACT_CODECS, decode_cuts, decode_luma, stream_luma
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import MOST_BITS
 from v2v_server.video.orientation import Window
 from v2v_server.video.probe import probe
 
@@ -147,6 +149,7 @@ def _frames(job: Transcoding, index: FrameIndex) -> Iterator[npt.NDArray[np.uint
 
 def _stored(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[npt.NDArray[np.uint8]]) -> Made:
     """Write a store file, and verify it by reading it back."""
+    first = decode_cuts(job.source, index, 0, [Cut(1, (0, 0, 1, 1))], most_bits=MOST_BITS)[0].signal
     packing = SIZES[job.encoding.size]
     top, _, rows, width = job.window
     rate = job.frames_per_second
@@ -154,7 +157,7 @@ def _stored(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[np
         video=job.video, fingerprint=job.fingerprint, height_px=index.height_px, width_px=width, top=top, rows=rows,
         first=0, count=len(index), frames=len(index), frames_per_second=0.0 if math.isnan(rate) else rate,
         codec=job.codec, bit_exact=job.codec in BIT_EXACT_CODECS, group=group_frames_for(rows, width),
-        packing=packing.method, index=job.index,
+        packing=packing.method, index=job.index, bits=first.bits, transfer=first.transfer,
     )  # fmt: skip
     wanted, got = xxhash.xxh3_128(), xxhash.xxh3_128()
     with StoreWriter(made, head, packing) as writer:

@@ -34,10 +34,11 @@ from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter
 from v2v_server.system.private import make_private
 from v2v_server.system.status_fields import GIB
-from v2v_server.video.collect import Cut
+from v2v_server.video.collect import Cut, LastFrame
 from v2v_server.video.decode import BIT_EXACT_CODECS, DecodedClip, stream_decoded
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import MIXED, SDR, Signal
 from v2v_server.video.orientation import Window
 
 _LOCK_SECONDS = 0.06
@@ -91,6 +92,7 @@ class Cache:
         start: int,
         cuts: Sequence[Cut],
         stride: int,
+        most_bits: int | None = None,
     ) -> tuple[DecodedClip, ...] | None:
         """Return several cuts of a video, read from the cache, or decoded and stored in it.
 
@@ -99,10 +101,11 @@ class Cache:
             video, fingerprint: its catalogue id and fingerprint.
             rows: (first, one after the last) usable row; these are stored. The cuts lie within.
             index: its frames, or a part that holds the needed pieces.
-            start, cuts, stride: see :func:`v2v_server.video.decode.decode_cuts`.
+            start, cuts, stride, most_bits: see :func:`v2v_server.video.decode.decode_cuts`.
 
         Returns:
-            None if the cache can neither read nor store them; the caller then decodes without the cache.
+            None if the cache can neither read nor store them, as frames of more than 8 bits; the caller then decodes
+            without the cache.
 
         Raises:
             VideoError: the file is another video now.
@@ -112,7 +115,9 @@ class Cache:
         last = start + max((cut.count - 1) * stride for cut in cuts)
         index.position(start, last - start + 1)
         size = piece_frames(rows[1] - rows[0], index.width_px)
-        key = hashlib.sha256(repr((video, fingerprint, rows, size)).encode()).hexdigest()[:32]
+        # Pieces that state their transfer have names of their own: older ones do not state it.
+        named = (video, fingerprint, rows, size) if most_bits is None else (video, fingerprint, rows, size, most_bits)
+        key = hashlib.sha256(repr(named).encode()).hexdigest()[:32]
         pieces = [
             _Piece(self.folder / key[:2] / f"{key}-{number}", number * size, min((number + 1) * size, index.end))
             for number in range(start // size, last // size + 1)
@@ -125,7 +130,7 @@ class Cache:
             return None
         check_fingerprint(path, fingerprint)
         try:
-            self._fill(path, video, fingerprint, rows, index, missing)
+            self._fill(path, video, fingerprint, rows, index, missing, most_bits)
         except OSError as error:
             self._rest(f"cannot be written to: {error.strerror or error}")
             return None
@@ -150,11 +155,12 @@ class Cache:
     ) -> tuple[DecodedClip, ...] | None:
         """Read the cuts if all pieces are present and sound. Damaged pieces are removed."""
         clips = [np.empty((cut.count, *_window(cut, index)[2:]), np.uint8) for cut in cuts]
-        codec, bit_exact, sound = "", False, True
+        codec, bit_exact, sound, transfers = "", False, True, set[str]()
         for piece in pieces:
             try:
                 with StoreFile(piece.path, fingerprint) as stored:
                     codec, bit_exact = stored.head.codec, stored.head.bit_exact
+                    transfers.add(stored.head.transfer)
                     for cut, frames in zip(cuts, clips, strict=True):
                         # The frames of start, start + stride ... that lie in this piece.
                         low = max(0, -(-(piece.first - start) // stride))
@@ -170,9 +176,10 @@ class Cache:
                 sound = False  # continue, so that all damaged pieces are decoded again together
         if not sound:
             return None
+        signal = Signal(transfer=transfers.pop() if len(transfers) == 1 else MIXED)
         times = [index.seconds(start, (cut.count - 1) * stride + 1)[::stride] for cut in cuts]
         return tuple(
-            DecodedClip(frames, seconds, codec, bit_exact, "cache")
+            DecodedClip(frames, seconds, codec, bit_exact, "cache", signal=signal)
             for frames, seconds in zip(clips, times, strict=True)
         )
 
@@ -203,28 +210,32 @@ class Cache:
         rows: tuple[int, int],
         index: FrameIndex,
         missing: Sequence[_Piece],
+        most_bits: int | None,
     ) -> None:
         """Decode the missing pieces in one pass, and store each.
 
         Raises:
-            VideoError: they cannot be decoded.
+            VideoError: they cannot be decoded, or have more than 8 bits.
             OSError: they cannot be written.
         """
         top, width = rows[0], index.width_px
         height, begin, end = rows[1] - rows[0], missing[0].first, missing[-1].end
-        with contextlib.closing(stream_decoded(path, index, begin, end - begin, (top, 0, height, width))) as frames:
+        decoded = stream_decoded(path, index, begin, end - begin, (top, 0, height, width), most_bits)
+        with contextlib.closing(decoded) as frames:
             for piece in missing:
                 for _ in range(begin, piece.first):  # frames of a piece that exists
                     next(frames)
                 begin = piece.end
-                codec, picture = next(frames)
+                stream, picture = next(frames)
+                if stream.signal.bits > SDR.bits:
+                    raise VideoError(video, piece.first, f"has {stream.signal.bits} bits; a piece holds 8")
                 head = Head(
                     video=video, fingerprint=fingerprint, height_px=index.height_px, width_px=width, top=top,
                     rows=height, first=piece.first, count=piece.end - piece.first, frames=piece.end,
-                    frames_per_second=0.0, codec=codec, bit_exact=codec in BIT_EXACT_CODECS,
-                    group=group_frames_for(height, width), packing=QUICK.method,
+                    frames_per_second=0.0, codec=stream.codec, bit_exact=stream.codec in BIT_EXACT_CODECS,
+                    group=group_frames_for(height, width), packing=QUICK.method, transfer=stream.signal.transfer,
                 )  # fmt: skip
-                more = (later for _, later in islice(frames, head.count - 1))
+                more = (_alike(head, *later) for later in islice(frames, head.count - 1))
                 self._keep(piece.path, head, chain((picture,), more))
 
     def _keep(self, path: Path, head: Head, pictures: Iterable[npt.NDArray[np.uint8]]) -> None:
@@ -292,6 +303,17 @@ def _remove_abandoned(folder: Path) -> None:
         with contextlib.suppress(OSError), path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             path.unlink()
+
+
+def _alike(head: Head, stream: LastFrame, picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return the picture.
+
+    Raises:
+        VideoError: the video states another transfer by now.
+    """
+    if stream.signal.transfer != head.transfer:
+        raise VideoError(head.video, None, "states different transfer characteristics within a piece")
+    return picture
 
 
 def _window(cut: Cut, index: FrameIndex) -> Window:

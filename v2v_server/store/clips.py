@@ -16,6 +16,7 @@ from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip, decode_cuts, stream_luma
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.orientation import Window
 from v2v_server.video.probe import VideoFacts, probe
 
@@ -24,7 +25,13 @@ STORE_FORMAT = "v2v store"
 
 
 def clips_of(
-    path: str | os.PathLike[str], fingerprint: str, index: FrameIndex, start: int, cuts: Sequence[Cut], stride: int
+    path: str | os.PathLike[str],
+    fingerprint: str,
+    index: FrameIndex,
+    start: int,
+    cuts: Sequence[Cut],
+    stride: int,
+    most_bits: int | None = None,
 ) -> tuple[DecodedClip, ...]:
     """Return several cuts of the frames from ``start`` on, see :func:`v2v_server.video.decode.decode_cuts`.
 
@@ -34,23 +41,32 @@ def clips_of(
 
     Raises:
         UsageError, VideoError: see :func:`v2v_server.video.decode.decode_cuts`; also if the file is, or was made from,
-            another video.
+            another video, or a store file holds fewer bits than asked for and its source has.
     """
     if not is_store_file(path):
         check_fingerprint(path, fingerprint)
-        return decode_cuts(path, index, start, cuts, stride=stride)
+        return decode_cuts(path, index, start, cuts, stride=stride, most_bits=most_bits)
     with StoreFile(path, fingerprint) as stored:
-        return tuple(stored_clip(stored, index, start, cut, stride) for cut in cuts)
+        if min(most_bits or 0, stored.head.bits) > SDR.bits:
+            why = (
+                f"the store file holds 8 of the {stored.head.bits} bits that light = declared needs: "
+                "serve its source, or set light to sdr"
+            )
+            raise VideoError(os.fspath(path), None, why)
+        signal = SDR if most_bits is None else Signal(transfer=stored.head.transfer)
+        return tuple(stored_clip(stored, index, start, cut, stride, signal) for cut in cuts)
 
 
-def stored_clip(stored: StoreFile, index: FrameIndex, start: int, cut: Cut, stride: int) -> DecodedClip:
+def stored_clip(
+    stored: StoreFile, index: FrameIndex, start: int, cut: Cut, stride: int, signal: Signal = SDR
+) -> DecodedClip:
     """Read one cut from an open store file that holds all of it."""
     head = stored.head
     window = cut.window or (head.top, 0, head.rows, head.width_px)
     frames = np.empty((cut.count, *window[2:]), np.uint8)
     stored.read(start, stride, window, frames)
     seconds = index.seconds(start, (cut.count - 1) * stride + 1)[::stride]
-    return DecodedClip(frames, seconds, head.codec, head.bit_exact, "store")
+    return DecodedClip(frames, seconds, head.codec, head.bit_exact, "store", signal=signal)
 
 
 def check_file(path: str | os.PathLike[str], fingerprint: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from av.video.frame import VideoFrame
 from v2v_protocol.errors import VideoError
 from v2v_server.video.colour.chroma import Chroma, ChromaCut, ChromaStack
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import LumaFormat, copy_luma, luma_plane, stretch
+from v2v_server.video.luma import MIXED, SDR, TRANSFERS, LumaFormat, Signal, copy_luma, luma_plane, stretch
 from v2v_server.video.orientation import Window
 
 
@@ -38,13 +38,14 @@ class FrameRange:
     """Which frames of a file are to be decoded.
 
     Attributes:
-        path, index, start, stride: see :func:`v2v_server.video.decode.decode_cuts`.
+        path, index, start, stride, most_bits: see :func:`v2v_server.video.decode.decode_cuts`.
     """
 
     path: str
     index: FrameIndex
     start: int
     stride: int
+    most_bits: int | None = None
 
 
 def window_of(cut: Cut) -> Window:
@@ -61,6 +62,7 @@ class Stack:
         self.index = index = wanted.index
         self._orientation = index.orientation
         self.codec = ""  # FFmpeg's name, once decoding has begun
+        self.signal = SDR  # of the collected frames
         self.sparse = False  # whether frames before the range are left out on purpose
         self._cuts = cuts
         self._stride = stride = wanted.stride
@@ -75,7 +77,7 @@ class Stack:
         self._colours = [
             None if cut.chroma is None else ChromaStack(cut.chroma, self._orientation, *size) for cut in cuts
         ]
-        self._parts: list[tuple[Window, npt.NDArray[np.uint8]]] = []  # stored window and frames of each cut
+        self._parts: list[tuple[Window, npt.NDArray[np.unsignedinteger]]] = []  # stored window and frames of each cut
 
     def take(self, frame: VideoFrame) -> bool:
         """Look at the next frame that the decoder delivers; True once the last asked one is in."""
@@ -128,6 +130,8 @@ class Stack:
     def _copy(self, frame: VideoFrame) -> None:
         if not self._parts:
             self._luma = LumaFormat.of(frame)
+            if self.wanted.most_bits is not None:
+                self.signal = Signal(min(self._luma.bits, self.wanted.most_bits), TRANSFERS.get(frame.color_trc, ""))
             self._size = self._orientation.size(self.index.height_px, self.index.width_px)
             self._parts = [self._part(cut) for cut in self._cuts]
         if (frame.height, frame.width) != self._size:
@@ -137,17 +141,19 @@ class Stack:
             )
         if not self._luma.describes(frame):
             self.refuse(f"the picture format changes from {self._luma} to {LumaFormat.of(frame)}")
+        if self.wanted.most_bits is not None and TRANSFERS.get(frame.color_trc, "") != self.signal.transfer:
+            self.signal = self.signal._replace(transfer=MIXED)
         self._keep(luma_plane(frame, self._luma))
 
     def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
         for stored, raw in self._parts:
             if self.taken < len(raw):
-                copy_luma(samples, self._luma, stored, raw[self.taken])
+                copy_luma(samples, self._luma, stored, raw[self.taken], self.signal)
 
-    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
+    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.unsignedinteger]]:
         window = window_of(cut)
         stored = self._orientation.stored_window(window, self.index.height_px, self.index.width_px)
-        return stored, np.empty((cut.count, *stored[2:]), np.uint8)
+        return stored, np.empty((cut.count, *stored[2:]), self.signal.dtype)
 
     def refuse(self, why: str) -> NoReturn:
         """Blame the next frame that should have come.
@@ -161,8 +167,8 @@ class Stack:
         """Return the collected colour of each cut; None if it takes none."""
         return [None if colour is None else colour.chroma() for colour in self._colours]
 
-    def grey(self) -> Iterator[npt.NDArray[np.uint8]]:
-        """Yield the collected frames of each cut, [count, h, w] uint8: upright, in full range."""
+    def grey(self) -> Iterator[npt.NDArray[Any]]:
+        """Yield the collected frames of each cut, [count, h, w] of the signal's dtype: upright, in full range."""
         for _, raw in self._parts:
             stretch(raw, self._luma)
             yield self._orientation.upright(raw)
@@ -177,13 +183,13 @@ class LastFrame(Stack):
     def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
         ((stored, last),) = self._parts
         self._parts = [(stored, np.empty_like(last))]  # a caller may keep the last one
-        copy_luma(samples, self._luma, stored, self._parts[0][1][0])
+        copy_luma(samples, self._luma, stored, self._parts[0][1][0], self.signal)
 
-    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
+    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.unsignedinteger]]:
         return super()._part(replace(cut, count=1))
 
-    def picture(self) -> npt.NDArray[np.uint8]:
-        """Return the last frame that was taken, [h, w] uint8: upright, in full range."""
+    def picture(self) -> npt.NDArray[Any]:
+        """Return the last frame that was taken, [h, w] of the signal's dtype: upright, in full range."""
         (grey,) = self.grey()
-        picture: npt.NDArray[np.uint8] = grey[0]
+        picture: npt.NDArray[Any] = grey[0]
         return picture

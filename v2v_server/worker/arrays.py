@@ -25,11 +25,13 @@ from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.flow import FlowClip
 from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.intensity import tone_table
 from v2v_server.simulation.kernels import ARRAYS
 from v2v_server.simulation.result import Voxels
 from v2v_server.simulation.view import Frames, Window
 from v2v_server.simulation.voxel import Levels
 from v2v_server.video.colour.chroma import Chroma, ChromaCut
+from v2v_server.video.luma import SDR, Signal
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +69,8 @@ class SampleContext:
         clip: the frames' place in the video, their times, and the opened sidecars.
         spec, params: the stream's spec, and the sample's draw.
         source: [steps + 1] int64, which frame of ``view`` each position of the clip shows.
-        view: [n, H, W] uint8, the decoded frames as the camera sees them.
+        view: [n, H, W], the decoded frames as the camera sees them.
+        signal: what the levels of ``view`` mean.
         step_seconds: [steps] float64, duration of each step; None if the recipe does not use it.
         flow: flow of the clip; None if it was not requested.
         levels: grey levels between frames (``substep_px``); None if there are none.
@@ -82,6 +85,7 @@ class SampleContext:
     params: SampleParams
     source: npt.NDArray[np.int64]
     view: Frames
+    signal: Signal
     step_seconds: npt.NDArray[np.float64] | None
     flow: FlowClip | None
     levels: Levels | None
@@ -134,6 +138,7 @@ def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Vox
             context.step_seconds,
             out,
             context.levels,
+            context.signal,
         )
     except UsageError as error:
         # The recipe was checked before, so the values come from the corpus.
@@ -152,15 +157,30 @@ def simulated(context: SampleContext, out: npt.NDArray[Any]) -> None:
 
 @makes("frames")
 def frames(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in the frame at the end of each voxel, and the lead frame."""
-    # The indices are valid; checking them again would cost a copy.
-    np.take(context.view, context.source[list(context.recipe.target_steps)], axis=0, out=out[:, 0], mode="clip")
+    """Fill in the frame at the end of each voxel, and the lead frame, tone mapped (``intensity.py``)."""
+    _shown(context, context.source[list(context.recipe.target_steps)], out)
+
+
+@makes("frames_u16")
+def frames_u16(context: SampleContext, out: npt.NDArray[Any]) -> None:
+    """Fill in the same frames with the levels that the video stores, 0 .. 65535, without tone mapping."""
+    white = context.signal.white
+    table = ((2 * 65535 * np.arange(white + 1) + white) // (2 * white)).astype(np.uint16)
+    np.take(table, context.view[context.source[list(context.recipe.target_steps)]], out=out[:, 0], mode="clip")
 
 
 @makes("frames_all")
 def frames_all(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in the frame at the beginning of the clip and at the end of each step."""
-    np.take(context.view, context.source, axis=0, out=out[:, 0], mode="clip")
+    """Fill in the frame at the beginning of the clip and at the end of each step, tone mapped."""
+    _shown(context, context.source, out)
+
+
+def _shown(context: SampleContext, numbers: npt.NDArray[np.int64], out: npt.NDArray[Any]) -> None:
+    # The indices are valid; checking them again would cost a copy.
+    if context.signal == SDR:
+        np.take(context.view, numbers, axis=0, out=out[:, 0], mode="clip")
+    else:
+        np.take(tone_table(context.recipe.gamma, context.signal), context.view[numbers], out=out[:, 0], mode="clip")
 
 
 @makes("flow")

@@ -40,6 +40,7 @@ from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.motion import MARGIN_PX, levels_of
 from v2v_server.simulation.draw import draw
+from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.kernels import ARRAYS, list_events
 from v2v_server.simulation.variants import Variant, variants
 from v2v_server.simulation.view import Window, apply_view, source_window, without_margin
@@ -51,6 +52,7 @@ from v2v_server.video.collect import Cut
 from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import MIXED, MOST_BITS, SDR
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, simulate
 from v2v_server.worker.cleaning import CleanFrames
@@ -165,7 +167,7 @@ def decode_for(
     _refuse_outside(lease.video)
     try:
         index, cuts = _frame_index(lease, frames.span), [plan.cut for plan in plans]
-        what = index, lease.start_frame, cuts, frames.stride or 1
+        what = index, lease.start_frame, cuts, frames.stride or 1, _most_bits(plans[0].spec)
         clips = None
         with source.open_local(lease.video, lease.fingerprint) as path:
             # The cache keeps no colour.
@@ -177,6 +179,9 @@ def decode_for(
     except VideoError as error:
         # Consumer and log identify videos by id; a path of this host means nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
+    if clips[0].signal.transfer == MIXED:
+        why = "states different transfer characteristics within a clip: re-encode it with one, or set light to sdr"
+        raise VideoError(lease.video, lease.start_frame, why)
     return tuple(
         Decoded(plan, frames.pick(clip, int(plan.source[-1]) + 1)) for plan, clip in zip(plans, clips, strict=True)
     )
@@ -272,16 +277,18 @@ def _context(
     """Return what the arrays are made from, and the number of irregular time stamps."""
     plan = decoded.plan
     params, recipe = plan.params, plan.spec.recipe
-    frames, flow, levels = decoded.clip.frames, None, None
+    frames, signal, flow, levels = decoded.clip.frames, decoded.clip.signal, None, None
     if plan.flow is not None and into:  # events need no flow
         methods = () if plan.flow_plan is None else plan.flow_plan.methods
         part = without_margin(frames, params, recipe, plan.margin_px, plan.flow.margin_px)
-        flow = flow_for(part, params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods)
+        flow = flow_for(
+            eight_bits(part, signal), params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods
+        )
     if plan.spec.substep_px and not (into and into.keys().isdisjoint(ARRAYS)):
         part = without_margin(frames, params, recipe, plan.margin_px, MARGIN_PX)
         levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px)
     seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
-    view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe)
+    view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe, signal)
     clip = SourceClip(
         lease.start_frame,
         decoded.clip.seconds,
@@ -293,7 +300,7 @@ def _context(
         usable=usable_window(lease, plan.frames.sides),
     )
     return SampleContext(
-        lease.video, clip, plan.spec, params, plan.source, view, seconds, flow, levels, into
+        lease.video, clip, plan.spec, params, plan.source, view, signal, seconds, flow, levels, into
     ), irregular
 
 
@@ -306,10 +313,18 @@ def _step_seconds(lease: Lease, decoded: Decoded) -> tuple[npt.NDArray[np.float6
     return step_seconds(decoded.clip.seconds, plan.source, lease.frames_per_second / plan.spec.recipe.frame_stride)
 
 
+def _most_bits(spec: StreamSpec) -> int | None:
+    """Return ``most_bits`` of :func:`decode_cuts`. Pictures between frames are made from 8 bits."""
+    if spec.recipe.light == "sdr":
+        return None
+    return SDR.bits if spec.substep_px else MOST_BITS
+
+
 def _decoder(clip: DecodedClip) -> str:
     """Describe the source of the pixels for the provenance."""
+    signal = "" if clip.signal == SDR else f", {clip.signal}"
     host = "" if clip.bit_exact else " (host-dependent)"
-    return f"{clip.codec}{host}, from the {clip.origin}" if clip.origin else f"{clip.codec}{host}"
+    return f"{clip.codec}{host}{signal}" + (f", from the {clip.origin}" if clip.origin else "")
 
 
 def kernels_of(lease: Lease) -> frozenset[Variant]:
