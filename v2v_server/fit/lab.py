@@ -10,7 +10,7 @@ refractory period       shortest interval between events of a pixel in a steep r
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,8 +20,9 @@ from v2v_protocol.recipe import Recipe, effect_settings
 from v2v_server.fit.interval import Doubles
 from v2v_server.simulation.clip import simulate
 
-SIDE_PX = 48
+SIDE_PX = 32
 DARK_GREY, BRIGHT_GREY = 70, 255
+_RAMP_GREYS = 40, 255
 _NOISE = ("shot_noise_hz", "leak_hz")
 _FREQUENCIES_HZ = np.geomspace(2.0, 1000.0, 19)
 
@@ -47,26 +48,21 @@ def measure(camera: Mapping[str, float]) -> dict[str, float]:
         ``refractory_us``. NaN where no event was seen.
     """
     quiet = {name: 0.0 if name in (*_NOISE, "dead_pixel_share") else value for name, value in camera.items()}
-    up, span = _ramp(camera, 4.0, falls=False)
-    down, span_down = _ramp(camera, 4.0, falls=True)
-    on, off = (_per_pixel(_events(quiet, ramp, 50.0)) for ramp in (up, down))
-    seen_on, seen_off = on[on > 0], off[off > 0]
-    spread = float(np.std(1.0 / seen_on) / np.mean(1.0 / seen_on)) if len(seen_on) else math.nan
+    on, off = (_ramp_thresholds(quiet, 4.0, falls=falls) for falls in (False, True))
     still = [_rate(camera, grey) for grey in (DARK_GREY, BRIGHT_GREY)]
-    steep = _events(quiet, _ramp(camera, 0.02, falls=False)[0], 1000.0)
-    pixel = steep.y.astype(np.int64) * steep.width_px + steep.x
-    order = np.lexsort((steep.t, pixel))
-    gaps = np.diff(steep.t[order])[np.diff(pixel[order]) == 0]
+    # Between events of a ramp pass the refractory period and the time in which the ramp rises by a threshold.
+    seconds = 0.02
+    period = _mean(_ramp_thresholds(quiet, seconds, falls=False)) - _mean(on)
     return {
-        "threshold_on": span / float(seen_on.mean()) if len(seen_on) else math.nan,
-        "threshold_off": span_down / float(seen_off.mean()) if len(seen_off) else math.nan,
-        "threshold_spread": spread,
+        "threshold_on": _mean(on),
+        "threshold_off": _mean(off),
+        "threshold_spread": float(np.std(on) / np.mean(on)) if len(on) else math.nan,
         "background_dark_hz": still[0],
         "background_bright_hz": still[1],
         "latency_dark_us": _latency_us(quiet, DARK_GREY // 2, DARK_GREY),
         "latency_bright_us": _latency_us(quiet, BRIGHT_GREY // 2, BRIGHT_GREY),
         "bandwidth_bright_hz": _bandwidth_hz(quiet),
-        "refractory_us": float(np.quantile(gaps, 0.01)) if len(gaps) else math.nan,
+        "refractory_us": max(1e6 * seconds * period / (_ends(camera)[1] - _ends(camera)[0]), 0.0),
     }
 
 
@@ -87,24 +83,30 @@ def _events(camera: Mapping[str, float], greys: Doubles, frames_per_second: floa
     return made.to_events(1e6 / frames_per_second)
 
 
-def _ramp(camera: Mapping[str, float], seconds: float, *, falls: bool) -> tuple[Doubles, float]:
-    """Return grey levels whose log intensity rises or falls evenly, and its whole change, log units."""
+def _ramp_thresholds(camera: Mapping[str, float], seconds: float, *, falls: bool) -> Doubles:
+    """Return the mean change of a ramp between two events of a pixel, log units: [pixels that fire three times]."""
     count = max(3, round(seconds * (50.0 if seconds > 1 else 1000.0)))
-    log_eps, gamma = camera["log_eps"], camera["gamma"]
-    level = _levels(log_eps, gamma)
-    wanted = np.linspace(float(level(np.array(40.0))), float(level(np.array(255.0))), count)
-    greys = np.rint(255.0 * np.maximum(np.exp(wanted) - log_eps, 0.0) ** (1 / gamma))
-    span = float(level(greys[-1]) - level(greys[0]))
-    return (greys[::-1] if falls else greys), span
-
-
-def _levels(log_eps: float, gamma: float) -> Callable[[Doubles], Doubles]:
-    return lambda grey: np.log(log_eps + (grey / 255.0) ** gamma)
-
-
-def _per_pixel(events: EventList) -> Doubles:
+    low, high = _ends(camera)
+    wanted = np.linspace(low, high, count + 1)
+    greys = np.rint(255.0 * np.maximum(np.exp(wanted) - camera["log_eps"], 0.0) ** (1 / camera["gamma"]))
+    events = _events(camera, greys[::-1] if falls else greys, count / seconds)
     place = events.y.astype(np.int64) * events.width_px + events.x
-    return np.bincount(place, minlength=SIDE_PX**2).astype(np.float64)
+    number = np.bincount(place, minlength=SIDE_PX**2)
+    first, last = np.full(SIDE_PX**2, np.inf), np.zeros(SIDE_PX**2)
+    np.minimum.at(first, place, events.t.astype(np.float64))
+    np.maximum.at(last, place, events.t.astype(np.float64))
+    fires = number >= 3
+    return np.asarray((last - first)[fires] / (number[fires] - 1) * 1e-6 / seconds * (high - low))
+
+
+def _ends(camera: Mapping[str, float]) -> tuple[float, float]:
+    """Return the log intensity at the ends of a ramp."""
+    low, high = (math.log(camera["log_eps"] + (grey / 255.0) ** camera["gamma"]) for grey in _RAMP_GREYS)
+    return low, high
+
+
+def _mean(values: Doubles) -> float:
+    return float(values.mean()) if len(values) else math.nan
 
 
 def _rate(camera: Mapping[str, float], grey: int, seconds: float = 10.0) -> float:
@@ -129,7 +131,7 @@ def _bandwidth_hz(camera: Mapping[str, float]) -> float:
     counts = []
     for frequency in _FREQUENCIES_HZ:
         turns = np.arange(0.0, 6.0, 1 / 32)
-        greys = 150.0 + 90.0 * np.sin(2 * math.pi * turns)
+        greys = 200.0 + 50.0 * np.sin(2 * math.pi * turns)
         counts.append(len(_events({**camera, "refractory_seconds": 0.0}, greys, 32 * frequency)))
     shares = np.array(counts) / max(counts[0], 1)
     below = np.flatnonzero(shares < math.sqrt(0.5))
