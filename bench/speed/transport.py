@@ -6,15 +6,20 @@
 for it; moving it is all other processor time of all processes. "Null workers" make nothing: they show the cost of
 moving alone, through shared memory and in messages.
 
+"Equal trainers": server and workers, for one trainer and for four with equal samples (``--share-gib``), in turns. Their
+clients' time is beside it.
+
 Bars: moving takes at most 5 % of all processor time under the preset "exact", on ``--videos``, and at most 10 % under
-"fast", on ``--fast-videos``.
+"fast", on ``--fast-videos``. Four equal trainers take at most 1.2 times the time of one, the median of the turns.
 """
 
 from __future__ import annotations
 
 import argparse
+import statistics
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +41,7 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser
 from v2v_protocol.spec import SpeedPreset
 
+EQUAL_TRAINERS, MOST_RATIO = 4, 1.2
 MOST_SHARE = {"exact": 0.05, "fast": 0.10}
 WORKERS = 2
 _SETTLE_SECONDS = 0.3
@@ -48,6 +54,9 @@ _COLUMNS: tuple[Column, ...] = (
     ("cpu_seconds_per_batch", "moving ms", "{:.1f}", 1e3),
     ("share", "of all", "{:.1%}", 1),
     ("batches_per_second", "batches/s", "{:.1f}", 1),
+    ("ratio_to_one", "of one", "{:.2f}", 1),
+    ("ratio_to_one_lowest", "lowest", "{:.2f}", 1),
+    ("ratio_to_one_highest", "highest", "{:.2f}", 1),
 )
 
 
@@ -92,12 +101,55 @@ def with_null_workers(asked: argparse.Namespace, shared_memory: bool) -> dict[st
     }
 
 
+def equal_trainers(asked: argparse.Namespace, trainers: int) -> dict[str, Any]:
+    """Return the record of a server from its start, with trainers that take one epoch of equal samples each."""
+    flags = ["--rows", asked.rows, "--share-gib", "2" if trainers > 1 else "0", *server_flags(asked.changes)]
+    with LocalServer(asked.videos, workers=1, flags=flags) as server:
+
+        def take(dataset: V2VStreamDataset) -> int:
+            return sum(1 for _ in dataset)
+
+        datasets = [V2VStreamDataset(server.address, asked.batch_size, rank=0, world_size=1) for _ in range(trainers)]
+        meter, began = Meter(roles_of(server)), time.perf_counter()
+        with ThreadPoolExecutor(trainers) as threads:
+            batches = max(threads.map(take, datasets))
+        elapsed = time.perf_counter() - began
+        time.sleep(_SETTLE_SECONDS)
+        used = meter.used()
+    return {
+        "name": f"equal trainers: {trainers}",
+        **{f"{role}_cpu_seconds_per_batch": seconds / batches for role, seconds in used.items()},
+        "batches_per_second": batches / elapsed,
+    }
+
+
+def sharing(asked: argparse.Namespace) -> list[dict[str, Any]]:
+    """Return the records of one trainer and of equal ones: medians over the turns."""
+    turns = [[equal_trainers(asked, trainers) for trainers in (1, EQUAL_TRAINERS)] for _ in range(asked.share_turns)]
+    found = []
+    for runs in zip(*turns, strict=True):
+        keys = [key for key in runs[0] if key != "name"]
+        found.append({"name": runs[0]["name"], **{key: statistics.median(run[key] for run in runs) for key in keys}})
+
+    def server_seconds(run: dict[str, Any]) -> float:
+        return float(run["workers_cpu_seconds_per_batch"] + run["broker_cpu_seconds_per_batch"])
+
+    ratios = [server_seconds(equal) / server_seconds(one) for one, equal in turns]
+    found[1]["ratio_to_one"] = statistics.median(ratios)
+    found[1] |= {"ratio_to_one_lowest": min(ratios), "ratio_to_one_highest": max(ratios)}
+    return found
+
+
 def missed(records: Sequence[Record]) -> list[str]:
     """Return the bars that these records miss."""
     return [
         f"{record['name']}: moving takes {record['share']:.1%} of all processor time; the bar is {most:.0%}"
         for record in records
         if "preset" in record and record["share"] > (most := MOST_SHARE[record["preset"]])
+    ] + [
+        f"{record['name']}: {record['ratio_to_one']:.2f} times the processor time of one; the bar is {MOST_RATIO}"
+        for record in records
+        if record.get("ratio_to_one", 0.0) > MOST_RATIO
     ]
 
 
@@ -107,6 +159,7 @@ def add_flags(parser: Parser) -> None:
     parser.add_argument("--fast-videos", type=Path, metavar="DIR", help='clips for the preset "fast", prepared')
     add_positive(parser, "--seconds", 5.0, "of each row, at least")
     add_whole(parser, "--batch-size", 12, "samples of a batch")
+    add_whole(parser, "--share-turns", 9, "turns of one trainer and of equal ones; 0: none", least=0)
     add_changes(parser)
 
 
@@ -116,5 +169,6 @@ def measure(asked: argparse.Namespace) -> Report:
     if asked.fast_videos is not None:
         records.append(at_work(asked, "fast", asked.fast_videos, "full"))
     records += [with_null_workers(asked, shared_memory) for shared_memory in (True, False)]
+    records += sharing(asked) if asked.share_turns else []
     records = [record | {"batch_size": asked.batch_size} for record in records]
     return Report(records, [(records, _COLUMNS)], missed=missed(records))
