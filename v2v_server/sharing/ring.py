@@ -15,6 +15,7 @@ from __future__ import annotations
 import resource
 from collections.abc import Container, Hashable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.messages import SampleHeader
@@ -51,14 +52,13 @@ class SharedSample:
             slot: what the consumer's request named; None: it cannot read memory of this host.
             is_first: whether the work on the sample was done for this consumer.
         """
-        header = replace(self.header, slot=NO_SLOT if slot is None else slot.number)
-        if not is_first:
-            header = replace(header, cpu_seconds=0.0, decoded=False, cache="")
-        if self.memory is None:
-            return [*encode(header), *self.frames]
-        if slot is None:
-            return [*encode(header), *self.memory.arrays()]
-        return encode(replace(header, arena=self.memory.slot.arena))
+        changes: dict[str, Any] = {} if is_first else {"cpu_seconds": 0.0, "decoded": False, "cache": ""}
+        if slot is not None:
+            changes["slot"] = slot.number
+            if self.memory is not None:
+                return encode(replace(self.header, arena=self.memory.slot.arena, **changes))
+        frames = self.frames if self.memory is None else self.memory.arrays()
+        return [*encode(replace(self.header, **changes)), *frames]
 
 
 class SampleRing:

@@ -2,6 +2,9 @@
 
 The arena is opened and mapped for each sample, which takes less than a millisecond. So no mapping keeps the memory of a
 consumer that is gone, and a killed worker leaves nothing to clean up.
+
+An arena with one slot, such as the server's (:mod:`v2v_server.sharing.memory`), is new memory as a rule. Writing a
+finished sample to it takes less than half the time of mapping it, because its pages need no zeros and no faults.
 """
 
 from __future__ import annotations
@@ -46,7 +49,7 @@ def open_output_buffer(lease: Lease, layout: Layout) -> OutputBuffer:
         lease: the work.
         layout: layout of its sample.
     """
-    if lease.slot != NO_SLOT:
+    if lease.slot != NO_SLOT and not _has_one_slot(lease.arena):
         there = slot_arrays(Slot(lease.arena, lease.slot), layout)
         if there is not None:
             return OutputBuffer(there, in_slot=True)
@@ -72,6 +75,7 @@ def sample_message(
         provenance, worker, cpu_seconds, decoded, cache: see :class:`v2v_protocol.messages.SampleHeader`.
         packed: compress arrays outside a slot even if the lease does not ask for it.
     """
+    in_slot = buffer.in_slot or (_has_one_slot(lease.arena) and _write(lease, buffer.arrays))
     return encode_sample(
         epoch=lease.epoch,
         index=lease.indices[0],
@@ -82,7 +86,7 @@ def sample_message(
         decoded=decoded,
         cache=cache,
         slot=lease.slot,
-        in_slot=buffer.in_slot,
+        in_slot=in_slot,
         quarantine=lease.quarantine,
         pack=pack if packed or lease.packed else None,
     )
@@ -116,6 +120,31 @@ def slot_arrays(slot: Slot, layout: Layout) -> dict[str, npt.NDArray[Any]] | Non
             os.close(descriptor)
     except (OSError, ProtocolError):
         return None
+
+
+def _has_one_slot(arena: str) -> bool:
+    try:
+        return bool(arena) and ArenaName.parse(arena).slots == 1
+    except ProtocolError:
+        return False
+
+
+def _write(lease: Lease, arrays: Mapping[str, npt.NDArray[Any]]) -> bool:
+    """Write a sample to the lease's arena of one slot; return False if it is not accessible or memory is full."""
+    raw = [array.reshape(-1).view(np.uint8).data for array in arrays.values()]
+    *offsets, total = array_offsets([len(each) for each in raw], 1)
+    try:
+        descriptor = open_memory(ArenaName.parse(lease.arena), total, writable=True)
+        try:
+            for offset, rest in zip(offsets, raw, strict=True):
+                while rest:
+                    written = os.pwrite(descriptor, rest, offset)
+                    offset, rest = offset + written, rest[written:]
+        finally:
+            os.close(descriptor)
+    except OSError:
+        return False
+    return True
 
 
 _Place: TypeAlias = tuple[str, np.dtype[Any], tuple[int, ...], int, int]
