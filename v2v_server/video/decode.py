@@ -28,7 +28,7 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.video.collect import Cut, FrameRange, LastFrame, Stack
+from v2v_server.video.collect import Cut, FrameRange, LastFrame, Stack, Watch
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.orientation import Window
 from v2v_server.video.packets import is_unreferenced, length_bytes
@@ -51,6 +51,8 @@ class DecodedClip:
         codec: FFmpeg's name of the format.
         bit_exact: whether every host decodes these very bytes.
         origin: "" where they were decoded just now; "store" or "cache" where they were read from there.
+        motion: [count, 2, rows, columns] int16, the motion to each frame from the one before in the cells of its cut
+            (:mod:`v2v_server.motion`), zero for the first; None if it was not asked for.
     """
 
     frames: npt.NDArray[np.uint8]
@@ -58,6 +60,7 @@ class DecodedClip:
     codec: str
     bit_exact: bool
     origin: str = ""
+    motion: npt.NDArray[np.int16] | None = None
 
 
 class _SeekFailed(Exception):
@@ -78,6 +81,7 @@ def decode_cuts(
     cuts: Sequence[Cut],
     *,
     stride: int = 1,
+    watch: Watch | None = None,
 ) -> tuple[DecodedClip, ...]:
     """Return several cuts of the frames from ``start`` on, from one pass of the decoder.
 
@@ -89,6 +93,7 @@ def decode_cuts(
         start: ordinal of the first frame, presentation order.
         cuts: at least one.
         stride: takes frames start, start + stride ...
+        watch: looks at the frames of the longest cut.
 
     Raises:
         UsageError: a range outside the index, or a window outside the picture.
@@ -98,7 +103,7 @@ def decode_cuts(
     for cut in cuts:
         index.position(start, (cut.count - 1) * stride + 1)
     checked = [replace(cut, window=_checked(cut.window, index)) for cut in cuts]
-    taken, codec = _decode(FrameRange(os.fspath(path), index, start, stride), checked)
+    taken, codec = _decode(FrameRange(os.fspath(path), index, start, stride), checked, watch)
     return tuple(
         DecodedClip(
             grey, index.seconds(start, (cut.count - 1) * stride + 1)[::stride], codec, codec in BIT_EXACT_CODECS
@@ -120,15 +125,15 @@ def _checked(window: Window | None, index: FrameIndex) -> Window:
     return window
 
 
-def _decode(wanted: FrameRange, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
+def _decode(wanted: FrameRange, cuts: Sequence[Cut], watch: Watch | None) -> tuple[list[npt.NDArray[np.uint8]], str]:
     """Return the cuts, [count, h, w] uint8 each, and the codec's name."""
-    stack = _filled(wanted, cuts)
+    stack = _filled(wanted, cuts, watch)
     return list(stack.grey()), stack.codec
 
 
-def _filled(wanted: FrameRange, cuts: Sequence[Cut]) -> Stack:
+def _filled(wanted: FrameRange, cuts: Sequence[Cut], watch: Watch | None = None) -> Stack:
     for frames_of in (_from_keyframe_on, _from_beginning):
-        stack = Stack(wanted, cuts)
+        stack = Stack(wanted, cuts, watch)
         try:
             for _ in _fill(stack, frames_of(stack)):
                 pass
