@@ -35,7 +35,7 @@ from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
-from v2v_server.motion import MARGIN_PX, levels_of
+from v2v_server.motion import MARGIN_PX, cells_of, levels_of
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.kernels import ARRAYS, list_events
@@ -114,7 +114,8 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
             flow = replace(flow, margin_px=0)
         margin_px = None if flow.margin_px is None else max(flow.margin_px, margin_px or 0)
     window = source_window(params, spec.recipe, top, bottom - top, lease.width_px, margin_px)
-    return SamplePlan(spec, params, source, Cut(int(source[-1]) + 1, window), margin_px, flow, flow_plan)
+    cells = cells_of(params, spec.recipe, bottom - top, lease.width_px) if spec.substep_px else None
+    return SamplePlan(spec, params, source, Cut(int(source[-1]) + 1, window, cells), margin_px, flow, flow_plan)
 
 
 def decode_for(
@@ -137,14 +138,15 @@ def decode_for(
     _refuse_outside(lease.video)
     try:
         index, cuts = _frame_index(lease, spec.recipe.frames_needed), [plan.cut for plan in plans]
-        what = index, lease.start_frame, cuts, spec.recipe.frame_stride, _most_bits(spec)
+        what = index, lease.start_frame, cuts, spec.recipe.frame_stride
+        most_bits = _most_bits(spec)
         clips = None
+        rows = Rows.parse(lease.rows).bounds(lease.height_px)
         with source.open_local(lease.video, lease.fingerprint) as path:
             if cache is not None and not is_store_file(path):
-                rows = Rows.parse(lease.rows).bounds(lease.height_px)
-                clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what)
+                clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what, most_bits)
             if clips is None:
-                clips = clips_of(path, lease.fingerprint, *what)
+                clips = clips_of(path, lease.fingerprint, *what, rows, most_bits)
     except VideoError as error:
         # Consumer and log identify videos by id; a path of this host means nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
@@ -244,7 +246,10 @@ def _context(
         )
     if plan.spec.substep_px and not (into and into.keys().isdisjoint(ARRAYS)):
         part = without_margin(frames, params, recipe, plan.margin_px, MARGIN_PX)
-        levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px)
+        top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
+        motion, size = decoded.clip.motion, (bottom - top, lease.width_px)
+        assert motion is not None
+        levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px, motion, size)
     seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
     view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe, signal)
     clip = SourceClip(lease.start_frame, decoded.clip.seconds, sidecars)
