@@ -28,6 +28,7 @@ BENCHES = {
     "kernel": "speed.kernel",
     "scaling": "speed.scaling",
     "catalogue": "speed.catalogue",
+    "sharing": "speed.sharing",
     "cache": "speed.cache",
     "store": "speed.store",
     "link": "speed.link",

@@ -44,7 +44,7 @@ def between(first: Picture, second: Picture, vectors: Vectors, top: int, left: i
 
     Args:
         first, second: of one size, padded (``matching.padded``).
-        vectors: the motion between them.
+        vectors: [2, rows, columns], the motion between them in the cells of the part.
         top, left: place of the part that is written.
         out: [n, h, w] uint16, C-contiguous, at least CELL_PX on each side: grey levels in 1/16.
     """
@@ -59,13 +59,16 @@ def _between(first, second, vectors, top, left, weights, out):
     a, b, flat, table = first.ravel(), second.ravel(), out.ravel(), weights.ravel()
     for number in range(count):
         share = ((number + 1) * 2 * _SHARES + count + 1) // (2 * (count + 1))
+        _mean(first, second, top, left, share, out[number])
         for line in range(0, rows, CELL_PX):
             row = min(line, rows - CELL_PX)
-            cell_row = min((top + row + CELL_PX // 2) // CELL_PX, vectors.shape[1] - 1)
+            cell_row = min((row + CELL_PX // 2) // CELL_PX, vectors.shape[1] - 1)
             for each in range(0, columns, CELL_PX):
                 column = min(each, columns - CELL_PX)
-                cell_column = min((left + column + CELL_PX // 2) // CELL_PX, vectors.shape[2] - 1)
+                cell_column = min((column + CELL_PX // 2) // CELL_PX, vectors.shape[2] - 1)
                 x, y = np.int64(vectors[0, cell_row, cell_column]), np.int64(vectors[1, cell_row, cell_column])
+                if x == 0 and y == 0 and row == line and column == each:
+                    continue
                 weight = share
                 at, at_x, at_y, is_first = _place(top + row, left + column, -share * x, -share * y, height, width)
                 rest = _SHARES - share
@@ -76,6 +79,17 @@ def _between(first, second, vectors, top, left, weights, out):
                     a, at, at_x, at_y, b, to, to_x, to_y, table, pitch, weight, flat,
                     (number * rows + row) * columns + column, columns,
                 )  # fmt: skip
+
+
+@compiled
+def _mean(first, second, top, left, share, out):
+    """Write the weighted mean of two pictures: what a warp without motion gives."""
+    for row in range(out.shape[0]):
+        one, other = first[PAD_PX + top + row, PAD_PX + left :], second[PAD_PX + top + row, PAD_PX + left :]
+        into = out[row]
+        for column in range(out.shape[1]):
+            mean = np.uint32(one[column]) * np.uint32(_SHARES - share) + np.uint32(other[column]) * np.uint32(share)
+            into[column] = np.uint16((mean + np.uint32(8)) >> np.uint32(4))
 
 
 @compiled

@@ -25,9 +25,10 @@ from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.scenes.analysis import SceneAnalysis
 from v2v_server.corpus.scenes.scene import MOST_FRAMES, Scene
 from v2v_server.prepare.encode import encode_luma
-from v2v_server.store.clips import stored_pictures
+from v2v_server.store.clips import stored_arrays, stored_pictures
 from v2v_server.store.encoding import Encoding
 from v2v_server.store.format import Head, group_frames_for
+from v2v_server.store.motion import with_planes
 from v2v_server.store.packing import SIZES
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter
@@ -63,6 +64,7 @@ class Transcoding:
         root: the folder that the target must not leave, resolved.
         target: the file to write; its folder is created if missing.
         scene: whether to compute the scene statistics.
+        planes: names of the planes to store beside the luma, of :data:`v2v_server.store.motion.MADE_PLANES`.
     """
 
     video: str
@@ -76,6 +78,7 @@ class Transcoding:
     root: Path
     target: Path
     scene: bool = False
+    planes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,16 +162,20 @@ def _stored(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[np
         codec=job.codec, bit_exact=job.codec in BIT_EXACT_CODECS, group=group_frames_for(rows, width),
         packing=packing.method, index=job.index, bits=first.bits, transfer=first.transfer,
     )  # fmt: skip
-    wanted, got = xxhash.xxh3_128(), xxhash.xxh3_128()
-    with StoreWriter(made, head, packing) as writer:
-        for picture in frames:
-            wanted.update(np.ascontiguousarray(picture).data)
-            writer.add(picture)
+    wanted, got = ({name: xxhash.xxh3_128() for name in ("", *job.planes)} for _ in range(2))
+    with StoreWriter(made, head, packing, job.planes) as writer:
+        for picture, planes in with_planes(frames, job.planes):
+            for name, array in (("", picture), *planes.items()):
+                wanted[name].update(np.ascontiguousarray(array).data)
+            writer.add(picture, planes)
         writer.close(lasting=True)
     with StoreFile(made, job.fingerprint) as stored:
         for picture in stored_pictures(stored, job.window):
-            got.update(np.ascontiguousarray(picture).data)
-    if wanted.digest() != got.digest():
+            got[""].update(np.ascontiguousarray(picture).data)
+        for name in job.planes:
+            for array in stored_arrays(stored, name):
+                got[name].update(array.data)
+    if any(wanted[name].digest() != got[name].digest() for name in wanted):
         raise VideoError(os.fspath(job.source), None, "verification: the stored file does not reproduce the frames")
     return Made(fingerprint(made), made.stat().st_size, HIGHEST_PSNR_DB, HIGHEST_PSNR_DB)
 

@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnreadable
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
+from v2v_server.store.motion import MOTION, has_planes, read_motion, wants_motion, with_motion, with_planes
 from v2v_server.store.packing import QUICK
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
 from v2v_server.store.reader import StoreFile
@@ -122,21 +123,25 @@ class Cache:
             _Piece(self.folder / key[:2] / f"{key}-{number}", number * size, min((number + 1) * size, index.end))
             for number in range(start // size, last // size + 1)
         ]
-        made = self._read(pieces, fingerprint, index, start, cuts, stride)
-        if made is not None:
+        picture = rows[0], 0, rows[1] - rows[0], index.width_px
+        planes = (MOTION,) if stride == 1 and wants_motion(cuts) else ()
+        lacking = [piece for piece in pieces if not has_planes(piece.path, planes)]
+        made = self._read(pieces, fingerprint, index, start, cuts, stride, picture)
+        if made is not None and not lacking:
             return made
-        missing = [piece for piece in pieces if not piece.path.exists()]
+        missing = [piece for piece in pieces if piece in lacking or not piece.path.exists()]
         if not missing or index.first > missing[0].first or not self._has_room(missing, rows, index):
-            return None
+            return made
         check_fingerprint(path, fingerprint)
         try:
-            self._fill(path, video, fingerprint, rows, index, missing, most_bits)
+            self._fill(path, video, fingerprint, rows, index, missing, planes, most_bits)
         except OSError as error:
             self._rest(f"cannot be written to: {error.strerror or error}")
-            return None
+            return made
         except VideoError:
-            return None  # the damage may lie beyond the frames that this sample needs
-        made = self._read(pieces, fingerprint, index, start, cuts, stride)
+            return made  # the damage may lie beyond the frames that this sample needs
+        if made is None:
+            made = self._read(pieces, fingerprint, index, start, cuts, stride, picture)
         return None if made is None else tuple(replace(clip, origin="") for clip in made)
 
     @property
@@ -152,36 +157,49 @@ class Cache:
         start: int,
         cuts: Sequence[Cut],
         stride: int,
+        picture: Window,
     ) -> tuple[DecodedClip, ...] | None:
         """Read the cuts if all pieces are present and sound. Damaged pieces are removed."""
         clips = [np.empty((cut.count, *_window(cut, index)[2:]), np.uint8) for cut in cuts]
         codec, bit_exact, sound, transfers = "", False, True, set[str]()
-        for piece in pieces:
-            try:
-                with StoreFile(piece.path, fingerprint) as stored:
+        files: list[tuple[StoreFile, range]] = []
+        with contextlib.ExitStack() as opened:
+            for piece in pieces:
+                try:
+                    stored = opened.enter_context(StoreFile(piece.path, fingerprint))
                     codec, bit_exact = stored.head.codec, stored.head.bit_exact
                     transfers.add(stored.head.transfer)
+                    # The frames of start, start + stride ... that lie in this piece.
+                    low = max(0, -(-(piece.first - start) // stride))
+                    end = -(-(piece.end - start) // stride)
+                    files.append((stored, range(low, min(end, max(cut.count for cut in cuts)))))
                     for cut, frames in zip(cuts, clips, strict=True):
-                        # The frames of start, start + stride ... that lie in this piece.
-                        low = max(0, -(-(piece.first - start) // stride))
-                        high = min(cut.count, -(-(piece.end - start) // stride))
-                        if low < high:
+                        if low < (high := min(cut.count, end)):
                             stored.read(start + low * stride, stride, _window(cut, index), frames[low:high])
-            except VideoUnreadable as error:
-                if not isinstance(error.__cause__, FileNotFoundError):
-                    self.trouble = error.reason
+                except VideoUnreadable as error:
+                    if not isinstance(error.__cause__, FileNotFoundError):
+                        self.trouble = error.reason
+                    return None
+                except (VideoError, UsageError) as error:
+                    self._remove(piece.path, error.reason if isinstance(error, VideoError) else str(error))
+                    sound = False  # continue, so that all damaged pieces are decoded again together
+            if not sound:
                 return None
-            except (VideoError, UsageError) as error:
-                self._remove(piece.path, error.reason if isinstance(error, VideoError) else str(error))
-                sound = False  # continue, so that all damaged pieces are decoded again together
-        if not sound:
-            return None
+            try:
+                vectors = read_motion(files, start, cuts, stride, picture)
+            except VideoUnreadable as error:
+                self.trouble = error.reason
+                return None
+            except VideoError as error:
+                self._remove(Path(error.video), error.reason)
+                return None
         signal = Signal(transfer=transfers.pop() if len(transfers) == 1 else MIXED)
         times = [index.seconds(start, (cut.count - 1) * stride + 1)[::stride] for cut in cuts]
-        return tuple(
+        read = [
             DecodedClip(frames, seconds, codec, bit_exact, "cache", signal=signal)
             for frames, seconds in zip(clips, times, strict=True)
-        )
+        ]
+        return with_motion(read, cuts, vectors)
 
     def _has_room(self, missing: Sequence[_Piece], rows: tuple[int, int], index: FrameIndex) -> bool:
         if time.monotonic() < self._rest_until:
@@ -210,6 +228,7 @@ class Cache:
         rows: tuple[int, int],
         index: FrameIndex,
         missing: Sequence[_Piece],
+        planes: Sequence[str],
         most_bits: int | None,
     ) -> None:
         """Decode the missing pieces in one pass, and store each.
@@ -236,20 +255,20 @@ class Cache:
                     group=group_frames_for(height, width), packing=QUICK.method, transfer=stream.signal.transfer,
                 )  # fmt: skip
                 more = (_alike(head, *later) for later in islice(frames, head.count - 1))
-                self._keep(piece.path, head, chain((picture,), more))
+                self._keep(piece.path, head, chain((picture,), more), planes)
 
-    def _keep(self, path: Path, head: Head, pictures: Iterable[npt.NDArray[np.uint8]]) -> None:
+    def _keep(self, path: Path, head: Head, pictures: Iterable[npt.NDArray[np.uint8]], planes: Sequence[str]) -> None:
         """Write a piece, and rename it into place if it fits the limit."""
         partial = self.folder / PARTIAL / secrets.token_hex(8)
         try:
             partial.parent.mkdir(exist_ok=True)
             make_private(partial)
-            with StoreWriter(partial, head, QUICK) as writer:
+            with StoreWriter(partial, head, QUICK, planes) as writer:
                 fcntl.flock(
                     writer.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB
                 )  # held for the life of this process: see _remove_abandoned
-                for picture in pictures:
-                    writer.add(picture)
+                for picture, arrays in with_planes(pictures, planes):
+                    writer.add(picture, arrays)
                 writer.close()
             with self._waiting():
                 self._quota.add(partial, path)

@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, VideoError
 from v2v_server.store.format import is_store_file
+from v2v_server.store.motion import MotionWatch, read_motion, with_motion
+from v2v_server.store.planes import PLANES
 from v2v_server.store.reader import StoreFile
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip, decode_cuts, stream_luma
@@ -31,6 +34,7 @@ def clips_of(
     start: int,
     cuts: Sequence[Cut],
     stride: int,
+    rows: tuple[int, int] | None = None,
     most_bits: int | None = None,
 ) -> tuple[DecodedClip, ...]:
     """Return several cuts of the frames from ``start`` on, see :func:`v2v_server.video.decode.decode_cuts`.
@@ -38,14 +42,20 @@ def clips_of(
     Args:
         path: a video, or a store file.
         fingerprint: of the video, or of the source of the store file.
+        rows: (first, one after the last) usable row, which the cells of a cut count from; None: all rows.
 
     Raises:
         UsageError, VideoError: see :func:`v2v_server.video.decode.decode_cuts`; also if the file is, or was made from,
             another video, or a store file holds fewer bits than asked for and its source has.
     """
+    top, bottom = rows or (0, index.height_px)
+    picture = top, 0, bottom - top, index.width_px
     if not is_store_file(path):
         check_fingerprint(path, fingerprint)
-        return decode_cuts(path, index, start, cuts, stride=stride, most_bits=most_bits)
+        motion = MotionWatch(cuts, picture)
+        return motion.added_to(
+            decode_cuts(path, index, start, cuts, stride=stride, most_bits=most_bits, watch=motion.watch)
+        )
     with StoreFile(path, fingerprint) as stored:
         if min(most_bits or 0, stored.head.bits) > SDR.bits:
             why = (
@@ -54,7 +64,9 @@ def clips_of(
             )
             raise VideoError(os.fspath(path), None, why)
         signal = SDR if most_bits is None else Signal(transfer=stored.head.transfer)
-        return tuple(stored_clip(stored, index, start, cut, stride, signal) for cut in cuts)
+        clips = tuple(stored_clip(stored, index, start, cut, stride, signal) for cut in cuts)
+        files = [(stored, range(max(cut.count for cut in cuts)))]
+        return with_motion(clips, cuts, read_motion(files, start, cuts, stride, picture))
 
 
 def stored_clip(
@@ -97,6 +109,16 @@ def stored_pictures(stored: StoreFile, window: Window) -> Iterator[npt.NDArray[n
         frames = np.empty((head.group_frames(number), *window[2:]), np.uint8)
         stored.read(head.first + number * head.group, 1, window, frames)
         yield from frames
+
+
+def stored_arrays(stored: StoreFile, name: str) -> Iterator[npt.NDArray[Any]]:
+    """Yield the arrays of a plane, one for each frame that an open store file holds."""
+    head = stored.head
+    _, rows, columns = PLANES[name].shape(head.rows, head.width_px)
+    for number in range(head.groups):
+        start, count = head.first + number * head.group, head.group_frames(number)
+        for array in stored.plane(name, start, count, (0, 0, rows, columns)):
+            yield np.ascontiguousarray(array)
 
 
 def facts_of(path: str | os.PathLike[str]) -> VideoFacts:

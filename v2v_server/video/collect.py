@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NoReturn
 
@@ -26,11 +26,27 @@ class Cut:
         count: number of frames, at least 1; with a stride, of those that are taken.
         window: (top, left, height, width) in the upright picture, pixels; None takes all of it.
         chroma: what it takes of the colour; None takes none.
+        cells: (top, left, rows, columns) of the cells whose motion is wanted (:mod:`v2v_server.motion`); None: none.
     """
 
     count: int
     window: Window | None = None
     chroma: ChromaCut | None = None
+    cells: Window | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """What else looks at the frames as they are decoded.
+
+    Attributes:
+        window: the part of each picture, as in :class:`Cut`.
+        begin: called when decoding begins, again if it begins again; returns a function that gets the part of each
+            frame, [h, w] uint8: upright, in full range.
+    """
+
+    window: Window
+    begin: Callable[[], Callable[[npt.NDArray[np.uint8]], object]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +73,9 @@ def window_of(cut: Cut) -> Window:
 class Stack:
     """Collects the asked frames of one pass, and refuses what is not exactly that."""
 
-    def __init__(self, wanted: FrameRange, cuts: Sequence[Cut]) -> None:
+    def __init__(self, wanted: FrameRange, cuts: Sequence[Cut], watch: Watch | None = None) -> None:
         self.wanted = wanted
+        self._watch, self._show = watch, None if watch is None else watch.begin()
         self.index = index = wanted.index
         self._orientation = index.orientation
         self.codec = ""  # FFmpeg's name, once decoding has begun
@@ -143,7 +160,14 @@ class Stack:
             self.refuse(f"the picture format changes from {self._luma} to {LumaFormat.of(frame)}")
         if self.wanted.most_bits is not None and TRANSFERS.get(frame.color_trc, "") != self.signal.transfer:
             self.signal = self.signal._replace(transfer=MIXED)
-        self._keep(luma_plane(frame, self._luma))
+        samples = luma_plane(frame, self._luma)
+        self._keep(samples)
+        if self._watch is not None and self._show is not None:
+            stored = self._orientation.stored_window(self._watch.window, self.index.height_px, self.index.width_px)
+            seen = np.empty((1, *stored[2:]), np.uint8)
+            copy_luma(samples, self._luma, stored, seen[0])
+            stretch(seen, self._luma)
+            self._show(self._orientation.upright(seen)[0])
 
     def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
         for stored, raw in self._parts:

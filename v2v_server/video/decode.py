@@ -29,7 +29,7 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.video.collect import Cut, FrameRange, LastFrame, Stack
+from v2v_server.video.collect import Cut, FrameRange, LastFrame, Stack, Watch
 from v2v_server.video.colour.chroma import Chroma
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.luma import SDR, Signal
@@ -57,6 +57,8 @@ class DecodedClip:
         origin: "" where they were decoded just now; "store" or "cache" where they were read from there.
         chroma: colour of the frames that the cut names; None without.
         signal: what the levels mean.
+        motion: [count, 2, rows, columns] int16, the motion to each frame from the one before in the cells of its cut
+            (:mod:`v2v_server.motion`), zero for the first; None if it was not asked for.
     """
 
     frames: npt.NDArray[Any]
@@ -66,6 +68,7 @@ class DecodedClip:
     origin: str = ""
     chroma: Chroma | None = None
     signal: Signal = SDR
+    motion: npt.NDArray[np.int16] | None = None
 
 
 class _SeekFailed(Exception):
@@ -87,6 +90,7 @@ def decode_cuts(
     *,
     stride: int = 1,
     most_bits: int | None = None,
+    watch: Watch | None = None,
 ) -> tuple[DecodedClip, ...]:
     """Return several cuts of the frames from ``start`` on, from one pass of the decoder.
 
@@ -100,6 +104,7 @@ def decode_cuts(
         stride: takes frames start, start + stride ...
         most_bits: bits of a level to keep of deeper luma, 8 to ``luma.MOST_BITS``; None: 8, and the signal is SDR,
             whatever the file states.
+        watch: looks at the frames of the longest cut.
 
     Raises:
         UsageError: a range outside the index, or a window outside the picture.
@@ -109,7 +114,7 @@ def decode_cuts(
     for cut in cuts:
         index.position(start, (cut.count - 1) * stride + 1)
     checked = [replace(cut, window=_checked(cut.window, index)) for cut in cuts]
-    stack = _filled(FrameRange(os.fspath(path), index, start, stride, most_bits), checked)
+    stack = _filled(FrameRange(os.fspath(path), index, start, stride, most_bits), checked, watch)
     return tuple(
         DecodedClip(
             grey,
@@ -136,9 +141,9 @@ def _checked(window: Window | None, index: FrameIndex) -> Window:
     return window
 
 
-def _filled(wanted: FrameRange, cuts: Sequence[Cut]) -> Stack:
+def _filled(wanted: FrameRange, cuts: Sequence[Cut], watch: Watch | None = None) -> Stack:
     for frames_of in (_from_keyframe_on, _from_beginning):
-        stack = Stack(wanted, cuts)
+        stack = Stack(wanted, cuts, watch)
         try:
             for _ in _fill(stack, frames_of(stack)):
                 pass

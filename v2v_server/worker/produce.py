@@ -38,7 +38,7 @@ from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.scenes.scene import Scene, Sides
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
-from v2v_server.motion import MARGIN_PX, levels_of
+from v2v_server.motion import MARGIN_PX, cells_of, levels_of
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.kernels import ARRAYS, list_events
@@ -124,7 +124,8 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
         margin_px = None if flow.margin_px is None else max(flow.margin_px, margin_px or 0)
     window = source_window(params, spec.recipe, picture, margin_px)
     chroma = _chroma_cut(lease, params, spec, frames, source) if "frames_rgb" in lease.arrays else None
-    cut = Cut(frames.count(int(source[-1]) + 1), window, chroma)
+    cells = cells_of(params, spec.recipe, _within_rows(lease, frames.sides)) if spec.substep_px else None
+    cut = Cut(frames.count(int(source[-1]) + 1), window, chroma, cells)
     return SamplePlan(spec, params, source, frames, cut, margin_px, flow, flow_plan)
 
 
@@ -133,6 +134,13 @@ def usable_window(lease: Lease, sides: Sides) -> Window:
     top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
     height, width = bottom - top - sides.top - sides.bottom, lease.width_px - sides.left - sides.right
     return Window(top + sides.top, sides.left, height, width)
+
+
+def _within_rows(lease: Lease, sides: Sides) -> Window:
+    """Return the window of :func:`usable_window`, counted from the first usable row."""
+    top, _ = Rows.parse(lease.rows).bounds(lease.height_px)
+    usable = usable_window(lease, sides)
+    return usable._replace(top_px=usable.top_px - top)
 
 
 def _chroma_cut(
@@ -167,15 +175,16 @@ def decode_for(
     _refuse_outside(lease.video)
     try:
         index, cuts = _frame_index(lease, frames.span), [plan.cut for plan in plans]
-        what = index, lease.start_frame, cuts, frames.stride or 1, _most_bits(plans[0].spec)
+        what = index, lease.start_frame, cuts, frames.stride or 1
+        most_bits = _most_bits(plans[0].spec)
         clips = None
+        rows = Rows.parse(lease.rows).bounds(lease.height_px)
         with source.open_local(lease.video, lease.fingerprint) as path:
             # The cache keeps no colour.
             if cache is not None and not is_store_file(path) and plans[0].cut.chroma is None:
-                rows = Rows.parse(lease.rows).bounds(lease.height_px)
-                clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what)
+                clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what, most_bits)
             if clips is None:
-                clips = clips_of(path, lease.fingerprint, *what)
+                clips = clips_of(path, lease.fingerprint, *what, rows, most_bits)
     except VideoError as error:
         # Consumer and log identify videos by id; a path of this host means nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
@@ -286,7 +295,9 @@ def _context(
         )
     if plan.spec.substep_px and not (into and into.keys().isdisjoint(ARRAYS)):
         part = without_margin(frames, params, recipe, plan.margin_px, MARGIN_PX)
-        levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px)
+        motion, picture = decoded.clip.motion, _within_rows(lease, plan.frames.sides)
+        assert motion is not None
+        levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px, motion, picture)
     seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
     view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe, signal)
     clip = SourceClip(
