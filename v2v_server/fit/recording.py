@@ -13,10 +13,10 @@ from v2v_protocol.errors import UsageError
 from v2v_recordings.forms import FORMS, recognise
 from v2v_recordings.items import ConvertOptions, EventChunk, Picture, Progress, SensorSize
 
-MOST_PIXELS = 1 << 16
-"""Pixels whose events and frames are kept."""
-MOST_EVENTS = 12_000_000
-"""Events of these pixels; reading stops there."""
+MOST_PIXELS = 1 << 15
+"""Pixels whose events and frames are kept at first."""
+MOST_EVENTS, MOST_FRAME_PIXELS = 4_000_000, 16_000_000
+"""Limits of what is kept of these pixels: with more, half of the tiles are dropped."""
 TILE_PX = 16
 Longs = npt.NDArray[np.int64]
 
@@ -85,15 +85,23 @@ def chosen_pixels(height_px: int, width_px: int) -> Longs:
 
 
 def recorded(
-    height_px: int, width_px: int, t_us: Longs, place: Longs, p: npt.NDArray[np.bool_],
-    frames: npt.NDArray[np.uint8], frame_us: Longs, counts: Longs | None = None,
-) -> Recorded:  # fmt: skip
+    height_px: int,
+    width_px: int,
+    t_us: Longs,
+    place: Longs,
+    p: npt.NDArray[np.bool_],
+    frames: npt.NDArray[np.uint8],
+    frame_us: Longs,
+    counts: Longs | None = None,
+    pixels: Longs | None = None,
+) -> Recorded:
     """Build a recording from events in any order.
 
     Args:
         t_us, place, p: [N] time, pixel in row order, polarity.
-        frames: [n, H, W], or [n, P] of the pixels of :func:`chosen_pixels`.
+        frames: [n, P] of ``pixels``, or [n, H, W].
         counts: see :class:`Recorded`; None counts the events given.
+        pixels: [P] pixels to keep, in row order; None: :func:`chosen_pixels`.
 
     Raises:
         UsageError: there are no events.
@@ -103,9 +111,8 @@ def recorded(
     if counts is None:
         counts = np.stack([np.bincount(place[p == sign], minlength=height_px * width_px) for sign in (False, True)])
         counts = counts.reshape(2, height_px, width_px)
-    pixels = chosen_pixels(height_px, width_px)
-    index = np.full(height_px * width_px, -1)
-    index[pixels] = np.arange(len(pixels))
+    pixels = chosen_pixels(height_px, width_px) if pixels is None else pixels
+    index = _index(pixels, height_px * width_px)
     kept = index[place] >= 0
     t_us, of_pixel, p = t_us[kept], index[place[kept]], p[kept]
     order = np.lexsort((t_us, of_pixel))
@@ -130,46 +137,99 @@ def read_recording(
         UsageError: the form is not known, the file is damaged or has no events, or its sensor's size is not known.
     """
     path, options = Path(path), options or ConvertOptions()
-    size, index, counts = options.size, np.empty(0, np.int64), np.empty(0, np.int64)
-    events: list[tuple[npt.NDArray[Any], ...]] = []
-    frames: list[npt.NDArray[np.uint8]] = []
-    frame_us: list[int] = []
-    kept = 0
+    size, kept = options.size, None if options.size is None else _Kept(options.size)
     for item in FORMS[recognise(path)].read(path, options, progress):
         if isinstance(item, SensorSize):
             size = size or item
         elif isinstance(item, Picture):
             size = size or SensorSize(item.pixels.shape[1], item.pixels.shape[0])
-        if size is not None and not len(index):
-            pixels = chosen_pixels(size.height, size.width)
-            index = np.full(size.height * size.width, -1, np.int32)
-            index[pixels] = np.arange(len(pixels))
-            counts = np.zeros(2 * size.height * size.width, np.int64)
-        if isinstance(item, Picture):
-            if size is None or item.pixels.shape != (size.height, size.width):
-                raise UsageError(f"{path}: a frame is {list(item.pixels.shape)}, not the size of the sensor, {size}")
-            frames.append(item.pixels.reshape(-1)[index >= 0])
-            frame_us.append(item.t_ns // 1000)
-        elif isinstance(item, EventChunk) and len(item):
-            if size is None:
-                raise UsageError(f"{path} does not state the size of the sensor: give --size WIDTHxHEIGHT")
-            if max(int(item.x.max()) - size.width, int(item.y.max()) - size.height) >= 0:
-                raise UsageError(f"{path}: an event lies outside {size.width}x{size.height} px: correct --size")
-            if kept >= MOST_EVENTS:
-                continue
-            place = item.y.astype(np.int64) * size.width + item.x
-            counts += np.bincount(place + item.p * size.height * size.width, minlength=len(counts))
-            mine = index[place] >= 0
-            events.append((item.t_ns[mine] // 1000, place[mine].astype(np.int32), item.p[mine]))
-            kept += int(mine.sum())
-    if size is None or not kept:
+        elif size is None:
+            raise UsageError(f"{path} does not state the size of the sensor: give --size WIDTHxHEIGHT")
+        if size is not None:
+            kept = kept or _Kept(size)
+        if kept is not None and isinstance(item, Picture):
+            kept.add_frame(item, path)
+        elif kept is not None and isinstance(item, EventChunk) and len(item):
+            kept.add_events(item, path)
+    if kept is None or not kept.event_count:
         raise UsageError(f"{path} has no events")
-    t_us, place, p = (np.concatenate(column) for column in zip(*events, strict=True))
-    begun = int(t_us.min())
-    shown = np.array(frame_us, np.int64) - begun
-    stack = np.stack(frames) if frames else np.empty((0, int((index >= 0).sum())), np.uint8)
-    within = shown <= int(t_us.max()) - begun
-    return recorded(
-        size.height, size.width, t_us - begun, place.astype(np.int64), p, stack[within], shown[within],
-        counts.reshape(2, size.height, size.width),
-    )  # fmt: skip
+    return kept.recorded()
+
+
+class _Kept:
+    """What is kept of a recording while it is read."""
+
+    def __init__(self, size: SensorSize) -> None:
+        self._size = size
+        self._pixels = chosen_pixels(size.height, size.width)
+        self._index = _index(self._pixels, size.height * size.width)
+        self._counts = np.zeros(2 * size.height * size.width, np.int64)
+        self._events: list[tuple[npt.NDArray[Any], ...]] = []
+        self._frames: list[npt.NDArray[np.uint8]] = []
+        self._frame_us: list[int] = []
+        self.event_count = 0
+
+    def add_frame(self, picture: Picture, path: Path) -> None:
+        """Add a frame.
+
+        Raises:
+            UsageError: it has another size than the sensor.
+        """
+        if picture.pixels.shape != (self._size.height, self._size.width):
+            raise UsageError(
+                f"{path}: a frame is {list(picture.pixels.shape)}, and the sensor "
+                f"{self._size.width}x{self._size.height}: correct --size"
+            )
+        self._frames.append(picture.pixels.reshape(-1)[self._pixels])
+        self._frame_us.append(picture.t_ns // 1000)
+        while len(self._frames) * len(self._pixels) > MOST_FRAME_PIXELS:
+            self._halve()
+
+    def add_events(self, chunk: EventChunk, path: Path) -> None:
+        """Add events.
+
+        Raises:
+            UsageError: one lies outside the sensor.
+        """
+        width, height = self._size.width, self._size.height
+        if int(chunk.x.max()) >= width or int(chunk.y.max()) >= height:
+            raise UsageError(f"{path}: an event lies outside {width}x{height} px: correct --size")
+        place = chunk.y.astype(np.int64) * width + chunk.x
+        self._counts += np.bincount(place + chunk.p * (width * height), minlength=len(self._counts))
+        mine = self._index[place] >= 0
+        self._events.append((chunk.t_ns[mine] // 1000, place[mine].astype(np.int32), chunk.p[mine]))
+        self.event_count += int(mine.sum())
+        while self.event_count > MOST_EVENTS:
+            self._halve()
+
+    def recorded(self) -> Recorded:
+        """Return the recording, its time from 0 on, without frames after the last event."""
+        t_us, place, p = (np.concatenate(column) for column in zip(*self._events, strict=True))
+        self._events.clear()
+        begun = int(t_us.min())
+        shown = np.array(self._frame_us, np.int64) - begun
+        within = shown <= int(t_us.max()) - begun
+        frames = np.stack(self._frames) if self._frames else np.empty((0, len(self._pixels)), np.uint8)
+        return recorded(
+            self._size.height, self._size.width, t_us - begun, place.astype(np.int64), p, frames[within], shown[within],
+            self._counts.reshape(2, self._size.height, self._size.width), self._pixels,
+        )  # fmt: skip
+
+    def _halve(self) -> None:
+        """Drop every second tile."""
+        y, x = np.divmod(self._pixels, self._size.width)
+        tiles, rank = np.unique(y // TILE_PX * (-(-self._size.width // TILE_PX)) + x // TILE_PX, return_inverse=True)
+        stays = rank % 2 == 0 if len(tiles) > 1 else np.arange(len(y)) % 2 == 0
+        self._pixels = self._pixels[stays]
+        self._index = _index(self._pixels, self._size.height * self._size.width)
+        self._frames = [frame[stays] for frame in self._frames]
+        kept = [self._index[place] >= 0 for _, place, _ in self._events]
+        self._events = [tuple(part[mine] for part in chunk) for chunk, mine in zip(self._events, kept, strict=True)]
+        self.event_count = sum(int(mine.sum()) for mine in kept)
+
+
+def _index(pixels: Longs, count: int) -> Longs:
+    """Return the number of each pixel of the sensor among those kept, or -1: [count]."""
+    index = np.full(count, -1, np.int64)
+    index[pixels] = np.arange(len(pixels))
+    return index

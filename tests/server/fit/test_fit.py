@@ -183,12 +183,30 @@ def test_a_recording_in_files_is_the_recording_in_memory(tmp_path: Path) -> None
 def write_ijrr(folder: Path, made: Mapping[str, npt.NDArray[Any]]) -> None:
     columns = zip(made["t"], made["x"], made["y"], made["p"], strict=True)
     lines = [f"{t * 1e-6:.6f} {x} {y} {int(p)}\n" for t, x, y, p in columns]
-    (folder / "events.txt").write_text("24 20\n" + "".join(lines))
+    height, width = made["frames"].shape[1:]
+    (folder / "events.txt").write_text(f"{width} {height}\n" + "".join(lines))
     listing = []
     for number, (t, frame) in enumerate(zip(made["frame_us"], made["frames"], strict=True)):
         cv2.imwrite(str(folder / f"{number}.png"), frame)
         listing.append(f"{t * 1e-6:.6f} {number}.png\n")
     (folder / "images.txt").write_text("".join(listing))
+
+
+def test_a_long_recording_is_read_within_its_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tiles are dropped, not time: the still end of a recording stays."""
+    made = record(rendered_film("coins", 40, 56, 60.0, moving=0.2, still=0.2), FAST, 1)
+    write_ijrr(tmp_path, made)
+    whole = read_recording(tmp_path)
+    monkeypatch.setattr(recording_module, "MOST_EVENTS", len(made["t"]) // 3)
+    monkeypatch.setattr(recording_module, "MOST_FRAME_PIXELS", made["frames"].size // 5)
+    part = read_recording(tmp_path)
+    assert 0 < len(part.t_us) <= len(made["t"]) // 3
+    assert 0 < part.frames.size <= made["frames"].size // 5
+    assert part.seconds == pytest.approx(whole.seconds, rel=0.05)
+    np.testing.assert_array_equal(part.counts, whole.counts)
+    mine = whole.part(np.isin(whole.pixels, part.pixels))
+    np.testing.assert_array_equal(part.frames, mine.frames)
+    np.testing.assert_array_equal(np.diff(part.first), np.diff(mine.first))
 
 
 @settings(max_examples=20)
