@@ -6,6 +6,8 @@ centres at half coordinates, so a continuous coordinate x becomes x width' / wid
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -54,13 +56,11 @@ def kept_boxes(corners: npt.NDArray[np.float64], share: npt.NDArray[np.float64])
     return np.asarray(kept[order], np.int64)
 
 
-def view_mask(
-    mask: npt.NDArray[np.uint8], picture: Window, params: SampleParams, recipe: Recipe
-) -> npt.NDArray[np.uint8]:
-    """Return a mask of the upright picture, [height, width], as the camera sees it: the class at each pixel's centre.
+def view_mask(mask: npt.NDArray[Any], picture: Window, params: SampleParams, recipe: Recipe) -> npt.NDArray[Any]:
+    """Return a map of the upright picture as the camera sees it: the value at each pixel's centre.
 
     Args:
-        mask: the whole upright picture.
+        mask: [height, width] of the whole upright picture.
         picture: its usable part.
         params, recipe: the draw and its recipe.
 

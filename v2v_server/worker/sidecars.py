@@ -69,6 +69,7 @@ def errors_of_sidecar(video: str, array: str, sidecars: Mapping[str, Traversable
         for ending in sidecar_endings((array,)):
             if sidecars.get(ending) is not None:
                 reason = f"{type(error).__name__}: {error}"[:_LONGEST_REASON]
-                # A read error is this host's; any other repeats wherever the file is read.
-                raise SidecarError(video, ending, reason, here=isinstance(error, OSError)) from error
+                # A read error is this host's; any other repeats wherever the sidecar is read.
+                here = isinstance(error, OSError) and not isinstance(error, FileNotFoundError)
+                raise SidecarError(video, ending, reason, here) from error
         raise
