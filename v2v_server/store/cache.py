@@ -22,11 +22,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnreadable
+from v2v_server.store.depth import detail_planes, read_levels, same_transfer
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
 from v2v_server.store.motion import MOTION, has_planes, read_motion, wants_motion, with_motion, with_planes
 from v2v_server.store.packing import QUICK
@@ -39,7 +41,7 @@ from v2v_server.video.collect import Cut, LastFrame
 from v2v_server.video.decode import BIT_EXACT_CODECS, DecodedClip, stream_decoded
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import MIXED, SDR, Signal
+from v2v_server.video.luma import MIXED, Signal
 from v2v_server.video.orientation import Window
 
 _LOCK_SECONDS = 0.06
@@ -105,8 +107,7 @@ class Cache:
             start, cuts, stride, most_bits: see :func:`v2v_server.video.decode.decode_cuts`.
 
         Returns:
-            None if the cache can neither read nor store them, as frames of more than 8 bits; the caller then decodes
-            without the cache.
+            None if the cache can neither read nor store them; the caller then decodes without the cache.
 
         Raises:
             VideoError: the file is another video now.
@@ -160,22 +161,26 @@ class Cache:
         picture: Window,
     ) -> tuple[DecodedClip, ...] | None:
         """Read the cuts if all pieces are present and sound. Damaged pieces are removed."""
-        clips = [np.empty((cut.count, *_window(cut, index)[2:]), np.uint8) for cut in cuts]
-        codec, bit_exact, sound, transfers = "", False, True, set[str]()
+        clips: list[npt.NDArray[Any]] = []
+        codec, bit_exact, sound, signals = "", False, True, set[Signal]()
         files: list[tuple[StoreFile, range]] = []
         with contextlib.ExitStack() as opened:
             for piece in pieces:
                 try:
                     stored = opened.enter_context(StoreFile(piece.path, fingerprint))
                     codec, bit_exact = stored.head.codec, stored.head.bit_exact
-                    transfers.add(stored.head.transfer)
+                    signal = stored.head.signal
+                    signals.add(signal)
+                    if not clips:
+                        clips = [np.empty((cut.count, *_window(cut, index)[2:]), signal.dtype) for cut in cuts]
                     # The frames of start, start + stride ... that lie in this piece.
                     low = max(0, -(-(piece.first - start) // stride))
                     end = -(-(piece.end - start) // stride)
                     files.append((stored, range(low, min(end, max(cut.count for cut in cuts)))))
                     for cut, frames in zip(cuts, clips, strict=True):
                         if low < (high := min(cut.count, end)):
-                            stored.read(start + low * stride, stride, _window(cut, index), frames[low:high])
+                            place = start + low * stride, stride, _window(cut, index)
+                            read_levels(stored, *place, frames[low:high], signal)
                 except VideoUnreadable as error:
                     if not isinstance(error.__cause__, FileNotFoundError):
                         self.trouble = error.reason
@@ -193,7 +198,8 @@ class Cache:
             except VideoError as error:
                 self._remove(Path(error.video), error.reason)
                 return None
-        signal = Signal(transfer=transfers.pop() if len(transfers) == 1 else MIXED)
+        if len(signals) > 1:
+            signal = signal._replace(transfer=MIXED)
         times = [index.seconds(start, (cut.count - 1) * stride + 1)[::stride] for cut in cuts]
         read = [
             DecodedClip(frames, seconds, codec, bit_exact, "cache", signal=signal)
@@ -234,7 +240,7 @@ class Cache:
         """Decode the missing pieces in one pass, and store each.
 
         Raises:
-            VideoError: they cannot be decoded, or have more than 8 bits.
+            VideoError: they cannot be decoded.
             OSError: they cannot be written.
         """
         top, width = rows[0], index.width_px
@@ -246,18 +252,20 @@ class Cache:
                     next(frames)
                 begin = piece.end
                 stream, picture = next(frames)
-                if stream.signal.bits > SDR.bits:
-                    raise VideoError(video, piece.first, f"has {stream.signal.bits} bits; a piece holds 8")
+                signal = stream.signal
                 head = Head(
                     video=video, fingerprint=fingerprint, height_px=index.height_px, width_px=width, top=top,
                     rows=height, first=piece.first, count=piece.end - piece.first, frames=piece.end,
                     frames_per_second=0.0, codec=stream.codec, bit_exact=stream.codec in BIT_EXACT_CODECS,
-                    group=group_frames_for(height, width), packing=QUICK.method, transfer=stream.signal.transfer,
+                    group=group_frames_for(height, width), packing=QUICK.method, bits=signal.bits,
+                    transfer=signal.transfer,
                 )  # fmt: skip
-                more = (_alike(head, *later) for later in islice(frames, head.count - 1))
-                self._keep(piece.path, head, chain((picture,), more), planes)
+                more = chain(((stream, picture),), islice(frames, head.count - 1))
+                self._keep(piece.path, head, more, [*planes, *detail_planes(signal)])
 
-    def _keep(self, path: Path, head: Head, pictures: Iterable[npt.NDArray[np.uint8]], planes: Sequence[str]) -> None:
+    def _keep(
+        self, path: Path, head: Head, pictures: Iterable[tuple[LastFrame, npt.NDArray[Any]]], planes: Sequence[str]
+    ) -> None:
         """Write a piece, and rename it into place if it fits the limit."""
         partial = self.folder / PARTIAL / secrets.token_hex(8)
         try:
@@ -267,7 +275,7 @@ class Cache:
                 fcntl.flock(
                     writer.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB
                 )  # held for the life of this process: see _remove_abandoned
-                for picture, arrays in with_planes(pictures, planes):
+                for picture, arrays in with_planes(same_transfer(head, pictures), planes):
                     writer.add(picture, arrays)
                 writer.close()
             with self._waiting():
@@ -322,17 +330,6 @@ def _remove_abandoned(folder: Path) -> None:
         with contextlib.suppress(OSError), path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             path.unlink()
-
-
-def _alike(head: Head, stream: LastFrame, picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return the picture.
-
-    Raises:
-        VideoError: the video states another transfer by now.
-    """
-    if stream.signal.transfer != head.transfer:
-        raise VideoError(head.video, None, "states different transfer characteristics within a piece")
-    return picture
 
 
 def _window(cut: Cut, index: FrameIndex) -> Window:

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, VideoError
+from v2v_server.store.depth import DETAIL, detail_planes, read_levels
 from v2v_server.store.format import is_store_file
 from v2v_server.store.motion import MotionWatch, read_motion, with_motion
 from v2v_server.store.planes import PLANES
@@ -43,10 +44,11 @@ def clips_of(
         path: a video, or a store file.
         fingerprint: of the video, or of the source of the store file.
         rows: (first, one after the last) usable row, which the cells of a cut count from; None: all rows.
+        most_bits: see :func:`v2v_server.video.decode.decode_cuts`.
 
     Raises:
         UsageError, VideoError: see :func:`v2v_server.video.decode.decode_cuts`; also if the file is, or was made from,
-            another video, or a store file holds fewer bits than asked for and its source has.
+            another video, or a store file lacks the detail of deeper levels.
     """
     top, bottom = rows or (0, index.height_px)
     picture = top, 0, bottom - top, index.width_px
@@ -57,13 +59,11 @@ def clips_of(
             decode_cuts(path, index, start, cuts, stride=stride, most_bits=most_bits, watch=motion.watch)
         )
     with StoreFile(path, fingerprint) as stored:
-        if min(most_bits or 0, stored.head.bits) > SDR.bits:
-            why = (
-                f"the store file holds 8 of the {stored.head.bits} bits that light = declared needs: "
-                "serve its source, or set light to sdr"
-            )
+        bits = min(most_bits or SDR.bits, stored.head.bits)
+        signal = SDR if most_bits is None else Signal(bits, stored.head.transfer)
+        if not stored.planes.issuperset(detail_planes(signal)):
+            why = f"the store file lacks the plane {DETAIL} of its {bits} bits: re-create it with v2v-prepare"
             raise VideoError(os.fspath(path), None, why)
-        signal = SDR if most_bits is None else Signal(transfer=stored.head.transfer)
         clips = tuple(stored_clip(stored, index, start, cut, stride, signal) for cut in cuts)
         files = [(stored, range(max(cut.count for cut in cuts)))]
         return with_motion(clips, cuts, read_motion(files, start, cuts, stride, picture))
@@ -75,8 +75,8 @@ def stored_clip(
     """Read one cut from an open store file that holds all of it."""
     head = stored.head
     window = cut.window or (head.top, 0, head.rows, head.width_px)
-    frames = np.empty((cut.count, *window[2:]), np.uint8)
-    stored.read(start, stride, window, frames)
+    frames = np.empty((cut.count, *window[2:]), signal.dtype)
+    read_levels(stored, start, stride, window, frames, signal)
     seconds = index.seconds(start, (cut.count - 1) * stride + 1)[::stride]
     return DecodedClip(frames, seconds, head.codec, head.bit_exact, "store", signal=signal)
 

@@ -28,7 +28,7 @@ import xxhash
 from v2v_protocol.errors import ProtocolError, VideoError
 from v2v_server.store.packing import METHODS
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
-from v2v_server.video.luma import MIXED, SDR, TRANSFERS, Signal
+from v2v_server.video.luma import MIXED, MOST_BITS, SDR, TRANSFERS, Signal
 
 MAGIC = b"V2VSTOR1"
 BLOCK_ROWS, BLOCK_COLUMNS = 32, 32
@@ -95,7 +95,7 @@ class Head:
             and 0 <= self.first < self.first + self.count <= self.frames <= LARGEST_FRAMES
             and 1 <= self.group <= GROUP_FRAMES
             and self.packing in METHODS
-            and self.bits >= SDR.bits
+            and SDR.bits <= self.bits <= MOST_BITS
             and self.transfer in (SDR.transfer, MIXED, *TRANSFERS.values())
         )
         if not inside:
@@ -104,6 +104,11 @@ class Head:
                 f"{self.width_px}x{self.height_px} px, groups of {self.group}, packed by {self.packing!r:.20}, "
                 f"{self.bits} bits, transfer {self.transfer!r:.20}"
             )
+
+    @property
+    def signal(self) -> Signal:
+        """What the source's levels mean."""
+        return Signal(self.bits, self.transfer)
 
     @property
     def groups(self) -> int:
@@ -131,8 +136,7 @@ class Head:
 
     def to_bytes(self) -> bytes:
         """Return the bytes in front of the table."""
-        source = Signal(self.bits, self.transfer)
-        defaults = {name for name, value in SDR._asdict().items() if getattr(source, name) == value}
+        defaults = {name for name, value in SDR._asdict().items() if getattr(self, name) == value}
         head = msgpack.packb({name: value for name, value in asdict(self).items() if name not in defaults})
         return _PREFIX.pack(MAGIC, len(head), check(head, 0)) + head
 

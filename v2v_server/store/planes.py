@@ -113,6 +113,8 @@ PLANES: Mapping[str, PlaneKind] = MappingProxyType(
     {
         # Motion to each frame from the one before (v2v_server.motion), x and y; zero for the first frame of the file.
         "motion": PlaneKind(version=1, dtype="<i2", values=2, cell_px=4),
+        # What 8 bits lack of the levels of deeper luma (v2v_server.store.depth).
+        "detail": PlaneKind(version=1, dtype="i1", values=1, cell_px=1),
     }
 )
 """The kinds of planes, by name."""

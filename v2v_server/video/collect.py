@@ -208,9 +208,17 @@ class LastFrame(Stack):
         ((stored, last),) = self._parts
         self._parts = [(stored, np.empty_like(last))]  # a caller may keep the last one
         copy_luma(samples, self._luma, stored, self._parts[0][1][0], self.signal)
+        if self.signal.bits > SDR.bits:
+            self._grey = np.empty(last.shape, np.uint8)
+            copy_luma(samples, self._luma, stored, self._grey[0])
 
     def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.unsignedinteger]]:
         return super()._part(replace(cut, count=1))
+
+    def grey_picture(self) -> npt.NDArray[np.uint8]:
+        """Return the last frame in 8 bits, [h, w], where the signal has more."""
+        upright: npt.NDArray[np.uint8] = self._orientation.upright(self._grey)[0]
+        return upright
 
     def picture(self) -> npt.NDArray[Any]:
         """Return the last frame that was taken, [h, w] of the signal's dtype: upright, in full range."""

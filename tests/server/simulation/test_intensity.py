@@ -67,6 +67,7 @@ def test_a_picture_shows_what_sdr_would_show() -> None:
     assert np.abs(eight_bits(frames, Signal(10, "pq")) - frames * (255 / 1023)).max() <= 0.5
 
 
+@pytest.mark.slow  # another compiled kernel
 def test_one_scene_in_every_signal() -> None:
     """Log intensity lies within one level of the truth, so steps agree within quantisation; 10 and 12 bits bring a slow
     scene's voxels nearer to the truth.
@@ -101,6 +102,7 @@ def test_one_scene_in_every_signal() -> None:
         assert error[Signal(12, transfer)] < 0.06
 
 
+@pytest.mark.slow  # another compiled kernel
 @given(
     bits=st.integers(9, 12),
     transfer=st.sampled_from(["", *TRANSFERS.values()]),

@@ -11,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from av.video.reformatter import ColorTrc
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.clips import panned_luma, write_clip
 from tests.oracles.leases import open_leases, whole_sample
@@ -24,8 +26,9 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.simulation.intensity import light_table
 from v2v_server.store.cache import Cache, make_cache
+from v2v_server.store.depth import detail_of, levels_of
 from v2v_server.store.encoding import Encoding
-from v2v_server.video.luma import Signal
+from v2v_server.video.luma import Signal, range_table
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.produce import make_sample
 
@@ -71,6 +74,7 @@ def ten_bits(folder: Path, transfer: ColorTrc | None) -> npt.NDArray[np.uint16]:
     return levels
 
 
+@pytest.mark.slow  # another compiled kernel
 @pytest.mark.parametrize(("transfer", "name"), [(None, ""), (ColorTrc.SMPTE2084, "pq"), (ColorTrc.ARIB_STD_B67, "hlg")])
 def test_a_deep_clip_is_simulated_from_the_light_that_it_states(
     tmp_path: Path, transfer: ColorTrc | None, name: str
@@ -110,12 +114,19 @@ def test_what_a_video_states_changes_no_name_that_does_not_ask_for_it(tmp_path: 
     assert Recipe.from_dict(DECLARED.to_dict()) == DECLARED
 
 
-def test_store_and_cache_keep_the_transfer(tmp_path: Path) -> None:
-    (tmp_path / "clips").mkdir()
-    write_clip(tmp_path / "clips" / "a.mp4", LUMA, transfer=ColorTrc.ARIB_STD_B67)
+@pytest.mark.parametrize("is_deep", [False, pytest.param(True, marks=pytest.mark.slow)])  # another compiled kernel
+def test_store_and_cache_keep_transfer_and_bits(tmp_path: Path, is_deep: bool) -> None:
+    if is_deep:
+        ten_bits(tmp_path / "clips", ColorTrc.SMPTE2084)
+    else:
+        (tmp_path / "clips").mkdir()
+        write_clip(tmp_path / "clips" / "a.mp4", LUMA, transfer=ColorTrc.ARIB_STD_B67)
     assert run(tmp_path / "clips", tmp_path / "store", Encoding.of("lossless")).complete
     exact = sample_of(tmp_path / "clips", DECLARED)
     require_equal(sample_of(tmp_path / "store", DECLARED), exact, "store")
+    for recipe, substep_px in ((SDR, 0.0), (DECLARED, 0.5), (DECLARED.replace(frame_stride=3, bins=1), 0.0)):
+        other = sample_of(tmp_path / "clips", recipe, substep_px=substep_px)
+        require_equal(sample_of(tmp_path / "store", recipe, substep_px=substep_px), other, "store")
     make_cache(tmp_path / "cache")
     clips = Clips(Folder(tmp_path / "clips"), Cache(tmp_path / "cache", 1 << 30))
     # A piece of an older stream does not state the transfer, so it is not used for one that needs it.
@@ -127,23 +138,19 @@ def test_store_and_cache_keep_the_transfer(tmp_path: Path) -> None:
     require_equal(make_sample(lease, decoded), exact, "cache")
 
 
-def test_what_holds_8_bits_does_not_stand_in_for_deeper_clips(tmp_path: Path) -> None:
-    """Apart from sub-steps, whose pictures are made from 8 bits wherever the clip comes from."""
+def test_sub_steps_are_made_of_8_bits(tmp_path: Path) -> None:
     ten_bits(tmp_path / "clips", ColorTrc.SMPTE2084)
-    assert run(tmp_path / "clips", tmp_path / "store", Encoding.of("lossless")).complete
-    with pytest.raises(VideoError, match="holds 8 of the 10 bits"):
-        sample_of(tmp_path / "store", DECLARED)
-    exact = sample_of(tmp_path / "clips", DECLARED)
-    make_cache(tmp_path / "cache")
-    cache = Cache(tmp_path / "cache", 1 << 30)
-    with closing(leases_of(tmp_path / "clips", DECLARED)) as leases:
-        root, lease = next(leases)
-        decoded, _ = Clips(Folder(root), cache).take(lease)
-    assert cache.used_bytes == 0
-    assert make_sample(lease, decoded).provenance == exact.provenance
-    divided = sample_of(tmp_path / "clips", DECLARED, substep_px=0.5)
-    assert divided.provenance.decoder == "ffv1, 8 bits, PQ"
-    require_equal(sample_of(tmp_path / "store", DECLARED, substep_px=0.5), divided, "store")
+    assert sample_of(tmp_path / "clips", DECLARED, substep_px=0.5).provenance.decoder == "ffv1, 8 bits, PQ"
+
+
+@given(bits=st.integers(9, 12), full_range=st.booleans())
+@settings(deadline=None)
+def test_detail_gives_every_level_back(bits: int, full_range: bool) -> None:
+    signal = Signal(bits)
+    grey, levels = range_table(bits, full_range)[None], range_table(bits, full_range, signal)[None]
+    detail = detail_of(levels, grey, signal)
+    assert np.abs(detail).max() <= 9
+    np.testing.assert_array_equal(levels_of(grey, detail[0], signal), levels)
 
 
 def test_a_clip_of_two_transfers_is_refused(tmp_path: Path) -> None:
@@ -156,3 +163,5 @@ def test_a_clip_of_two_transfers_is_refused(tmp_path: Path) -> None:
     assert sample_of(tmp_path / "clips", SDR).arrays["voxels"].any()
     with pytest.raises(VideoError, match="different transfer characteristics"):
         sample_of(tmp_path / "clips", DECLARED)
+    report = run(tmp_path / "clips", tmp_path / "store", Encoding.of("lossless"))
+    assert "its transfer changes from pq" in str(report.failed)
