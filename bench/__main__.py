@@ -35,6 +35,7 @@ BENCHES = {
     "watched": "speed.watched",
     "sessions": "speed.sessions",
     "physics": "accuracy.physics",
+    "motion": "speed.motion",
     "substeps": "accuracy.substeps",
     "extremes": "accuracy.extremes",
     "sensor": "accuracy.sensor",
