@@ -33,6 +33,7 @@ BENCHES = {
     "store": "speed.store",
     "link": "speed.link",
     "physics": "accuracy.physics",
+    "motion": "speed.motion",
     "substeps": "accuracy.substeps",
     "fit": "accuracy.fit",
     "extremes": "accuracy.extremes",

@@ -17,7 +17,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import MOST_SUBSTEPS
 from v2v_server.motion.lanes import CELL_PX
-from v2v_server.motion.matching import UNITS_PER_PX, Cells, Vectors, padded, without_slow
+from v2v_server.motion.matching import UNITS_PER_PX, Cells, Vectors, padded
 from v2v_server.motion.plane import motions
 from v2v_server.motion.warping import between
 from v2v_server.simulation.draw import resized_size
@@ -132,31 +132,34 @@ def levels_between(
     shortest = math.ceil(substep_px * UNITS_PER_PX / 2)
     steps, counts = [], []
     for step, (before, after) in enumerate(pairwise(source_index.tolist())):
-        if before != after and vectors[after].any():
-            found = without_slow(vectors[after], shortest)
-            if (count := substeps(found, substep_px)) > 1:
-                steps.append((step, after, found))
-                counts.append(count - 1)
+        if before != after and (count := substeps(vectors[after], substep_px)) > 1:
+            steps.append((step, after))
+            counts.append(count - 1)
     if not steps:
         return None
     grey = np.empty((sum(counts), height, width), np.uint16)
-    first = 0
-    for (_, after, found), count in zip(steps, counts, strict=True):
-        one, other = (padded(np.ascontiguousarray(pictures[number])) for number in (after - 1, after))
-        between(one, other, found, top, left, grey[first : first + count])
+    first, shown, later = 0, -1, pictures[:0]
+    for (_, after), count in zip(steps, counts, strict=True):
+        earlier = later if shown == after - 1 else padded(np.ascontiguousarray(pictures[after - 1]))
+        shown, later = after, padded(np.ascontiguousarray(pictures[after]))
+        field = np.ascontiguousarray(vectors[after])
+        between(earlier, later, field, shortest, top, left, grey[first : first + count])
         first += count
-    at = np.repeat([step for step, _, _ in steps], counts)
+    at = np.repeat([step for step, _ in steps], counts)
     share = np.concatenate([np.arange(1, count + 1) / (count + 1) for count in counts])
     return Levels(Moments(at, share), grey)
 
 
 def substeps(vectors: Vectors, substep_px: float) -> int:
     """Return the number of sub-steps of a step with this motion: 1 .. MOST_SUBSTEPS."""
-    squares = (vectors.astype(np.int64) ** 2).sum(axis=0)
-    moving = np.sort(squares[squares > 0])
+    x, y = vectors.astype(np.int32)
+    squares = x * x + y * y
+    shortest = math.ceil(substep_px * UNITS_PER_PX / 2)
+    moving = squares[squares >= max(shortest * shortest, 1)]
     if len(moving) < _LEAST_SHARE * squares.size or not len(moving):
         return 1
-    longest = math.sqrt(int(moving[int(len(moving) * (1 - _FASTEST_SHARE))])) / UNITS_PER_PX
+    which = int(len(moving) * (1 - _FASTEST_SHARE))
+    longest = math.sqrt(int(np.partition(moving, which)[which])) / UNITS_PER_PX
     return 1 + int(min(longest / substep_px, MOST_SUBSTEPS - 1))  # the quotient may be infinite
 
 
