@@ -194,7 +194,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tmp_path = tmp_path_factory.mktemp("tree")
     for name in ("v2v_server/worker", "v2v_server/corpus/sources", "v2v_protocol"):
         (tmp_path / name).mkdir(parents=True)
-    for name, *_ in (*LABEL_LINES, SOURCE_LINE):
+    for name, *_ in (*DEPTH_LINES, SOURCE_LINE):
         shutil.copy(ROOT / name, tmp_path / name)
     (tmp_path / "sitecustomize.py").write_text(OVERLAY)
     (tmp_path / "clips").mkdir()
