@@ -74,13 +74,13 @@ class Pyramid:
 
     @property
     def cells(self) -> Cells:
-        """All cells of the picture."""
+        """Return all cells of the picture."""
         height, width = self.picture.shape
         return Cells(0, 0, -(-height // CELL_PX), -(-width // CELL_PX))
 
     @cached_property
     def levels(self) -> list[Picture]:
-        """The picture and its rounded means of four, each with PAD_PX more on each side."""
+        """Return the picture and its rounded means of four, each with PAD_PX more on each side."""
         picture, levels = self.picture, [padded(self.picture)]
         while len(levels) < _LEVELS and min(picture.shape) >= 2 * _SMALLEST_SIDE_PX:
             picture = _halved(picture)

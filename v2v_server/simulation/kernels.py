@@ -74,7 +74,7 @@ class KernelInput:
 
     @property
     def needs_general(self) -> bool:
-        """Whether the voxels alone need the general kernel."""
+        """Return whether the voxels alone need the general kernel."""
         return bool(self.params.effects) or self.levels is not None or bool(self.edges.share.any())
 
     @property
