@@ -109,6 +109,8 @@ class SampleParams:
         effects: what the camera does beyond the paper's pixel model: the values drawn for those fields of the recipe
             that switch an effect on; empty for the paper's pixel.
         log_eps: epsilon inside the logarithm where the recipe gives a range; None where it gives one value.
+        voxel_seconds: drawn duration of a voxel grid; 0 if the recipe states none.
+        grid_steps: steps between frames that each grid of this duration spans; empty if the recipe states none.
     """
 
     threshold_pos: float
@@ -125,6 +127,20 @@ class SampleParams:
     noise_key: tuple[int, int, int, int]
     effects: Mapping[str, float] = dataclasses.field(default_factory=dict)
     log_eps: float | None = None
+    voxel_seconds: float = 0.0
+    grid_steps: tuple[int, ...] = ()
+
+    def ends(self, recipe: Recipe) -> npt.NDArray[np.int64]:
+        """Return the positions in the clip (0 .. steps) between which its spans lie, from one delivered frame to the
+        next.
+
+        Returns:
+            [recipe.spans + 1] int64, from 0 to the number of steps; the delivered frames are those from
+            ``recipe.first_frame`` on.
+        """
+        if self.grid_steps:
+            return np.concatenate(([0], np.cumsum(self.grid_steps, dtype=np.int64)))
+        return np.arange(0, recipe.steps + 1, recipe.steps_per_frame)
 
     def source_index(self, steps: int) -> npt.NDArray[np.int64]:
         """Return which decoded frame each position of the clip shows.
@@ -139,13 +155,10 @@ class SampleParams:
         return np.cumsum(advance)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for the provenance; ``effects`` and ``log_eps`` are left out if they are empty."""
+        """Return plain values for the provenance; fields after ``noise_key`` are left out if they are empty."""
         values = _fields(self)
-        if not self.effects:
-            del values["effects"]
-        if self.log_eps is None:
-            del values["log_eps"]
-        return values
+        optional = ("effects", "log_eps", "voxel_seconds", "grid_steps")
+        return {name: value for name, value in values.items() if value or name not in optional}
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,6 +181,7 @@ class Provenance:
         scene: decisions from the statistics of its scene, and the figures behind them; empty with scene "off".
         saturated: as ``saturated_bins``, for other arrays by name; only those that have any.
         sidecars: fingerprints of the sidecars that its arrays were made from, by ending.
+        grid_seconds: actual duration of each voxel grid, where the recipe states ``voxel_seconds``.
     """
 
     id: SampleId
@@ -184,6 +198,7 @@ class Provenance:
     scene: str = ""
     saturated: Mapping[str, int] = dataclasses.field(default_factory=dict)
     sidecars: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    grid_seconds: tuple[float, ...] = ()
 
     def __repr__(self) -> str:
         where = f"seed {self.id.seed}, epoch {self.id.epoch}, index {self.id.index}"
@@ -196,7 +211,7 @@ class Provenance:
         return html_table(f"{self.video}, from frame {self.start_frame}", rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values, as they travel in the sample's header; ``scene``, ``saturated`` and ``sidecars`` are
+        """Return plain values, as they travel in the sample's header; fields after ``quarantine`` are
         left out if they are empty.
         """
         values = _fields(self) | {
@@ -204,7 +219,7 @@ class Provenance:
             "refusals": tuple(refusal.to_dict() for refusal in self.refusals),
             "params": self.params.to_dict(),
         }
-        optional = ("scene", "saturated", "sidecars")
+        optional = ("scene", "saturated", "sidecars", "grid_seconds")
         return {name: value for name, value in values.items() if value or name not in optional}
 
     @classmethod
@@ -219,6 +234,8 @@ class Provenance:
             params = dict(rest.pop("params"))
             params["pauses"] = tuple((int(first), int(length)) for first, length in params["pauses"])
             params["noise_key"] = tuple(int(word) for word in params["noise_key"])
+            params["grid_steps"] = tuple(map(int, params.get("grid_steps", ())))
+            rest["grid_seconds"] = tuple(map(float, rest.get("grid_seconds", ())))
             known = effect_settings()
             params["effects"] = {
                 name: known[name].single.check(name, value) for name, value in params.get("effects", {}).items()

@@ -46,6 +46,7 @@ SOURCES = dict.fromkeys(
     "noise_scales_with_threshold": "an option of V2V's released code",
     "frame_stride": _OURS,
     "grids_per_frame": _OURS,
+    "voxel_seconds": _OURS,
     "noise_unit": _OURS,
 }  # fmt: skip
 """The source of a recipe's field and its default; those of the effects are on another page."""

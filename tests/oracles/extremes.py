@@ -21,8 +21,9 @@ import numpy.typing as npt
 from tests.oracles.balance import Camera, balance, imbalance, trace_of
 from tests.oracles.dense import trace
 from tests.oracles.extremes_in_time import excess_of_divided_steps, steps_of_any_duration
+from v2v_protocol.bounds import most_events
 from v2v_protocol.errors import RecipeError, UsageError
-from v2v_protocol.recipe import Recipe, most_events, preset
+from v2v_protocol.recipe import Recipe, preset
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.draw import draw, noise_key_of_seed
 from v2v_server.simulation.intensity import log_table, log_table_float64

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.recipe import most_events
+from v2v_protocol.bounds import most_events
 from v2v_server.simulation import simulate
 from v2v_server.simulation.intensity import log_table_float64
 from v2v_server.simulation.kernels import KernelInput, fill

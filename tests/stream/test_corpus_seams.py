@@ -32,7 +32,7 @@ def label(context, out):
     if sidecar is not None:
         labels = json.loads(sidecar.read_text())
         frames = context.clip.start_frame + context.source * context.recipe.frame_stride
-        for place, frame in enumerate(frames[list(context.recipe.target_steps)]):
+        for place, frame in enumerate(frames[context.target_steps]):
             if frame >= len(labels):
                 raise SidecarError(context.video, ENDING, f"has no frame {frame}")
             out[place] = labels[frame]

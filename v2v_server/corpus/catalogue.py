@@ -243,7 +243,11 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
         IndexUnreadable: the index cannot be read at the moment.
         V2VError: the index of this video is damaged, or belongs to another file.
     """
-    video, start, count = lease.video, lease.start_frame, spec.recipe.frames_needed
+    video, start, recipe = lease.video, lease.start_frame, spec.recipe
+    reach = recipe.sequence_at if spec.scene != "off" else recipe.reach_at  # a sequence does not reach the next scene
+    count = int(reach(lease.frames_per_second)) + 1
+    if recipe.is_timed and (number := catalogue.videos.find(video)) is not None:
+        count = min(count, int(catalogue.videos.frames[number]) - start)
     scene = catalogue.scene(video).slice(start, count).to_bytes() if spec.scene != "off" else b""
     return replace(lease, frame_index=catalogue.frame_index_bytes(video, start, count), scene=scene)
 

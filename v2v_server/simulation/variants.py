@@ -60,7 +60,8 @@ def variants(
         EFFECTS_MARGIN if recipe.has_effects else 1.0
     )
     precisions = ["float32"] if events <= LIMITS["float32"][1] else list(LIMITS)
-    is_general = recipe.has_effects or recipe.grids_per_frame > 0 or levels_per_step > 0 or {"voxels"} != set(arrays)
+    has_times = recipe.grids_per_frame > 0 or recipe.is_timed
+    is_general = recipe.has_effects or has_times or levels_per_step > 0 or {"voxels"} != set(arrays)
     return frozenset(Variant(voxel_dtype, is_general, precision, levels_per_step > 0) for precision in precisions)
 
 

@@ -78,6 +78,11 @@ class SampleContext:
     saturated: Mapping[str, int] | None = None
 
     @property
+    def target_steps(self) -> npt.NDArray[np.int64]:
+        """Return the positions of the delivered frames in the clip, [T + lead_frames]."""
+        return self.params.ends(self.recipe)[self.recipe.first_frame :]
+
+    @property
     def recipe(self) -> Recipe:
         """The spec's recipe."""
         return self.spec.recipe
@@ -137,7 +142,7 @@ def simulated(context: SampleContext, out: npt.NDArray[Any]) -> None:
 def frames(context: SampleContext, out: npt.NDArray[Any]) -> None:
     """Fill in the frame at the end of each voxel, and the lead frame."""
     # The indices are valid; checking them again would cost a copy.
-    np.take(context.view, context.source[list(context.recipe.target_steps)], axis=0, out=out[:, 0], mode="clip")
+    np.take(context.view, context.source[context.target_steps], axis=0, out=out[:, 0], mode="clip")
 
 
 @makes("flow")

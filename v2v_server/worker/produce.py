@@ -20,6 +20,7 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError, UsageError, VideoError
 from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
+from v2v_protocol.recipe import Recipe
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.safe_json import parse_json
 from v2v_protocol.sample import (
@@ -36,7 +37,7 @@ from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.motion import MARGIN_PX, levels_of
-from v2v_server.simulation.draw import draw
+from v2v_server.simulation.draw import FrameTimes, draw
 from v2v_server.simulation.kernels import ARRAYS, list_events
 from v2v_server.simulation.variants import Variant, variants
 from v2v_server.simulation.view import apply_view, source_window, without_margin
@@ -89,11 +90,13 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
 
     Raises:
         ProtocolError: the lease is malformed.
+        VideoError: the recipe needs time stamps that the lease does not state.
     """
     spec = _spec(lease.spec)
+    recipe = spec.recipe
     top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
     params = draw(
-        spec.recipe,
+        recipe,
         seed=lease.seed,
         epoch=lease.epoch,
         index=index,
@@ -101,8 +104,9 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
         picture_width_px=lease.width_px,
         video_id=lease.video,
         video_thresholds=_pair(lease.thresholds),
+        times=_frame_times(lease, spec) if recipe.is_timed else None,
     )
-    source = params.source_index(spec.recipe.steps)
+    source = params.source_index(int(params.ends(recipe)[-1]))
     flow: FlowSettings | None = None
     margin_px: int | None = MARGIN_PX if spec.substep_px else 0
     flow_plan = _flow_plan(lease, spec, params, bottom - top)
@@ -111,7 +115,7 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
         if flow_plan is not None and flow_plan.still:
             flow = replace(flow, margin_px=0)
         margin_px = None if flow.margin_px is None else max(flow.margin_px, margin_px or 0)
-    window = source_window(params, spec.recipe, top, bottom - top, lease.width_px, margin_px)
+    window = source_window(params, recipe, top, bottom - top, lease.width_px, margin_px)
     return SamplePlan(spec, params, source, Cut(int(source[-1]) + 1, window), margin_px, flow, flow_plan)
 
 
@@ -134,7 +138,7 @@ def decode_for(
     spec = plans[0].spec
     _refuse_outside(lease.video)
     try:
-        index, cuts = _frame_index(lease, spec.recipe.frames_needed), [plan.cut for plan in plans]
+        index, cuts = _frame_index(lease, spec.recipe), [plan.cut for plan in plans]
         what = index, lease.start_frame, cuts, spec.recipe.frame_stride
         clips = None
         with source.open_local(lease.video, lease.fingerprint) as path:
@@ -206,6 +210,7 @@ def make_sample(
             scene="" if plan.flow_plan is None else plan.flow_plan.reason,
             sidecars={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
             saturated={name: count for name, count in saturated.items() if count},
+            grid_seconds=_grid_seconds(context),
         ),
     )
 
@@ -244,6 +249,22 @@ def _context(
     return SampleContext(
         lease.video, clip, plan.spec, params, plan.source, view, seconds, flow, levels, into
     ), irregular
+
+
+def step_durations(lease: Lease, decoded: Decoded) -> npt.NDArray[np.float64] | None:
+    """Return the duration of each step of a sample, [steps] float64, s; None if the recipe does not use it.
+
+    Raises:
+        VideoError: the video's frame rate is unknown.
+    """
+    return _step_seconds(lease, decoded)[0] if decoded.plan.spec.recipe.needs_seconds else None
+
+
+def _grid_seconds(context: SampleContext) -> tuple[float, ...]:
+    """Return the actual duration of each voxel grid if the recipe states one."""
+    if not context.recipe.is_timed or context.step_seconds is None:
+        return ()
+    return tuple(np.add.reduceat(context.step_seconds, context.params.ends(context.recipe)[:-1]).tolist())
 
 
 def _step_seconds(lease: Lease, decoded: Decoded) -> tuple[npt.NDArray[np.float64], int]:
@@ -302,7 +323,20 @@ def _pair(thresholds: tuple[float, ...]) -> tuple[float, float] | None:
     return (thresholds[0], thresholds[1]) if thresholds else None
 
 
-def _frame_index(lease: Lease, frames: int) -> FrameIndex:
+def _frame_times(lease: Lease, spec: StreamSpec) -> FrameTimes:
+    """Return the time stamps of the frames that a sample may use: the same for every server, whose index of a lease may
+    hold more.
+    """
+    if not lease.frames_per_second:
+        raise VideoError(lease.video, None, "its frame rate is unknown, and voxel_seconds needs it")
+    recipe, rate = spec.recipe, lease.frames_per_second
+    index = _frame_index(lease, recipe)
+    reach = int((recipe.reach_at if spec.scene == "off" else recipe.sequence_at)(rate))
+    count = min(reach + 1, index.end - lease.start_frame)
+    return FrameTimes(index.seconds(lease.start_frame, count)[:: recipe.frame_stride], rate / recipe.frame_stride)
+
+
+def _frame_index(lease: Lease, recipe: Recipe) -> FrameIndex:
     """Decode the frame index of a lease. Its server may not have checked it.
 
     Raises:
@@ -310,7 +344,7 @@ def _frame_index(lease: Lease, frames: int) -> FrameIndex:
     """
     try:
         frame_index = FrameIndex.from_bytes(lease.frame_index)
-        frame_index.position(lease.start_frame, frames)
+        frame_index.position(lease.start_frame, int(recipe.sequence_at(lease.frames_per_second)) + 1)
     except (ProtocolError, UsageError) as error:
         raise VideoError(lease.video, None, f"its index from the server is damaged: {error}") from error
     return frame_index

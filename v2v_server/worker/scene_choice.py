@@ -76,9 +76,9 @@ def plan_flow(
     """
     recipe = spec.recipe
     tiles = _tiles(params, recipe, picture_height_px, picture_width_px)
-    source = start_frame + recipe.frame_stride * params.source_index(recipe.steps)
-    span = recipe.steps_per_frame
-    ends = source[recipe.lead_voxels * span :: span].tolist()
+    positions = params.ends(recipe)
+    source = start_frame + recipe.frame_stride * params.source_index(int(positions[-1]))
+    ends = source[positions[recipe.lead_voxels :]].tolist()
     methods = tuple(_method(scene, earlier, later, tiles, params.scale) for earlier, later in pairwise(ends))
     values = scene.values(int(source[0]), int(source[-1]))
     kind, figures = _kind(methods), _figures(values, tiles)
