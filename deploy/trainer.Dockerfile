@@ -11,6 +11,7 @@ COPY v2v_protocol v2v_protocol
 COPY v2v_server v2v_server
 COPY v2v_client v2v_client
 COPY v2v_pictures v2v_pictures
+COPY v2v_recordings v2v_recordings
 COPY trainer trainer
 RUN pip install --no-cache-dir --constraint constraints.txt '.[trainer]'
 

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -122,11 +123,14 @@ def test_ports_of_the_broker_match_workers_trainers_probes_and_policies() -> Non
 def test_workers_connect_to_the_broker_and_have_its_videos(monkeypatch: pytest.MonkeyPatch) -> None:
     pod, calls = container("v2v-workers"), []
     assert pod["command"] == ["v2v-worker"]
-    monkeypatch.setattr(worker_command, "open_source", lambda name, options: name)
+    monkeypatch.setattr(
+        worker_command, "open_source", lambda name, options: SimpleNamespace(name=name, make=lambda: None)
+    )
     monkeypatch.setattr(worker_command, "run_worker", lambda *arguments: calls.append(arguments))
     assert worker_command.main(pod["args"]) == 0
     port = named("Service", "v2v-broker")["spec"]["ports"][1]["port"]
-    assert calls[0][:2] == (f"tcp://v2v-broker:{port}", serving().videos)
+    address, source, *_ = calls[0]
+    assert (address, source.name) == (f"tcp://v2v-broker:{port}", serving().videos)
 
 
 @pytest.mark.parametrize("deployment", ["v2v-broker", "v2v-workers"])
@@ -192,7 +196,9 @@ def test_the_workers_unit_runs_a_valid_command(monkeypatch: pytest.MonkeyPatch) 
     ]
     program, *arguments = shlex.split(line)
     assert program.endswith("/v2v-worker")
-    monkeypatch.setattr(worker_command, "open_source", lambda name, options: name)
+    monkeypatch.setattr(
+        worker_command, "open_source", lambda name, options: SimpleNamespace(name=name, make=lambda: None)
+    )
     monkeypatch.setattr(worker_command, "run_worker", lambda *arguments: None)
     assert worker_command.main(arguments) == 0
 

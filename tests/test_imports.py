@@ -10,10 +10,30 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("v2v_protocol", "v2v_pictures", "v2v_server", "v2v_client", "trainer", "bench", "examples")
+PACKAGES = (
+    "v2v_protocol",
+    "v2v_pictures",
+    "v2v_recordings",
+    "v2v_server",
+    "v2v_client",
+    "trainer",
+    "bench",
+    "examples",
+)
 
 FORBIDDEN: dict[str, set[str]] = {
     "v2v_pictures": {"v2v_server", "v2v_client", "trainer", "bench", "examples", "torch", "zmq", "numba", "cv2"},
+    "v2v_recordings": {
+        "v2v_server",
+        "v2v_client",
+        "v2v_pictures",
+        "trainer",
+        "bench",
+        "examples",
+        "torch",
+        "zmq",
+        "numba",
+    },
     "v2v_server": {"torch", "v2v_client", "trainer", "bench", "examples"},
     "v2v_client": {"v2v_server", "trainer", "bench", "examples", "av", "numba", "cv2"},
     "trainer": {"v2v_server", "bench", "examples"},
@@ -175,7 +195,7 @@ def test_what_a_fresh_interpreter_loads(module: str, without: tuple[str, ...]) -
 def test_no_two_classes_have_one_name() -> None:
     """But for what the files of one seam have in common: every effect has its ``Tables``."""
     found: dict[str, list[str]] = {}
-    for package in ("v2v_protocol", "v2v_pictures", "v2v_server", "v2v_client", "trainer"):
+    for package in ("v2v_protocol", "v2v_pictures", "v2v_recordings", "v2v_server", "v2v_client", "trainer"):
         for path in modules(package):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.ClassDef) and "effects" not in path.parts:

@@ -1,6 +1,6 @@
 """Convert raw recordings of event cameras to the h5 layout that evaluation reads (``trainer.evaluation.layout``)."""
 
 from trainer.convert.conversion import Converted, convert
-from trainer.convert.items import EventChunk, Item, Picture, SensorSize
+from v2v_recordings.items import EventChunk, Item, Picture, SensorSize
 
 __all__ = ["Converted", "EventChunk", "Item", "Picture", "SensorSize", "convert"]

@@ -10,14 +10,15 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from trainer.convert import items
-from trainer.convert.conversion import FORMS, Converted, convert, default_name
-from trainer.convert.text_events import NS_PER_UNIT
+from trainer.convert.conversion import Converted, convert, default_name
 from trainer.evaluation import layout
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
+from v2v_recordings import items
+from v2v_recordings.forms import FORMS
+from v2v_recordings.text_events import NS_PER_UNIT
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -21,10 +21,10 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from trainer.convert.items import EventChunk, FlowField, Item, Picture, SensorSize
 from trainer.evaluation import layout
 from v2v_protocol.errors import UsageError
 from v2v_protocol.write_aside import write_aside_and_rename
+from v2v_recordings.items import EventChunk, FlowField, Item, Picture, SensorSize
 
 FLUSH_EVENTS = 1 << 19
 REORDER_EVENTS = 1 << 17

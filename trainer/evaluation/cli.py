@@ -15,7 +15,6 @@ from typing import Any, get_args
 import torch
 from rich.console import Console
 
-from trainer.convert.items import SensorSize
 from trainer.evaluation.config import EvaluationConfig, folder_config, read_config, shipped
 from trainer.evaluation.evaluate import Advance, Drawing, Run, check_data_set, evaluate_data_set, find_recordings
 from trainer.evaluation.flow import FlowRun, evaluate_flow, flow_records, flow_table
@@ -30,6 +29,7 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
+from v2v_recordings.items import SensorSize
 
 LEAST_WIDTH = 110
 """Width of tables that are not written to a terminal, in characters."""

@@ -21,8 +21,8 @@ import numpy.typing as npt
 
 from trainer.evaluation import layout
 from trainer.evaluation.voxelise import Events
-from trainer.hdf5 import require_self_contained
 from v2v_protocol.errors import UsageError
+from v2v_recordings.hdf5 import require_self_contained
 
 BLOCK_EVENTS = 1 << 16
 CACHED_BLOCKS = 64

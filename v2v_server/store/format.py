@@ -124,7 +124,7 @@ class Head:
     def to_bytes(self) -> bytes:
         """Return the bytes in front of the table."""
         head = msgpack.packb(asdict(self))
-        return _PREFIX.pack(MAGIC, len(head), _check(head, 0)) + head
+        return _PREFIX.pack(MAGIC, len(head), check(head, 0)) + head
 
 
 def group_frames_for(rows: int, width_px: int) -> int:
@@ -132,19 +132,23 @@ def group_frames_for(rows: int, width_px: int) -> int:
     return max(1, min(GROUP_FRAMES, _LARGEST_GROUP_BYTES // (rows * width_px)))
 
 
-def read_head(path: str, file: int) -> tuple[Head, int]:
-    """Read the head of an open file, and return it with the position of the table.
+def read_head(path: str, file: int, offset: int = 0) -> tuple[Head, int]:
+    """Read the head of an open file, and return it with the position of the table in the store file.
+
+    Args:
+        path, file: its name and descriptor.
+        offset: where the store file begins in it.
 
     Raises:
         VideoError: it is not a store file, or its head is damaged.
         OSError: it cannot be read.
     """
-    prefix = os.pread(file, _PREFIX.size, 0)
+    prefix = os.pread(file, _PREFIX.size, offset)
     if len(prefix) < _PREFIX.size or not prefix.startswith(MAGIC):
         raise VideoError(path, None, f"begins with {prefix[:8]!r}: not a store file, or a truncated one")
-    _, length, check = _PREFIX.unpack(prefix)
-    head = os.pread(file, length, _PREFIX.size) if length <= _LARGEST_HEAD_BYTES else b""
-    if len(head) != length or _check(head, 0) != check:
+    _, length, expected = _PREFIX.unpack(prefix)
+    head = os.pread(file, length, offset + _PREFIX.size) if length <= _LARGEST_HEAD_BYTES else b""
+    if len(head) != length or check(head, 0) != expected:
         raise VideoError(path, None, "the store file is corrupt (its head is damaged): re-create it with v2v-prepare")
     try:
         return Head(**msgpack.unpackb(head)), _PREFIX.size + length
@@ -176,7 +180,7 @@ def pack_record(head: Head, group: int, offset: int, sizes: list[int], checks: l
     blocks = np.empty(head.down * head.across, _BLOCK)
     blocks["bytes"], blocks["check"] = sizes, checks
     body = struct.pack("<Q", offset) + blocks.tobytes()
-    return body + struct.pack("<Q", _check(body, group + 1))
+    return body + struct.pack("<Q", check(body, group + 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +198,7 @@ class BlockRecord:
 
 def unpack_record(group: int, data: bytes) -> BlockRecord | None:
     """Decode the record of a group; None if it is damaged."""
-    if len(data) < 16 or _check(data[:-8], group + 1) != struct.unpack("<Q", data[-8:])[0]:
+    if len(data) < 16 or check(data[:-8], group + 1) != struct.unpack("<Q", data[-8:])[0]:
         return None
     if struct.unpack("<Q", data[:8])[0] >= 1 << 62:  # longer than any file; offsets are signed
         return None
@@ -205,8 +209,9 @@ def unpack_record(group: int, data: bytes) -> BlockRecord | None:
 
 def block_check(block: bytes | memoryview, group: int, number: int) -> int:
     """Return the hash of a block at its position."""
-    return _check(block, group << 32 | number)
+    return check(block, group << 32 | number)
 
 
-def _check(data: bytes | memoryview, place: int) -> int:
+def check(data: bytes | memoryview, place: int) -> int:
+    """Return the hash of data at a place."""
     return xxhash.xxh3_64_intdigest(data, place)

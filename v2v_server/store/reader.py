@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import cached_property
 from itertools import pairwise
 from types import TracebackType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -17,61 +18,40 @@ from v2v_server.store.format import (
     BLOCK_ROWS,
     LARGEST_BLOCK_BYTES,
     BlockRecord,
-    Head,
     block_check,
     read_head,
     unpack_record,
 )
 from v2v_server.store.packing import UnpackingError, unpack
+from v2v_server.store.planes import PLANES, PlanePlace, read_footer
 from v2v_server.video.orientation import Window
 
+_REMEDY = "re-create it with v2v-prepare"
+_ZEROS = np.empty(0, np.uint8)
 
-class StoreFile:
-    """An open store file.
+
+class BlockReader:
+    """The pictures of a store file, or of a plane within one.
 
     Args:
-        path: the file.
-        fingerprint: fingerprint of the expected source; "" accepts any.
+        path, file: name and descriptor of the file; the descriptor stays open.
+        offset: where the store file begins in it, bytes.
+        is_sparse: whether an empty block means zeros.
 
     Attributes:
-        head: the file's head.
+        head: head of the store file.
 
     Raises:
         VideoUnreadable: it cannot be read.
-        VideoChanged: it was made from another source.
         VideoError: it is not a store file, or its head is damaged.
     """
 
-    def __init__(self, path: str | os.PathLike[str], fingerprint: str = "") -> None:
-        self._path = os.fspath(path)
+    def __init__(self, path: str, file: int, offset: int = 0, *, is_sparse: bool = False) -> None:
+        self._path, self._file, self._offset, self._is_sparse = path, file, offset, is_sparse
         try:
-            self._file = os.open(
-                self._path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK
-            )  # opening a FIFO must not block
+            self.head, self._table = read_head(path, file, offset)
         except OSError as error:
-            raise VideoUnreadable(self._path, None, f"cannot be read: {error.strerror or error}") from error
-        try:
-            self.head, self._table = self._opened()
-            if fingerprint not in ("", self.head.fingerprint):
-                made_of = self.head.fingerprint
-                raise VideoChanged(self._path, None, f"was made from another file: {made_of} instead of {fingerprint}")
-        except BaseException:
-            os.close(self._file)
-            raise
-
-    def _opened(self) -> tuple[Head, int]:
-        try:
-            return read_head(self._path, self._file)
-        except OSError as error:
-            raise VideoUnreadable(self._path, None, f"cannot be read: {error.strerror or error}") from error
-
-    def __enter__(self) -> StoreFile:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        os.close(self._file)
+            raise VideoUnreadable(path, None, f"cannot be read: {error.strerror or error}") from error
 
     def read(self, start: int, stride: int, window: Window, out: npt.NDArray[np.uint8]) -> None:
         """Read frames start, start + stride ... of a window.
@@ -110,6 +90,9 @@ class StoreFile:
 
         head, (top, left, height, width) = self.head, window
         record = self._record(group)
+        if self._is_sparse and record.starts[0] == record.starts[-1]:
+            out[...] = 0
+            return
         frames = head.group_frames(group)
         columns = range(left // BLOCK_COLUMNS, (left + width - 1) // BLOCK_COLUMNS + 1)
         for row in range(top // BLOCK_ROWS, (top + height - 1) // BLOCK_ROWS + 1):
@@ -122,7 +105,10 @@ class StoreFile:
                 wide = min(BLOCK_COLUMNS, head.width_px - x)
                 here, there = max(left, x), min(left + width, x + wide)
                 part = out[:, upper - top : lower - top, here - left : there - left]
-                from_differences(block, tall, wide, upper - y, here - x, first, stride, part)
+                if len(block):
+                    from_differences(block, tall, wide, upper - y, here - x, first, stride, part)
+                else:
+                    part[...] = 0
 
     def _record(self, group: int) -> BlockRecord:
         size = self.head.record_bytes
@@ -138,7 +124,7 @@ class StoreFile:
     def _blocks(
         self, group: int, record: BlockRecord, before: int, columns: range, column_bytes: int
     ) -> Iterator[npt.NDArray[np.uint8]]:
-        """Yield neighbouring blocks of a row, checked and unpacked.
+        """Yield neighbouring blocks of a row, checked and unpacked; an empty one for zeros that are left out.
 
         Args:
             before: number of blocks in front of the row.
@@ -151,6 +137,9 @@ class StoreFile:
             packed = data[record.starts[number] - start : record.starts[number + 1] - start]
             if block_check(packed, group, number) != record.checks[number]:
                 self._refuse(group, f"block {number} is damaged or truncated")
+            if self._is_sparse and not packed:
+                yield _ZEROS
+                continue
             wide = min(BLOCK_COLUMNS, self.head.width_px - column * BLOCK_COLUMNS)
             try:
                 yield np.frombuffer(unpack(self.head.packing, packed, wide * column_bytes), np.uint8)
@@ -159,7 +148,7 @@ class StoreFile:
 
     def _pread(self, size: int, offset: int, group: int) -> bytes:
         try:
-            return os.pread(self._file, size, offset)
+            return os.pread(self._file, size, self._offset + offset)
         except OSError as error:
             first = self.head.first + group * self.head.group
             raise VideoUnreadable(self._path, first, f"cannot be read: {error.strerror or error}") from error
@@ -168,5 +157,87 @@ class StoreFile:
         raise VideoError(
             self._path,
             self.head.first + group * self.head.group,
-            f"the store file is corrupt ({why}): re-create it with v2v-prepare",
+            f"the store file is corrupt ({why}): {_REMEDY}",
         )
+
+
+class StoreFile(BlockReader):
+    """An open store file.
+
+    Args:
+        path: the file.
+        fingerprint: fingerprint of the expected source; "" accepts any.
+
+    Attributes:
+        head: the file's head.
+
+    Raises:
+        VideoUnreadable: it cannot be read.
+        VideoChanged: it was made from another source.
+        VideoError: it is not a store file, or its head is damaged.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], fingerprint: str = "") -> None:
+        path = os.fspath(path)
+        try:
+            file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # opening a FIFO must not block
+        except OSError as error:
+            raise VideoUnreadable(path, None, f"cannot be read: {error.strerror or error}") from error
+        try:
+            super().__init__(path, file)
+            if fingerprint not in ("", self.head.fingerprint):
+                made_of = self.head.fingerprint
+                raise VideoChanged(path, None, f"was made from another file: {made_of} instead of {fingerprint}")
+        except BaseException:
+            os.close(file)
+            raise
+
+    def __enter__(self) -> StoreFile:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        os.close(self._file)
+
+    @cached_property
+    def planes(self) -> frozenset[str]:
+        """Names of the planes of this version that the file has.
+
+        Raises:
+            VideoUnreadable, VideoError: see :meth:`plane`.
+        """
+        return frozenset(name for name, place in self._places.items() if place.version == PLANES[name].version)
+
+    def plane(self, name: str, start: int, count: int, cells: Window) -> npt.NDArray[Any]:
+        """Read a part of a plane.
+
+        Args:
+            name: one of :attr:`planes`.
+            start, count: ordinal of the first frame in the source, and number of frames.
+            cells: (top, left, rows, columns) in the plane of the stored rows, cells.
+
+        Returns:
+            [count, values, rows, columns].
+
+        Raises:
+            UsageError: the file does not hold a requested frame or cell.
+            VideoUnreadable: the system reports an error.
+            VideoError: the plane is damaged.
+        """
+        kind = PLANES[name]
+        stored = BlockReader(self._path, self._file, self._places[name].offset, is_sparse=True)
+        if stored.head != kind.head(self.head):
+            raise VideoError(self._path, None, f"the store file is corrupt (its plane {name}): {_REMEDY}")
+        window = kind.window(cells)
+        pictures = np.empty((count, *window[2:]), np.uint8)
+        stored.read(start, 1, window, pictures)
+        return kind.from_pictures(pictures, cells)
+
+    @cached_property
+    def _places(self) -> Mapping[str, PlanePlace]:
+        try:
+            places = read_footer(self._path, self._file)
+        except OSError as error:
+            raise VideoUnreadable(self._path, None, f"cannot be read: {error.strerror or error}") from error
+        return {name: place for name, place in places.items() if name in PLANES}

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import os
-from types import TracebackType
-from typing import BinaryIO
+import shutil
+import tempfile
+from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -12,43 +17,28 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_server.store.format import BLOCK_COLUMNS, BLOCK_ROWS, Head, block_check, pack_record
 from v2v_server.store.packing import Packing
+from v2v_server.store.planes import PLANES, PlanePlace, pack_footer
 
 
-class StoreWriter:
-    """Write the frames that a head announces. The file is a store file once it is closed without an error.
-
-    Memory: one group of frames, twice (see :func:`v2v_server.store.format.group_frames_for`), and the compressed blocks
-    of one group.
+class _BlockWriter:
+    """Write the pictures of one store file, the front of it last.
 
     Args:
-        path: the file; overwritten.
-        head: describes what is written.
-        packing: compression; its method is the head's.
-
-    Raises:
-        OSError: the file cannot be written; every call may raise it.
+        file: empty, and open for writing.
+        head, packing: see :class:`StoreWriter`.
+        is_sparse: leave out blocks of zeros.
     """
 
-    def __init__(self, path: str | os.PathLike[str], head: Head, packing: Packing) -> None:
+    def __init__(self, file: BinaryIO, head: Head, packing: Packing, *, is_sparse: bool = False) -> None:
         assert head.packing == packing.method
-        self._head = head
+        self._file, self._head, self._is_sparse = file, head, is_sparse
         self._pack = packing.packer()
         self._front = head.to_bytes()
         self._group = np.empty((min(head.group, head.count), head.rows, head.width_px), np.uint8)
         self._differences = np.empty(self._group[:, :BLOCK_ROWS].size, np.uint8)
         self._frames = 0
         self._table: list[bytes] = []
-        self._end = len(self._front) + head.groups * head.record_bytes
-        self._file: BinaryIO = open(path, "wb")  # noqa: SIM115 - closed by close()
-
-    @property
-    def bytes(self) -> int:
-        """Size of the file so far, bytes."""
-        return self._end
-
-    def fileno(self) -> int:
-        """Return the file descriptor."""
-        return self._file.fileno()
+        self.end = len(self._front) + head.groups * head.record_bytes
 
     def add(self, picture: npt.NDArray[np.uint8]) -> None:
         """Add the next frame: [rows, width] uint8.
@@ -78,15 +68,84 @@ class StoreWriter:
             view = packed.data
             column = band.size // head.width_px  # bytes of one column of pixels
             for left in range(0, head.width_px, BLOCK_COLUMNS):
-                blocks.append(self._pack(view[left * column : (left + BLOCK_COLUMNS) * column]))
+                block = view[left * column : (left + BLOCK_COLUMNS) * column]
+                is_empty = self._is_sparse and not np.frombuffer(block, np.uint8).any()
+                blocks.append(b"" if is_empty else self._pack(block))
         checks = [block_check(block, group, number) for number, block in enumerate(blocks)]
-        self._table.append(pack_record(head, group, self._end, [len(block) for block in blocks], checks))
-        self._file.seek(self._end)
+        self._table.append(pack_record(head, group, self.end, [len(block) for block in blocks], checks))
+        self._file.seek(self.end)
         self._file.write(b"".join(blocks))
-        self._end += sum(map(len, blocks))
+        self.end += sum(map(len, blocks))
+
+    def write_table(self) -> None:
+        """Write the table.
+
+        Raises:
+            UsageError: fewer frames were added than announced.
+        """
+        if self._frames != self._head.count:
+            raise UsageError(f"{self._frames} of {self._head.count} frames were written")
+        self._file.seek(len(self._front))
+        self._file.write(b"".join(self._table))
+        self._file.flush()
+
+    def write_front(self) -> None:
+        """Write the head, without which the file is not a store file."""
+        self._file.seek(0)
+        self._file.write(self._front)
+        self._file.flush()
+
+
+class StoreWriter:
+    """Write the frames that a head announces. The file is a store file once it is closed without an error.
+
+    Memory: one group of frames, twice (see :func:`v2v_server.store.format.group_frames_for`), and the compressed blocks
+    of one group; the same of each plane, whose files lie beside the file, without a name.
+
+    Args:
+        path: the file; overwritten.
+        head: describes what is written.
+        packing: compression; its method is the head's.
+        planes: names of the planes to write, of :data:`v2v_server.store.planes.PLANES`.
+
+    Raises:
+        OSError: the file cannot be written; every call may raise it.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], head: Head, packing: Packing, planes: Iterable[str] = ()) -> None:
+        self._files = ExitStack()
+        self._file: BinaryIO = self._files.enter_context(open(path, "wb"))  # noqa: SIM115 - closed by close()
+        self._luma = _BlockWriter(self._file, head, packing)
+        self._planes: dict[str, tuple[BinaryIO, _BlockWriter]] = {}
+        for name in planes:
+            file: BinaryIO = self._files.enter_context(tempfile.TemporaryFile(dir=Path(path).parent))  # noqa: SIM115
+            self._planes[name] = file, _BlockWriter(file, PLANES[name].head(head), packing, is_sparse=True)
+
+    @property
+    def bytes(self) -> int:
+        """Size of the file so far without its planes, bytes."""
+        return self._luma.end
+
+    def fileno(self) -> int:
+        """Return the file descriptor."""
+        return self._file.fileno()
+
+    def add(
+        self, picture: npt.NDArray[np.uint8], planes: Mapping[str, npt.NDArray[Any]] = MappingProxyType({})
+    ) -> None:
+        """Add the next frame: [rows, width] uint8, and the array of each plane.
+
+        Raises:
+            UsageError: it has another size, there are more frames than announced, or other planes.
+        """
+        self._luma.add(picture)
+        if planes.keys() != self._planes.keys():
+            raise UsageError(f"planes {sorted(planes)}: give {sorted(self._planes)}")
+        for name, array in planes.items():
+            self._planes[name][1].add(PLANES[name].to_picture(array))
 
     def close(self, *, lasting: bool = False) -> None:
-        """Write the table and then the head, without which the file is not a store file.
+        """Write the table, the planes, and then the head, without which the file is not a store file.
 
         Args:
             lasting: wait until the data is on disk.
@@ -94,17 +153,24 @@ class StoreWriter:
         Raises:
             UsageError: fewer frames were added than announced.
         """
-        with self._file as file:
-            if self._frames != self._head.count:
-                raise UsageError(f"{self._frames} of {self._head.count} frames were written")
-            file.seek(len(self._front))
-            file.write(b"".join(self._table))
-            file.flush()
-            file.seek(0)
-            file.write(self._front)
-            file.flush()
+        with self._files:
+            self._luma.write_table()
+            if self._planes:
+                self._append_planes()
+            self._luma.write_front()
             if lasting:
-                os.fsync(file.fileno())
+                os.fsync(self._file.fileno())
+
+    def _append_planes(self) -> None:
+        places = {}
+        self._file.seek(self._luma.end)
+        for name, (file, writer) in self._planes.items():
+            writer.write_table()
+            writer.write_front()
+            file.seek(0)
+            places[name] = PlanePlace(PLANES[name].version, self._file.tell(), writer.end)
+            shutil.copyfileobj(file, self._file)
+        self._file.write(pack_footer(places))
 
     def __enter__(self) -> StoreWriter:
         return self
@@ -112,4 +178,4 @@ class StoreWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
+        self._files.close()

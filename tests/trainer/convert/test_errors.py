@@ -15,11 +15,12 @@ import pytest
 from tests.trainer.convert import raw_forms
 from tests.trainer.convert.aedat4_file import write_aedat4
 from tests.trainer.convert.scene import scene
-from trainer.convert import cli, convert, text_events
-from trainer.convert.faery_reader import _errors_of_faery
-from trainer.convert.items import ConvertOptions, EventChunk, SensorSize
-from trainer.convert.text_events import read_text_events
+from trainer.convert import cli, convert
 from v2v_protocol.errors import UsageError
+from v2v_recordings import text_events
+from v2v_recordings.faery_reader import _errors_of_faery
+from v2v_recordings.items import ConvertOptions, EventChunk, SensorSize
+from v2v_recordings.text_events import read_text_events
 
 
 def ijrr(path: Path, **changes: bytes | None) -> Path:

@@ -14,11 +14,11 @@ from tests.trainer.convert import raw_forms
 from tests.trainer.convert.aedat4_file import write_aedat4
 from tests.trainer.convert.scene import HEIGHT, PERIOD_US, WIDTH, WINDOWS, Scene, expected_voxels, scene
 from trainer.convert import convert
-from trainer.convert.items import ConvertOptions, SensorSize
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.evaluation.windows import picture_windows, regular_windows
 from v2v_protocol.errors import UsageError
+from v2v_recordings.items import ConvertOptions, SensorSize
 
 Write = Callable[[Path, Scene], None]
 

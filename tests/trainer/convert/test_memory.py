@@ -10,7 +10,8 @@ import h5py
 import numpy as np
 import pytest
 
-from trainer.convert import convert, mvsec, text_events, writer
+from trainer.convert import convert, writer
+from v2v_recordings import mvsec, text_events
 
 
 def write_mvsec(path: Path, events: int) -> Path:

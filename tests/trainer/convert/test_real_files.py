@@ -9,11 +9,11 @@ import pytest
 
 from tests.trainer.conftest import WEIGHTS
 from trainer.convert import Converted, convert
-from trainer.convert.items import ConvertOptions, SensorSize
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.evaluation.windows import picture_windows, regular_windows
 from v2v_protocol.errors import UsageError
+from v2v_recordings.items import ConvertOptions, SensorSize
 
 EVENTS = WEIGHTS.parent / "events"
 

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trainer.convert import conversion
-from trainer.convert.conversion import FORMS, RawForm, convert, recognise
-from trainer.convert.items import ConvertOptions, EventChunk, Item, Picture, Progress, SensorSize
+from trainer.convert.conversion import convert
 from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.windows import picture_windows
+from v2v_protocol.errors import UsageError
+from v2v_recordings.forms import FORMS, RawForm, recognise
+from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, Progress, SensorSize
 
 
 def recognises(path: Path) -> bool:
@@ -46,5 +47,5 @@ def test_a_toy_form_is_recognised_and_converted(tmp_path: Path, monkeypatch: pyt
 
 def test_an_unknown_form_is_refused_with_a_list_of_forms(tmp_path: Path) -> None:
     (tmp_path / "raw.toy").write_text("")
-    with pytest.raises(conversion.UsageError, match="is not a known recording"):
+    with pytest.raises(UsageError, match="is not a known recording"):
         recognise(tmp_path / "raw.toy")

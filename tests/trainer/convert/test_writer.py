@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trainer.convert import writer as writer_module
-from trainer.convert.items import EventChunk, Item, Picture, SensorSize
 from trainer.convert.writer import RecordingWriter, Written
 from v2v_protocol.errors import UsageError
+from v2v_recordings.items import EventChunk, Item, Picture, SensorSize
 
 
 def chunk(times_ns: list[int], x: int = 0, y: int = 0) -> EventChunk:

@@ -6,10 +6,10 @@ import posixpath
 from collections.abc import Iterator
 from pathlib import Path
 
-from trainer.convert.archive import Archive
-from trainer.convert.items import ConvertOptions, Item, Picture, Progress, SensorSize
-from trainer.convert.text_events import NS_PER_UNIT, read_text_events
 from v2v_protocol.errors import UsageError
+from v2v_recordings.archive import Archive
+from v2v_recordings.items import ConvertOptions, Item, Picture, Progress, SensorSize
+from v2v_recordings.text_events import NS_PER_UNIT, read_text_events
 
 TIMES = "timestamps.txt"
 SHAPE = "shape.txt"

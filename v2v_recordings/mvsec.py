@@ -21,13 +21,15 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 
-from trainer.convert.items import ConvertOptions, EventChunk, FlowField, Item, Picture, Progress, SensorSize, to_ns
-from trainer.hdf5 import require_self_contained
 from v2v_protocol.errors import UsageError
+from v2v_recordings.items import ConvertOptions, EventChunk, FlowField, Item, Picture, Progress, SensorSize, to_ns
+
+if TYPE_CHECKING:
+    import h5py
 
 READ_EVENTS = 1 << 18
 
@@ -38,7 +40,7 @@ def recognises(path: Path) -> bool:
     Raises:
         UsageError: it is an HDF5 file, but damaged.
     """
-    if path.suffix not in (".hdf5", ".h5") or not h5py.is_hdf5(path):
+    if path.suffix not in (".hdf5", ".h5") or not _h5py(path).is_hdf5(path):
         return False
     with _open(path) as file:
         return "davis" in file
@@ -58,10 +60,20 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
             yield from _flow(file, truth, options.camera)
 
 
+def _h5py(path: Path) -> Any:
+    try:
+        import h5py
+    except ModuleNotFoundError as error:
+        raise UsageError(f"{path}: needs the package {error.name}: pip install h5py") from error
+    return h5py
+
+
 @contextlib.contextmanager
 def _open(path: Path) -> Iterator[h5py.File]:
     try:
-        with h5py.File(path, "r") as file:
+        with _h5py(path).File(path, "r") as file:
+            from v2v_recordings.hdf5 import require_self_contained
+
             require_self_contained(file, path)
             yield file
     except (OSError, RuntimeError, KeyError, ValueError) as error:  # h5py's errors, for truncated or damaged files

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from trainer.convert.items import ConvertOptions, EventChunk, Item, Picture, Progress, SensorSize
 from v2v_protocol.errors import UsageError
+from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, Progress, SensorSize
 
 AEDAT4_MAGIC = b"#!AER-DAT4"
 EVT_WORDS: dict[str, np.dtype[Any]] = {

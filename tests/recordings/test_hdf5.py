@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from tests.trainer.evaluation.h5_file import random_recording
-from trainer.convert import mvsec
 from trainer.evaluation.readers import Recording
-from trainer.hdf5 import require_self_contained
 from v2v_protocol.errors import UsageError
+from v2v_recordings import mvsec
+from v2v_recordings.hdf5 import require_self_contained
 
 
 @pytest.fixture

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from trainer.convert.faery_reader import read_prophesee
-from trainer.convert.items import ConvertOptions, EventChunk, Item, Picture, Progress, SensorSize
 from v2v_protocol.errors import UsageError
+from v2v_recordings.faery_reader import read_prophesee
+from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, Progress, SensorSize
 
 EVENT_ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 EVENT_PACKETS = "event_camera_msgs/msg/EventPacket"

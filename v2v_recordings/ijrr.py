@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from trainer.convert.archive import Archive
-from trainer.convert.items import ConvertOptions, Item, Picture, Progress, to_ns
-from trainer.convert.text_events import read_text_events
 from v2v_protocol.errors import UsageError
+from v2v_recordings.archive import Archive
+from v2v_recordings.items import ConvertOptions, Item, Picture, Progress, to_ns
+from v2v_recordings.text_events import read_text_events
 
 EVENTS = "events.txt"
 IMAGES = "images.txt"

@@ -14,8 +14,8 @@ from typing import IO
 import numpy as np
 import numpy.typing as npt
 
-from trainer.convert.items import EventChunk, SensorSize, to_ns
 from v2v_protocol.errors import UsageError
+from v2v_recordings.items import EventChunk, SensorSize, to_ns
 
 BLOCK_BYTES = 1 << 22
 COMMENT = re.compile(rb"^[ \t]*#[^\r\n]*", re.MULTILINE)

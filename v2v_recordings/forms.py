@@ -1,0 +1,55 @@
+"""List the known forms of recordings, and find which of them a path has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from v2v_protocol.errors import UsageError
+from v2v_recordings import bag, evaid, faery_reader, ijrr, mvsec
+from v2v_recordings.items import ConvertOptions, Item, Progress
+
+
+@dataclass(frozen=True)
+class RawForm:
+    """Describe a raw form.
+
+    Attributes:
+        title: description for the help text.
+        recognises: returns whether a path has this form, judged by the name and the first bytes only.
+        read: yields the items of a recording.
+        published_shift: how many events earlier the published conversion of this form pairs a picture.
+    """
+
+    title: str
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path, ConvertOptions, Progress], Iterator[Item]]
+    published_shift: int = 0
+
+
+FORMS = {
+    "ijrr": RawForm(
+        "IJRR: events.txt, images.txt, PNGs in a zip or folder; or one .txt or .csv", ijrr.recognises, ijrr.read
+    ),
+    "evaid": RawForm("EVAID-R: event/*.txt, gt/, timestamps.txt in a zip or folder", evaid.recognises, evaid.read),
+    "mvsec": RawForm("MVSEC: *_data.hdf5", mvsec.recognises, mvsec.read),
+    "bag": RawForm("ROS 1 bag (HQF, IJRR, MVSEC)", bag.recognises, bag.read, published_shift=1),
+    "aedat4": RawForm("aedat4 of a DAVIS", faery_reader.recognises_aedat4, faery_reader.read_aedat4),
+    "prophesee": RawForm("EVT 2, 3 (.raw), DAT", faery_reader.recognises_prophesee, faery_reader.read_prophesee),
+}
+
+
+def recognise(path: Path) -> str:
+    """Return the key of FORMS for a file or folder.
+
+    Raises:
+        UsageError: it is missing, or has a form that is not in FORMS.
+    """
+    if not path.exists():
+        raise UsageError(f"no file or folder {path}")
+    for name, form in FORMS.items():
+        if form.recognises(path):
+            return name
+    forms = "; ".join(form.title for form in FORMS.values())
+    raise UsageError(f"{path} is not a known recording. Known forms: {forms}. Give the form with --form")

@@ -1,0 +1,163 @@
+"""Planes: named arrays beside the luma of a store file, each optional, with an entry for every frame.
+
+    store file of the luma       as without planes; a reader that needs no plane reads nothing else
+    store file of each plane     of its bytes, arranged as pictures
+    footer                       msgpack {name: [version, offset, bytes]}
+    its length, check and magic  4 + 8 + 8 bytes
+
+A plane has one cell for every square of ``cell_px`` pixels of the stored rows, and some values in each cell. A plane of
+another version is treated as missing. A block in which every value is zero takes no space and no time.
+
+To add a plane, add its kind to :data:`PLANES`, and pass its arrays to :meth:`v2v_server.store.writer.StoreWriter.add`.
+:func:`v2v_server.store.reader.StoreFile.plane` reads a part of it.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import msgpack
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.errors import UsageError, VideoError
+from v2v_server.store.format import BLOCK_ROWS, Head, check, group_frames_for
+from v2v_server.video.orientation import Window
+
+_MAGIC = b"V2VPLAN1"
+_SUFFIX = struct.Struct("<IQ8s")
+_LARGEST_FOOTER_BYTES = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneKind:
+    """How a plane is stored.
+
+    Attributes:
+        version: to be raised when the same pictures get other values.
+        dtype: of a value, in little-endian order.
+        values: values of a cell; together at most 32 bytes.
+        cell_px: side of a cell, pixels.
+    """
+
+    version: int
+    dtype: str
+    values: int
+    cell_px: int
+
+    def shape(self, rows: int, width_px: int) -> tuple[int, int, int]:
+        """Return the shape of a frame's array: values, rows and columns of cells."""
+        return self.values, -(-rows // self.cell_px), -(-width_px // self.cell_px)
+
+    @property
+    def _cell_bytes(self) -> int:
+        return self.values * np.dtype(self.dtype).itemsize
+
+    @property
+    def _band(self) -> int:
+        """Rows of cells in a row of blocks."""
+        return BLOCK_ROWS // self._cell_bytes
+
+    def head(self, luma: Head) -> Head:
+        """Return the head of the plane's store file."""
+        _, rows, columns = self.shape(luma.rows, luma.width_px)
+        rows = -(-rows // self._band) * BLOCK_ROWS
+        return replace(
+            luma, height_px=rows, width_px=columns, top=0, rows=rows, group=group_frames_for(rows, columns), index=b""
+        )
+
+    def to_picture(self, array: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+        """Arrange the bytes of one frame as a picture whose rows of blocks hold all bytes of some rows of cells.
+
+        Args:
+            array: [values, rows, columns].
+
+        Raises:
+            UsageError: the number of values or the dtype is another one.
+        """
+        if array.shape[0] != self.values or array.dtype != np.dtype(self.dtype):
+            raise UsageError(f"a plane of {array.dtype}{list(array.shape)}: give {self.values} values of {self.dtype}")
+        _, rows, columns = array.shape
+        bands = -(-rows // self._band)
+        padded = np.zeros((self.values, bands * self._band, columns), self.dtype)
+        padded[:, :rows] = array
+        parts = padded.view(np.uint8).reshape(self.values, bands, self._band, columns, -1)
+        picture = np.zeros((bands, BLOCK_ROWS, columns), np.uint8)
+        used = picture[:, : self._cell_bytes * self._band]
+        used[...] = parts.transpose(1, 0, 4, 2, 3).reshape(used.shape)
+        return picture.reshape(-1, columns)
+
+    def window(self, cells: Window) -> Window:
+        """Return the part of the picture that holds some cells (top, left, rows, columns)."""
+        top, left, rows, columns = cells
+        first, end = top // self._band, (top + rows - 1) // self._band + 1
+        return first * BLOCK_ROWS, left, (end - first) * BLOCK_ROWS, columns
+
+    def from_pictures(self, pictures: npt.NDArray[np.uint8], cells: Window) -> npt.NDArray[Any]:
+        """Return the cells of a window of frames: [n, values, rows, columns]."""
+        count, size = len(pictures), np.dtype(self.dtype).itemsize
+        top, _, rows, columns = cells
+        bands = pictures.reshape(count, -1, BLOCK_ROWS, columns)[:, :, : self._cell_bytes * self._band]
+        parts = bands.reshape(count, bands.shape[1], self.values, size, self._band, columns)
+        array = np.ascontiguousarray(parts.transpose(0, 2, 1, 4, 5, 3)).view(self.dtype)
+        first = top % self._band
+        return array.reshape(count, self.values, -1, columns)[:, :, first : first + rows]
+
+
+PLANES: Mapping[str, PlaneKind] = MappingProxyType(
+    {
+        # Motion to each frame from the one before (v2v_server.motion), x and y; zero for the first frame of the file.
+        "motion": PlaneKind(version=1, dtype="<i2", values=2, cell_px=4),
+    }
+)
+"""The kinds of planes, by name."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanePlace:
+    """Version of a plane, and where its store file lies."""
+
+    version: int
+    offset: int
+    bytes: int
+
+
+def pack_footer(places: Mapping[str, PlanePlace]) -> bytes:
+    """Return the end of a file with planes."""
+    body = msgpack.packb({name: [place.version, place.offset, place.bytes] for name, place in places.items()})
+    return body + _SUFFIX.pack(len(body), check(body, 0), _MAGIC)
+
+
+def read_footer(path: str, file: int) -> dict[str, PlanePlace]:
+    """Return the places of the planes of an open store file, by name; empty if it has none.
+
+    Raises:
+        VideoError: the footer is damaged.
+        OSError: it cannot be read.
+    """
+    end = os.fstat(file).st_size - _SUFFIX.size
+    suffix = os.pread(file, _SUFFIX.size, max(0, end))
+    if len(suffix) < _SUFFIX.size or not suffix.endswith(_MAGIC):
+        return {}
+    length, expected, _ = _SUFFIX.unpack(suffix)
+    body = os.pread(file, length, end - length) if length <= min(_LARGEST_FOOTER_BYTES, end) else b""
+    try:
+        if len(body) != length or check(body, 0) != expected:
+            raise ValueError("damaged")
+        return {str(name): _place(value, end - length) for name, value in msgpack.unpackb(body).items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise VideoError(
+            path, None, f"the store file is corrupt (its list of planes: {error}): re-create it with v2v-prepare"
+        ) from error
+
+
+def _place(value: Any, end: int) -> PlanePlace:
+    version, offset, size = value
+    if not all(type(number) is int for number in value) or not 0 <= offset <= offset + size <= end:
+        raise ValueError(f"place {value!r:.80}")
+    return PlanePlace(version, offset, size)
