@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tests.oracles import extremes_in_time as in_time
 from tests.oracles.balance import Camera, balance, imbalance, trace_of
 from tests.oracles.dense import trace
-from tests.oracles.extremes_in_time import excess_of_divided_steps, steps_of_any_duration
+from v2v_protocol.bounds import most_events
 from v2v_protocol.errors import RecipeError, UsageError
-from v2v_protocol.recipe import Recipe, most_events, preset
+from v2v_protocol.recipe import Recipe, preset
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.draw import draw, noise_key_of_seed
 from v2v_server.simulation.intensity import log_table, log_table_float64
@@ -333,7 +334,7 @@ def divided_rows() -> list[Row]:
     }
 
     def check(setting: tuple[Any, ...]) -> Finding:
-        return Finding(*excess_of_divided_steps(*setting))
+        return Finding(*in_time.excess_of_divided_steps(*setting))
 
     quantity = "more than a threshold left, log units"
     return [Row(name, "counted", quantity, partial(check, setting)) for name, setting in asked.items()]
@@ -384,7 +385,9 @@ def rows() -> list[Row]:
         Row("more than float64 can count", "refused", "calls not refused", beyond_float64),
         Row("recipes beyond float64", "refused", "calls not refused", recipe_beyond_float64),
         *divided_rows(),
-        Row("steps of 1 us and 1 h", "counted", "violations", lambda: Finding(steps_of_any_duration(), 0.0)),
+        Row("steps of 1 us and 1 h", "counted", "violations", lambda: Finding(in_time.steps_of_any_duration(), 0.0)),
+        Row("time stamps of any kind", "counted", "violations", lambda: Finding(in_time.any_time_stamps(), 0.0)),
+        Row("float16 above 2,048 events", "counted", wrong, lambda: Finding(in_time.large_float16(), 0.0)),
         Row("table of gamma 4, eps 0.1", "counted", "falls of log intensity", table_never_falls),
     ]  # fmt: skip
 

@@ -26,7 +26,7 @@ from v2v_server.simulation.view import apply_view
 from v2v_server.store.clips import clips_of
 from v2v_server.tradeoff.errors import Tally, Voxels, compare
 from v2v_server.video.collect import Cut
-from v2v_server.worker.produce import decode_for, plan_sample
+from v2v_server.worker.produce import decode_for, plan_sample, step_durations
 
 THRESHOLDS = (0.05, 0.2, 0.5, 1.0, 2.0)
 
@@ -42,17 +42,19 @@ class CameraView:
         frames: [n, H, W] uint8, after the view.
         params: the draw.
         recipe: of the draw.
+        step_seconds: duration of each step; None if the recipe does not use it.
         other_params: another sample's draw, for scale.
     """
 
     frames: npt.NDArray[np.uint8]
     params: SampleParams
     recipe: Recipe
+    step_seconds: npt.NDArray[np.float64] | None
     other_params: SampleParams
 
     def voxels(self, params: SampleParams) -> Voxels:
         """Return voxels [T, B, H, W] float32 of a camera with these thresholds, noise and key."""
-        return simulate_clip(self.frames, params, self.recipe, "float32").voxels
+        return simulate_clip(self.frames, params, self.recipe, "float32", self.step_seconds).voxels
 
 
 def seen(root: Path, lease: Lease) -> CameraView:
@@ -61,7 +63,11 @@ def seen(root: Path, lease: Lease) -> CameraView:
     recipe = decoded.plan.spec.recipe
     params = dataclasses.replace(decoded.plan.params, hot_pixel_count=0)
     return CameraView(
-        apply_view(decoded.clip.frames, params, recipe), params, recipe, plan_sample(lease, lease.indices[1]).params
+        apply_view(decoded.clip.frames, params, recipe),
+        params,
+        recipe,
+        step_durations(lease, decoded),
+        plan_sample(lease, lease.indices[1]).params,
     )
 
 
