@@ -109,6 +109,12 @@ def test_lookup_by_rank_equals_the_list(lengths: list[int], most: int, voxels: i
         assert start + recipe.frames_needed <= entry.frames
 
 
+def _divided(ends: list[int]) -> bytes:
+    """Return pieces of which every other one is black, from the first on; without ends, a video that fades."""
+    parts = pieces(*((end, 0 if at % 2 else Flag.BLACK) for at, end in enumerate(ends) if end))
+    return encoded_pieces(parts if ends else pieces((9, Flag.FADE)), max(ends, default=9))
+
+
 @given(st.lists(_runs, max_size=8), st.integers(1, 6), _blocks)
 def test_lookup_by_rank_equals_the_list_between_shot_boundaries(
     stretches: list[list[tuple[int, int]]], most: int, block: int
@@ -118,10 +124,7 @@ def test_lookup_by_rank_equals_the_list_between_shot_boundaries(
     for number, each in enumerate(stretches):
         ends = list(itertools.accumulate(itertools.chain.from_iterable(each)))
         runs = tuple(zip(ends[::2], ends[1::2], strict=True))
-        parts = pieces(*((end, 0 if at % 2 else Flag.BLACK) for at, end in enumerate(ends) if end))
-        frames = max(ends, default=9)
-        divided = encoded_pieces(parts if runs else pieces((9, Flag.FADE)), frames)
-        entry = dataclasses.replace(video(f"v{number}", frames), pieces=divided)
+        entry = dataclasses.replace(video(f"v{number}", max(ends, default=9)), pieces=_divided(ends))
         starts = [
             start
             for first, end in runs
@@ -149,7 +152,8 @@ def test_grids_of_a_duration_have_as_many_frames_as_the_rate_of_their_video_says
     for number, (each, rate) in enumerate(stretches):
         ends = list(itertools.accumulate(itertools.chain.from_iterable(each)))
         runs = tuple(zip(ends[::2], ends[1::2], strict=True))
-        entry = dataclasses.replace(video(f"v{number}", max(ends, default=9), rate=rate), runs=runs)
+        divided = _divided(ends)
+        entry = dataclasses.replace(video(f"v{number}", max(ends, default=9), rate=rate), pieces=divided)
         videos.append(entry)
         if math.isnan(rate) or (steps := max(1, math.floor(seconds * rate / stride + 0.5))) > MOST_STEPS_PER_GRID:
             continue
