@@ -3,7 +3,8 @@
 The change of a step is the sum of the squared changes of the means of 8 x 8 blocks, of those that change by more than a
 grey level. Means of blocks hold little coder noise, and squares give most weight to moving edges. A step is a duplicate
 if its change is at most 1/25 (so 1/5 of the amplitude) of the largest one of the four steps before it, and of the four
-after it. Where motion comes to rest or begins, only one side is that large; beside a cut, too.
+after it. Where motion comes to rest or begins, only one side is that large; beside a cut, too. Near the first and the
+last frame one side is enough.
 
 Coders with few bits blend a repeat with its neighbours. So 1/5 (almost half of the amplitude) suffices where repeats
 come in a regular pattern.
@@ -16,7 +17,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.defects.defect import Spans
+Spans = tuple[tuple[int, int], ...]
+"""(first frame, frame after the last) of each stretch."""
 
 _RATIO = 25
 _BLENDED_RATIO = 5
@@ -55,7 +57,8 @@ def duplicated(changes: Sequence[int], blocks: int) -> npt.NDArray[np.bool_]:
     moving = np.zeros(len(changes), np.int64)
     for at in range(len(changes)):
         before, after = changes[max(0, at - _REACH) : at], changes[at + 1 : at + 1 + _REACH]
-        moving[at] = min(max(before, default=0), max(after, default=0))
+        sides = max(before, default=0), max(after, default=0)
+        moving[at] = min(sides) if len(before) == len(after) else max(sides)
     is_moving, each = moving >= _LEAST_CHANGE * blocks, np.array(changes, np.int64)
     blended = is_moving & (_BLENDED_RATIO * each <= moving)
     if blended.sum() >= 2 * _LEAST_COUNT and _period(blended):
@@ -66,12 +69,12 @@ def duplicated(changes: Sequence[int], blocks: int) -> npt.NDArray[np.bool_]:
 
 
 def is_cut(changes: Sequence[int], step: int) -> bool:
-    """Return whether a step changes at least twice as much (in amplitude) as all but two of the steps around it.
+    """Return whether a step changes at least twice as much (in amplitude) as four fifths of the steps around it.
 
-    A shot boundary is found by the median of the steps around it, which duplicates make small.
+    A shot boundary is found by the median of the steps around it, which repeats make small.
     """
     around = sorted([*changes[max(0, step - _CUT_REACH) : step], *changes[step + 1 : step + 1 + _CUT_REACH]])
-    return len(around) < _CUT_REACH or changes[step] >= 4 * around[-3]
+    return len(around) < _CUT_REACH or changes[step] >= 4 * around[-1 - len(around) // 5]
 
 
 def pattern_of(flags: npt.NDArray[np.bool_]) -> str:

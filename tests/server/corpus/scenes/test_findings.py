@@ -15,13 +15,14 @@ from skimage import data
 
 from tests.clips import write_clip
 from v2v_protocol.errors import VideoError
-from v2v_server.defects.defect import BARS, BLACK, CUTS, DUPLICATES, STILL, Defect, Sides
-from v2v_server.defects.finder import find_defects
+from v2v_server.corpus.scenes.analysis import analyse
+from v2v_server.corpus.scenes.findings import BARS, BLACK, CUTS, DUPLICATES, STILL, Defect, defects_of
+from v2v_server.corpus.scenes.scene import Sides
 from v2v_server.video.decode import stream_luma
 from v2v_server.video.probe import probe
 
 HEIGHT, WIDTH, FRAMES = 144, 208, 96
-FOLDER = Path(os.environ.get("V2V_TEST_VIDEOS", Path(__file__).parents[4] / "shared" / "data" / "videos"))
+FOLDER = Path(os.environ.get("V2V_TEST_VIDEOS", Path(__file__).parents[5] / "shared" / "data" / "videos"))
 Film = npt.NDArray[np.uint8]
 
 BIT_RATES = {"fine": ({"crf": "20"}, 3), "coarse": ({"crf": "36"}, 0)}
@@ -49,9 +50,9 @@ def found(luma: Film, folder: Path, rate: str) -> dict[str, Defect]:
     path = write_clip(
         folder / "clip.mp4", luma, gop=48, b_frames=b_frames, options={**options, "preset": "veryfast"}, full_range=True
     )
-    count, defects = find_defects(stream_luma(path, probe(path).index, 0, len(luma)))
-    assert count == len(luma)
-    return {defect.kind: defect for defect in defects}
+    scene = analyse(stream_luma(path, probe(path).index, 0, len(luma)))
+    assert scene.end == len(luma)
+    return {defect.kind: defect for defect in defects_of(scene)}
 
 
 def repeated(luma: Film, source: Callable[[int], int]) -> Film:
@@ -127,7 +128,7 @@ def test_cuts(rate: str, tmp_path: Path) -> None:
 
 def test_fast_motion_with_repeats_makes_no_cuts() -> None:
     """Half of the steps are still, so the others stand out from the median."""
-    _, defects = find_defects(repeated(film(frames=4 * FRAMES)[::4], lambda at: at // 2))
+    defects = defects_of(analyse(repeated(film(frames=4 * FRAMES)[::4], lambda at: at // 2)))
     assert [defect.kind for defect in defects] == [DUPLICATES]
 
 
@@ -154,9 +155,8 @@ def test_black_stretches(rate: str, tmp_path: Path) -> None:
 
 
 def test_frames_without_anything_to_compare() -> None:
-    assert find_defects([]) == (0, ())
-    assert find_defects(film()[:1]) == (1, ())
-    assert find_defects(np.zeros((3, 5, 6), np.uint8)) == (3, ())
+    for luma in (film()[:0], film()[:1], np.zeros((3, 5, 6), np.uint8)):
+        assert defects_of(analyse(luma)) == ()
 
 
 TRUE_DEFECTS = {
@@ -177,7 +177,7 @@ def test_false_alarms_on_real_clips() -> None:
         try:
             index = probe(path).index
             count = min(len(index), 160)
-            _, defects = find_defects(stream_luma(path, index, (len(index) - count) // 2, count))
+            defects = defects_of(analyse(stream_luma(path, index, (len(index) - count) // 2, count)))
         except VideoError:
             continue  # damaged on purpose
         said |= {(path.name, defect.kind) for defect in defects}
