@@ -83,7 +83,7 @@ def load_kernels() -> None:
 
 @contextmanager
 def _without_scipy() -> Iterator[None]:
-    """Make numba find no SciPy. It would import it for linear algebra, which no kernel uses, in a quarter of the time."""
+    """Make numba find no SciPy. It imports it for linear algebra, which no kernel uses, in a quarter of the time."""
     if "scipy" in sys.modules:
         yield
         return
