@@ -66,7 +66,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     encoding.add_argument(
         "--size",
         choices=tuple(SIZES),
-        help=f"lossless: {DEFAULT_SIZE} (default), or fast: a third larger, reads faster",
+        help=f"lossless: {DEFAULT_SIZE} (default), fast: a third larger, reads faster, or raw: "
+        "not compressed, reads fastest from memory",
     )
     encoding.add_argument(
         "--planes", choices=tuple(MADE_PLANES), action="append", default=[],
