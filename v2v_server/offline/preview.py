@@ -30,8 +30,9 @@ from v2v_server.motion.prediction import Prediction
 from v2v_server.offline.motion import WholePictures, describe_loss, moving_seeds, predicted_loss, quiet_voxels
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
-from v2v_server.store.clips import clips_of
+from v2v_server.store.clips import clips_of, signal_of
 from v2v_server.video.collect import Cut
+from v2v_server.video.luma import SDR
 
 KINDS = (".png", ".mp4", ".gif", ".html")
 _SMALLEST_CROP_PX = 16
@@ -170,11 +171,23 @@ def _camera(
     arrays = ("voxels", "frames", "flow") if with_flow else ("voxels", "frames")
     made = Remaker(catalogue, stream, arrays).made(shot.seed, 0, 0)
     provenance = made.sample.provenance
+    if note := _signal_note(catalogue, provenance, stream.recipe):
+        notes.setdefault(note, []).append(title)
     whole = _whole_picture(catalogue, provenance)
     camera = Camera.of(made.sample.arrays, provenance, title, stream.recipe, whole)
     quiet_grids = quiet_voxels(made).reshape(-1, *camera.voxels.shape[1:])
     quiet = dataclasses.replace(camera, voxels=quiet_grids[camera.lead_voxels :])
     return dataclasses.replace(camera, quiet=quiet.rates), predicted_loss(made)
+
+
+def _signal_note(catalogue: Catalogue, provenance: Provenance, recipe: Recipe) -> str:
+    """Return what the video states about its levels, and whether the recipe uses it; "" for 8 bits of SDR."""
+    id = provenance.video
+    with catalogue.source.open_local(id, provenance.fingerprint) as path:
+        signal = signal_of(path, catalogue.frame_index(id))
+    if signal == SDR or recipe.light == "declared":
+        return "" if signal == SDR else f"{id} has {signal}"
+    return f"{id} has {signal}, and is read as {SDR}: --set light=declared uses what it has"
 
 
 def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[np.uint8]:

@@ -77,7 +77,9 @@ def _activities(root: Path, lease: Lease) -> list[tuple[SampleParams, _Activity]
     for decoded in decode_for(lease, lease.indices, Folder(root)):
         recipe = decoded.plan.spec.recipe
         params = dataclasses.replace(decoded.plan.params, hot_pixel_count=0)
-        voxels, _ = simulate_clip(apply_view(decoded.clip.frames, params, recipe), params, recipe, "float32")
+        signal = decoded.clip.signal
+        view = apply_view(decoded.clip.frames, params, recipe, signal)
+        voxels, _ = simulate_clip(view, params, recipe, "float32", signal=signal)
         events = np.abs(voxels).reshape(-1, *voxels.shape[2:])
         # Every fourth pixel of every fourth row: the same coefficient at a sixteenth of the memory.
         made.append((params, (events[:, ::4, ::4].copy(), events.sum(axis=(1, 2)))))
