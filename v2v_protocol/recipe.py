@@ -56,7 +56,7 @@ SMALLEST_THRESHOLD_SHARE = 0.25
 """Lower limit of a pixel's threshold under mismatch, as a share of the nominal threshold."""
 LARGEST_NORMAL = 6.56
 """No noise deviates by more standard deviations (``v2v_server.simulation.noise``)."""
-LATER_FIELDS = ("grids_per_frame", "light")
+LATER_FIELDS = ("grids_per_frame", "max_boxes", "light")
 """Fields that the plain form leaves out at their defaults, so that older digests hold."""
 BRIGHTEST = 50.0
 """Upper limit of light where a recipe uses the transfer that a video states; white is 1. PQ reaches 49.3."""
@@ -83,6 +83,9 @@ class Recipe:
     lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
     lead_voxels: int = whole(0, 0, 1, "1 adds one voxel grid before the first (ERAFT)")
     frame_stride: int = whole(1, 1, 1000, "use every n-th frame, as if the video had 1/n of its frame rate")
+    max_boxes: int = whole(
+        64, 1, 4096, "most boxes of a frame, if boxes are requested; the smallest ones beyond it are left out"
+    )
 
     crop_height_px: int = whole(128, 1, LARGEST_SIDE_PX, "height of the random crop", unit="px", group="View")
     crop_width_px: int = whole(128, 1, LARGEST_SIDE_PX, "width of the random crop", unit="px")
@@ -288,10 +291,8 @@ class Recipe:
         low, high = self.log_eps
         if low == high:
             values["log_eps"] = low
-        defaults = settings_of(Recipe)
-        return {
-            name: value for name, value in values.items() if name not in LATER_FIELDS or value != defaults[name].default
-        }
+        later = {name: settings_of(Recipe)[name].default for name in LATER_FIELDS}
+        return {name: value for name, value in values.items() if name not in later or value != later[name]}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:

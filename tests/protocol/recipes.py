@@ -48,6 +48,7 @@ recipes = st.builds(
     lead_frames=st.integers(0, 1),
     lead_voxels=st.integers(0, 1),
     frame_stride=st.integers(1, 3),
+    max_boxes=st.integers(1, 4096),
     crop_height_px=st.integers(1, 16_384),
     crop_width_px=st.integers(1, 16_384),
     resize_scale=_range(0.01, 100.0),

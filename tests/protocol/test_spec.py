@@ -31,6 +31,7 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "pause_probability": 0.01,
     "pause_stay_probability": 0.5,
     "frame_stride": 2,
+    "max_boxes": 9,
     "contrast_probability": 0.1,
     "contrast_scale": [1.0, 2.0],
     "gamma": 1.0,
@@ -65,6 +66,8 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
     "flow_margin_px": -1,
     "substep_px": 1.0,
     "scene": "auto",
+    "keep_defects": "bars,cuts",
+    "still_share": 0.5,
 }
 
 

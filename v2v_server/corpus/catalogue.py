@@ -197,7 +197,8 @@ class Catalogue:
     @property
     def facts(self) -> CorpusFacts:
         """What is known in memory: all that a server's dispatcher needs."""
-        return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars)
+        has_colour = self.prepared is None
+        return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars, has_colour)
 
     def part(self) -> CorpusPart:
         """Return what the status says of it."""
@@ -243,9 +244,13 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
         IndexUnreadable: the index cannot be read at the moment.
         V2VError: the index of this video is damaged, or belongs to another file.
     """
-    video, start, count = lease.video, lease.start_frame, spec.recipe.frames_needed
-    scene = catalogue.scene(video).slice(start, count).to_bytes() if spec.scene != "off" else b""
-    return replace(lease, frame_index=catalogue.frame_index_bytes(video, start, count), scene=scene)
+    video, start, count, part = lease.video, lease.start_frame, spec.recipe.frames_needed, b""
+    if spec.scene != "off":
+        scene = catalogue.scene(video)
+        if "duplicates" not in spec.kept_defects:
+            count = int(scene.frames_from(start, count)[-1]) + 1 - start
+        part = scene.slice(start, count).to_bytes()
+    return replace(lease, frame_index=catalogue.frame_index_bytes(video, start, count), scene=part)
 
 
 def open_catalogue(

@@ -11,7 +11,7 @@ from typing import overload
 from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import sidecar_endings
 from v2v_server.corpus.index.columns import CHUNK, NO_STRINGS, VideoTable
-from v2v_server.corpus.scenes.runs import Runs, SplitVideos
+from v2v_server.corpus.scenes.pieces import SplitVideos
 from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.video.rows import Rows
 
@@ -31,8 +31,8 @@ class VideoEntry:
         frames_per_second: average rate; NaN where unknown.
         codec: FFmpeg's name of the format.
         threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
-        runs: (first frame, frame after the last) of each stretch without a shot boundary and with something to see;
-            None where the catalogue was opened without ``scene``.
+        pieces: its pieces, see :func:`v2v_server.corpus.scenes.pieces.encoded_pieces`; None where the catalogue was
+            opened without ``scene``.
     """
 
     id: str
@@ -44,7 +44,7 @@ class VideoEntry:
     codec: str
     threshold_pos: float | None = None
     threshold_neg: float | None = None
-    runs: Runs | None = None
+    pieces: bytes | None = None
 
 
 class Videos(Sequence[VideoEntry]):
@@ -53,7 +53,7 @@ class Videos(Sequence[VideoEntry]):
     Args:
         table: the usable rows, sorted by id.
         thresholds: (positive, negative) of videos that have some, by number.
-        split: the videos whose usable frames are not one run of all; None where that is unknown.
+        split: the videos that are divided into pieces; None where that is unknown.
 
     Attributes:
         ids, fingerprints, frames, width_px, height_px, interlaced: columns, one value for each video.
@@ -117,9 +117,6 @@ class Videos(Sequence[VideoEntry]):
         number = range(len(self))[at]
         record = self._table.row(number)
         pos, neg = self._thresholds.get(number, NO_THRESHOLDS)
-        runs = None
-        if self.split is not None and (runs := self.split.runs(number)) is None:
-            runs = ((0, record.frames),)
         return VideoEntry(
             id=record.id,
             fingerprint=record.fingerprint,
@@ -130,8 +127,11 @@ class Videos(Sequence[VideoEntry]):
             codec=record.codec,
             threshold_pos=pos,
             threshold_neg=neg,
-            runs=runs,
+            pieces=None if self.split is None else self.split.encoded(number),
         )
+
+
+COLOUR_REMEDY = "serve the videos that they were prepared from"
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +144,7 @@ class CorpusFacts:
         digest: names this snapshot.
         scene_digest: names this snapshot together with the statistics of its videos; None without them.
         sidecars: the files beside the videos, by ending.
+        has_colour: whether the videos were catalogued with their colour.
     """
 
     videos: Sequence[VideoEntry]
@@ -151,6 +152,18 @@ class CorpusFacts:
     digest: str
     scene_digest: str | None
     sidecars: Mapping[str, Sidecars] = field(default_factory=dict)
+    has_colour: bool = True
+
+    def require_arrays(self, arrays: tuple[str, ...]) -> None:
+        """Check that the videos have what these arrays are made from.
+
+        Raises:
+            UsageError: they have no colour.
+        """
+        if "frames_rgb" in arrays and not self.has_colour:
+            raise UsageError(
+                "arrays: frames_rgb needs colour, which these prepared videos do not have: " + COLOUR_REMEDY
+            )
 
     def sidecars_of(self, video: str, arrays: tuple[str, ...]) -> dict[str, str]:
         """Return the fingerprints of a video's sidecars that these arrays are made from, by ending."""

@@ -2,7 +2,7 @@
 
 A sequence is a run of consecutive frames of one video. The sequences of a video start at frame 0, L, 2L ... while
 start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L = frames per sequence). With scene
-"auto" the same holds for each stretch of the video between shot boundaries in which there is something to see.
+"auto" the same holds for each run of the video (:mod:`v2v_server.schedule.runs`).
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.scenes.runs import SplitVideos
+from v2v_server.corpus.scenes.pieces import SplitVideos
+from v2v_server.corpus.scenes.scene import NO_BARS, Sides
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.corpus.videos import Videos as CatalogueVideos
+from v2v_server.schedule.runs import Cleaning, Runs, SplitSequences
 from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.rows import Rows
 
@@ -53,7 +55,7 @@ class Columns:
         frames: int64 [N], frames of each video.
         size: int32 [N], index into ``first_of_size``.
         first_of_size: for each picture size, the first video that has it.
-        split: the videos whose usable frames are not one run of all; None if runs are unknown.
+        split: the videos that are divided into pieces; None if pieces are unknown.
     """
 
     def __init__(self, videos: Videos) -> None:
@@ -72,13 +74,13 @@ def _sizes(height_px: npt.NDArray[np.integer], width_px: npt.NDArray[np.integer]
 
 
 def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], SplitVideos | None]:
-    """Return frames, sizes, and the videos with shot boundaries."""
+    """Return frames, sizes, and the videos that are divided into pieces."""
     frames, heights, widths = (
         np.array([getattr(video, name) for video in videos], np.int64) for name in ("frames", "height_px", "width_px")
     )
     sizes = _sizes(heights, widths)
-    runs = [video.runs for video in videos if video.runs is not None]
-    return frames, sizes, SplitVideos.of(frames, runs) if len(runs) == len(videos) else None
+    pieces = [video.pieces for video in videos if video.pieces is not None]
+    return frames, sizes, SplitVideos.of(pieces) if len(pieces) == len(videos) else None
 
 
 class SequenceTable:
@@ -90,7 +92,7 @@ class SequenceTable:
     Args:
         videos: the catalogue's entries, in its order.
         rows: the usable rows of each picture.
-        spec: determines the frames in a sequence, the size of the crop, and whether shot boundaries count.
+        spec: determines the frames in a sequence, the size of the crop, and what is done about defects.
         columns: columns of the videos; None computes them.
 
     Attributes:
@@ -161,7 +163,7 @@ class SequenceTable:
         stride = self._spec.recipe.frames_per_sequence
         return VideoSequence(self._all[first + at], place * stride if start is None else start)
 
-    def _count(self, first: int, end: int) -> tuple[npt.NDArray[np.int64], _CutSequences | None]:
+    def _count(self, first: int, end: int) -> tuple[npt.NDArray[np.int64], SplitSequences | None]:
         """Count the sequences of each of the videos ``first`` .. ``end`` - 1."""
         columns, spec = self._columns, self._spec
         counts = (columns.frames[first:end] - spec.recipe.frames_needed) // spec.recipe.frames_per_sequence + 1
@@ -169,60 +171,15 @@ class SequenceTable:
         counts *= self._suits[columns.size[first:end]]
         if spec.scene == "off" or columns.split is None:
             return counts, None
-        cut = _between(columns.split, first, end)
-        sequences = _CutSequences(cut, counts[cut.numbers - first], spec)
-        counts[cut.numbers - first] = sequences.counts
+        split = columns.split.between(first, end)
+
+        def suits(size: int, sides: Sides) -> bool:
+            return _too_small(self._all[columns.first_of_size[size]], self._rows, spec.recipe, sides) is None
+
+        whole, sizes = counts[split.numbers - first], columns.size[split.numbers]
+        sequences = SplitSequences(split, whole, spec, sizes, suits)
+        counts[split.numbers - first] = sequences.counts
         return counts, sequences
-
-
-def _between(cut: SplitVideos, first: int, end: int) -> SplitVideos:
-    """Return those of the videos ``first`` .. ``end`` - 1."""
-    low, high = cut.numbers.searchsorted(np.array((first, end), np.int32)).tolist()  # int64 would convert them all
-    runs = slice(*cut.bounds[[low, high]].tolist())
-    return SplitVideos(
-        cut.numbers[low:high], cut.bounds[low : high + 1] - cut.bounds[low], cut.first[runs], cut.end[runs]
-    )
-
-
-class _CutSequences:
-    """Sequences of the videos with shot boundaries: at 0, L, 2L ... of each run.
-
-    Args:
-        cut: these videos.
-        whole: int64 [C], number of sequences that each would have without its shot boundaries.
-        spec: determines the frames in a sequence, and the largest number for one video.
-
-    Attributes:
-        counts: int64 [C], number of sequences of each video.
-    """
-
-    def __init__(self, cut: SplitVideos, whole: npt.NDArray[np.int64], spec: StreamSpec) -> None:
-        self._cut, self._whole, self._stride = cut, whole, spec.recipe.frames_per_sequence
-        each = np.maximum((cut.end - cut.first - spec.recipe.frames_needed) // self._stride + 1, 0)
-        self._upto = np.concatenate(([0], np.cumsum(each)))  # sequences before each run, if a video may have any number
-        self._most = np.where(whole > 0, spec.max_sequences_per_video, 0)
-        self.counts = np.minimum(np.diff(self._upto[cut.bounds]), self._most)
-
-    def spoilt(self) -> int:
-        """Return the number of sequences that are not where they would be without shot boundaries."""
-        cut, owners = self._cut, self._cut.owners()
-        before = self._upto[:-1] - self._upto[cut.bounds[:-1]][owners]
-        each = np.clip(self._most[owners] - before, 0, np.diff(self._upto))
-        in_place = np.clip(self._whole[owners] - cut.first // self._stride, 0, each)
-        return int(self._whole.sum() - in_place[cut.first % self._stride == 0].sum())
-
-    def too_short(self) -> list[int]:
-        """Return the frames of the longest run of each video that has no sequence because of its shot boundaries."""
-        longest: list[int] = self._cut.longest()[(self._whole > 0) & (self.counts == 0)].tolist()
-        return longest
-
-    def start(self, video: int, place: int) -> int | None:
-        """Return the first frame of a sequence of a video; None if the video has no shot boundaries."""
-        if (at := self._cut.find(video)) is None:
-            return None
-        low, high = self._cut.bounds[at : at + 2].tolist()
-        run = int(self._upto[low:high].searchsorted(self._upto[low] + place, side="right")) - 1 + low
-        return int(self._cut.first[run]) + self._stride * (place - int(self._upto[run] - self._upto[low]))
 
 
 class Refusals(Sequence[Refusal]):
@@ -255,11 +212,7 @@ class Refusals(Sequence[Refusal]):
         video, recipe = self._videos[place], self._spec.recipe
         if video.frames < recipe.frames_needed:
             return _too_short(video, recipe)
-        return _unsuited_size(video, self._rows, self._spec) or _all_cut(video, _longest_run(video), recipe)
-
-
-def _longest_run(video: VideoEntry) -> int:
-    return max((end - first for first, end in video.runs or ()), default=0)
+        return _unsuited_size(video, self._rows, self._spec) or _all_cut(video, self._rows, self._spec)
 
 
 def _longest_clip(frames: int, recipe: Recipe) -> int:
@@ -281,12 +234,17 @@ def _too_short(video: VideoEntry, recipe: Recipe) -> Refusal:
     return _unsuited(video, f"{video.frames} frames, the recipe needs {recipe.frames_needed}", remedy)
 
 
-def _all_cut(video: VideoEntry, longest_run: int, recipe: Recipe) -> Refusal:
-    most = _longest_clip(longest_run, recipe)
-    reason = (
-        f"at most {longest_run} frames without a cut and with something to see, the recipe needs {recipe.frames_needed}"
-    )
-    return _unsuited(video, reason, f"voxels_per_clip at most {most}, or scene off" if most else "scene off")
+def _all_cut(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal:
+    runs = Runs(SplitVideos.of([video.pieces or b""]), Cleaning.of(spec))
+    longest, needed = max(runs.frames.tolist(), default=0), spec.recipe.frames_needed
+    if longest < needed:
+        most = _longest_clip(longest, spec.recipe)
+        reason = f"at most {longest} frames in a row without a defect, the recipe needs {needed}"
+        return _unsuited(video, reason, f"voxels_per_clip at most {most}, or scene off" if most else "scene off")
+    for sides in runs.sides[runs.frames >= needed].tolist():
+        if (refusal := _too_small(video, rows, spec.recipe, Sides(*sides))) is not None:
+            return refusal
+    return _unsuited(video, "all its sequences are still", "still_share 1")
 
 
 def _unsuited_size(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:
@@ -308,16 +266,21 @@ def _too_large(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | Non
     return _unsuited(video, reason, "fewer voxels_per_clip or samples_per_decode, or resize_scale 1")
 
 
-def _too_small(video: VideoEntry, rows: Rows, recipe: Recipe) -> Refusal | None:
+def _too_small(video: VideoEntry, rows: Rows, recipe: Recipe, sides: Sides = NO_BARS) -> Refusal | None:
     try:
         top, bottom = rows.bounds(video.height_px)
     except UsageError as error:
         return _unsuited(video, str(error), "other rows")
-    height, width = bottom - top, video.width_px
+    height, width = bottom - top - sides.top - sides.bottom, video.width_px - sides.left - sides.right
     if admits(recipe, height, width):
         return None
+    bars = " and without its bars" if any(sides) else ""
+    if min(height, width) <= 0:
+        return _unsuited(video, f"nothing is left of the picture after rows {rows}{bars}", "other rows")
     # Round up; otherwise the picture would be a fraction of a pixel too small.
     scale = math.ceil(smallest_scale(recipe, height, width) * 1000) / 1000
-    reason = f"picture {width}x{height} after rows {rows}, the crop is {recipe.crop_width_px}x{recipe.crop_height_px}"
+    reason = (
+        f"picture {width}x{height} after rows {rows}{bars}, the crop is {recipe.crop_width_px}x{recipe.crop_height_px}"
+    )
     larger = f"resize_scale up to {scale:g}, or a smaller crop" if scale <= LARGEST_SCALE else "a smaller crop"
     return _unsuited(video, reason, larger)

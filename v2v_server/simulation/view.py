@@ -35,26 +35,23 @@ class Window(NamedTuple):
 def source_window(
     params: SampleParams,
     recipe: Recipe,
-    picture_top_px: int,
-    picture_height_px: int,
-    picture_width_px: int,
+    picture: Window,
     margin_px: int | None = 0,
 ) -> Window:
     """Return the part of the video picture that :func:`apply_view` needs.
 
     Args:
         params, recipe: the draw and its recipe.
-        picture_top_px: first usable row of the upright video picture.
-        picture_height_px, picture_width_px: size of the usable picture.
+        picture: the usable part of the upright video picture.
         margin_px: margin around the crop; None: the whole picture.
 
     Returns:
         the crop and its margin at scale 1, otherwise the whole usable picture.
     """
     if params.scale != 1.0:
-        return Window(picture_top_px, 0, picture_height_px, picture_width_px)
-    top, left, height, width = crop_region(params, recipe, picture_height_px, picture_width_px, margin_px)
-    return Window(picture_top_px + top, left, height, width)
+        return picture
+    top, left, height, width = crop_region(params, recipe, picture.height_px, picture.width_px, margin_px)
+    return Window(picture.top_px + top, picture.left_px + left, height, width)
 
 
 def crop_region(

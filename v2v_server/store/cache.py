@@ -202,7 +202,7 @@ class Cache:
             signal = signal._replace(transfer=MIXED)
         times = [index.seconds(start, (cut.count - 1) * stride + 1)[::stride] for cut in cuts]
         read = [
-            DecodedClip(frames, seconds, codec, bit_exact, "cache", signal)
+            DecodedClip(frames, seconds, codec, bit_exact, "cache", signal=signal)
             for frames, seconds in zip(clips, times, strict=True)
         ]
         return with_motion(read, cuts, vectors)

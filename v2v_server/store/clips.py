@@ -78,7 +78,7 @@ def stored_clip(
     frames = np.empty((cut.count, *window[2:]), signal.dtype)
     read_levels(stored, start, stride, window, frames, signal)
     seconds = index.seconds(start, (cut.count - 1) * stride + 1)[::stride]
-    return DecodedClip(frames, seconds, head.codec, head.bit_exact, "store", signal)
+    return DecodedClip(frames, seconds, head.codec, head.bit_exact, "store", signal=signal)
 
 
 def signal_of(path: str | os.PathLike[str], index: FrameIndex) -> Signal:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from av.video.frame import VideoFrame
 
 from v2v_protocol.errors import VideoError
+from v2v_server.video.colour.chroma import Chroma, ChromaCut, ChromaStack
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import MIXED, SDR, TRANSFERS, LumaFormat, Signal, copy_luma, luma_plane, stretch
 from v2v_server.video.orientation import Window
@@ -24,11 +25,13 @@ class Cut:
     Attributes:
         count: number of frames, at least 1; with a stride, of those that are taken.
         window: (top, left, height, width) in the upright picture, pixels; None takes all of it.
+        chroma: what it takes of the colour; None takes none.
         cells: (top, left, rows, columns) of the cells whose motion is wanted (:mod:`v2v_server.motion`); None: none.
     """
 
     count: int
     window: Window | None = None
+    chroma: ChromaCut | None = None
     cells: Window | None = None
 
 
@@ -87,6 +90,10 @@ class Stack:
         self.taken = 0
         self._cursor = 0  # where the next frame is expected in the index
         self._damaged = False
+        size = index.height_px, index.width_px
+        self._colours = [
+            None if cut.chroma is None else ChromaStack(cut.chroma, self._orientation, *size) for cut in cuts
+        ]
         self._parts: list[tuple[Window, npt.NDArray[np.unsignedinteger]]] = []  # stored window and frames of each cut
 
     def take(self, frame: VideoFrame) -> bool:
@@ -102,6 +109,9 @@ class Stack:
         if self._damaged:
             self.refuse("is damaged, or refers to a damaged or lost frame")
         self._copy(frame)
+        for colour in self._colours:
+            if colour is not None:
+                colour.add(frame, self.taken)
         self.taken += 1
         return self.taken == len(self._expected)
 
@@ -176,6 +186,10 @@ class Stack:
             VideoError: always.
         """
         raise VideoError(self.wanted.path, self.wanted.start + self.taken * self._stride, why)
+
+    def chroma(self) -> list[Chroma | None]:
+        """Return the collected colour of each cut; None if it takes none."""
+        return [None if colour is None else colour.chroma() for colour in self._colours]
 
     def grey(self) -> Iterator[npt.NDArray[Any]]:
         """Yield the collected frames of each cut, [count, h, w] of the signal's dtype: upright, in full range."""

@@ -30,6 +30,7 @@ from av.video.stream import VideoStream
 
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.video.collect import Cut, FrameRange, LastFrame, Stack, Watch
+from v2v_server.video.colour.chroma import Chroma
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.orientation import Window
@@ -54,6 +55,7 @@ class DecodedClip:
         codec: FFmpeg's name of the format.
         bit_exact: whether every host decodes these very bytes.
         origin: "" where they were decoded just now; "store" or "cache" where they were read from there.
+        chroma: colour of the frames that the cut names; None without.
         signal: what the levels mean.
         motion: [count, 2, rows, columns] int16, the motion to each frame from the one before in the cells of its cut
             (:mod:`v2v_server.motion`), zero for the first; None if it was not asked for.
@@ -64,6 +66,7 @@ class DecodedClip:
     codec: str
     bit_exact: bool
     origin: str = ""
+    chroma: Chroma | None = None
     signal: Signal = SDR
     motion: npt.NDArray[np.int16] | None = None
 
@@ -119,8 +122,9 @@ def decode_cuts(
             stack.codec,
             stack.codec in BIT_EXACT_CODECS,
             signal=stack.signal,
+            chroma=chroma,
         )
-        for grey, cut in zip(stack.grey(), checked, strict=True)
+        for grey, chroma, cut in zip(stack.grey(), stack.chroma(), checked, strict=True)
     )
 
 

@@ -46,7 +46,7 @@ def made(first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8], vector: tu
     vectors = np.empty((2, -(-height // 4), -(-width // 4)), np.int16)
     vectors[0], vectors[1] = vector
     out = np.empty((count, height, width), np.uint16)
-    between(padded(np.ascontiguousarray(first)), padded(np.ascontiguousarray(second)), vectors, 0, 0, out)
+    between(padded(np.ascontiguousarray(first)), padded(np.ascontiguousarray(second)), vectors, 0, 0, 0, out)
     return out / PARTS
 
 

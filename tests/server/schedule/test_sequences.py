@@ -13,9 +13,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.pieces import pieces
 from tests.server.named_corpus import SMALL, SMALL_SPEC, video
 from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.scenes.pieces import encoded_pieces
+from v2v_server.corpus.scenes.scene import Flag
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.schedule import sequences
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
@@ -114,7 +117,10 @@ def test_lookup_by_rank_equals_the_list_between_shot_boundaries(
     for number, each in enumerate(stretches):
         ends = list(itertools.accumulate(itertools.chain.from_iterable(each)))
         runs = tuple(zip(ends[::2], ends[1::2], strict=True))
-        entry = dataclasses.replace(video(f"v{number}", max(ends, default=9)), runs=runs)
+        parts = pieces(*((end, 0 if at % 2 else Flag.BLACK) for at, end in enumerate(ends) if end))
+        frames = max(ends, default=9)
+        divided = encoded_pieces(parts if runs else pieces((9, Flag.FADE)), frames)
+        entry = dataclasses.replace(video(f"v{number}", frames), pieces=divided)
         starts = [
             start
             for first, end in runs
