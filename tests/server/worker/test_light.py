@@ -25,6 +25,7 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.folder import Folder
+from v2v_server.offline.doctor_pictures import look_at_pictures
 from v2v_server.offline.motion import WholePictures, predicted_loss
 from v2v_server.offline.preview import _signal_note
 from v2v_server.offline.remake import Remaker
@@ -143,13 +144,15 @@ def test_store_and_cache_keep_transfer_and_bits(tmp_path: Path, is_deep: bool) -
     require_equal(make_sample(lease, decoded), exact, "cache")
 
 
-def test_a_preview_names_what_a_video_has(tmp_path: Path) -> None:
+def test_preview_and_doctor_name_what_a_video_has(tmp_path: Path) -> None:
     ten_bits(tmp_path / "clips", ColorTrc.SMPTE2084)
     provenance = sample_of(tmp_path / "clips", SDR).provenance
     with closing(open_catalogue(tmp_path / "clips", processes=0)) as catalogue:
         assert _signal_note(catalogue, provenance, DECLARED) == "a.mkv has 10 bits, PQ"
         note = _signal_note(catalogue, provenance, SDR)
+        lines = list(look_at_pictures(catalogue, 7))
     assert note.startswith("a.mkv has 10 bits, PQ, and is read as 8 bits, SDR: --set light=declared")
+    assert lines[-1][2] == "1 of 1 videos have other levels than 8 bits, SDR (a.mkv: 10 bits, PQ)"
 
 
 @pytest.mark.slow  # another compiled kernel
