@@ -9,6 +9,9 @@ PICTURE := .venv-picture
 VIDEO ?= $(PICTURE)/clip.mp4
 CLIPS := .demo/videos
 
+# Hundreds of test processes start; without stored bytecode each compiles every module that it imports.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help picture demo test test-slow test-old-numpy check docs format clean
 
 help:

@@ -56,8 +56,10 @@ SMALLEST_THRESHOLD_SHARE = 0.25
 """Lower limit of a pixel's threshold under mismatch, as a share of the nominal threshold."""
 LARGEST_NORMAL = 6.56
 """No noise deviates by more standard deviations (``v2v_server.simulation.noise``)."""
-LATER_FIELDS = ("grids_per_frame",)
+LATER_FIELDS = ("grids_per_frame", "max_boxes", "light")
 """Fields that the plain form leaves out at their defaults, so that older digests hold."""
+BRIGHTEST = 50.0
+"""Upper limit of light where a recipe uses the transfer that a video states; white is 1. PQ reaches 49.3."""
 LARGEST_EVENTS = 2.0**49
 """Largest number of events of a pixel in a clip. With more, float64 no longer resolves a threshold."""
 
@@ -81,6 +83,9 @@ class Recipe:
     lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
     lead_voxels: int = whole(0, 0, 1, "1 adds one voxel grid before the first (ERAFT)")
     frame_stride: int = whole(1, 1, 1000, "use every n-th frame, as if the video had 1/n of its frame rate")
+    max_boxes: int = whole(
+        64, 1, 4096, "most boxes of a frame, if boxes are requested; the smallest ones beyond it are left out"
+    )
 
     crop_height_px: int = whole(128, 1, LARGEST_SIDE_PX, "height of the random crop", unit="px", group="View")
     crop_width_px: int = whole(128, 1, LARGEST_SIDE_PX, "width of the random crop", unit="px")
@@ -104,6 +109,11 @@ class Recipe:
     log_eps: Range = span(
         (0.001, 0.001), 1e-12, 1.0, "epsilon inside the logarithm: the dark current as a share of white's photocurrent"
     )
+    light: str = word(
+        "sdr", ("sdr", "declared"),
+        "sdr: read 8 bits of every video, and apply gamma; declared: read the bit depth that the video has, up to 12, "
+        "and apply the transfer that it states (PQ, HLG, log, linear), or gamma where it states none of these",
+    )  # fmt: skip
 
     threshold: Range = span(
         (0.05, 2.0), 1e-6, 1e6, "smaller of the two contrast thresholds", unit="log units", group="Pixel"
@@ -262,7 +272,8 @@ class Recipe:
         smallest, largest = pixel_thresholds(min(low, high), nominal, self.threshold_mismatch_sigma[1])
         sigma = self.noise_sigma[1] * (nominal if self.noise_scales_with_threshold else 1.0)
         hot = self.hot_pixel_sigma[1] if self.hot_pixel_share[1] else 0.0
-        ends = math.log(self.log_eps[0]), math.log1p(self.log_eps[1])
+        brightest = 1.0 if self.light == "sdr" else BRIGHTEST
+        ends = math.log(self.log_eps[0]), math.log1p(self.log_eps[1] + (brightest - 1.0))
         unit = step_seconds if self.noise_unit == "second" else 1.0
         leak = self.leak_hz[1] * largest * step_seconds
         segments = self.most_segments + self.steps * levels_per_step
@@ -280,7 +291,8 @@ class Recipe:
         low, high = self.log_eps
         if low == high:
             values["log_eps"] = low
-        return {name: value for name, value in values.items() if value or name not in LATER_FIELDS}
+        later = {name: settings_of(Recipe)[name].default for name in LATER_FIELDS}
+        return {name: value for name, value in values.items() if name not in later or value != later[name]}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:

@@ -57,6 +57,7 @@ from v2v_server.system.clock import Clock
 from v2v_server.system.log import Level, Log
 from v2v_server.system.process import keep_freed_memory, open_many_files, usable_cores
 from v2v_server.system.service import stop_on_signals, utc_now, write_port_file
+from v2v_server.system.status_fields import GIB
 from v2v_server.video.rows import Rows
 
 _MANY_WORKERS_A_CORE = 4
@@ -139,6 +140,7 @@ def serve(config: ServeConfig) -> None:
         session_idle_seconds=config.session_idle_seconds,
         max_credit_bytes=config.max_credit_bytes,
         expected_workers=config.workers_in_all,
+        share_bytes=int(config.share_gib * GIB),
     )
     # Workers of this host use an address that requires no key.
     worker_flags = ["--keys", ""] if config.engine == "local" else []

@@ -197,7 +197,8 @@ class Catalogue:
     @property
     def facts(self) -> CorpusFacts:
         """What is known in memory: all that a server's dispatcher needs."""
-        return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars)
+        has_colour = self.prepared is None
+        return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars, has_colour)
 
     def part(self) -> CorpusPart:
         """Return what the status says of it."""

@@ -131,6 +131,9 @@ class Videos(Sequence[VideoEntry]):
         )
 
 
+COLOUR_REMEDY = "serve the videos that they were prepared from"
+
+
 @dataclass(frozen=True, slots=True)
 class CorpusFacts:
     """Facts about a corpus, all in memory: using them never reads the index on disk.
@@ -141,6 +144,7 @@ class CorpusFacts:
         digest: names this snapshot.
         scene_digest: names this snapshot together with the statistics of its videos; None without them.
         sidecars: the files beside the videos, by ending.
+        has_colour: whether the videos were catalogued with their colour.
     """
 
     videos: Sequence[VideoEntry]
@@ -148,6 +152,18 @@ class CorpusFacts:
     digest: str
     scene_digest: str | None
     sidecars: Mapping[str, Sidecars] = field(default_factory=dict)
+    has_colour: bool = True
+
+    def require_arrays(self, arrays: tuple[str, ...]) -> None:
+        """Check that the videos have what these arrays are made from.
+
+        Raises:
+            UsageError: they have no colour.
+        """
+        if "frames_rgb" in arrays and not self.has_colour:
+            raise UsageError(
+                "arrays: frames_rgb needs colour, which these prepared videos do not have: " + COLOUR_REMEDY
+            )
 
     def sidecars_of(self, video: str, arrays: tuple[str, ...]) -> dict[str, str]:
         """Return the fingerprints of a video's sidecars that these arrays are made from, by ending."""

@@ -23,7 +23,7 @@ from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.progress import Progress
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import Provenance
+from v2v_protocol.sample import Provenance, sidecar_endings
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.motion.prediction import Prediction
@@ -33,6 +33,8 @@ from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.store.clips import clips_of
 from v2v_server.video.collect import Cut
 
+LABELS = ("boxes", "masks")
+"""Arrays that are drawn if the videos have their sidecars."""
 KINDS = (".png", ".mp4", ".gif", ".html")
 _SMALLEST_CROP_PX = 16
 _GIF_EVERY = 2  # every other bin: half the size
@@ -167,7 +169,9 @@ def _camera(
             f"{recipe.crop_height_px}: no video here is long and large enough for more"
         )
         notes.setdefault(note, []).append(title)
-    arrays = ("voxels", "frames", "flow") if with_flow else ("voxels", "frames")
+    sidecars = catalogue.sidecars
+    labels = [name for name in LABELS if any(sidecars[each].fingerprints for each in sidecar_endings((name,)))]
+    arrays = ("voxels", "frames", *(("flow",) if with_flow else ()), *labels)
     made = Remaker(catalogue, stream, arrays).made(shot.seed, 0, 0)
     provenance = made.sample.provenance
     whole = _whole_picture(catalogue, provenance)

@@ -4,6 +4,8 @@ conversation   what the worker says: a state machine without I/O
 process        the process that does what the conversation says
 produce        from a lease to its sample: decode, view, simulate
 arrays         functions that fill each array; additional arrays are files beside it
+colour         frames in colour
+labels         boxes and masks
 sidecars       files beside the video that arrays are made from
 decode_cache   one decode for siblings
 output_buffer  memory for a sample, shared with its consumer or private

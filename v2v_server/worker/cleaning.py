@@ -11,6 +11,8 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.scenes.scene import NO_BARS, Scene, Sides
 from v2v_server.video.decode import DecodedClip
 
+_LONGEST = np.iinfo(np.int16).max
+
 
 @dataclass(frozen=True, slots=True)
 class CleanFrames:
@@ -66,4 +68,11 @@ class CleanFrames:
         if self.stride:
             return clip
         at = self.numbers[:frames] - self.numbers[0]
-        return replace(clip, frames=clip.frames[at], seconds=clip.seconds[at])
+        motion = None if clip.motion is None else _motion_between(clip.motion, at)
+        return replace(clip, frames=clip.frames[at], seconds=clip.seconds[at], motion=motion)
+
+
+def _motion_between(motion: npt.NDArray[np.int16], frames: npt.NDArray[np.int64]) -> npt.NDArray[np.int16]:
+    """Return the motion to each of some frames from the one before it among them: the sum on the way."""
+    way = np.cumsum(motion, axis=0, dtype=np.int32)[frames]
+    return np.clip(np.diff(way, axis=0, prepend=way[:1]), -_LONGEST, _LONGEST).astype(np.int16)

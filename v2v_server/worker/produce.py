@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+import v2v_server.worker.colour  # registers its arrays
+import v2v_server.worker.labels  # noqa: F401  # registers its arrays
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.errors import ProtocolError, UsageError, VideoError
+from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
 from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal
@@ -29,14 +31,16 @@ from v2v_protocol.sample import (
     SampleId,
     SampleParams,
     array_layout,
+    empty_value,
     new_arrays,
 )
 from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.scenes.scene import Scene, Sides
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
-from v2v_server.motion import MARGIN_PX, levels_of
+from v2v_server.motion import MARGIN_PX, cells_of, levels_of
 from v2v_server.simulation.draw import draw
+from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.kernels import ARRAYS, list_events
 from v2v_server.simulation.variants import Variant, variants
 from v2v_server.simulation.view import Window, apply_view, source_window, without_margin
@@ -45,8 +49,10 @@ from v2v_server.store.cache import Cache
 from v2v_server.store.clips import clips_of
 from v2v_server.store.format import is_store_file
 from v2v_server.video.collect import Cut
+from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import MIXED, MOST_BITS, SDR
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, simulate
 from v2v_server.worker.cleaning import CleanFrames
@@ -117,7 +123,9 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
             flow = replace(flow, margin_px=0)
         margin_px = None if flow.margin_px is None else max(flow.margin_px, margin_px or 0)
     window = source_window(params, spec.recipe, picture, margin_px)
-    cut = Cut(frames.count(int(source[-1]) + 1), window)
+    chroma = _chroma_cut(lease, params, spec, frames, source) if "frames_rgb" in lease.arrays else None
+    cells = cells_of(params, spec.recipe, _within_rows(lease, frames.sides)) if spec.substep_px else None
+    cut = Cut(frames.count(int(source[-1]) + 1), window, chroma, cells)
     return SamplePlan(spec, params, source, frames, cut, margin_px, flow, flow_plan)
 
 
@@ -126,6 +134,25 @@ def usable_window(lease: Lease, sides: Sides) -> Window:
     top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
     height, width = bottom - top - sides.top - sides.bottom, lease.width_px - sides.left - sides.right
     return Window(top + sides.top, sides.left, height, width)
+
+
+def _within_rows(lease: Lease, sides: Sides) -> Window:
+    """Return the window of :func:`usable_window`, counted from the first usable row."""
+    top, _ = Rows.parse(lease.rows).bounds(lease.height_px)
+    usable = usable_window(lease, sides)
+    return usable._replace(top_px=usable.top_px - top)
+
+
+def _chroma_cut(
+    lease: Lease, params: SampleParams, spec: StreamSpec, frames: CleanFrames, source: npt.NDArray[np.int64]
+) -> ChromaCut:
+    """Return which colour to decode: that of the delivered frames, in the crop."""
+    delivered = np.unique(source[list(spec.recipe.target_steps)])
+    if not frames.stride:
+        delivered = frames.numbers[delivered] - frames.numbers[0]
+    top, _ = Rows.parse(lease.rows).bounds(lease.height_px)
+    window = source_window(params, spec.recipe, usable_window(lease, frames.sides))
+    return ChromaCut(tuple(delivered.tolist()), window, top)
 
 
 def decode_for(
@@ -149,16 +176,21 @@ def decode_for(
     try:
         index, cuts = _frame_index(lease, frames.span), [plan.cut for plan in plans]
         what = index, lease.start_frame, cuts, frames.stride or 1
+        most_bits = _most_bits(plans[0].spec)
         clips = None
+        rows = Rows.parse(lease.rows).bounds(lease.height_px)
         with source.open_local(lease.video, lease.fingerprint) as path:
-            if cache is not None and not is_store_file(path):
-                rows = Rows.parse(lease.rows).bounds(lease.height_px)
-                clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what)
+            # The cache keeps no colour.
+            if cache is not None and not is_store_file(path) and plans[0].cut.chroma is None:
+                clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what, most_bits)
             if clips is None:
-                clips = clips_of(path, lease.fingerprint, *what)
+                clips = clips_of(path, lease.fingerprint, *what, rows, most_bits)
     except VideoError as error:
         # Consumer and log identify videos by id; a path of this host means nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
+    if clips[0].signal.transfer == MIXED:
+        why = "states different transfer characteristics within a clip: re-encode it with one, or set light to sdr"
+        raise VideoError(lease.video, lease.start_frame, why)
     return tuple(
         Decoded(plan, frames.pick(clip, int(plan.source[-1]) + 1)) for plan, clip in zip(plans, clips, strict=True)
     )
@@ -191,7 +223,7 @@ def make_sample(
         sidecars: what :func:`v2v_server.worker.sidecars.open_sidecars` lends; needed if an array is made from one.
 
     Raises:
-        SidecarError: an array cannot be made from its sidecar.
+        SidecarError: this host cannot read a sidecar.
         VideoError: the video's frame rate is unknown and the recipe needs it, or its stated thresholds or time stamps
             are beyond what can be simulated.
         ProtocolError: the lease is malformed.
@@ -199,9 +231,16 @@ def make_sample(
     plan, index = decoded.plan, lease.indices[0]
     arrays = new_arrays(sample_layout(lease)) if into is None else into
     context, irregular = _context(lease, decoded, arrays, sidecars)
+    unlabelled = dict[str, str]()
     for name, array in context.into.items():
-        with errors_of_sidecar(lease.video, name, sidecars):
-            ARRAY_BUILDERS[name](context, array)
+        try:
+            with errors_of_sidecar(lease.video, name, sidecars):
+                ARRAY_BUILDERS[name](context, array)
+        except SidecarError as error:
+            if error.here:
+                raise
+            array[...] = empty_value(name)
+            unlabelled[name] = str(error)
     saturated = dict(context.saturated or {})
     saturated_bins = saturated.pop("voxels", 0)
     return Sample(
@@ -219,7 +258,9 @@ def make_sample(
             decoder=_decoder(decoded.clip),
             quarantine=lease.quarantine,
             scene="" if plan.flow_plan is None else plan.flow_plan.reason,
-            sidecars={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
+            sidecars=dict(context.clip.fingerprints),
+            unlabelled=unlabelled,
+            boxes_dropped=context.boxes_dropped,
             saturated={name: count for name, count in saturated.items() if count},
         ),
     )
@@ -245,19 +286,32 @@ def _context(
     """Return what the arrays are made from, and the number of irregular time stamps."""
     plan = decoded.plan
     params, recipe = plan.params, plan.spec.recipe
-    frames, flow, levels = decoded.clip.frames, None, None
+    frames, signal, flow, levels = decoded.clip.frames, decoded.clip.signal, None, None
     if plan.flow is not None and into:  # events need no flow
         methods = () if plan.flow_plan is None else plan.flow_plan.methods
         part = without_margin(frames, params, recipe, plan.margin_px, plan.flow.margin_px)
-        flow = flow_for(part, params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods)
+        flow = flow_for(
+            eight_bits(part, signal), params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods
+        )
     if plan.spec.substep_px and not (into and into.keys().isdisjoint(ARRAYS)):
         part = without_margin(frames, params, recipe, plan.margin_px, MARGIN_PX)
-        levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px)
+        motion, picture = decoded.clip.motion, _within_rows(lease, plan.frames.sides)
+        assert motion is not None
+        levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px, motion, picture)
     seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
-    view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe)
-    clip = SourceClip(lease.start_frame, decoded.clip.seconds, sidecars, plan.frames.numbers)
+    view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe, signal)
+    clip = SourceClip(
+        lease.start_frame,
+        decoded.clip.seconds,
+        None if plan.cut.chroma is None or decoded.clip.chroma is None else (decoded.clip.chroma, plan.cut.chroma),
+        sidecars,
+        fingerprints={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
+        numbers=plan.frames.numbers,
+        picture_px=(lease.height_px, lease.width_px),
+        usable=usable_window(lease, plan.frames.sides),
+    )
     return SampleContext(
-        lease.video, clip, plan.spec, params, plan.source, view, seconds, flow, levels, into
+        lease.video, clip, plan.spec, params, plan.source, view, signal, seconds, flow, levels, into
     ), irregular
 
 
@@ -270,10 +324,18 @@ def _step_seconds(lease: Lease, decoded: Decoded) -> tuple[npt.NDArray[np.float6
     return step_seconds(decoded.clip.seconds, plan.source, lease.frames_per_second / plan.spec.recipe.frame_stride)
 
 
+def _most_bits(spec: StreamSpec) -> int | None:
+    """Return ``most_bits`` of :func:`decode_cuts`. Pictures between frames are made from 8 bits."""
+    if spec.recipe.light == "sdr":
+        return None
+    return SDR.bits if spec.substep_px else MOST_BITS
+
+
 def _decoder(clip: DecodedClip) -> str:
     """Describe the source of the pixels for the provenance."""
+    signal = "" if clip.signal == SDR else f", {clip.signal}"
     host = "" if clip.bit_exact else " (host-dependent)"
-    return f"{clip.codec}{host}, from the {clip.origin}" if clip.origin else f"{clip.codec}{host}"
+    return f"{clip.codec}{host}{signal}" + (f", from the {clip.origin}" if clip.origin else "")
 
 
 def kernels_of(lease: Lease) -> frozenset[Variant]:

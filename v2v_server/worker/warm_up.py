@@ -51,7 +51,13 @@ def load_in_turn(variant: Variant) -> None:
     with one_compiles(*_place(variant)) as is_to_compile:
         if is_to_compile:
             print(f"compiling the kernel for {variant}, once on this host", file=sys.stderr, flush=True)
-            kind = variant.voxel_dtype, int(variant.is_general), variant.precision, int(variant.is_divided)
+            kind = (
+                variant.voxel_dtype,
+                int(variant.is_general),
+                variant.precision,
+                int(variant.is_divided),
+                variant.bits,
+            )
             _compile_apart(*map(str, kind))
         _load(variant)
 
@@ -144,6 +150,6 @@ def _lock(path: Path, longest_wait_seconds: float) -> Iterator[None]:
 if __name__ == "__main__":
     die_with_parent(int(sys.argv[1]))
     if asked := sys.argv[2:]:
-        _load(Variant(asked[0], asked[1] == "1", asked[2], asked[3] == "1"))
+        _load(Variant(asked[0], asked[1] == "1", asked[2], asked[3] == "1", int(asked[4])))
     else:
         load_kernels()
