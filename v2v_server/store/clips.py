@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, VideoError
+from v2v_server.store.chroma import with_chroma
 from v2v_server.store.depth import DETAIL, detail_planes, read_levels
 from v2v_server.store.format import is_store_file
 from v2v_server.store.motion import MotionWatch, read_motion, with_motion
@@ -48,7 +49,7 @@ def clips_of(
 
     Raises:
         UsageError, VideoError: see :func:`v2v_server.video.decode.decode_cuts`; also if the file is, or was made from,
-            another video, or a store file lacks the detail of deeper levels.
+            another video, or a store file lacks the detail of deeper levels or the colour.
     """
     top, bottom = rows or (0, index.height_px)
     picture = top, 0, bottom - top, index.width_px
@@ -66,6 +67,7 @@ def clips_of(
             raise VideoError(os.fspath(path), None, why)
         clips = tuple(stored_clip(stored, index, start, cut, stride, signal) for cut in cuts)
         files = [(stored, range(max(cut.count for cut in cuts)))]
+        clips = with_chroma(clips, cuts, files, start, stride)
         return with_motion(clips, cuts, read_motion(files, start, cuts, stride, picture))
 
 

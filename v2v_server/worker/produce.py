@@ -183,8 +183,7 @@ def decode_for(
         clips = None
         rows = Rows.parse(lease.rows).bounds(lease.height_px)
         with source.open_local(lease.video, lease.fingerprint) as path:
-            # The cache keeps no colour.
-            if cache is not None and not is_store_file(path) and plans[0].cut.chroma is None:
+            if cache is not None and not is_store_file(path):
                 clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what, most_bits)
             if clips is None:
                 clips = clips_of(path, lease.fingerprint, *what, rows, most_bits)
