@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from v2v_protocol.messages import Lease
 from v2v_protocol.recipe import Recipe
