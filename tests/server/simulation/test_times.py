@@ -15,11 +15,14 @@ from hypothesis import strategies as st
 from tests.oracles.in_time import bilinear_of, counts_of, stacked_histogram, watch
 from tests.server.simulation.generic_processor import printed_on_a_generic_processor
 from tests.server.simulation.test_pixel import moving_frames
+from tests.server.video.test_real_videos import FOLDER as REAL_VIDEOS
 from v2v_protocol.errors import UsageError
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.kernels import ARRAYS, fill, list_events
 from v2v_server.simulation.result import Voxels
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, bin_edges, rounding_tolerance, timeline
+from v2v_server.video.decode import decode_luma
+from v2v_server.video.probe import probe
 
 FPS = 25.0
 ALL = {
@@ -228,12 +231,20 @@ def test_arrays_and_events_agree(effects: dict[str, float], grids: int) -> None:
     np.testing.assert_allclose(bilinear[grid, :, 11, 20], expected, atol=0.01)
 
 
+def real_frames(name: str) -> np.ndarray:
+    """Return 21 frames of the middle of a real video, [21, 30, 40]."""
+    if not (REAL_VIDEOS / name).is_file():
+        pytest.skip(f"no {name} in {REAL_VIDEOS}; set V2V_TEST_VIDEOS")
+    index = probe(REAL_VIDEOS / name).index
+    return decode_luma(REAL_VIDEOS / name, index.slice(30, 21), 30, 21, (100, 100, 30, 40)).frames
+
+
 @pytest.mark.parametrize("grids", [0, 2])
-def test_the_published_stacked_histogram_of_the_events_is_the_array(grids: int) -> None:
+@pytest.mark.parametrize("video", ["", "gopro_hero7_walk.mp4"])
+def test_the_published_stacked_histogram_of_the_events_is_the_array(video: str, grids: int) -> None:
     """Its bins reach from the first to the last event. A column beside the picture has one at either end of a grid."""
-    made = simulate(
-        moving_frames(21, 30, 40, 5), threshold_pos=0.1, bins=10, grids_per_frame=grids, dtype="int16", seed=4
-    )
+    frames = real_frames(video) if video else moving_frames(21, 30, 40, 5)
+    made = simulate(frames, threshold_pos=0.1, bins=10, grids_per_frame=grids, dtype="int16", seed=4)
     counts, bin_us = made.array("event_counts"), 5000
     events = made.to_events(bin_us)
     for grid, expected in enumerate(counts):

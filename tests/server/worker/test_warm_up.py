@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import threading
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -187,3 +188,16 @@ def test_the_compiler_dies_with_its_worker(tmp_path: Path) -> None:
         finally:
             worker.kill()
     until(lambda: all(map(has_ended, seen)))
+
+
+def test_scipy_cannot_be_imported_while_kernels_are_loaded_unless_it_was_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delitem(sys.modules, "scipy", raising=False)
+    with module._without_scipy(), pytest.raises(ImportError):
+        import_module("scipy")
+    assert "scipy" not in sys.modules
+    monkeypatch.setitem(sys.modules, "scipy", sys)
+    with module._without_scipy():
+        assert import_module("scipy") is sys
+    assert sys.modules["scipy"] is sys
