@@ -38,6 +38,8 @@ MODULES = {
 _LAUNCHED = {
     "trainer.train": "trainer.train",
     "examples/overfit.py": "examples.overfit",
+    "examples/detect.py": "examples.detect",
+    "examples/render_sprites.py": "examples.render_sprites",
     "examples/pan_photographs.py": "examples.pan_photographs",
     "examples/draw_curve.py": "examples.draw_curve",
     "examples.ray_train": "examples.ray_train",

@@ -42,8 +42,8 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 
 FLOORS = (
-    "system", "keys", "video", "config", "simulation", "motion", "flow", "store", "corpus", "defects", "schedule",
-    "quarantine",
+    "system", "keys", "video", "config", "simulation", "labels", "motion", "flow", "store", "corpus", "schedule",
+    "quarantine", "sharing",
     "broker",
     "worker", "supervise", "status", "offline", "prepare", "tradeoff", "fit", "page",
     "corpus_actions", "serve", "commands",

@@ -15,13 +15,26 @@ from skimage import data
 
 from tests.clips import write_clip
 from v2v_protocol.errors import VideoError
-from v2v_server.defects.defect import BARS, BLACK, CUTS, DUPLICATES, STILL, Defect, Sides
-from v2v_server.defects.finder import find_defects
+from v2v_server.corpus.scenes.analysis import analyse
+from v2v_server.corpus.scenes.findings import (
+    BARS,
+    BLACK,
+    COMBED,
+    CUTS,
+    DUPLICATES,
+    FADES,
+    NOISY,
+    STILL,
+    WHITE,
+    Defect,
+    defects_of,
+)  # fmt: skip
+from v2v_server.corpus.scenes.scene import Sides
 from v2v_server.video.decode import stream_luma
 from v2v_server.video.probe import probe
 
 HEIGHT, WIDTH, FRAMES = 144, 208, 96
-FOLDER = Path(os.environ.get("V2V_TEST_VIDEOS", Path(__file__).parents[4] / "shared" / "data" / "videos"))
+FOLDER = Path(os.environ.get("V2V_TEST_VIDEOS", Path(__file__).parents[5] / "shared" / "data" / "videos"))
 Film = npt.NDArray[np.uint8]
 
 BIT_RATES = {"fine": ({"crf": "20"}, 3), "coarse": ({"crf": "36"}, 0)}
@@ -49,9 +62,9 @@ def found(luma: Film, folder: Path, rate: str) -> dict[str, Defect]:
     path = write_clip(
         folder / "clip.mp4", luma, gop=48, b_frames=b_frames, options={**options, "preset": "veryfast"}, full_range=True
     )
-    count, defects = find_defects(stream_luma(path, probe(path).index, 0, len(luma)))
-    assert count == len(luma)
-    return {defect.kind: defect for defect in defects}
+    scene = analyse(stream_luma(path, probe(path).index, 0, len(luma)))
+    assert scene.end == len(luma)
+    return {defect.kind: defect for defect in defects_of(scene)}
 
 
 def repeated(luma: Film, source: Callable[[int], int]) -> Film:
@@ -127,7 +140,7 @@ def test_cuts(rate: str, tmp_path: Path) -> None:
 
 def test_fast_motion_with_repeats_makes_no_cuts() -> None:
     """Half of the steps are still, so the others stand out from the median."""
-    _, defects = find_defects(repeated(film(frames=4 * FRAMES)[::4], lambda at: at // 2))
+    defects = defects_of(analyse(repeated(film(frames=4 * FRAMES)[::4], lambda at: at // 2)))
     assert [defect.kind for defect in defects] == [DUPLICATES]
 
 
@@ -153,10 +166,41 @@ def test_black_stretches(rate: str, tmp_path: Path) -> None:
     assert defects[BLACK].spans == ((40, 60),)
 
 
+@pytest.mark.parametrize("rate", BIT_RATES)
+@pytest.mark.parametrize("frames", [12, 40])
+def test_fades_to_and_from_black(frames: int, rate: str, tmp_path: Path) -> None:
+    gain = np.interp(np.arange(FRAMES), (44 - frames, 44, 50, 50 + frames), (1, 0, 0, 1))[:, None, None]
+    defects = found(np.rint(film() * gain).astype(np.uint8), tmp_path, rate)
+    assert {FADES} <= set(defects) <= {FADES, BLACK}
+    (out, _), (_, back) = defects[FADES].spans[0], defects[FADES].spans[-1]
+    assert abs(out - (44 - frames)) <= 4
+    assert abs(back - (50 + frames)) <= 4
+
+
+@pytest.mark.parametrize("rate", BIT_RATES)
+def test_combing_is_found_where_something_moves(rate: str, tmp_path: Path) -> None:
+    moving = film(frames=2 * FRAMES)
+    woven = moving[::2].copy()
+    woven[:, 1::2] = moving[1::2, 1::2]
+    defects = found(woven, tmp_path, rate)
+    assert set(defects) == {COMBED}
+    assert defects[COMBED].per_mille > 700
+
+
+def test_white_and_noisy_stretches() -> None:
+    luma = film().copy()
+    luma[20:40] = 250
+    noise = 2.0 * np.random.default_rng(3).standard_normal(luma[:40].shape)
+    luma[56:] = np.clip(np.rint(luma[56] + noise), 0, 255)
+    defects = {defect.kind: defect for defect in defects_of(analyse(luma))}
+    assert {WHITE, NOISY, STILL} <= set(defects) <= {WHITE, NOISY, STILL, CUTS}
+    assert defects[WHITE].spans == ((20, 40),)
+    assert defects[NOISY].spans[-1][1] == FRAMES
+
+
 def test_frames_without_anything_to_compare() -> None:
-    assert find_defects([]) == (0, ())
-    assert find_defects(film()[:1]) == (1, ())
-    assert find_defects(np.zeros((3, 5, 6), np.uint8)) == (3, ())
+    for luma in (film()[:0], film()[:1], np.zeros((3, 5, 6), np.uint8)):
+        assert defects_of(analyse(luma)) == ()
 
 
 TRUE_DEFECTS = {
@@ -177,7 +221,7 @@ def test_false_alarms_on_real_clips() -> None:
         try:
             index = probe(path).index
             count = min(len(index), 160)
-            _, defects = find_defects(stream_luma(path, index, (len(index) - count) // 2, count))
+            defects = defects_of(analyse(stream_luma(path, index, (len(index) - count) // 2, count)))
         except VideoError:
             continue  # damaged on purpose
         said |= {(path.name, defect.kind) for defect in defects}
