@@ -52,10 +52,12 @@ class Camera:
         flow: [T, 2, H, W], px, or None.
         title: written beside the camera, for instance the recipe's name.
         provenance: where the clip came from, and the draw.
-        steps_per_frame: of the recipe; a pause is a run of repeated frames.
+        steps_per_frame: of the recipe, unless the draw has ``grid_steps``; a pause is a run of repeated frames.
         lead_voxels: voxel grids of the clip in front of the first one here.
         whole: [rows, columns] uint8, the video's picture that the camera's crop was taken from, or None.
         quiet: as ``rates``, of the same draw without noise, or None: not measured.
+        boxes: [T, n, 7], see ``v2v_protocol.sample.BOX_COLUMNS``, or None.
+        masks: [T, H, W] uint8, classes, or None.
     """
 
     voxels: npt.NDArray[Any]
@@ -67,6 +69,8 @@ class Camera:
     lead_voxels: int = 0
     whole: npt.NDArray[np.uint8] | None = None
     quiet: npt.NDArray[np.float64] | None = None
+    boxes: npt.NDArray[Any] | None = None
+    masks: npt.NDArray[np.uint8] | None = None
 
     @classmethod
     def of(
@@ -88,6 +92,7 @@ class Camera:
         if recipe is not None and recipe.grids_per_frame:
             voxels = voxels.reshape(-1, recipe.grids_per_frame * recipe.bins, *voxels.shape[2:])
         count = min(len(array) for array in (voxels, frames, flow) if array is not None)
+        boxes, masks = arrays.get("boxes"), arrays.get("masks")
         return cls(
             voxels[len(voxels) - count :],
             np.asarray(frames[len(frames) - count :]),
@@ -97,6 +102,8 @@ class Camera:
             steps_per_frame,
             len(voxels) - count,
             whole,
+            boxes=None if boxes is None else np.asarray(boxes[len(boxes) - count :]),
+            masks=None if masks is None else np.asarray(masks[len(masks) - count :, 0]),
         )
 
     @property
@@ -119,12 +126,14 @@ class Camera:
     def paused(self) -> npt.NDArray[np.bool_]:
         """[T * bins] bool: True where every frame of the bin repeats the one before."""
         grids, bins = self.voxels.shape[:2]
-        still = np.zeros((self.lead_voxels + grids) * self.steps_per_frame, np.bool_)
-        for first, length in self.provenance.params.pauses:
+        params = self.provenance.params
+        ends = np.cumsum(params.grid_steps or (self.steps_per_frame,) * (self.lead_voxels + grids))
+        still = np.zeros(ends[-1], np.bool_)
+        for first, length in params.pauses:
             still[first - 1 : first - 1 + length] = True  # positions count from 1
         # A bin holds several steps, or a step several bins.
-        parts = np.repeat(still, bins).reshape(-1, self.steps_per_frame)
-        return np.asarray(parts.all(axis=1))[self.lead_voxels * bins :]
+        parts = [np.repeat(steps, bins).reshape(bins, -1).all(axis=1) for steps in np.split(still, ends[:-1])]
+        return np.concatenate(parts)[self.lead_voxels * bins :]
 
     def moments(self, count: int) -> list[int]:
         """Choose voxel grids to show: the most active one of each of ``count`` equal stretches of time.
@@ -187,6 +196,8 @@ class Camera:
             parts.append("mirrored")
         if params.contrast:
             parts.append(f"contrast {params.contrast:.2f}")
+        if params.voxel_seconds:
+            parts.append(f"grids of {1e3 * params.voxel_seconds:.3g} ms")
         effects = params.to_dict().get("effects", {})
         parts += [_with_unit(name, value) for name, value in effects.items() if value]
         return "   ".join(parts)

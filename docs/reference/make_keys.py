@@ -42,10 +42,13 @@ SOURCES = dict.fromkeys(
     "contrast_scale": "V2V's ablation LDR",
     "gamma": "V2V's released code",
     "log_eps": "V2V's released code",
+    "light": _OURS,
     "threshold_source": "V2V's ablation with fixed thresholds",
     "noise_scales_with_threshold": "an option of V2V's released code",
     "frame_stride": _OURS,
+    "max_boxes": _OURS,
     "grids_per_frame": _OURS,
+    "voxel_seconds": _OURS,
     "noise_unit": _OURS,
 }  # fmt: skip
 """The source of a recipe's field and its default; those of the effects are on another page."""

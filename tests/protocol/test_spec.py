@@ -22,6 +22,7 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "bins": 6,
     "frames_per_bin": 2,
     "grids_per_frame": 4,
+    "voxel_seconds": [0.02, 0.1],
     "lead_frames": 1,
     "lead_voxels": 1,
     "crop_height_px": 129,
@@ -31,10 +32,12 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "pause_probability": 0.01,
     "pause_stay_probability": 0.5,
     "frame_stride": 2,
+    "max_boxes": 9,
     "contrast_probability": 0.1,
     "contrast_scale": [1.0, 2.0],
     "gamma": 1.0,
     "log_eps": [0.002, 0.1],
+    "light": "declared",
     "threshold": [0.05, 1.0],
     "threshold_ratio": [1.0, 1.6],
     "threshold_source": "video",
@@ -64,6 +67,8 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
     "flow_margin_px": -1,
     "substep_px": 1.0,
     "scene": "auto",
+    "keep_defects": "bars,cuts",
+    "still_share": 0.5,
 }
 
 

@@ -21,7 +21,7 @@ from v2v_server.motion.matching import UNITS_PER_PX, Cells, Vectors, padded
 from v2v_server.motion.plane import motions
 from v2v_server.motion.warping import between
 from v2v_server.simulation.draw import resized_size
-from v2v_server.simulation.view import Frames, contrast_table, crop_place, crop_region, resized
+from v2v_server.simulation.view import Frames, Window, contrast_table, crop_place, crop_region, resized
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
 
 MARGIN_PX = 16
@@ -31,27 +31,32 @@ _LEAST_SHARE = 1 / 256
 _FASTEST_SHARE = 0.1
 
 
-def cells_of(params: SampleParams, recipe: Recipe, height_px: int, width_px: int) -> Cells:
-    """Return the cells of the usable picture that a crop shows."""
+def cells_of(params: SampleParams, recipe: Recipe, picture: Window) -> Cells:
+    """Return the cells that a crop shows.
+
+    Args:
+        params, recipe: the draw and its recipe.
+        picture: the part of the usable picture that the draw is about, less its bars.
+    """
     (top, rows), (left, columns) = (
-        (int(cells[0]), int(cells[-1] - cells[0]) + 1) for cells in _shown_cells(params, recipe, height_px, width_px)
+        (int(cells[0]), int(cells[-1] - cells[0]) + 1) for cells in _shown_cells(params, recipe, picture)
     )
     return Cells(top, left, rows, columns)
 
 
 def _shown_cells(
-    params: SampleParams, recipe: Recipe, height_px: int, width_px: int
+    params: SampleParams, recipe: Recipe, picture: Window
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Return row and column of the cell of the usable picture at the middle of each cell of the crop."""
 
-    def shown(first: int, size: int, side: int) -> npt.NDArray[np.int64]:
+    def shown(first: int, size: int, start: int, side: int) -> npt.NDArray[np.int64]:
         middles = first + CELL_PX // 2 + CELL_PX * np.arange(-(-size // CELL_PX))
-        at: npt.NDArray[np.int64] = (middles / params.scale).astype(np.int64) // CELL_PX
-        return np.minimum(at, (side - 1) // CELL_PX)
+        at: npt.NDArray[np.int64] = np.minimum((middles / params.scale).astype(np.int64), side - 1)
+        return (start + at) // CELL_PX
 
     return (
-        shown(params.crop_top_px, recipe.crop_height_px, height_px),
-        shown(params.crop_left_px, recipe.crop_width_px, width_px),
+        shown(params.crop_top_px, recipe.crop_height_px, picture.top_px, picture.height_px),
+        shown(params.crop_left_px, recipe.crop_width_px, picture.left_px, picture.width_px),
     )
 
 
@@ -62,7 +67,7 @@ def levels_of(
     source_index: npt.NDArray[np.int64],
     substep_px: float,
     vectors: Vectors,
-    picture_size: tuple[int, int],
+    picture: Window,
 ) -> Levels | None:
     """Return the levels between the frames of a sample, as its camera sees them.
 
@@ -75,14 +80,14 @@ def levels_of(
         substep_px: longest motion of a sub-step, above 0.
         vectors: [n, 2, rows, columns] of :func:`cells_of`: the motion to each frame from the one before, in the usable
             picture.
-        picture_size: height and width of that, pixels.
+        picture: see :func:`cells_of`.
 
     Returns:
         the levels, for ``simulate_clip``; None if no step is divided.
     """
     if not vectors.any():
         return None
-    down, across = _shown_cells(params, recipe, *picture_size)
+    down, across = _shown_cells(params, recipe, picture)
     vectors = vectors[:, :, down - down[0]][..., across - across[0]]
     top, left = crop_place(params, MARGIN_PX)
     if params.scale != 1.0:
@@ -98,7 +103,7 @@ def levels_of(
         return None
     grey = levels.grey[:, :, ::-1] if params.flip else levels.grey
     if params.contrast != 0.0:
-        grey = contrast_table(params.contrast, FINE_STEPS)[grey]
+        grey = contrast_table(params.contrast, 255 * FINE_STEPS)[grey]
     return Levels(levels.at, np.ascontiguousarray(grey))
 
 

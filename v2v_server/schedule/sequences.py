@@ -2,7 +2,8 @@
 
 A sequence is a run of consecutive frames of one video. The sequences of a video start at frame 0, L, 2L ... while
 start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L = frames per sequence). With scene
-"auto" the same holds for each stretch of the video between shot boundaries in which there is something to see.
+"auto" the same holds for each run of the video (:mod:`v2v_server.schedule.runs`). With ``voxel_seconds``, L is the
+frames of the longest duration that the recipe can draw, at the video's average rate.
 """
 
 from __future__ import annotations
@@ -10,18 +11,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from typing import overload
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import LARGEST_SCALE, Recipe
+from v2v_protocol.recipe import LARGEST_SCALE, MOST_STEPS_PER_GRID, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.scenes.runs import SplitVideos
+from v2v_server.corpus.scenes.pieces import SplitVideos
+from v2v_server.corpus.scenes.scene import NO_BARS, Sides
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.corpus.videos import Videos as CatalogueVideos
+from v2v_server.schedule.runs import Cleaning, Runs, SplitSequences
 from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.rows import Rows
 
@@ -51,16 +55,19 @@ class Columns:
 
     Attributes:
         frames: int64 [N], frames of each video.
+        rates: float64 [N], average frames per second; NaN where unknown.
         size: int32 [N], index into ``first_of_size``.
         first_of_size: for each picture size, the first video that has it.
-        split: the videos whose usable frames are not one run of all; None if runs are unknown.
+        split: the videos that are divided into pieces; None if pieces are unknown.
     """
 
     def __init__(self, videos: Videos) -> None:
         if isinstance(videos, CatalogueVideos):
             self.frames, sizes, self.split = videos.frames, _sizes(videos.height_px, videos.width_px), videos.split
+            self.rates = videos.frames_per_second
         else:
             self.frames, sizes, self.split = _columns(videos)
+            self.rates = np.array([video.frames_per_second for video in videos], np.float64)
         _, first, size = np.unique(sizes, return_index=True, return_inverse=True)
         self.size = size.astype(np.int32)
         self.first_of_size = tuple(first.tolist())
@@ -72,13 +79,13 @@ def _sizes(height_px: npt.NDArray[np.integer], width_px: npt.NDArray[np.integer]
 
 
 def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], SplitVideos | None]:
-    """Return frames, sizes, and the videos with shot boundaries."""
+    """Return frames, sizes, and the videos that are divided into pieces."""
     frames, heights, widths = (
         np.array([getattr(video, name) for video in videos], np.int64) for name in ("frames", "height_px", "width_px")
     )
     sizes = _sizes(heights, widths)
-    runs = [video.runs for video in videos if video.runs is not None]
-    return frames, sizes, SplitVideos.of(frames, runs) if len(runs) == len(videos) else None
+    pieces = [video.pieces for video in videos if video.pieces is not None]
+    return frames, sizes, SplitVideos.of(pieces) if len(pieces) == len(videos) else None
 
 
 class SequenceTable:
@@ -90,7 +97,7 @@ class SequenceTable:
     Args:
         videos: the catalogue's entries, in its order.
         rows: the usable rows of each picture.
-        spec: determines the frames in a sequence, the size of the crop, and whether shot boundaries count.
+        spec: determines the frames in a sequence, the size of the crop, and what is done about defects.
         columns: columns of the videos; None computes them.
 
     Attributes:
@@ -108,8 +115,12 @@ class SequenceTable:
                 f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '
                 "start the server with --scene auto"
             )
-        suits = [_unsuited_size(videos[first], rows, spec) is None for first in self._columns.first_of_size]
-        self._suits = np.array(suits, bool)
+        shown = [videos[first] for first in self._columns.first_of_size]
+        self._suits = np.array([_too_small(video, rows, spec.recipe) is None for video in shown], bool)
+        self._most_steps = np.array(
+            [_most_steps(video, rows, spec) if suits else 0 for video, suits in zip(shown, self._suits, strict=True)],
+            np.int64,
+        )
         counts, _ = self._count(0, len(videos))
         self.videos = int(np.count_nonzero(counts))
         ends = np.cumsum(counts)
@@ -132,10 +143,18 @@ class SequenceTable:
     @property
     def longest_clips(self) -> tuple[int, ...]:
         """The ``voxels_per_clip`` that each of the videos that are too short is long enough for."""
-        frames, recipe = self._columns.frames, self._spec.recipe
+        columns, recipe = self._columns, self._spec.recipe
         _, cut = self._count(0, len(self._all))
-        runs = [] if cut is None else cut.too_short()
-        clips = (_longest_clip(each, recipe) for each in [*frames[frames < recipe.frames_needed].tolist(), *runs])
+        steps = recipe.steps_at(columns.rates)
+        short = columns.frames <= recipe.sequence_at(columns.rates)
+        if recipe.is_timed:
+            short &= steps <= MOST_STEPS_PER_GRID
+        videos, frames = np.flatnonzero(short), columns.frames[short]
+        if cut is not None:
+            videos, frames = (np.concatenate(both) for both in zip((videos, frames), cut.too_short(), strict=True))
+        clips = map(
+            _longest_clip, frames.tolist(), np.broadcast_to(steps, short.shape)[videos].tolist(), repeat(recipe)
+        )
         return tuple(voxels for voxels in clips if voxels)
 
     def __getitem__(self, rank: int) -> VideoSequence:
@@ -158,71 +177,32 @@ class SequenceTable:
         at = int(ends.searchsorted(within, side="right"))
         place = within - (int(ends[at - 1]) if at else 0)
         start = None if cut is None else cut.start(first + at, place)
-        stride = self._spec.recipe.frames_per_sequence
-        return VideoSequence(self._all[first + at], place * stride if start is None else start)
+        video = self._all[first + at]
+        stride = int(self._spec.recipe.sequence_at(video.frames_per_second))
+        return VideoSequence(video, place * stride if start is None else start)
 
-    def _count(self, first: int, end: int) -> tuple[npt.NDArray[np.int64], _CutSequences | None]:
+    def _count(self, first: int, end: int) -> tuple[npt.NDArray[np.int64], SplitSequences | None]:
         """Count the sequences of each of the videos ``first`` .. ``end`` - 1."""
-        columns, spec = self._columns, self._spec
-        counts = (columns.frames[first:end] - spec.recipe.frames_needed) // spec.recipe.frames_per_sequence + 1
-        counts = np.minimum(np.maximum(counts, 0), spec.max_sequences_per_video)
-        counts *= self._suits[columns.size[first:end]]
+        columns, spec, recipe = self._columns, self._spec, self._spec.recipe
+        rates, size = columns.rates[first:end], columns.size[first:end]
+        strides = np.maximum(recipe.sequence_at(rates), 1)
+        counts = np.clip((columns.frames[first:end] - 1) // strides, 0, spec.max_sequences_per_video)
+        counts *= self._suits[size] & (recipe.reach_at(rates) <= self._most_steps[size] * recipe.frame_stride)
+        if recipe.is_timed:
+            steps = recipe.steps_at(rates)
+            counts *= (steps > 0) & (steps <= MOST_STEPS_PER_GRID)
         if spec.scene == "off" or columns.split is None:
             return counts, None
-        cut = _between(columns.split, first, end)
-        sequences = _CutSequences(cut, counts[cut.numbers - first], spec)
-        counts[cut.numbers - first] = sequences.counts
+        split = columns.split.between(first, end)
+
+        def suits(size: int, sides: Sides) -> bool:
+            return _too_small(self._all[columns.first_of_size[size]], self._rows, recipe, sides) is None
+
+        at = split.numbers - first
+        of_split = np.broadcast_to(strides, counts.shape)[at]
+        sequences = SplitSequences(split, counts[at], of_split, spec, columns.size[split.numbers], suits)
+        counts[at] = sequences.counts
         return counts, sequences
-
-
-def _between(cut: SplitVideos, first: int, end: int) -> SplitVideos:
-    """Return those of the videos ``first`` .. ``end`` - 1."""
-    low, high = cut.numbers.searchsorted(np.array((first, end), np.int32)).tolist()  # int64 would convert them all
-    runs = slice(*cut.bounds[[low, high]].tolist())
-    return SplitVideos(
-        cut.numbers[low:high], cut.bounds[low : high + 1] - cut.bounds[low], cut.first[runs], cut.end[runs]
-    )
-
-
-class _CutSequences:
-    """Sequences of the videos with shot boundaries: at 0, L, 2L ... of each run.
-
-    Args:
-        cut: these videos.
-        whole: int64 [C], number of sequences that each would have without its shot boundaries.
-        spec: determines the frames in a sequence, and the largest number for one video.
-
-    Attributes:
-        counts: int64 [C], number of sequences of each video.
-    """
-
-    def __init__(self, cut: SplitVideos, whole: npt.NDArray[np.int64], spec: StreamSpec) -> None:
-        self._cut, self._whole, self._stride = cut, whole, spec.recipe.frames_per_sequence
-        each = np.maximum((cut.end - cut.first - spec.recipe.frames_needed) // self._stride + 1, 0)
-        self._upto = np.concatenate(([0], np.cumsum(each)))  # sequences before each run, if a video may have any number
-        self._most = np.where(whole > 0, spec.max_sequences_per_video, 0)
-        self.counts = np.minimum(np.diff(self._upto[cut.bounds]), self._most)
-
-    def spoilt(self) -> int:
-        """Return the number of sequences that are not where they would be without shot boundaries."""
-        cut, owners = self._cut, self._cut.owners()
-        before = self._upto[:-1] - self._upto[cut.bounds[:-1]][owners]
-        each = np.clip(self._most[owners] - before, 0, np.diff(self._upto))
-        in_place = np.clip(self._whole[owners] - cut.first // self._stride, 0, each)
-        return int(self._whole.sum() - in_place[cut.first % self._stride == 0].sum())
-
-    def too_short(self) -> list[int]:
-        """Return the frames of the longest run of each video that has no sequence because of its shot boundaries."""
-        longest: list[int] = self._cut.longest()[(self._whole > 0) & (self.counts == 0)].tolist()
-        return longest
-
-    def start(self, video: int, place: int) -> int | None:
-        """Return the first frame of a sequence of a video; None if the video has no shot boundaries."""
-        if (at := self._cut.find(video)) is None:
-            return None
-        low, high = self._cut.bounds[at : at + 2].tolist()
-        run = int(self._upto[low:high].searchsorted(self._upto[low] + place, side="right")) - 1 + low
-        return int(self._cut.first[run]) + self._stride * (place - int(self._upto[run] - self._upto[low]))
 
 
 class Refusals(Sequence[Refusal]):
@@ -253,20 +233,22 @@ class Refusals(Sequence[Refusal]):
 
     def _why(self, place: int) -> Refusal:
         video, recipe = self._videos[place], self._spec.recipe
-        if video.frames < recipe.frames_needed:
+        if recipe.is_timed and (refusal := _unsuited_rate(video, recipe)) is not None:
+            return refusal
+        if video.frames <= recipe.sequence_at(video.frames_per_second):
             return _too_short(video, recipe)
-        return _unsuited_size(video, self._rows, self._spec) or _all_cut(video, _longest_run(video), recipe)
+        unsuited_size = _too_small(video, self._rows, recipe) or _too_large(video, self._rows, self._spec)
+        return unsuited_size or _all_cut(video, self._rows, self._spec)
 
 
-def _longest_run(video: VideoEntry) -> int:
-    return max((end - first for first, end in video.runs or ()), default=0)
-
-
-def _longest_clip(frames: int, recipe: Recipe) -> int:
+def _longest_clip(frames: int, steps: int, recipe: Recipe) -> int:
     """Return the largest ``voxels_per_clip`` that this number of frames is enough for; 0 if it is not enough for
     any.
+
+    Args:
+        steps: from one delivered frame to the next.
     """
-    return max(0, (frames - 1) // (recipe.steps_per_frame * recipe.frame_stride) - recipe.lead_voxels)
+    return max(0, (frames - 1) // (steps * recipe.frame_stride) - recipe.lead_voxels)
 
 
 def _unsuited(video: VideoEntry, reason: str, remedy: str) -> Refusal:
@@ -274,50 +256,85 @@ def _unsuited(video: VideoEntry, reason: str, remedy: str) -> Refusal:
 
 
 def _too_short(video: VideoEntry, recipe: Recipe) -> Refusal:
-    most = _longest_clip(video.frames, recipe)
-    remedy = f"voxels_per_clip at most {most}" if most else "fewer bins, frames_per_bin or frame_stride, no lead_voxels"
+    most = _longest_clip(video.frames, int(recipe.steps_at(video.frames_per_second)), recipe)
+    shorter = "shorter voxel_seconds" if recipe.is_timed else "fewer bins, frames_per_bin"
+    remedy = f"voxels_per_clip at most {most}" if most else f"{shorter} or frame_stride, no lead_voxels"
     if video.frames < 2:
         remedy = "none: a voxel grid needs two frames"
-    return _unsuited(video, f"{video.frames} frames, the recipe needs {recipe.frames_needed}", remedy)
+    return _unsuited(video, f"{video.frames} frames, {_needs(video, recipe)}", remedy)
 
 
-def _all_cut(video: VideoEntry, longest_run: int, recipe: Recipe) -> Refusal:
-    most = _longest_clip(longest_run, recipe)
+def _needs(video: VideoEntry, recipe: Recipe) -> str:
+    needed = f"the recipe needs {recipe.sequence_at(video.frames_per_second) + 1}"
+    return f"{needed} at {video.frames_per_second:g} frames/s" if recipe.is_timed else needed
+
+
+def _unsuited_rate(video: VideoEntry, recipe: Recipe) -> Refusal | None:
+    """Return a refusal if the number of steps in a grid of ``voxel_seconds`` is unknown or too large."""
+    steps = int(recipe.steps_at(video.frames_per_second))
+    if not steps:
+        return _unsuited(video, "its frame rate is unknown, and voxel_seconds needs it", "voxel_seconds 0")
+    if steps <= MOST_STEPS_PER_GRID:
+        return None
     reason = (
-        f"at most {longest_run} frames without a cut and with something to see, the recipe needs {recipe.frames_needed}"
+        f"a voxel grid of {recipe.voxel_seconds[1]:g} s spans {steps} steps at {video.frames_per_second:g} frames/s"
     )
-    return _unsuited(video, reason, f"voxels_per_clip at most {most}, or scene off" if most else "scene off")
+    return _unsuited(video, f"{reason}, the limit is {MOST_STEPS_PER_GRID}", "shorter voxel_seconds, or frame_stride")
 
 
-def _unsuited_size(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:
-    return _too_small(video, rows, spec.recipe) or _too_large(video, rows, spec)
+def _all_cut(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal:
+    recipe, runs = spec.recipe, Runs(SplitVideos.of([video.pieces or b""]), Cleaning.of(spec))
+    longest, needed = max(runs.frames.tolist(), default=0), int(recipe.sequence_at(video.frames_per_second)) + 1
+    if longest < needed:
+        most = _longest_clip(longest, int(recipe.steps_at(video.frames_per_second)), recipe)
+        reason = f"at most {longest} frames in a row without a defect, {_needs(video, recipe)}"
+        return _unsuited(video, reason, f"voxels_per_clip at most {most}, or scene off" if most else "scene off")
+    for sides in runs.sides[runs.frames >= needed].tolist():
+        if (refusal := _too_small(video, rows, recipe, Sides(*sides))) is not None:
+            return refusal
+    return _unsuited(video, "all its sequences are still", "still_share 1")
 
 
-def _too_large(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:
-    """Return a refusal if the decoded frames of a lease exceed the limit. They are held whole until they are resized,
+def _frame_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec) -> int:
+    """Return the size of one decoded frame of all samples of a lease. Frames are held whole until they are resized,
     however small the sample is.
     """
     recipe = spec.recipe
     top, bottom = rows.bounds(video.height_px)
     cropped = recipe.resize_scale == (1.0, 1.0)
     frame = recipe.crop_height_px * recipe.crop_width_px if cropped else (bottom - top) * video.width_px
-    size = frame * (recipe.steps + 1) * spec.samples_per_decode
-    if size <= MOST_CLIP_BYTES:
+    return frame * spec.samples_per_decode
+
+
+def _most_steps(video: VideoEntry, rows: Rows, spec: StreamSpec) -> int:
+    """Return the largest number of steps whose decoded frames a lease may hold."""
+    return MOST_CLIP_BYTES // _frame_bytes(video, rows, spec) - 1
+
+
+def _too_large(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:
+    steps = int(spec.recipe.reach_at(video.frames_per_second)) // spec.recipe.frame_stride
+    if steps <= _most_steps(video, rows, spec):
         return None
+    size = _frame_bytes(video, rows, spec) * (steps + 1)
     reason = f"one sample takes {size >> 20} MiB of decoded frames, the limit is {MOST_CLIP_BYTES >> 20} MiB"
     return _unsuited(video, reason, "fewer voxels_per_clip or samples_per_decode, or resize_scale 1")
 
 
-def _too_small(video: VideoEntry, rows: Rows, recipe: Recipe) -> Refusal | None:
+def _too_small(video: VideoEntry, rows: Rows, recipe: Recipe, sides: Sides = NO_BARS) -> Refusal | None:
     try:
         top, bottom = rows.bounds(video.height_px)
     except UsageError as error:
         return _unsuited(video, str(error), "other rows")
-    height, width = bottom - top, video.width_px
+    height, width = bottom - top - sides.top - sides.bottom, video.width_px - sides.left - sides.right
     if admits(recipe, height, width):
         return None
+    bars = " and without its bars" if any(sides) else ""
+    if min(height, width) <= 0:
+        return _unsuited(video, f"nothing is left of the picture after rows {rows}{bars}", "other rows")
     # Round up; otherwise the picture would be a fraction of a pixel too small.
     scale = math.ceil(smallest_scale(recipe, height, width) * 1000) / 1000
-    reason = f"picture {width}x{height} after rows {rows}, the crop is {recipe.crop_width_px}x{recipe.crop_height_px}"
+    reason = (
+        f"picture {width}x{height} after rows {rows}{bars}, the crop is {recipe.crop_width_px}x{recipe.crop_height_px}"
+    )
     larger = f"resize_scale up to {scale:g}, or a smaller crop" if scale <= LARGEST_SCALE else "a smaller crop"
     return _unsuited(video, reason, larger)

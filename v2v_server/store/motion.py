@@ -13,8 +13,10 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import VideoError
 from v2v_server.motion import Cells, MotionOfCuts, MotionOfPictures, Pyramid, Vectors
+from v2v_server.store.chroma import CHROMA, chroma_of
+from v2v_server.store.depth import DETAIL, detail_of, grey_of
 from v2v_server.store.reader import StoreFile
-from v2v_server.video.collect import Cut, DecodedFrame
+from v2v_server.video.collect import Cut, DecodedFrame, LastFrame
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.orientation import Window
 
@@ -149,12 +151,20 @@ def pictures_in(
 
 
 def with_planes(
-    pictures: Iterable[npt.NDArray[np.uint8]], planes: Sequence[str]
+    pictures: Iterable[tuple[LastFrame, npt.NDArray[Any]]], planes: Sequence[str]
 ) -> Iterator[tuple[npt.NDArray[np.uint8], dict[str, npt.NDArray[Any]]]]:
-    """Yield pictures with their planes, which are made from the luma: those of :data:`MADE_PLANES`."""
-    makers = {name: MADE_PLANES[name]() for name in planes}
-    for picture in pictures:
-        yield picture, {name: make(picture) for name, make in makers.items()}
+    """Yield decoded pictures in 8 bits with their planes: those of :data:`MADE_PLANES`, which are made from them, and
+    the detail of deeper ones, and the colour.
+    """
+    makers = {name: MADE_PLANES[name]() for name in planes if name in MADE_PLANES}
+    for stream, picture in pictures:
+        grey = grey_of(stream, picture)
+        arrays = {name: make(grey) for name, make in makers.items()}
+        if DETAIL in planes:
+            arrays[DETAIL] = detail_of(picture, grey, stream.signal)
+        if CHROMA in planes:
+            arrays[CHROMA] = chroma_of(stream)
+        yield grey, arrays
 
 
 def _motion_across(before: StoreFile, after: StoreFile, at: int, cells: Cells, picture: Window) -> Vectors:

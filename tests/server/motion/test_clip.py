@@ -18,7 +18,7 @@ from v2v_protocol.spec import MOST_SUBSTEPS
 from v2v_server.motion import MARGIN_PX, cells_of, levels_between, levels_of, motions, substeps
 from v2v_server.motion.matching import UNITS_PER_PX
 from v2v_server.simulation.draw import draw
-from v2v_server.simulation.view import apply_view, source_window, without_margin
+from v2v_server.simulation.view import Window, apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import FINE_STEPS, Levels
 
 HERTZ, THRESHOLD = 30.0, 0.2
@@ -111,15 +111,15 @@ def test_a_wider_window_changes_nothing() -> None:
 
 
 def _window(video: np.ndarray, params: SampleParams, margin: int | None) -> np.ndarray:
-    top, left, height, width = source_window(params, RECIPE, 0, *video.shape[1:], margin)
+    top, left, height, width = source_window(params, RECIPE, Window(0, 0, *video.shape[1:]), margin)
     return np.ascontiguousarray(video[:, top : top + height, left : left + width])
 
 
 def _levels(video: np.ndarray, params: SampleParams) -> Levels:
-    top, left, rows, columns = cells_of(params, RECIPE, *video.shape[1:])
+    top, left, rows, columns = cells_of(params, RECIPE, Window(0, 0, *video.shape[1:]))
     vectors = motions(video)[:, :, top : top + rows, left : left + columns]
     window = _window(video, params, MARGIN_PX)
-    levels = levels_of(window, params, RECIPE, np.arange(4), 1.0, vectors, video.shape[1:])
+    levels = levels_of(window, params, RECIPE, np.arange(4), 1.0, vectors, Window(0, 0, *video.shape[1:]))
     assert levels is not None
     return levels
 
