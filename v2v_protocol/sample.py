@@ -182,6 +182,7 @@ class Provenance:
         saturated: as ``saturated_bins``, for other arrays by name; only those that have any.
         sidecars: fingerprints of the sidecars that its arrays were made from, by ending.
         grid_seconds: actual duration of each voxel grid, where the recipe states ``voxel_seconds``.
+        left_out: effects of the draw that were not simulated (``tolerance`` of the spec).
     """
 
     id: SampleId
@@ -199,6 +200,7 @@ class Provenance:
     saturated: Mapping[str, int] = dataclasses.field(default_factory=dict)
     sidecars: Mapping[str, str] = dataclasses.field(default_factory=dict)
     grid_seconds: tuple[float, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         where = f"seed {self.id.seed}, epoch {self.id.epoch}, index {self.id.index}"
@@ -219,7 +221,7 @@ class Provenance:
             "refusals": tuple(refusal.to_dict() for refusal in self.refusals),
             "params": self.params.to_dict(),
         }
-        optional = ("scene", "saturated", "sidecars", "grid_seconds")
+        optional = ("scene", "saturated", "sidecars", "grid_seconds", "left_out")
         return {name: value for name, value in values.items() if value or name not in optional}
 
     @classmethod
@@ -236,6 +238,7 @@ class Provenance:
             params["noise_key"] = tuple(int(word) for word in params["noise_key"])
             params["grid_steps"] = tuple(map(int, params.get("grid_steps", ())))
             rest["grid_seconds"] = tuple(map(float, rest.get("grid_seconds", ())))
+            rest["left_out"] = tuple(map(str, rest.get("left_out", ())))
             known = effect_settings()
             params["effects"] = {
                 name: known[name].single.check(name, value) for name, value in params.get("effects", {}).items()

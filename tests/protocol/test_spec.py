@@ -64,6 +64,7 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
     "flow_from": 20,
     "flow_margin_px": -1,
     "substep_px": 1.0,
+    "tolerance": 0.01,
     "scene": "auto",
 }
 
