@@ -66,19 +66,9 @@ def roles_of(server: LocalServer) -> dict[str, list[int]]:
     return {"workers": workers, "broker": [server.pid], "client": [os.getpid()]}
 
 
-class Meter:
-    """Measure processor time by role, from construction on; all processes must live until :meth:`used`."""
-
-    def __init__(self, roles: Roles) -> None:
-        self._roles = roles
-        self._began = self._totals()
-
-    def _totals(self) -> dict[str, float]:
-        return {role: sum(map(cpu_seconds, pids)) for role, pids in self._roles.items()}
-
-    def used(self) -> dict[str, float]:
-        """Return the CPU seconds of each role."""
-        return {role: total - self._began[role] for role, total in self._totals().items()}
+def cpu_seconds_of(roles: Roles) -> dict[str, float]:
+    """Return the processor time of each role so far; all processes must live."""
+    return {role: sum(map(cpu_seconds, pids)) for role, pids in roles.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,14 +102,15 @@ def consume(dataset: V2VStreamDataset, roles: Roles, *, seconds: float, warmup_b
     batches = endless(dataset)
     for _ in range(warmup_batches):
         next(batches)
-    meter, began, taken, nbytes = Meter(roles), time.perf_counter(), 0, 0
+    before, began, taken, nbytes = cpu_seconds_of(roles), time.perf_counter(), 0, 0
     while True:
         nbytes += next(batches).nbytes
         taken += 1
         elapsed = time.perf_counter() - began
         if elapsed >= seconds:
             batches.close()
-            return Consumed(taken, nbytes, elapsed, meter.used())
+            used = {role: total - before[role] for role, total in cpu_seconds_of(roles).items()}
+            return Consumed(taken, nbytes, elapsed, used)
 
 
 def endless(dataset: Iterable[Batch]) -> Generator[Batch, None, None]:

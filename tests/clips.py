@@ -13,7 +13,7 @@ import av
 import numpy as np
 import numpy.typing as npt
 from av.video.frame import VideoFrame
-from av.video.reformatter import ColorRange
+from av.video.reformatter import ColorRange, ColorTrc
 from av.video.stream import VideoStream
 from skimage import data
 
@@ -59,6 +59,7 @@ def write_clip(
     b_frames: int = 0,
     rate: Fraction | int = 25,
     full_range: bool | None = False,
+    transfer: ColorTrc | None = None,
     rotation_degrees: int = 0,
     hflip: bool = False,
     pts: Sequence[int] | None = None,
@@ -77,6 +78,7 @@ def write_clip(
         b_frames: most consecutive B-frames.
         rate: frames per second, where ``pts`` is not given.
         full_range: the range to state; None states none.
+        transfer: the transfer characteristic to state.
         rotation_degrees, hflip: display matrix to write.
         pts: time stamps in units of TIME_BASE, one a frame.
         container: FFmpeg's name of the container, if the suffix does not determine it.
@@ -91,6 +93,8 @@ def write_clip(
         stream.thread_count = 1
         if full_range is not None:
             stream.color_range = ColorRange.JPEG if full_range else ColorRange.MPEG
+        if transfer is not None:
+            stream.codec_context.color_trc = transfer
         if pts is not None:
             stream.codec_context.time_base = TIME_BASE
         if rotation_degrees or hflip:

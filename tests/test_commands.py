@@ -29,6 +29,7 @@ MODULES = {
     "v2v-doctor": "v2v_server.commands.doctor",
     "v2v-keys": "v2v_server.commands.keys",
     "v2v-tradeoff": "v2v_server.commands.tradeoff",
+    "v2v-fit": "v2v_server.commands.fit",
     "v2v-loadtest": "v2v_client.tools.loadtest",
     "v2v-train": "trainer.train",
     "v2v-eval": "trainer.evaluation.cli",
@@ -37,6 +38,8 @@ MODULES = {
 _LAUNCHED = {
     "trainer.train": "trainer.train",
     "examples/overfit.py": "examples.overfit",
+    "examples/detect.py": "examples.detect",
+    "examples/render_sprites.py": "examples.render_sprites",
     "examples/pan_photographs.py": "examples.pan_photographs",
     "examples/draw_curve.py": "examples.draw_curve",
     "examples.ray_train": "examples.ray_train",

@@ -42,10 +42,11 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 
 FLOORS = (
-    "system", "keys", "video", "config", "simulation", "motion", "flow", "store", "corpus", "defects", "schedule",
-    "quarantine",
+    "system", "keys", "video", "config", "simulation", "labels", "motion", "flow", "store", "corpus", "schedule",
+    "quarantine", "sharing",
     "broker",
-    "worker", "supervise", "status", "offline", "prepare", "tradeoff", "page", "corpus_actions", "serve", "commands",
+    "worker", "supervise", "status", "offline", "prepare", "tradeoff", "fit", "page",
+    "corpus_actions", "serve", "commands",
 )  # fmt: skip
 """The rooms of the server, from the ground up: each imports only from itself and from those before it."""
 

@@ -13,7 +13,7 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 from v2v_client import notebook
 from v2v_protocol.errors import UsageError
-from v2v_protocol.sample import Provenance
+from v2v_protocol.sample import BOX_COLUMNS, Provenance
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.tables import html_table
 
@@ -183,6 +183,34 @@ class Batch:
             UsageError: the dataset did not request this array.
         """
         return self._array("flow_valid")
+
+    @property
+    def boxes(self) -> list[list[torch.Tensor]]:
+        """Return the boxes: ``boxes[b][t]`` is float32 [n, 7] with the columns of ``v2v_protocol.sample.BOX_COLUMNS``.
+
+        x0, y0, x1, y1 in px, class, track, and the visible share; the largest box first. Index t as for :attr:`frames`.
+        ``self["boxes"]`` is the same as one tensor, [B, T, max_boxes, 7], with -1 where there is no box.
+
+        Raises:
+            UsageError: the dataset did not request this array.
+        """
+        boxes = self._array("boxes")
+        counts = (boxes[..., BOX_COLUMNS.index("class")] >= 0).sum(-1).tolist()
+        return [[frame[:count] for frame, count in zip(*clip, strict=True)] for clip in zip(boxes, counts, strict=True)]
+
+    @property
+    def masks(self) -> torch.Tensor:
+        """Return the class masks: [B, T, 1, H, W] uint8, T as for :attr:`frames`; 255 in a sample without labels.
+
+        Raises:
+            UsageError: the dataset did not request this array.
+        """
+        return self._array("masks")
+
+    @property
+    def labelled(self) -> tuple[bool, ...]:
+        """Return, for each sample, whether it has all boxes and masks that were requested."""
+        return tuple(origin.labelled for origin in self.provenance)
 
     def _array(self, name: str) -> torch.Tensor:
         if name not in self.arrays:

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from typing import Any, Self, Unpack
 
-import torch.distributed
 from torch.utils.data import IterableDataset, get_worker_info
 
 from v2v_client.batch import Batch
@@ -20,10 +19,11 @@ from v2v_client.delivery import deliver
 from v2v_client.loaders import end_with_parent, send_before_exit
 from v2v_client.local_server import LocalServer, recipe_flags
 from v2v_client.memory.buffers import BatchBuffers
-from v2v_client.options import Options, require_arguments
+from v2v_client.options import Labels, Options, check_labels, require_arguments, require_labels
 from v2v_client.position.plan import Consumer, EpochPlan
 from v2v_client.position.position import Iteration, Position
 from v2v_client.position.state import ResumeState, StreamIdentity
+from v2v_client.ranks import distributed_rank
 from v2v_client.session.brokers import addresses
 from v2v_client.session.connector import Connector, ConsumerId
 from v2v_client.session.liveness import Patience
@@ -77,6 +77,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
         world_size: number of ranks that share an epoch; None: that of torch.distributed, else 1.
         shared_memory: whether server workers on this host may write samples into memory of this process, which saves
             most of the cost of moving them. Workers that cannot do so send samples in messages.
+        labels: "required" raises SampleUnavailable for a sample without the boxes or masks that ``arrays`` requests;
+            "optional" delivers it (``batch.labelled``).
         compress: whether samples are compressed for transport, which costs a server worker about 5 % of its time;
             None: only if the server is on another host.
         keys: path of this consumer's key file, see `v2v-keys`; None uses the file that ``V2V_KEYS`` names, which ranks
@@ -124,6 +126,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         rank: int | None = None,
         world_size: int | None = None,
         shared_memory: bool = True,
+        labels: Labels = "required",
         compress: bool | None = None,
         keys: str | os.PathLike[str] | None = None,
         timeout_seconds: float = 60.0,
@@ -147,8 +150,9 @@ class V2VStreamDataset(IterableDataset[Batch]):
             patience=dataclasses.replace(patience or Patience(), timeout_seconds=timeout_seconds),
         )
         self._shared_memory = shared_memory
+        self._needs_labels = check_labels(labels)
         self._explicit = None if rank is None or world_size is None else (rank, world_size)
-        self._ambient = _distributed() or (0, 1)
+        self._ambient = distributed_rank() or (0, 1)
         self._position = Position(seed, require_whole("epoch", epoch, 0, LARGEST_EPOCH))
         self._buffers = BatchBuffers()
         self._offered: StreamIdentity | None = None  # the server's answer to len(), not pinned
@@ -167,6 +171,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         workers: int = 4,
         flags: Sequence[str] = (),
         seed: int = 0,
+        labels: Labels = "required",
         **options: Unpack[SpecOptions],
     ) -> V2VStreamDataset:
         """Start a server on this host and return a dataset that streams from it.
@@ -179,7 +184,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
 
         Args:
             videos: folder or list, as for ``v2v-serve --videos``.
-            batch_size, arrays, recipe, seed, options: as for the dataset.
+            batch_size, arrays, recipe, seed, labels, options: as for the dataset.
             workers: number of server workers.
             flags: more flags for ``v2v-serve``, for instance ``["--cache", "clips/"]``.
 
@@ -194,7 +199,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         server = LocalServer(videos, workers=workers, flags=asked).__enter__()
         try:
             # V2V_KEYS may name a key for other servers.
-            dataset = cls(server.address, batch_size, arrays, resolved, seed=seed, keys="", **options)
+            dataset = cls(server.address, batch_size, arrays, resolved, seed=seed, labels=labels, keys="", **options)
         except BaseException:
             server.stop()
             raise
@@ -225,7 +230,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         # A spawned loader worker has no process group. A shallow copy shares the record of the position, and iterates
         # on its own.
         own = {"_position": copy.copy(self._position), "_buffers": BatchBuffers(), "_stop_server": None}
-        return self.__dict__ | {"_ambient": _distributed() or self._ambient} | own
+        return self.__dict__ | {"_ambient": distributed_rank() or self._ambient} | own
 
     def __repr__(self) -> str:
         own = f"seed {self._connector.seed}, rank {self.rank} of {self.world_size}"
@@ -239,12 +244,12 @@ class V2VStreamDataset(IterableDataset[Batch]):
     @property
     def rank(self) -> int:
         """Return this process's rank, 0 .. world_size - 1."""
-        return (self._explicit or _distributed() or self._ambient)[0]
+        return (self._explicit or distributed_rank() or self._ambient)[0]
 
     @property
     def world_size(self) -> int:
         """Return the number of ranks that share an epoch."""
-        return (self._explicit or _distributed() or self._ambient)[1]
+        return (self._explicit or distributed_rank() or self._ambient)[1]
 
     @property
     def epoch(self) -> int:
@@ -385,15 +390,10 @@ class V2VStreamDataset(IterableDataset[Batch]):
                 connection, plan, batches, begun.state.epoch, after, self._buffers, shared_memory=self._shared_memory
             )
             for batch, number in zip(delivered, batches, strict=True):
+                if self._needs_labels:
+                    require_labels(batch.provenance)
                 state = after(number, batch.resume_state["quarantine"])
                 self._position.reached(begun, consumer, state, last=number == batches[-1])
                 yield batch
                 self._require_open()
         self._position.finish(begun)
-
-
-def _distributed() -> tuple[int, int] | None:
-    """Return (rank, world size) of the default process group; None if there is none."""
-    if torch.distributed.is_available() and torch.distributed.is_initialized():
-        return torch.distributed.get_rank(), torch.distributed.get_world_size()
-    return None

@@ -24,6 +24,7 @@ class _PartialBatch:
 
     memory: BatchMemory
     headers: dict[int, SampleHeader] = field(default_factory=dict)  # by row
+    is_local: bool = False  # whether any sample came in memory of this host
 
 
 def deliver(
@@ -74,6 +75,7 @@ def deliver(
         if place is not None:
             batch = partial[place.batch]
             batch.memory.fill(place.row, sample.arrays, slot_is_free=sample.slot_is_free)
+            batch.is_local = batch.is_local or sample.arrays is None or bool(sample.header.arena)
             batch.headers[place.row] = sample.header
 
     while not window.finished:
@@ -92,7 +94,7 @@ def deliver(
         sample = None  # a reference kept here would keep the batch's buffers and messages alive
         batch = partial.pop(number)
         # Workers on other hosts cannot use slots, and a message without slots is cheaper.
-        lend = lend and (batch.memory.in_place > 0 or not batch.memory.has_slots)
+        lend = lend and (batch.is_local or not batch.memory.has_slots)
         headers = [batch.headers[row] for row in range(plan.batch_size)]
         provenance = tuple(connection.provenance(header) for header in headers)
         quarantine = max([quarantine, *(item.quarantine for item in provenance)])

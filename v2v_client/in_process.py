@@ -18,7 +18,7 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 from v2v_client import notebook
 from v2v_client.batch import Batch
-from v2v_client.options import require_arguments
+from v2v_client.options import Labels, check_labels, require_arguments, require_labels
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
 from v2v_protocol.recipe import Recipe
@@ -85,6 +85,7 @@ class V2VDataset(Dataset[Sample]):
         rows: rows of each picture to use, as for ``v2v-serve --rows``.
         list_file: list file that restricts a folder.
         cache_dir: folder of the catalogue's index; None uses the user's cache.
+        labels: see :class:`v2v_client.V2VStreamDataset`.
         options: ``preset`` and other fields of :class:`v2v_protocol.spec.StreamSpec`.
 
     Raises:
@@ -102,11 +103,13 @@ class V2VDataset(Dataset[Sample]):
         rows: str = "full",
         list_file: str | None = None,
         cache_dir: str | None = None,
+        labels: Labels = "required",
         **options: Unpack[SpecOptions],
     ) -> None:
         require_arguments(V2VDataset.__init__, options)
         self.seed = require_whole("seed", seed, 0, LARGEST_SEED)
         self.epoch = require_whole("epoch", epoch, 0, LARGEST_EPOCH)
+        self._needs_labels = check_labels(labels)
         self.spec = StreamSpec.from_dict({**options, "recipe": recipe})
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
         self._source = (os.fspath(videos), rows, list_file, cache_dir)
@@ -122,10 +125,12 @@ class V2VDataset(Dataset[Sample]):
 
         Raises:
             IndexError: ``index`` is outside -len .. len - 1.
-            SampleUnavailable: no candidate video could give it.
+            SampleUnavailable: no candidate video could give it, or it lacks its labels.
         """
         place = self._place(index)
         sample: Sample = self._open().sample(self.seed, self.epoch, place)
+        if self._needs_labels:
+            require_labels([sample.provenance])
         title = f"Sample {place} of {self._length}"
         return ShownSample(sample.arrays, sample.provenance, self.spec.recipe, title)
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
 
 from v2v_client.position.state import StreamIdentity
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import SampleUnavailable, UsageError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import array_layout
+from v2v_protocol.sample import Provenance, array_layout
 from v2v_protocol.settings import nearest
 from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, SpecOptions, StreamSpec
 
+Labels = Literal["required", "optional"]
 # Fields left to the server may have any value, so an option that fits at least one of them is accepted here.
 _ANY = StreamSpec(samples_per_decode=MOST_SAMPLES_PER_DECODE)
 _LONGEST = Recipe(voxels_per_clip=1_000_000, bins=1)
@@ -77,6 +78,33 @@ def require_arguments(function: Callable[..., Any], options: Mapping[str, Any]) 
     for name in options:
         if name not in SpecOptions.__annotations__:
             raise UsageError(f"no argument {name!r}{nearest(name, known)}; known: {', '.join(known)}")
+
+
+def check_labels(labels: str) -> bool:
+    """Return whether samples without their labels are errors.
+
+    Raises:
+        UsageError: the option is neither "required" nor "optional".
+    """
+    if labels not in ("required", "optional"):
+        raise UsageError(f'labels = {labels!r}: choose "required" or "optional"')
+    return labels == "required"
+
+
+def require_labels(provenances: Sequence[Provenance]) -> None:
+    """Check that samples have all labels that were requested.
+
+    Raises:
+        SampleUnavailable: one has not. The message names the file, the reason and the remedy.
+    """
+    for origin in provenances:
+        for name, why in origin.unlabelled.items():
+            raise SampleUnavailable(
+                "unlabelled",
+                f"sample {origin.id.index} of epoch {origin.id.epoch} has no {name}: {why}. Correct the file and "
+                'restart the server, leave the video out, or create the dataset with labels="optional" and use '
+                "batch.labelled",
+            )
 
 
 def _plain(recipe: Any) -> Any:

@@ -56,6 +56,8 @@ class Camera:
         lead_voxels: voxel grids of the clip in front of the first one here.
         whole: [rows, columns] uint8, the video's picture that the camera's crop was taken from, or None.
         quiet: as ``rates``, of the same draw without noise, or None: not measured.
+        boxes: [T, n, 7], see ``v2v_protocol.sample.BOX_COLUMNS``, or None.
+        masks: [T, H, W] uint8, classes, or None.
     """
 
     voxels: npt.NDArray[Any]
@@ -67,6 +69,8 @@ class Camera:
     lead_voxels: int = 0
     whole: npt.NDArray[np.uint8] | None = None
     quiet: npt.NDArray[np.float64] | None = None
+    boxes: npt.NDArray[Any] | None = None
+    masks: npt.NDArray[np.uint8] | None = None
 
     @classmethod
     def of(
@@ -88,6 +92,7 @@ class Camera:
         if recipe is not None and recipe.grids_per_frame:
             voxels = voxels.reshape(-1, recipe.grids_per_frame * recipe.bins, *voxels.shape[2:])
         count = min(len(array) for array in (voxels, frames, flow) if array is not None)
+        boxes, masks = arrays.get("boxes"), arrays.get("masks")
         return cls(
             voxels[len(voxels) - count :],
             np.asarray(frames[len(frames) - count :]),
@@ -97,6 +102,8 @@ class Camera:
             steps_per_frame,
             len(voxels) - count,
             whole,
+            boxes=None if boxes is None else np.asarray(boxes[len(boxes) - count :]),
+            masks=None if masks is None else np.asarray(masks[len(masks) - count :, 0]),
         )
 
     @property

@@ -8,6 +8,7 @@ from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
 from v2v_pictures.canvas import GAP_PX, MARGIN_PX, Canvas, label
 from v2v_pictures.colours import Image, draw_events, draw_grey
+from v2v_pictures.labels import labelled_panel
 from v2v_pictures.sheet import Scale, events_heading, flow_panel
 from v2v_pictures.strip import LABEL_PX, TICKS_PX, draw_strip
 
@@ -82,8 +83,9 @@ def _draw_camera(page: Canvas, camera: Camera, place: int, top: int, number: int
     page.text(left[0], top, "video frame", size=canvas.HEADING_PT)
     events_heading(page, left[1], top, "events:")
     top += _NAMES_PX
-    page.panel(left[0], top, draw_grey(camera.frames[grid]), tile_px, tile_px)
-    page.panel(left[1], top, draw_events(camera.voxels[grid, bin_], scale.full), tile_px, tile_px)
+    labelled_panel(page, camera, grid, left[0], top, draw_grey(camera.frames[grid]), tile_px, with_text=True)
+    events = draw_events(camera.voxels[grid, bin_], scale.full)
+    labelled_panel(page, camera, grid, left[1], top, events, tile_px)
     if camera.paused[number]:
         label(page, left[1] + 5, top + 5, "paused")
     if camera.flow is not None:

@@ -16,6 +16,7 @@ from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
 from v2v_pictures.canvas import GAP_PX, MARGIN_PX, Canvas, label
 from v2v_pictures.colours import BRIGHTER, DARKER, Image, draw_events, draw_flow, draw_grey, draw_wheel, full_colour
+from v2v_pictures.labels import labelled_panel
 from v2v_pictures.overview import draw_overview, overview_height, overview_width, whole_panel
 from v2v_pictures.strip import LABEL_PX, TICKS_PX, draw_strip
 
@@ -176,10 +177,11 @@ def _camera_line(page: Canvas, camera: Camera, number: int, picks: Sequence[int]
 
 
 def _moment(page: Canvas, camera: Camera, pick: int, scale: Scale, left: list[int], y: int, tile_px: int) -> None:
-    page.panel(left[0], y, draw_grey(camera.frames[pick]), tile_px, tile_px)
+    labelled_panel(page, camera, pick, left[0], y, draw_grey(camera.frames[pick]), tile_px, with_text=True)
     bins = camera.voxels.shape[1]
     for number in range(min(bins, MOST_BINS)):
-        page.panel(left[1 + number], y, draw_events(camera.voxels[pick, number], scale.full), tile_px, tile_px)
+        events = draw_events(camera.voxels[pick, number], scale.full)
+        labelled_panel(page, camera, pick, left[1 + number], y, events, tile_px)
         if camera.paused[pick * bins + number]:
             label(page, left[1 + number] + 5, y + 5, "paused")
     if camera.flow is not None:
@@ -200,6 +202,8 @@ def _legend(page: Canvas, cameras: Sequence[Camera], scale: Scale, top: int) -> 
     said = "threshold: the change of log brightness that makes an event, brighter / darker"
     page.text(x, y + 56, said, colour=canvas.SOFT)
     said = "pale bars of the strip: noise; a bar is as long as the square root of the events"
+    if any(camera.boxes is not None or camera.masks is not None for camera in cameras):
+        said += "; boxes and tints in a panel: labels, a colour a class"
     page.text(x, y + 80, said, colour=canvas.SOFT)
     if cameras[0].flow is not None:
         radius = 46

@@ -139,7 +139,8 @@ class Welcome:
 class SampleHeader:
     """One sample; the raw bytes of each array follow as frames of their own, C order, little endian.
 
-    If ``slot`` is set and no frames follow, the arrays lie in that slot, one after the other.
+    If ``slot`` is set and no frames follow, the arrays lie in that slot, one after the other. If ``arena`` is set as
+    well, they lie in that arena of the server instead, which has one slot and whose content is sealed.
 
     Attributes:
         epoch, index: which sample.
@@ -155,6 +156,7 @@ class SampleHeader:
         slot: the slot that the lease named, to which this worker no longer writes; 0: the lease named no slot.
         quarantine: number of the quarantine snapshot that the lease named, as in the provenance.
         packed: the raw frames are zstd frames, one for each array.
+        arena: name of the server's memory that holds the arrays; "": they lie in the slot, or follow.
     """
 
     epoch: int
@@ -170,6 +172,7 @@ class SampleHeader:
     slot: int = 0
     quarantine: int = 0
     packed: bool = False
+    arena: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -67,6 +67,7 @@ quarantine = _program("v2v-quarantine", "v2v_server.commands.quarantine", "main"
 doctor = _program("v2v-doctor", "v2v_server.commands.doctor", "main", "server")
 keys = _program("v2v-keys", "v2v_server.commands.keys", "main", "server")
 tradeoff = _program("v2v-tradeoff", "v2v_server.commands.tradeoff", "main", "server")
+fit = _program("v2v-fit", "v2v_server.commands.fit", "main", "server")
 loadtest = _program("v2v-loadtest", "v2v_client.tools.loadtest", "main", "client")
 train = _program("v2v-train", "trainer.train", "main", "trainer")
 evaluate = _program("v2v-eval", "trainer.evaluation.cli", "main", "trainer")

@@ -56,10 +56,12 @@ EFFECTS = "Effects beyond the paper's model; zero is off"
 TIME_UNITS = ("Hz", "s")
 """An effect in one of these needs the time between frames."""
 _LARGEST_FRAMES = 1_000_001
-LATER_FIELDS = ("grids_per_frame", "voxel_seconds")
+LATER_FIELDS = ("grids_per_frame", "max_boxes", "light", "voxel_seconds")
 """Fields that the plain form leaves out at their defaults, so that older digests hold."""
 MOST_STEPS_PER_GRID = 1024
 """Largest number of steps between video frames that a grid of ``voxel_seconds`` may span."""
+BRIGHTEST = 50.0
+"""Upper limit of light where a recipe uses the transfer that a video states; white is 1. PQ reaches 49.3."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +89,9 @@ class Recipe:
     lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
     lead_voxels: int = whole(0, 0, 1, "1 adds one voxel grid before the first (ERAFT)")
     frame_stride: int = whole(1, 1, 1000, "use every n-th frame, as if the video had 1/n of its frame rate")
+    max_boxes: int = whole(
+        64, 1, 4096, "most boxes of a frame, if boxes are requested; the smallest ones beyond it are left out"
+    )
 
     crop_height_px: int = whole(128, 1, LARGEST_SIDE_PX, "height of the random crop", unit="px", group="View")
     crop_width_px: int = whole(128, 1, LARGEST_SIDE_PX, "width of the random crop", unit="px")
@@ -110,6 +115,11 @@ class Recipe:
     log_eps: Range = span(
         (0.001, 0.001), 1e-12, 1.0, "epsilon inside the logarithm: the dark current as a share of white's photocurrent"
     )
+    light: str = word(
+        "sdr", ("sdr", "declared"),
+        "sdr: read 8 bits of every video, and apply gamma; declared: read the bit depth that the video has, up to 12, "
+        "and apply the transfer that it states (PQ, HLG, log, linear), or gamma where it states none of these",
+    )  # fmt: skip
 
     threshold: Range = span(
         (0.05, 2.0), 1e-6, 1e6, "smaller of the two contrast thresholds", unit="log units", group="Pixel"
@@ -320,7 +330,8 @@ class Recipe:
         smallest, largest = pixel_thresholds(min(low, high), nominal, self.threshold_mismatch_sigma[1])
         sigma = self.noise_sigma[1] * (nominal if self.noise_scales_with_threshold else 1.0)
         hot = self.hot_pixel_sigma[1] if self.hot_pixel_share[1] else 0.0
-        ends = math.log(self.log_eps[0]), math.log1p(self.log_eps[1])
+        brightest = 1.0 if self.light == "sdr" else BRIGHTEST
+        ends = math.log(self.log_eps[0]), math.log1p(self.log_eps[1] + (brightest - 1.0))
         unit = step_seconds if self.noise_unit == "second" else 1.0
         leak = self.leak_hz[1] * largest * step_seconds
         steps = self.spans * int(self.steps_at(self.frame_stride / step_seconds))
@@ -337,9 +348,9 @@ class Recipe:
         low, high = self.log_eps
         if low == high:
             values["log_eps"] = low
-        return {
-            name: value for name, value in values.items() if value not in (0, [0.0, 0.0]) or name not in LATER_FIELDS
-        }
+        defaults = {name: settings_of(Recipe)[name].default for name in LATER_FIELDS}
+        plain = {name: list(value) if isinstance(value, tuple) else value for name, value in defaults.items()}
+        return {name: value for name, value in values.items() if name not in plain or value != plain[name]}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:

@@ -20,6 +20,11 @@ from v2v_protocol.tables import html_table
 LARGEST_SEED = 2**64 - 1
 LARGEST_EPOCH = 2**32 - 1
 LARGEST_INDEX = 2**48 - 1
+BOX_COLUMNS = ("x0", "y0", "x1", "y1", "class", "track", "visible")
+"""Columns of the array ``boxes``: corners in px of the crop, class, track, and the share of the box in the crop.
+
+Coordinates are continuous: pixel (row, column) covers column <= x < column + 1 and row <= y < row + 1. Class and track
+are whole numbers; a box without a track has -1. Rows without a box hold -1 in all columns."""
 ArrayForm: TypeAlias = Callable[[Recipe, str], tuple[str, tuple[int, ...]]]
 
 
@@ -31,13 +36,22 @@ class FromSidecar:
         ending: of the sidecar's name, in the place of the video's: ".boxes.json" for ``clip.boxes.json`` beside
             ``clip.mp4``; with a slash at its end for a folder.
         form: dtype and shape, as for any array.
+        or_else: other endings that the array can be made from.
+        empty: value of the whole array in a sample without labels.
     """
 
     ending: str
     form: ArrayForm
+    or_else: tuple[str, ...] = ()
+    empty: int = 0
 
     def __call__(self, recipe: Recipe, voxel_dtype: str) -> tuple[str, tuple[int, ...]]:
         return self.form(recipe, voxel_dtype)
+
+    @property
+    def endings(self) -> tuple[str, ...]:
+        """All endings that the array can be made from."""
+        return self.ending, *self.or_else
 
 
 ARRAYS: dict[str, ArrayForm] = {
@@ -49,8 +63,26 @@ ARRAYS: dict[str, ArrayForm] = {
         "float32" if voxel_dtype == "float32" else "float16", (recipe.voxel_grids, recipe.bins, *recipe.crop_px)
     ),
     "frames": lambda recipe, _: ("uint8", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
+    "frames_rgb": lambda recipe, _: (
+        "uint8", (recipe.voxels_per_clip + recipe.lead_frames, 3, *recipe.crop_px)
+    ),
+    "frames_all": lambda recipe, _: ("uint8", (recipe.steps + 1, 1, *recipe.crop_px)),
+    "frames_u16": lambda recipe, _: ("uint16", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
     "flow": lambda recipe, _: ("float16", (recipe.voxels_per_clip, 2, *recipe.crop_px)),
     "flow_valid": lambda recipe, _: ("uint8", (recipe.voxels_per_clip, 1, *recipe.crop_px)),
+    "boxes": FromSidecar(
+        ".boxes.json",
+        lambda recipe, _: (
+            "float32", (recipe.voxels_per_clip + recipe.lead_frames, recipe.max_boxes, len(BOX_COLUMNS))
+        ),
+        or_else=(".boxes.txt", ".boxes/"),
+        empty=-1,
+    ),
+    "masks": FromSidecar(
+        ".masks/",
+        lambda recipe, _: ("uint8", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
+        empty=255,
+    ),
 }  # fmt: skip
 """Arrays a consumer may request: dtype and shape for one sample (no batch dimension), by the recipe and the spec's
 ``voxel_dtype``. ``v2v_server.worker.arrays`` makes them, ``Batch.arrays`` has them. Flow is px in (x, y); flow_valid is
@@ -59,7 +91,10 @@ ARRAYS: dict[str, ArrayForm] = {
 event_counts are the negative (0) and positive (1) events of each bin: one array with an axis of polarity, because
 RVT's stacked histogram and the input of a spiking network are then views of it, with one name and one buffer. Its dtype
 is that of the voxels, so that ``counts[:, 1] - counts[:, 0]`` does not wrap. voxels_bilinear shares each event between
-the two bins next to its time (Zhu et al. 2019)."""
+the two bins next to its time (Zhu et al. 2019).
+
+frames_rgb are the frames in colour; frames_all are all frames that are simulated, the first included. boxes and masks
+belong to the frames of the same number. masks hold classes; 255 marks a sample without labels."""
 DEFAULT_ARRAYS = ("voxels", "frames")
 Layout: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
 """dtype and shape of each array of one sample, by name, in the order of the headers."""
@@ -181,6 +216,8 @@ class Provenance:
         scene: decisions from the statistics of its scene, and the figures behind them; empty with scene "off".
         saturated: as ``saturated_bins``, for other arrays by name; only those that have any.
         sidecars: fingerprints of the sidecars that its arrays were made from, by ending.
+        unlabelled: reason by array, for each requested array that could not be made from the video's sidecars.
+        boxes_dropped: boxes that ``max_boxes`` left out, in all frames of the sample.
         grid_seconds: actual duration of each voxel grid, where the recipe states ``voxel_seconds``.
         left_out: effects of the draw that were not simulated (``tolerance`` of the spec).
     """
@@ -199,8 +236,15 @@ class Provenance:
     scene: str = ""
     saturated: Mapping[str, int] = dataclasses.field(default_factory=dict)
     sidecars: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    unlabelled: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    boxes_dropped: int = 0
     grid_seconds: tuple[float, ...] = ()
     left_out: tuple[str, ...] = ()
+
+    @property
+    def labelled(self) -> bool:
+        """Whether all requested labels could be made."""
+        return not self.unlabelled
 
     def __repr__(self) -> str:
         where = f"seed {self.id.seed}, epoch {self.id.epoch}, index {self.id.index}"
@@ -213,15 +257,13 @@ class Provenance:
         return html_table(f"{self.video}, from frame {self.start_frame}", rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values, as they travel in the sample's header; fields after ``quarantine`` are
-        left out if they are empty.
-        """
+        """Return plain values, as they travel in the sample's header, without optional fields that are empty."""
         values = _fields(self) | {
             "id": _fields(self.id),
             "refusals": tuple(refusal.to_dict() for refusal in self.refusals),
             "params": self.params.to_dict(),
         }
-        optional = ("scene", "saturated", "sidecars", "grid_seconds", "left_out")
+        optional = ("scene", "saturated", "sidecars", "unlabelled", "boxes_dropped", "grid_seconds", "left_out")
         return {name: value for name, value in values.items() if value or name not in optional}
 
     @classmethod
@@ -264,20 +306,29 @@ def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> L
     """Return dtype and shape of each requested array of one sample, as :data:`ARRAYS` states them.
 
     Raises:
-        UsageError: an unknown array, an array requested twice, or an empty request.
+        UsageError: an unknown array, an array requested twice, an empty request, or ``frames_all`` with
+            ``voxel_seconds``.
     """
     if not arrays or len(set(arrays)) != len(arrays):
         raise UsageError(f"arrays = {list(arrays)}: ask for one or more of {', '.join(ARRAYS)}, each once")
     for name in arrays:
         if name not in ARRAYS:
             raise UsageError(f"arrays: unknown array {name!r}; known: {', '.join(ARRAYS)}")
+    if recipe.is_timed and "frames_all" in arrays:
+        raise UsageError("arrays: frames_all has another length in each sample with voxel_seconds: ask for frames")
     return {name: ARRAYS[name](recipe, voxel_dtype) for name in arrays}
 
 
 def sidecar_endings(arrays: tuple[str, ...]) -> tuple[str, ...]:
     """Return the endings of the sidecars that these arrays are made from, sorted."""
     forms = (ARRAYS.get(name) for name in arrays)
-    return tuple(sorted({form.ending for form in forms if isinstance(form, FromSidecar)}))
+    return tuple(sorted({ending for form in forms if isinstance(form, FromSidecar) for ending in form.endings}))
+
+
+def empty_value(name: str) -> int:
+    """Return the value of an array in a sample without its labels, see :class:`FromSidecar`."""
+    form = ARRAYS[name]
+    return form.empty if isinstance(form, FromSidecar) else 0
 
 
 def layout_bytes(layout: Layout) -> int:

@@ -22,6 +22,7 @@ from v2v_protocol.settings import (
     require_known,
     settings_of,
     switch,
+    text,
     whole,
     word,
 )
@@ -37,10 +38,12 @@ FLOW_METHODS: tuple[FlowMethod, ...] = get_args(FlowMethod)
 ON_BAD_VIDEO: tuple[OnBadVideo, ...] = get_args(OnBadVideo)
 FLOW_DIRECTIONS: tuple[FlowDirection, ...] = get_args(FlowDirection)
 SCENES: tuple[SceneChoice, ...] = get_args(SceneChoice)
+DEFECTS = ("bars", "black", "combed", "cuts", "duplicates", "fades", "white")
+"""What scene "auto" finds in a video and leaves out."""
 MOST_SAMPLES_PER_DECODE = 32
 MOST_SUBSTEPS = 16
 """Largest number of sub-steps of a step between video frames."""
-LATER_FIELDS = ("substep_px", "tolerance")
+LATER_FIELDS = ("substep_px", "keep_defects", "still_share", "tolerance")
 """Fields that the plain form leaves out at their defaults, so that older digests hold."""
 
 
@@ -102,10 +105,12 @@ class StreamSpec:
     )  # fmt: skip
     scene: SceneChoice = word(
         "off", SceneChoice,
-        "auto decodes all videos once, leaves out sequences with a shot boundary or with nothing to see, and skips "
-        "flow where nothing moves (if flow_method is auto)",
+        "auto decodes all videos once, drops repeated frames, leaves out bars, cuts, fades, combed pictures and what "
+        "shows nothing, and skips flow where nothing moves (if flow_method is auto)",
         group="Scene",
     )  # fmt: skip
+    keep_defects: str = text("", f"what scene auto serves as it is, with commas between; of {', '.join(DEFECTS)}")
+    still_share: float = number(0.1, 0.0, 1.0, "share of the still sequences that scene auto serves")
     substep_px: float = number(
         0.0, 0.0, 64.0,
         "longest motion that a pixel model sees as one step: a step in which the picture moves further is divided, at "
@@ -122,6 +127,9 @@ class StreamSpec:
 
     def __post_init__(self) -> None:
         check_settings(self, "spec {}".format)
+        kinds = sorted({kind.strip() for kind in self.keep_defects.split(",")} - {""})
+        require_known(kinds, DEFECTS, "kind in spec keep_defects")
+        object.__setattr__(self, "keep_defects", ",".join(kinds))
         if self.flow_from > self.recipe.voxels_per_clip:
             raise UsageError(
                 f"spec flow_from = {self.flow_from}: give a whole number from 0 to the recipe's voxels_per_clip "
@@ -139,6 +147,11 @@ class StreamSpec:
                 "1: set sibling_spacing = 0, or raise samples_per_decode"
             )
 
+    @property
+    def kept_defects(self) -> frozenset[str]:
+        """The defects that are served as they are: all with scene "off"."""
+        return frozenset(DEFECTS if self.scene == "off" else filter(None, self.keep_defects.split(",")))
+
     def spaced(self, stride: int) -> StreamSpec:
         """Return this spec with its ``sibling_spacing`` set.
 
@@ -152,7 +165,8 @@ class StreamSpec:
     def to_dict(self) -> dict[str, Any]:
         """Return all fields as plain values, without LATER_FIELDS that are at their defaults."""
         plain = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        plain = {name: value for name, value in plain.items() if value or name not in LATER_FIELDS}
+        defaults = {name: setting.default for name, setting in settings_of(StreamSpec).items()}
+        plain = {name: value for name, value in plain.items() if name not in LATER_FIELDS or value != defaults[name]}
         return plain | {"recipe": self.recipe.to_dict()}
 
     @classmethod
@@ -207,6 +221,8 @@ class SpecOptions(TypedDict, total=False):
     flow_from: int | None
     flow_margin_px: int | None
     scene: SceneChoice | None
+    keep_defects: str | None
+    still_share: float | None
     substep_px: float | None
     tolerance: float | None
 

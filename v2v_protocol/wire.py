@@ -51,11 +51,11 @@ MOST_CONTAINERS = 4096
 """Lists and maps in a header. They cost a hundred times their bytes; a Lease, the largest in use, has some dozens."""
 LARGEST_ARRAY_BYTES = 1 << 31
 LARGEST_TUPLE = 65_536
-ARRAY_DTYPES = ("int8", "uint8", "int16", "float16", "float32")
+ARRAY_DTYPES = ("int8", "uint8", "int16", "uint16", "float16", "float32")
 _DTYPE_NAMES = {np.dtype(name): name for name in ARRAY_DTYPES}
 _ENCRYPTION_BYTES = 64
 """Bytes added to a frame by encryption; CURVE adds 33."""
-_MOST_ARRAYS = 8
+_MOST_ARRAYS = 16
 _MOST_DIMENSIONS = 8
 _DEEPEST_NESTING = 16
 """Containers within containers. Deeper ones could not even be shown in an error message (RecursionError)."""
@@ -86,6 +86,7 @@ _NAMES = {cls: name for name, cls in _TYPES.items()}
 _LATER: dict[type[Any], dict[str, Any]] = {
     Welcome: {"sidecars": ""},
     LeaseFailed: {"sidecar": ""},
+    SampleHeader: {"arena": ""},
     Lease: {"sidecars": {}},
 }
 """Fields that were added within a protocol version, with their defaults: a header leaves them out at the default."""

@@ -10,7 +10,6 @@
     quarantine/   sequences that brought workers down
     worker/       from a lease to its sample
     schedule/     which sequence each index is made from
-    defects/      what is wrong with the pictures of a video
     corpus/       which videos exist
     store/        prepared clips, lossless
     flow/         optical flow

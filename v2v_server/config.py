@@ -107,6 +107,11 @@ class ServeConfig:
         600.0, 0.001, 1e6, "a consumer that is silent for longer is forgotten; it can reconnect", unit="s", metavar="S"
     )
     max_credit_bytes: int = whole(2 << 30, 1, 1 << 40, "largest number of bytes in flight to one consumer")
+    share_gib: float = number(
+        0.0, 0.0, 1e6,
+        "memory for finished samples: each is made once for all consumers that request equal ones; 0: off",
+        unit="GiB", metavar="N",
+    )  # fmt: skip
     page: int = whole(
         0, 0, 65535, "port of the status page and its metrics; 5580 if no PORT is given, 0: no page",
         bare=5580, metavar="PORT", group="Watching",

@@ -31,7 +31,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.flow.methods import AUTO, METHODS, Estimator, choose, estimator
 from v2v_server.simulation.draw import draw
-from v2v_server.simulation.view import source_window
+from v2v_server.simulation.view import Window, source_window
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
 
@@ -134,7 +134,7 @@ def largest_flow_of_a_still_clip_px() -> float:
     settings = FlowSettings()
     frames = np.repeat(photograph("camera")[None, :180, :300], recipe.frames_needed, axis=0)
     params = draw(recipe, seed=0, epoch=0, index=0, picture_height_px=180, picture_width_px=300, video_id="still")
-    top, left, height, width = source_window(params, recipe, 0, 180, 300, settings.margin_px)
+    top, left, height, width = source_window(params, recipe, Window(0, 0, 180, 300), settings.margin_px)
     seen = frames[:, top : top + height, left : left + width]
     return float(np.abs(flow_for(seen, params, recipe, settings).flow).max())
 

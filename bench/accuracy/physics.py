@@ -1,11 +1,11 @@
 """Measure the error of simulating from few frames, against exact events.
 
-    python -m bench physics --video VIDEO --recording RECORDING.aedat4 --json physics.json --plot physics.png
+    python -m bench physics --video VIDEO --json physics.json --plot physics.png
 
 Analytic scenes have events known from a formula. Photographs moved along a known path are rendered at 1200 frames a
 second, and every frame is simulated event by event; so is a film of true high rate (``--video``). V2V gets every n-th
-frame. Both sides start with the same residuals and are summed into the same bins. ``--recording`` compares the events
-of a camera with V2V's from the camera's frames, at the threshold that fires as many.
+frame. Both sides start with the same residuals and are summed into the same bins. The sensor bench compares the
+events of a real camera.
 
     count error   (events of V2V - events) / events, whatever their sign
     voxel error   sum of |V2V - true| / sum of |true|, over the signed counts of common bins and pixels
@@ -24,9 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage  # type: ignore[import-untyped]
 
-from bench.accuracy.sensor import BLUR_SIGMA_PX, Recording, lamps, read_recording
 from bench.frame import Column, Record, Report
 from bench.plots import panels
 from tests.oracles.analytic_scenes import SECONDS, START_SHARE, analytic_scenes, moved_photograph
@@ -52,18 +50,6 @@ EVERY = (1, 2, 4, 8, 16, 48)
 SPEEDS_PX = (0.005, 0.02, 0.1, 0.5)  # px per rendered frame: 6 to 600 px/s
 VIDEO_EVERY, VIDEO_BIN_FRAMES, VIDEO_SIDE_PX = (1, 2, 4, 8, 16), 16, 320
 LARGEST_DIFFERENCE_PPM = 60.0
-_RECORDED: tuple[Column, ...] = (
-    ("part", "real events", "{}", 1),
-    ("gamma", "gamma", "{:g}", 1),
-    ("events_real", "events", "{:.0f}", 1),
-    ("threshold", "c of equal count", "{:.3f}", 1),
-    ("rising_share_real", "rising", "{:.0%}", 1),
-    ("rising_share_v2v", "V2V", "{:.0%}", 1),
-    ("active_share_real", "active pixels", "{:.1%}", 1),
-    ("active_share_v2v", "V2V", "{:.1%}", 1),
-    ("correlation_signed", "signed counts", "{:.2f}", 1),
-    ("correlation_mirrored", "counts, mirrored", "{:.2f}", 1),
-)
 
 
 def analytic(threshold: float = 0.2) -> Records:
@@ -182,39 +168,6 @@ def liveliest(frames: Frames, side: int) -> Frames:
     return np.ascontiguousarray(frames[:, top : top + side, left : left + side])
 
 
-def recorded(recording: Recording) -> Records:
-    """Return one record for each gamma and part of a recording, at the threshold that fires as many events."""
-    counts = recording.counts(recording.seconds[0], recording.seconds[-1])
-    bright = lamps(recording.frames)
-    records: Records = []
-    for gamma in (1.0, 2.2):
-        made = {
-            c: simulate(
-                recording.frames, threshold_pos=c, gamma=gamma, bins=len(recording.frames) - 1, dtype="int16"
-            ).voxels[0].astype(np.float64)
-            for c in np.geomspace(0.03, 1.0, 36).tolist()
-        }  # fmt: skip
-        for part, mask in (("whole picture", np.ones_like(bright)), ("without the lamps", ~bright)):
-            real = float(sum(side[mask].sum() for side in counts))
-            threshold = min(made, key=lambda c: abs(np.abs(made[c][:, mask]).sum() - real))
-            v2v = [np.maximum(sign * made[threshold], 0).sum(0) for sign in (1, -1)]
-            pairs = {
-                "signed": (counts[0] - counts[1], v2v[0] - v2v[1]),
-                "mirrored": ((counts[0] + counts[1])[:, ::-1], v2v[0] + v2v[1]),  # a control
-            }
-            records.append(
-                {"measure": "recorded", "part": part, "gamma": gamma, "events_real": real, "threshold": threshold}
-                | {f"rising_share_{name}": float(side[0][mask].sum() / max(1.0, (side[0] + side[1])[mask].sum()))
-                   for name, side in (("real", counts), ("v2v", v2v))}
-                | {f"active_share_{name}": float(((side[0] + side[1]) > 0)[mask].mean())
-                   for name, side in (("real", counts), ("v2v", v2v))}
-                | {f"correlation_{name}": float(np.corrcoef(
-                       *(ndimage.gaussian_filter(each, BLUR_SIGMA_PX)[mask] for each in pair))[0, 1])
-                   for name, pair in pairs.items()}
-            )  # fmt: skip
-    return records
-
-
 def missed(records: Sequence[Record]) -> list[str]:
     """Return the bars that these records miss."""
     texts = []
@@ -244,7 +197,6 @@ def pivot(records: Sequence[Record], down: dict[str, str], across: str, unit: st
 def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     parser.add_argument("--video", type=Path, metavar="FILE", help="a film of high frame rate")
-    parser.add_argument("--recording", type=Path, metavar="FILE.aedat4", help="frames and events of one camera")
 
 
 def measure(asked: argparse.Namespace) -> Report:
@@ -261,9 +213,8 @@ def measure(asked: argparse.Namespace) -> Report:
         tables.append(pivot(chosen, {"motion_px_per_frame": title, "frame_rate_hz": "Hz"}, "threshold", "c ="))
     if film:
         tables.append(pivot(film, {"every": "film, every n-th frame", "frame_rate_hz": "Hz"}, "threshold", "c ="))
-    real = [] if asked.recording is None else recorded(read_recording(asked.recording))
-    records = [*scenes, *photographs, *film, *real]
-    return Report(records, [*tables, (real, _RECORDED)] if real else tables, missed=missed(records))
+    records = [*scenes, *photographs, *film]
+    return Report(records, tables, missed=missed(records))
 
 
 def plot(records: Sequence[Record], file: Path) -> None:

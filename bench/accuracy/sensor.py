@@ -6,7 +6,6 @@ The frames of a recording are simulated, one bin from each frame to the next, an
 pixels recorded in that time. Each setting uses the threshold that fires as many events as the camera did.
 
     pixels     correlation of the signed counts of every pixel and bin
-    blurred    the same, both blurred by 2 px: events of two cameras never coincide to the pixel
     mirrored   the same as pixels with the simulation mirrored: a control
     ceiling    correlation of the frames' change of log intensity, before a threshold turns it into events
 
@@ -24,14 +23,12 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage  # type: ignore[import-untyped]
 
 from bench.frame import Column, Report
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_server.simulation import simulate
 
-BLUR_SIGMA_PX = 2.0  # Blur of both counts before they are correlated: single events of two cameras never coincide
 LAMP_LEVEL, LAMP_MARGIN_PX = 250, 12
 Image = npt.NDArray[np.float64]
 LOG_OFFSETS = (0.001, 0.003, 0.01, 0.03, 0.05, 0.1, 0.15, 0.2, 0.5)
@@ -52,7 +49,6 @@ _COLUMNS: tuple[Column, ...] = (
     ("first_residual", "residual", "{}", 1),
     ("threshold", "c", "{:.3f}", 1),
     ("correlation_pixels", "pixels", "{:.3f}", 1),
-    ("correlation_blurred", "blurred", "{:.3f}", 1),
     ("correlation_pixels_mirrored", "mirrored", "{:.3f}", 1),
     ("ceiling_pixels", "ceiling", "{:.3f}", 1),
     ("effect", "effect", "{}", 1),
@@ -142,10 +138,9 @@ class Sensor:
             "log_eps": log_eps,
             "first_residual": "random" if residual is None else "zero",
             "threshold": threshold,
-            "correlation_pixels": self._alike(made[threshold], 0.0),
-            "correlation_blurred": self._alike(made[threshold], BLUR_SIGMA_PX),
-            "correlation_pixels_mirrored": self._alike(made[threshold][:, :, ::-1], 0.0),
-            "ceiling_pixels": self._alike(change, 0.0),
+            "correlation_pixels": self._alike(made[threshold]),
+            "correlation_pixels_mirrored": self._alike(made[threshold][:, :, ::-1]),
+            "ceiling_pixels": self._alike(change),
         }
 
     def _simulated(
@@ -158,13 +153,9 @@ class Sensor:
         counts: Counts = voxels[0].astype(np.float64)
         return counts
 
-    def _alike(self, made: Counts, blur_px: float) -> float:
+    def _alike(self, made: Counts) -> float:
         """Return Pearson's correlation with the recorded events over all used pixels of all bins."""
-        one, other = (
-            np.stack([ndimage.gaussian_filter(each, blur_px) for each in counts])[:, self._used].ravel()
-            for counts in (self._recorded, made)
-        )
-        return float(np.corrcoef(one, other)[0, 1])
+        return float(np.corrcoef(self._recorded[:, self._used].ravel(), made[:, self._used].ravel())[0, 1])
 
 
 def records_of(recording: Recording) -> list[dict[str, Any]]:

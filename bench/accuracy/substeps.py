@@ -43,7 +43,7 @@ from tests.oracles.rendered import (
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
-from v2v_server.motion import levels_between
+from v2v_server.motion import levels_between, motions
 from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, predict
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import draw
@@ -107,7 +107,7 @@ def light_of(frames: Frames, levels: Levels | None, seconds: Reals) -> tuple[Rea
 
 def compared(frames: Frames, seconds: Reals, edges: Reals, true: Counts, substep_px: float) -> dict[str, float]:
     """Return the errors of frames alone and with sub-steps."""
-    levels = levels_between(frames, (0, 0, *frames.shape[1:]), np.arange(len(frames)), substep_px)
+    levels = levels_between(frames, (0, 0, *frames.shape[1:]), np.arange(len(frames)), substep_px, motions(frames))
     found: dict[str, float] = {"substeps": 1 + (0 if levels is None else len(levels.grey) / (len(frames) - 1))}
     for name, between in (("linear", None), ("divided", levels)):
         light, moments = light_of(frames, between, seconds)
@@ -214,12 +214,14 @@ def costs(substep_px: float, repeats: int) -> Iterator[dict[str, Any]]:
     for px in (2.0, 4.8, 12.0):
         pictures = rendered_scene("camera", 160, 160, px * FRAMES_PER_SECOND).frames(FRAMES_PER_SECOND, steps + 1)
         frames, source = np.ascontiguousarray(pictures[:, 16:-16, 16:-16]), np.arange(steps + 1)
-        levels = levels_between(pictures, part, source, substep_px)
+        vectors = motions(pictures)[:, :, 4:36, 4:36]
+        levels = levels_between(pictures, part, source, substep_px, vectors)
         yield {
             "measure": "cost", "px_per_frame": px, "substep_px": substep_px,
             "substeps": 1 + (0 if levels is None else len(levels.grey) / steps),
             "kernel_seconds": shortest(partial(simulate_clip, frames, params, recipe, "int8")),
-            "levels_seconds": shortest(partial(levels_between, pictures, part, source, substep_px)),
+            "motion_seconds": shortest(partial(motions, pictures)),
+            "levels_seconds": shortest(partial(levels_between, pictures, part, source, substep_px, vectors)),
             "divided_seconds": shortest(partial(simulate_clip, frames, params, recipe, "int8", levels=levels)),
         }  # fmt: skip
 

@@ -205,6 +205,12 @@ def add_flags(parser: Parser) -> None:
     add_positive(parser, "--lease-deadline-seconds", 10.0, "the server's lease deadline, seconds")
     parser.add_argument("--cache", action="store_true", help="keep decoded clips, and damage them")
     parser.add_argument("--keys", action="store_true", help="require keys: all connections are encrypted")
+    parser.add_argument(
+        "--share-gib",
+        default="0",
+        metavar="N",
+        help="memory of the server for samples of equal consumers: every fourth",
+    )
     add_whole(parser, "--remakes", 300, "samples to make again and compare")
     add_whole(parser, "--seed", 0, "of the faults", least=0)
 
@@ -228,7 +234,7 @@ def measure(asked: argparse.Namespace) -> Report:
         cache = folder / "decoded" if asked.cache else None
         fleet = Fleet(
             folder / "run", videos, asked.workers, asked.consumers, asked.lease_deadline_seconds, clip_cache=cache,
-            keyed=asked.keys,
+            keyed=asked.keys, server_flags=("--share-gib", asked.share_gib),
         )  # fmt: skip
         # Two SIGSEGVs quarantine a video: one video must remain.
         most_segv = sum(path.suffix.lower() in VIDEO_SUFFIXES for path in videos.rglob("*")) - 1

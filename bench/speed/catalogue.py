@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 
 from bench.frame import Column, Report, add_whole
+from tests.pieces import shots
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser
@@ -95,7 +96,7 @@ def make_up(clip: Path, folder: Path, cache: Path, videos: int, scene: bool = Fa
     def scenes() -> Iterator[Figures]:
         end = min(known.frames, MOST_FRAMES)
         values = np.random.default_rng(0).uniform(1.0, 10.0, (-(-end // SEGMENT_FRAMES), COLUMNS))
-        whole, split = (figures(known, Scene.of(end, shot_boundaries, values)) for shot_boundaries in ((), (end // 2,)))
+        whole, split = (figures(known, Scene.of(pieces, values)) for pieces in (shots(end), shots(end, end // 2)))
         for number, id in enumerate(ids):
             yield dataclasses.replace(whole if number % 3 else split, id=id)
 

@@ -32,10 +32,12 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "pause_probability": 0.01,
     "pause_stay_probability": 0.5,
     "frame_stride": 2,
+    "max_boxes": 9,
     "contrast_probability": 0.1,
     "contrast_scale": [1.0, 2.0],
     "gamma": 1.0,
     "log_eps": [0.002, 0.1],
+    "light": "declared",
     "threshold": [0.05, 1.0],
     "threshold_ratio": [1.0, 1.6],
     "threshold_source": "video",
@@ -66,6 +68,8 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
     "substep_px": 1.0,
     "tolerance": 0.01,
     "scene": "auto",
+    "keep_defects": "bars,cuts",
+    "still_share": 0.5,
 }
 
 

@@ -300,6 +300,7 @@ def peers(
     max_credit_bytes: int = 2 << 30,
     quarantine: Quarantine | None = None,
     expected_workers: int = 0,
+    share_bytes: int = 0,
 ) -> Peers:
     """A dispatcher over a small corpus (or the one given), with nobody connected yet."""
     videos = catalogue or corpus(*(video(f"v{number}.mp4") for number in range(5)))
@@ -313,5 +314,6 @@ def peers(
         quarantine=held,
         wall_clock=lambda: "2024-02-29T12:00:00+00:00",
         expected_workers=expected_workers,
+        share_bytes=share_bytes,
     )
     return Peers(dispatcher, videos, held)

@@ -1,8 +1,9 @@
-"""An array from a sidecar and a kind of source, added to a copy of the packages as `docs/extending.md` says."""
+"""An array from a sidecar and a kind of source, added to the packages as `docs/extending.md` says."""
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -15,33 +16,16 @@ from tests.test_seams import add
 
 ROOT = Path(__file__).parents[2]
 
-LABEL = '''
-"""The label that a file beside the video states for each frame; -1 without one."""
-
-import json
-
-from v2v_protocol.errors import SidecarError
-from v2v_server.worker.arrays import makes
-
-ENDING = ".label.json"
-
-
-@makes("label")
-def label(context, out):
-    out[:], sidecar = -1, context.clip.sidecars[ENDING]
-    if sidecar is not None:
-        labels = json.loads(sidecar.read_text())
-        frames = context.clip.start_frame + context.source * context.recipe.frame_stride
-        for place, frame in enumerate(frames[context.target_steps]):
-            if frame >= len(labels):
-                raise SidecarError(context.video, ENDING, f"has no frame {frame}")
-            out[place] = labels[frame]
-'''
-LABEL_LINES = (
-    ("v2v_protocol/sample.py", '    "flow_valid": lambda',
-     '    "label": FromSidecar(".label.json", lambda recipe, _: ("float32", (recipe.voxels_per_clip,))),\n'),
+FORM, BUILDER = re.findall(
+    r"```python\n(.*?)```",
+    (ROOT / "docs/extending.md").read_text("utf-8").partition("### An array from a file beside the video")[2],
+    re.DOTALL,
+)[:2]
+"""The line and the file that the page shows for depth."""
+DEPTH_LINES = (
+    ("v2v_protocol/sample.py", '    "flow_valid": lambda', FORM),
     ("v2v_server/worker/produce.py", "from v2v_server.worker.arrays import",
-     "import v2v_server.worker.label  # noqa: F401\n"),
+     "import v2v_server.worker.depth  # noqa: F401\n"),
 )  # fmt: skip
 
 SOURCE = '''
@@ -81,6 +65,24 @@ def open_source(name, options):
 '''
 SOURCE_LINE = ("v2v_server/corpus/sources/source.py", '"copies", "prepared"', '"toy", ')
 
+OVERLAY = '''
+"""Import a module from this folder if it is there. All others, the kernels too, are those of the packages."""
+
+import sys
+from importlib.util import spec_from_file_location
+from pathlib import Path
+
+
+class Overlay:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        file = Path(__file__).parent.joinpath(*name.split(".")).with_suffix(".py")
+        return spec_from_file_location(name, file) if file.is_file() else None
+
+
+sys.meta_path.insert(0, Overlay)
+'''
+
 USE_SIDECAR = """
 import json, sys
 from pathlib import Path
@@ -95,48 +97,58 @@ from v2v_server.offline.remake import remake
 folder, cache = Path(sys.argv[1]), sys.argv[2]
 small = dict(voxels_per_clip=4, bins=2, crop_height_px=16, crop_width_px=24, pause_probability=0.0)
 flags = ["--cache-dir", cache, *(f"--set={name}={value}" for name, value in small.items())]
-arrays = ("frames", "label")
+arrays = ("frames", "depth")
 
-def stream(server, asked=arrays, **more):
-    return V2VStreamDataset(server.address, batch_size=2, arrays=asked, seed=1, **more)
+def stream(server, asked=arrays, labels="optional", **more):
+    return V2VStreamDataset(server.address, batch_size=2, arrays=asked, seed=1, labels=labels, **more)
 
-def labels(batches):
+def depths(batches):
     made = {}
     for batch in batches:
-        made.update(zip(batch.indices, np.asarray(batch.arrays["label"]).tolist()))
+        depth = np.asarray(batch["depth"])
+        assert depth.shape == (2, 4, 1, 16, 24) and (depth == depth[..., :1, :1]).all()
+        made.update(zip(batch.indices, depth[:, :, 0, 0, 0].tolist()))
     return made
 
+def write(frames):
+    for frame in range(frames):
+        np.save(folder / f"a.depth/{frame:06}.npy", np.full((16, 24), 10.0 * frame, np.float32))
+
+write(30)
 with LocalServer(folder, workers=1, flags=flags) as server:
     batches = list(stream(server))
-    made = labels(batches)
-    assert labels(stream(server, shared_memory=False)) == made, "in the message as in shared memory"
+    made = depths(batches)
+    assert depths(stream(server, shared_memory=False)) == made, "in the message as in shared memory"
     state, plain = batches[0].resume_state, next(iter(stream(server, ("frames",)))).resume_state
     resumed = stream(server)
     resumed.load_state_dict(state)
-    rest = labels(resumed)
+    rest = depths(resumed)
     assert rest == {index: made[index] for index in rest} and len(rest) == len(made) - 2
     for batch in batches:
-        for row, origin in zip(np.asarray(batch.arrays["label"]), batch.provenance):
+        for row, origin in zip(np.asarray(batch["depth"][:, :, 0, 0, 0]), batch.provenance):
             expected = [-1.0] * 4
             if origin.video == "a.mp4":
                 expected = [10.0 * (origin.start_frame + 2 * step) for step in range(1, 5)]
-                assert list(origin.sidecars) == [".label.json"]
+                assert list(origin.sidecars) == [".depth/"]
             assert row.tolist() == expected, (origin, row)
 assert state["sidecars"] and "sidecars" not in plain
 
-with_labels = open_catalogue(folder, cache_dir=cache, processes=0)
+with_depth = open_catalogue(folder, cache_dir=cache, processes=0)
 for index, expected in made.items():
-    sample = remake(with_labels, StreamSpec.from_dict(state["spec"]), seed=1, epoch=0, index=index, arrays=arrays)
-    assert sample.arrays["label"].tolist() == expected
+    sample = remake(with_depth, StreamSpec.from_dict(state["spec"]), seed=1, epoch=0, index=index, arrays=arrays)
+    assert sample.arrays["depth"][:, 0, 0, 0].tolist() == expected
 
-# A damaged label is an error of that sample in the consumer; an array without labels does not notice.
-(folder / "a.label.json").write_text("[1, 2]")
+# A damaged sidecar leaves its samples without labels, or is an error; an array without labels does not notice.
+(folder / "a.depth/000002.npy").write_text("no array")
 with LocalServer(folder, workers=1, flags=flags) as server:
+    origins = [each for batch in stream(server) for each in batch.provenance]
+    assert any("a.mp4: its sidecar .depth/: " in each.unlabelled.get("depth", "") for each in origins)
+    assert all(each.unlabelled for each in origins if each.video == "b.mp4")
     try:
-        list(stream(server))
+        list(stream(server, labels="required"))
         raise AssertionError("no error")
     except SampleUnavailable as error:
-        assert "a.mp4: its sidecar .label.json: has no frame" in str(error), error
+        assert "its sidecar .depth/: " in str(error) and 'labels="optional"' in str(error), error
     resumed = stream(server)
     resumed.load_state_dict(state)
     try:
@@ -149,18 +161,18 @@ with LocalServer(folder, workers=1, flags=flags) as server:
     frames = list(resumed)
     assert len(frames) == len(batches) - 1
     # Changed under a running server, here and so everywhere: the consumer is told, and no video is refused.
-    (folder / "a.label.json").write_text("[1, 2, 3]")
+    write(29)
     try:
         list(stream(server))
         raise AssertionError("no error")
     except SampleUnavailable as error:
-        assert "a.mp4: its sidecar .label.json: changed since it was catalogued" in str(error), error
+        assert "a.mp4: its sidecar .depth/: changed since it was catalogued" in str(error), error
     assert not any(each.refusals for batch in stream(server, ("frames",)) for each in batch.provenance)
 again = open_catalogue(folder, cache_dir=cache, processes=0)
-assert again.digest == with_labels.digest
-assert again.sidecars[".label.json"].digest != with_labels.sidecars[".label.json"].digest
+assert again.digest == with_depth.digest
+assert again.sidecars[".depth/"].digest != with_depth.sidecars[".depth/"].digest
 again.close()
-with_labels.close()
+with_depth.close()
 """
 
 USE_SOURCE = """
@@ -178,21 +190,24 @@ assert {each.video for batch in batches for each in batch.provenance} == {"toys/
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the packages with both additions, and two clips."""
+    """The files with both additions, which an import prefers to those of the packages, and two clips."""
     tmp_path = tmp_path_factory.mktemp("tree")
-    for package in ("v2v_protocol", "v2v_server", "v2v_client", "v2v_pictures"):
-        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("v2v_server/worker", "v2v_server/corpus/sources", "v2v_protocol"):
+        (tmp_path / name).mkdir(parents=True)
+    for name, *_ in (*DEPTH_LINES, SOURCE_LINE):
+        shutil.copy(ROOT / name, tmp_path / name)
+    (tmp_path / "sitecustomize.py").write_text(OVERLAY)
     (tmp_path / "clips").mkdir()
     for name in ("a.mp4", "b.mp4"):
         write_clip(tmp_path / "clips" / name, panned_luma(30, 16, 24), gop=12)
-    (tmp_path / "v2v_server/worker/label.py").write_text(LABEL)
+    (tmp_path / "v2v_server/worker/depth.py").write_text(BUILDER)
     (tmp_path / "v2v_server/corpus/sources/toy.py").write_text(SOURCE)
-    add(tmp_path, (*LABEL_LINES, SOURCE_LINE))
+    add(tmp_path, (*DEPTH_LINES, SOURCE_LINE))
     return tmp_path
 
 
 def run(tree: Path, program: str) -> None:
-    environment = os.environ | {"PYTHONPATH": str(tree)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tree), str(ROOT)])}
     done = subprocess.run(
         [sys.executable, "-c", program, str(tree / "clips"), str(tree / "cache")], env=environment, cwd=tree,
         capture_output=True, text=True, timeout=500, check=False,
@@ -202,7 +217,7 @@ def run(tree: Path, program: str) -> None:
 
 @pytest.mark.slow
 def test_an_array_with_a_sidecar_is_a_file_and_two_lines(tree: Path) -> None:
-    (tree / "clips/a.label.json").write_text(str([10 * frame for frame in range(30)]))
+    (tree / "clips/a.depth").mkdir()
     run(tree, USE_SIDECAR)
 
 

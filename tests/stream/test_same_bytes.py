@@ -131,7 +131,7 @@ def test_a_stopped_worker_is_replaced(clips: Path, reference: list[str]) -> None
         stopped = server_workers(server.pid)[0]
         stopped.suspend()
         got = [digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
-        stopped.wait(timeout=20)
+        stopped.wait(timeout=60)
     assert got == reference
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from tests.clips import panned_luma, write_clip
@@ -20,9 +22,10 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.remake import remake
 from v2v_server.worker.scene_choice import MOVING
 
+Luma = npt.NDArray[np.uint8]
 ARRAYS = ("voxels", "frames", "flow", "flow_valid")
 STEADY = SMALL.replace(pause_probability=0.0)
-AUTO = StreamSpec(recipe=STEADY, scene="auto", shuffle=False)
+AUTO = StreamSpec(recipe=STEADY, scene="auto", shuffle=False, still_share=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +95,7 @@ def test_voxels_and_frames_are_those_of_scene_off(catalogue: Catalogue) -> None:
 
 
 def test_the_stream_is_what_is_remade_and_a_server_with_scenes_serves_both(scenes: Path, catalogue: Catalogue) -> None:
-    flags = (*SMALL_FLAGS, "--set", "pause_probability=0", "--scene", "auto", "--no-shuffle")
+    flags = (*SMALL_FLAGS, "--set", "pause_probability=0", "--scene", "auto", "--no-shuffle", "--still-share", "1")
     with LocalServer(scenes, workers=2, flags=flags) as server:
         stream = V2VStreamDataset(server.address, batch_size=4, arrays=ARRAYS, seed=3)
         count = 0
@@ -110,3 +113,38 @@ def test_the_stream_is_what_is_remade_and_a_server_with_scenes_serves_both(scene
 def test_a_server_without_scenes_refuses_them(scenes: Path) -> None:
     with closing(open_catalogue(scenes, processes=0)) as plain, pytest.raises(UsageError, match="--scene auto"):
         remake(plain, AUTO, seed=3, epoch=0, index=0)
+
+
+def boxed(luma: Luma) -> Luma:
+    return np.pad(luma, ((0, 0), (16, 20), (0, 12)))
+
+
+MOVING_LUMA = panned_luma(64, 96, 128, (1, 2))
+DEFECTS = {
+    "24 in 30": lambda luma: luma[np.arange(79) * 4 // 5],
+    "twos": lambda luma: luma[np.arange(126) // 2],
+    "bars": boxed,
+    "twos with bars": lambda luma: boxed(luma[np.arange(126) // 2]),
+}
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+@pytest.mark.parametrize("stride", [1, 2])
+def test_a_cleaned_clip_has_the_voxels_of_the_clean_one(name: str, stride: int, tmp_path: Path) -> None:
+    spec = dataclasses.replace(AUTO, recipe=STEADY.replace(frame_stride=stride), max_sequences_per_video=1)
+    samples = []
+    for folder, luma in {"clean": MOVING_LUMA, "spoilt": DEFECTS[name](MOVING_LUMA)}.items():
+        (tmp_path / folder).mkdir()
+        clip = tmp_path / folder / "clip.mkv"
+        write_clip(clip, luma, codec="ffv1", pixel_format="gray", gop=12, full_range=True)
+        with closing(open_catalogue(clip.parent, scene=True, processes=0, cache_dir=tmp_path / "index")) as opened:
+            samples.append(made(opened, spec, 1)[0])
+            kept = dataclasses.replace(spec, keep_defects="bars,duplicates")
+            untouched = made(opened, kept, 1)[0]
+    clean, cleaned = samples
+    for array in ARRAYS:
+        np.testing.assert_array_equal(cleaned.arrays[array], clean.arrays[array])
+    assert ("dropped" in cleaned.provenance.scene) == ("24" in name or "twos" in name)
+    assert ("bars left out: top 16, bottom 20, right 12 px" in cleaned.provenance.scene) == ("bars" in name)
+    assert not np.array_equal(untouched.arrays["frames"], clean.arrays["frames"])
+    assert "dropped" not in clean.provenance.scene + untouched.provenance.scene

@@ -26,6 +26,7 @@ import numpy.typing as npt
 
 from v2v_protocol.arena import ArenaName, Slot, array_offsets
 from v2v_protocol.sample import Form, Layout, new_arrays
+from v2v_protocol.shared_memory import create_memory, seal_memory
 
 Bytes = npt.NDArray[np.uint8]
 
@@ -101,8 +102,9 @@ class Arena:
         self._offsets = dict(zip(layout, offsets, strict=True))
         token = os.urandom(16).hex()
         memory_name = ArenaName(self.process, 0, slots, token).memory_name
-        self._descriptor = _sealed_file(memory_name, self._bytes)
+        self._descriptor = create_memory(memory_name, self._bytes)
         weakref.finalize(self, os.close, self._descriptor).atexit = False
+        seal_memory(self._descriptor, content=False)
         self._memory: Bytes | None = None  # mapped for an earlier batch and no longer in use
         self._name = str(ArenaName(self.process, self._descriptor, slots, token))
         _arenas.add(self)
@@ -196,19 +198,3 @@ def open_arena(layout: Layout, slots: int) -> Arena | None:
         return Arena(layout, slots)
     except OSError:
         return None
-
-
-def _sealed_file(name: str, size: int) -> int:
-    create = getattr(os, "memfd_create", None)  # Linux only, and so is sealing
-    if create is None:
-        raise OSError("this system has no memfd_create")
-    from fcntl import F_ADD_SEALS, F_SEAL_GROW, F_SEAL_SEAL, F_SEAL_SHRINK, fcntl
-
-    descriptor: int = create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-    try:
-        os.ftruncate(descriptor, size)
-        fcntl(descriptor, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL)
-    except BaseException:
-        os.close(descriptor)
-        raise
-    return descriptor

@@ -34,7 +34,6 @@ class BatchMemory:
 
     Attributes:
         has_slots: whether the batch started with an arena.
-        in_place: number of samples that a worker wrote into their row.
     """
 
     def __init__(self, buffers: BatchBuffers, arena: Arena | None) -> None:
@@ -44,7 +43,6 @@ class BatchMemory:
         self._left: Arena | None = None
         self._filled: list[int] = []
         self.has_slots = arena is not None
-        self.in_place = 0
 
     def slot(self, row: int) -> Slot | None:
         """Return where a worker on this host may write the sample of that row; None without an arena."""
@@ -64,10 +62,8 @@ class BatchMemory:
                 self._put(before, self._left.get(before))
         if arrays is not None:
             self._put(row, arrays)
-        else:
-            self.in_place += 1
-            if self._left is not None:
-                self._put(row, self._left.get(row))
+        elif self._left is not None:
+            self._put(row, self._left.get(row))
         self._filled.append(row)
 
     def _put(self, row: int, arrays: Mapping[str, npt.NDArray[Any]]) -> None:

@@ -18,6 +18,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Protocol
 
+from v2v_client.memory.server_memory import open_sample
 from v2v_client.position.state import StreamIdentity
 from v2v_client.session.conversation import WAIT_REPORT_SECONDS, Arrival, Conversation
 from v2v_client.session.liveness import ListeningClock, Patience
@@ -270,7 +271,10 @@ class Connection:
         self._listening.wake(self._clock(), due)
         arrival = None
         if frames is not None:
-            arrival = conversation.handle_message(decode(frames[0]), frames[1:], self._now())
+            message, arrays = decode(frames[0]), frames[1:]
+            if isinstance(message, SampleHeader) and message.arena and conversation.state is State.WELCOMED:
+                arrays = [*open_sample(message.arena, conversation.form.sizes)]
+            arrival = conversation.handle_message(message, arrays, self._now())
         elif link.has_reconnected():
             conversation.handle_event(Event.DISCONNECTED, self._now())
         self._send(link)

@@ -62,7 +62,7 @@ class Arrival:
 
     Attributes:
         header: the sample's header; :meth:`Conversation.provenance` decodes its provenance.
-        arrays: read-only views of the received message, by name; None if a worker wrote them into the sample's slot.
+        arrays: read-only views of the message or the server's memory, by name; None if they are in the sample's slot.
         slot_is_free: False if a worker may still write to the sample's slot.
     """
 
@@ -127,8 +127,7 @@ class Conversation:
         self._moved = False  # whether the stream was offered by an earlier broker
         self._asked: dict[int, None] = {}  # sent and not answered, in the order sent
         self._queued: deque[int] = deque()  # to send when the credit allows
-        self._hello_due = 0.0
-        self._hello_wait = 0.0
+        self._hello_due = self._hello_wait = 0.0
         self._asked_again = False
         self._owed = False  # whether a request was denied for credit since all requests were repeated
         self._credit_denials = 0
@@ -275,7 +274,7 @@ class Conversation:
 
         Args:
             message: the decoded first frame.
-            arrays: the raw frames after it.
+            arrays: the raw frames after it, or the bytes in the server's memory that it names.
             now: the time, in seconds of listening.
 
         Returns:
@@ -351,10 +350,14 @@ class Conversation:
                 f"asked: {self.layout}"
             )
         again = header.index not in self._asked
-        in_message = bool(frames) or header.slot == NO_SLOT
-        arrays = decode_sample(header, frames, unpack) if in_message else None
+        is_gone = bool(header.arena) and not frames  # the server dropped it before it was read
+        in_message = bool(frames) or is_gone or header.slot == NO_SLOT
+        arrays = decode_sample(header, frames, unpack) if in_message and not is_gone else None
         answer = self._slots.record_arrival(header.index, header.slot, in_message=in_message)
-        if answer is Answer.NOWHERE:
+        if is_gone and not again:
+            del self._asked[header.index]
+            self._queued.appendleft(header.index)  # without a slot, it comes in a message
+        if is_gone or answer is Answer.NOWHERE:
             self.strays += 1
             self._ask_for_more(again)
             return None

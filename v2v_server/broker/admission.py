@@ -86,6 +86,7 @@ class Admission:
         spec = spec.spaced(hello.stride or hello.batch_size)
         layout = array_layout(spec.recipe, spec.voxel_dtype, hello.arrays)
         self._check_sizes(layout)
+        self._facts.require_arrays(hello.arrays)
         newest = self._quarantine.latest
         quarantine = newest if hello.quarantine is None else hello.quarantine
         if quarantine > newest:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from v2v_protocol.messages import Result
@@ -56,8 +57,9 @@ class Counters(WorkDone):
     decodes: int = counter("Clips decoded for the samples sent; siblings share one.", is_routine=True)
     bytes: int = counter("Bytes of the arrays of the samples sent.", "sample_bytes", unit="bytes", is_routine=True)
     in_slots: int = counter(
-        "Samples written to memory shared with their consumer.", "shared_memory_samples", is_routine=True
+        "Samples delivered in memory shared with their consumer.", "shared_memory_samples", is_routine=True
     )
+    shared: int = counter("Samples that were made for another consumer already.", "shared_samples", is_routine=True)
     cpu_seconds: float = counter(
         "Processor time that samples took in workers.", "worker_cpu_seconds", unit="s", is_routine=True
     )
@@ -91,6 +93,18 @@ class Counters(WorkDone):
     cache_hits: int = 0
     cache_misses: int = 0
     cache_trouble: str = ""
+
+    def count_sent(self, batch_size: int, sizes: Sequence[int], *, in_slot: bool) -> None:
+        """Count a sample that is sent.
+
+        Args:
+            batch_size: of its consumer.
+            sizes: bytes of each array.
+            in_slot: whether its arrays are not in the message.
+        """
+        self.batches += 1 / batch_size
+        self.bytes += sum(sizes)
+        self.in_slots += in_slot
 
     def count_cache(self, said: str) -> None:
         """Count the cache field of a sample's header."""

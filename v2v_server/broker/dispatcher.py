@@ -55,6 +55,7 @@ from v2v_server.broker.worker_registry import SILENCE_SECONDS, Workers
 from v2v_server.broker.worker_side import WorkerSide, owner_digest
 from v2v_server.corpus.videos import CorpusFacts
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
+from v2v_server.sharing.ring import SampleRing
 
 MOST_SESSIONS = 4096
 MOST_FAULTS = 16
@@ -75,6 +76,7 @@ class Dispatcher:
         wall_clock: returns the time for a quarantine entry, ISO 8601.
         expected_workers: total number of workers expected, including other hosts. It sets a consumer's credit when the
             consumer connects, which may be before the first worker says hello.
+        share_bytes: size limit of the finished samples kept for other consumers; 0: keep none.
 
     Attributes:
         counters: totals since the start.
@@ -95,6 +97,7 @@ class Dispatcher:
         quarantine: Quarantine,
         wall_clock: Callable[[], str],
         expected_workers: int = 0,
+        share_bytes: int = 0,
     ) -> None:
         self.counters = Counters()
         self.leases = LeaseBook(lease_deadline_seconds)
@@ -105,7 +108,8 @@ class Dispatcher:
         self.candidates = Candidates(self.sessions, quarantine, self.counters, wall_clock)
         self._admission = Admission(facts, default_spec, max_credit_bytes, session_idle_seconds, quarantine)
         self.registry = Workers(self.leases)
-        self._grants = Grants(facts, self.sessions, self.leases, self.registry, self.candidates)
+        ring = SampleRing(share_bytes) if share_bytes else None
+        self._grants = Grants(facts, self.sessions, self.leases, self.registry, self.candidates, self.counters, ring)
         self._worker_side = WorkerSide(
             facts, self.sessions, self.leases, self.registry, self.candidates, self._grants, self.counters
         )
@@ -198,7 +202,8 @@ class Dispatcher:
                 if session is None:
                     return [_deny(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
                 self.counters.waited_seconds += session.add_wait(message.waited_seconds, now)
-                return self._want(session, message) or self._grants.assign(now)
+                denials = self._want(session, message)
+                return denials or [*self._grants.answer_shared(session, message), *self._grants.assign(now)]
             case WorkerHello():
                 stray = ProtocolError("this is the consumers' port: connect to the address of --worker-bind")
                 return [self._fault(identity, stray)]

@@ -2,32 +2,37 @@
 
 A lease holds everything that a worker on any host needs, and nothing else. Its result is checked before it is passed
 on: a consumer trusts its server, but the server does not trust a worker, which may run another version, be broken or be
-hostile. Only the small header is read. The arrays are measured, unless they lie in a slot of the consumer.
+hostile. Only the small header is read. The arrays are measured, unless they lie in a slot.
+
+With a ring, equal samples are made once. A request for one that is being made follows its *maker*, the request that has
+the lease; one in the ring is answered at once. If the maker's lease ends without a sample, its followers wait again.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from typing import Any
 
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.errors import ProtocolError
-from v2v_protocol.messages import Lease, SampleHeader
+from v2v_protocol.messages import Lease, SampleHeader, Want
 from v2v_protocol.refusal import RefusalKind
 from v2v_protocol.sample import Form
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import decode, largest_packed_bytes
-from v2v_server.broker.actions import Action, SendLease
+from v2v_server.broker.actions import Action, SendLease, ToConsumer
 from v2v_server.broker.blame import runs_alone
 from v2v_server.broker.candidates import Candidates
+from v2v_server.broker.counters import Counters
 from v2v_server.broker.leases import LeaseBook, Request
-from v2v_server.broker.session import Sessions
+from v2v_server.broker.session import Session, Sessions
 from v2v_server.broker.worker_registry import Workers
 from v2v_server.corpus.videos import CorpusFacts, VideoEntry
 from v2v_server.schedule.sequences import VideoSequence
+from v2v_server.sharing.ring import SampleRing, SharedSample
 
 
 class Grants:
@@ -36,16 +41,30 @@ class Grants:
     Attributes:
         blocked_reason: why no lease can be granted at the moment; empty if leases can be granted.
         lone: requests that run alone and wait for a worker without leases.
+
+    Args:
+        ring: finished samples for other consumers; None: equal samples are made for each.
     """
 
     def __init__(
-        self, facts: CorpusFacts, sessions: Sessions, leases: LeaseBook, registry: Workers, candidates: Candidates
+        self,
+        facts: CorpusFacts,
+        sessions: Sessions,
+        leases: LeaseBook,
+        registry: Workers,
+        candidates: Candidates,
+        counters: Counters,
+        ring: SampleRing | None = None,
     ) -> None:
         self._facts = facts
         self._sessions = sessions
         self._leases = leases
         self._registry = registry
         self._candidates = candidates
+        self._counters = counters
+        self._ring = ring
+        self._makers: dict[Hashable, tuple[bytes, int, int]] = {}
+        self._followers: dict[Hashable, list[Request]] = {}
         self.blocked_reason = ""
         self.lone: deque[Request] = deque()
 
@@ -53,10 +72,13 @@ class Grants:
         """Drop the requests of a consumer that is gone, and abandon its leases."""
         self._leases.forget_session(session)
         self.lone = deque(request for request in self.lone if request.session != session)
+        for key, followers in self._followers.items():
+            self._followers[key] = [request for request in followers if request.session != session]
 
     def assign(self, now: float) -> list[Action]:
         """Give waiting requests to workers until there are no requests or no free workers."""
         actions: list[Action] = []
+        self._release_followers()
         while not self.blocked_reason:
             if self.lone:
                 empty = self._registry.for_lone_request()
@@ -104,10 +126,12 @@ class Grants:
         for request in requests:
             current = self._candidates.current(request, session)
             quarantined = self._candidates.quarantined(session, current, session.quarantine)
-            if quarantined is None:
-                good.append(current)
-            else:
+            if quarantined is not None:
                 actions += self._candidates.refuse(current, None, quarantined, RefusalKind.QUARANTINED)
+            elif (answer := self._share(session, current)) is not None:
+                actions += answer
+            else:
+                good.append(current)
         for place, request in enumerate(good):
             actions += self._grant(request, worker, now, tuple(other.index for other in good[place + 1 :]))
         return actions
@@ -118,9 +142,15 @@ class Grants:
             return []
         sequence = self._candidates.sequence(session, request)
         seconds = work_seconds(session.spec, session.arrays, sequence.video)
+        number = self._leases.grant(request, worker, now, seconds)
+        if self._ring is not None:
+            self._makers[sharing_key(session, request)] = request.sample
+            # A consumer without a slot is on another host, as far as is known, and gets a message.
+            if request.slot is not None and not session.packed:
+                self._ring.lend(number, session.form.sizes)
         lease = lease_for(
-            request,
-            number=self._leases.grant(request, worker, now, seconds),
+            self.as_leased(request, number),
+            number=number,
             sequence=sequence,
             facts=self._facts,
             spec=session.spec,
@@ -130,6 +160,93 @@ class Grants:
             packed=session.packed,
         )
         return [SendLease(worker, lease, session.spec)]
+
+    # --- sharing ------------------------------------------------------------------------------------------------------
+
+    def as_leased(self, request: Request, lease: int) -> Request:
+        """Return a request with the slot that its lease names: its own, or memory of the ring."""
+        slot = None if self._ring is None else self._ring.lent(lease)
+        return request if slot is None else replace(request, slot=slot)
+
+    def answer_shared(self, session: Session, want: Want) -> list[Action]:
+        """Answer the new requests whose samples are in the ring, and let those that are being made follow."""
+        if self._ring is None:
+            return []
+        actions: list[Action] = []
+        indices, taken = set(want.indices), set()
+        for request in list(session.waiting):
+            if request.epoch == want.epoch and request.index in indices:
+                answer = self._share(session, self._candidates.current(request, session))
+                if answer is not None:
+                    actions += answer
+                    taken.add(request)
+        self._sessions.take_waiting(session, taken)
+        return actions
+
+    def deliver(
+        self, session: Session, request: Request, lease: int, header: SampleHeader, payload: Sequence[Any]
+    ) -> list[Action]:
+        """Send a finished sample to its consumer, and to those that wait for an equal one.
+
+        Args:
+            session, request: that it was made for.
+            lease: number of the lease.
+            header: of the sample.
+            payload: the frames of its message, with the header's.
+        """
+        if self._ring is None:
+            return [ToConsumer(request.session, payload)]
+        key = sharing_key(session, request)
+        sample = self._ring.add(key, lease, header, payload[1:])
+        self._makers.pop(key, None)
+        actions: list[Action] = [ToConsumer(request.session, sample.message(request.slot, is_first=True))]
+        for follower in self._followers.pop(key, ()):
+            actions += self._send_shared(follower, sample)
+        return actions
+
+    def _share(self, session: Session, request: Request) -> list[Action] | None:
+        """Answer a request from the ring, or let it follow its maker; return None if it must be made."""
+        if self._ring is None:
+            return None
+        key = sharing_key(session, request)
+        sample = self._ring.get(key)
+        if sample is not None:
+            return self._send_shared(request, sample)
+        maker = self._makers.get(key)
+        if maker is None or not self._leases.is_out(maker):
+            return None
+        self._followers.setdefault(key, []).append(request)
+        return []
+
+    def _send_shared(self, request: Request, sample: SharedSample) -> list[Action]:
+        session = self._sessions.get(request.session)
+        if session is None or not self._sessions.mark_answered(request, 0.0):
+            return []
+        in_slot = sample.memory is not None and request.slot is not None
+        self._counters.count_sent(session.batch_size, session.form.sizes, in_slot=in_slot)
+        self._counters.samples += 1
+        self._counters.shared += 1
+        return [ToConsumer(request.session, sample.message(request.slot, is_first=False))]
+
+    def _release_followers(self) -> None:
+        """Queue the followers of makers without a lease again, and free the memory of leases that have ended."""
+        if self._ring is None:
+            return
+        self._ring.release(self._leases)
+        for key in [key for key, maker in self._makers.items() if not self._leases.is_out(maker)]:
+            del self._makers[key]
+            for request in reversed(self._followers.pop(key, [])):
+                self._sessions.put_back(request)
+
+
+def sharing_key(session: Session, request: Request) -> Hashable:
+    """Return a key that is equal for requests whose samples, provenance included, are equal byte for byte and whose
+    consumers have the same key.
+    """
+    return (
+        session.user, session.spec.digest, session.seed, session.arrays, session.packed,
+        request.epoch, request.index, request.candidate, request.refusals, request.snapshot,
+    )  # fmt: skip
 
 
 def lease_for(

@@ -109,6 +109,13 @@ class LeaseBook:
     def __len__(self) -> int:
         return len(self._leases)
 
+    def __contains__(self, number: object) -> bool:
+        return number in self._leases
+
+    def is_out(self, sample: tuple[bytes, int, int]) -> bool:
+        """Return whether a worker has a lease for a requested sample (:attr:`Request.sample`) that is still wanted."""
+        return sample in self._out
+
     def held_by(self, worker: bytes) -> int:
         """Return the number of clips that this worker has to decode for its leases.
 

@@ -13,7 +13,7 @@ Memory: the server queues at most credit x sample bytes for a session, whatever 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 
@@ -253,6 +253,11 @@ class Sessions:
             session.unanswered.add((epoch, index))
             place = session.schedule.place(index)
             session.waiting.append(Request(session.identity, epoch, index, place=place, slot=places[index]))
+        self._requeue(session)
+
+    def take_waiting(self, session: Session, requests: Collection[Request]) -> None:
+        """Take waiting requests of a session that are answered without a worker of their own."""
+        session.waiting = deque(request for request in session.waiting if request not in requests)
         self._requeue(session)
 
     def next_request(self) -> Request | None:

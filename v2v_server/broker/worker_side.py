@@ -24,7 +24,7 @@ from v2v_protocol.messages import (
     WorkerHello,
 )
 from v2v_protocol.wire import Frames, decode, encode
-from v2v_server.broker.actions import Action, CheckVideo, SendStatus, ToConsumer, ToWorker, denial, malformed
+from v2v_server.broker.actions import Action, CheckVideo, SendStatus, ToWorker, denial, malformed
 from v2v_server.broker.blame import Cause, Loss, judge
 from v2v_server.broker.candidates import Candidates
 from v2v_server.broker.counters import Counters, bounded_seconds
@@ -164,7 +164,7 @@ class WorkerSide:
             self._charge(result.lease, identity, now)
         else:
             try:
-                header = check_result(payload, request, session.form)
+                header = check_result(payload, self._grants.as_leased(request, result.lease), session.form)
             except ProtocolError as error:
                 # Our workers never send such a result; a worker that sends one would send more.
                 refused = ToWorker(identity, self._malformed(ProtocolError(f"malformed result: {error}")))
@@ -173,7 +173,7 @@ class WorkerSide:
             if self._count(session, request, header, in_slot=len(payload) == 1):
                 self._counters.add(result, header.cpu_seconds)
                 self._registry.worked(identity, result, header.cpu_seconds)
-                actions.append(ToConsumer(request.session, payload))
+                actions += self._grants.deliver(session, request, result.lease, header, payload)
         self._registry.can_work(identity)
         self._leases.finished(result.lease, identity, now, decoded=decoded)
         self._leases.mark_begun(result.begins, identity, now)
@@ -209,9 +209,7 @@ class WorkerSide:
             return False
         self._counters.decodes += header.decoded
         self._counters.count_cache(header.cache)
-        self._counters.batches += 1 / session.batch_size
-        self._counters.bytes += sum(session.form.sizes)
-        self._counters.in_slots += in_slot
+        self._counters.count_sent(session.batch_size, session.form.sizes, in_slot=in_slot)
         return True
 
     def _take_back(self, identity: bytes, loss: Loss, now: float) -> list[Action]:

@@ -24,7 +24,9 @@ from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
 from v2v_server.prepare.report import Report
+from v2v_server.store.chroma import CHROMA
 from v2v_server.store.encoding import DEFAULT_GOP, DEFAULT_QUALITY, DEFAULT_SIZE, H264, LOSSLESS, Encoding
+from v2v_server.store.motion import MADE_PLANES
 from v2v_server.store.packing import SIZES
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
@@ -65,8 +67,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     encoding.add_argument(
         "--size",
         choices=tuple(SIZES),
-        help=f"lossless: {DEFAULT_SIZE} (default), or fast: a third larger, reads faster",
+        help=f"lossless: {DEFAULT_SIZE} (default), fast: a third larger, reads faster, or raw: "
+        "not compressed, reads fastest from memory",
     )
+    encoding.add_argument(
+        "--planes", choices=(*MADE_PLANES, CHROMA), action="append", default=[],
+        help="lossless: also store the motion between frames, which streams with substep_px then need not find, or "
+        "chroma, for frames_rgb; a video prepared without it is prepared again",
+    )  # fmt: skip
     encoding.add_argument(
         "--quality", type=int, metavar="Q", help=f"h264: rate factor, lower is better and larger ({DEFAULT_QUALITY})"
     )
@@ -114,6 +122,7 @@ def _run(arguments: argparse.Namespace) -> int:
             floor_db=arguments.floor,
             frame_floor_db=arguments.frame_floor,
             scene=arguments.scene != "off",
+            planes=tuple(dict.fromkeys(arguments.planes)),
             single=_is_video(Path(arguments.source)),
             progress=lambda done, total, made, expected: shown(done, total, _size(made, expected)),
         )
@@ -178,7 +187,7 @@ def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:
     )
     lines += _listed("could not be prepared:", [(video.id, str(video.problem)) for video in report.failed])
     lines += _listed(
-        "lack statistics of their scenes (their files stay):",
+        "lack requested statistics or planes (their files stay):",
         [(problem.video, problem.reason) for problem in report.not_looked_at],
     )
     lines += _listed("cannot be used:", [(problem.video, problem.reason) for problem in report.unusable])

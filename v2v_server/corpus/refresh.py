@@ -104,7 +104,7 @@ def _refreshed(
                 store.put(batch)
         if stale:
             table = _table(store, ids, kind)
-        if scenes is not None and scenes.collect(store, source, table, processes, progress):
+        if scenes is not None and scenes.collect(store, source, table, processes, progress, notice):
             table = _table(store, ids, kind)
         _remove_earlier_caches(path)
         return store, table

@@ -71,7 +71,7 @@ def collect_sidecars(
                 fresh = []
             if notice is not None:
                 notice(f"looking for sidecars {ending} in {source}: {done} of {len(ids)} videos")
-    notes = [f"{len(fingerprints)} of {len(ids)} videos have a sidecar {ending}"]
+    notes = [f"{len(fingerprints)} of {len(ids)} videos have a sidecar {ending}"] if fingerprints else []
     if unreadable:
         notes.append(f"{len(unreadable)} sidecars cannot be read and count as missing ({unreadable[0]})")
     return Sidecars(fingerprints, _digest(ending, fingerprints)), notes

@@ -11,8 +11,12 @@ from typing import overload
 from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import sidecar_endings
 from v2v_server.corpus.index.columns import CHUNK, NO_STRINGS, VideoTable
-from v2v_server.corpus.scenes.runs import Runs, SplitVideos
+from v2v_server.corpus.scenes.pieces import SplitVideos
 from v2v_server.corpus.sidecars import Sidecars
+from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.store.chroma import CHROMA
+from v2v_server.store.format import is_store_file
+from v2v_server.store.motion import has_planes
 from v2v_server.video.rows import Rows
 
 Thresholds = tuple[float | None, float | None]
@@ -31,8 +35,8 @@ class VideoEntry:
         frames_per_second: average rate; NaN where unknown.
         codec: FFmpeg's name of the format.
         threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
-        runs: (first frame, frame after the last) of each stretch without a shot boundary and with something to see;
-            None where the catalogue was opened without ``scene``.
+        pieces: its pieces, see :func:`v2v_server.corpus.scenes.pieces.encoded_pieces`; None where the catalogue was
+            opened without ``scene``.
     """
 
     id: str
@@ -44,7 +48,7 @@ class VideoEntry:
     codec: str
     threshold_pos: float | None = None
     threshold_neg: float | None = None
-    runs: Runs | None = None
+    pieces: bytes | None = None
 
 
 class Videos(Sequence[VideoEntry]):
@@ -53,7 +57,7 @@ class Videos(Sequence[VideoEntry]):
     Args:
         table: the usable rows, sorted by id.
         thresholds: (positive, negative) of videos that have some, by number.
-        split: the videos whose usable frames are not one run of all; None where that is unknown.
+        split: the videos that are divided into pieces; None where that is unknown.
 
     Attributes:
         ids, fingerprints, frames, frames_per_second, width_px, height_px, interlaced: columns, one value for each
@@ -119,9 +123,6 @@ class Videos(Sequence[VideoEntry]):
         number = range(len(self))[at]
         record = self._table.row(number)
         pos, neg = self._thresholds.get(number, NO_THRESHOLDS)
-        runs = None
-        if self.split is not None and (runs := self.split.runs(number)) is None:
-            runs = ((0, record.frames),)
         return VideoEntry(
             id=record.id,
             fingerprint=record.fingerprint,
@@ -132,8 +133,24 @@ class Videos(Sequence[VideoEntry]):
             codec=record.codec,
             threshold_pos=pos,
             threshold_neg=neg,
-            runs=runs,
+            pieces=None if self.split is None else self.split.encoded(number),
         )
+
+
+COLOUR_REMEDY = "prepare them again with v2v-prepare --planes chroma, or serve the videos that they were prepared from"
+_ASKED = 16
+"""Prepared files that are checked for their colour."""
+
+
+def has_chroma(source: VideoSource, ids: Sequence[str]) -> bool:
+    """Return whether some prepared files of this host, evenly spaced, all have their colour."""
+    if not source.is_local:
+        return False
+    for id in ids[:: max(1, len(ids) // _ASKED)]:
+        with source.open_local(id, "") as path:
+            if not is_store_file(path) or not has_planes(path, (CHROMA,)):
+                return False
+    return True
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +163,7 @@ class CorpusFacts:
         digest: names this snapshot.
         scene_digest: names this snapshot together with the statistics of its videos; None without them.
         sidecars: the files beside the videos, by ending.
+        has_colour: whether the videos were catalogued with their colour.
     """
 
     videos: Sequence[VideoEntry]
@@ -153,6 +171,18 @@ class CorpusFacts:
     digest: str
     scene_digest: str | None
     sidecars: Mapping[str, Sidecars] = field(default_factory=dict)
+    has_colour: bool = True
+
+    def require_arrays(self, arrays: tuple[str, ...]) -> None:
+        """Check that the videos have what these arrays are made from.
+
+        Raises:
+            UsageError: they have no colour.
+        """
+        if "frames_rgb" in arrays and not self.has_colour:
+            raise UsageError(
+                "arrays: frames_rgb needs colour, which these prepared videos do not have: " + COLOUR_REMEDY
+            )
 
     def sidecars_of(self, video: str, arrays: tuple[str, ...]) -> dict[str, str]:
         """Return the fingerprints of a video's sidecars that these arrays are made from, by ending."""

@@ -5,6 +5,7 @@ that is wrong: the pixels on its way brighten and darken again. So a step in whi
 (``substep_px`` of the spec), and the levels between them are made of both frames, moved along.
 
     matching.py    block motion between two pictures
+    plane.py       the motion along a video
     warping.py     the pictures between
     lanes.py       vector code for both
     prediction.py  events that a clip loses between its frames, and those that sub-steps restore
@@ -13,6 +14,20 @@ that is wrong: the pixels on its way brighten and darken again. So a step in whi
 All of it but the prediction is integer arithmetic, so that every host makes the same bytes.
 """
 
-from v2v_server.motion.clip import MARGIN_PX, levels_between, levels_of, load, substeps
+from v2v_server.motion.clip import MARGIN_PX, cells_of, levels_between, levels_of, load, substeps
+from v2v_server.motion.matching import Cells, Vectors
+from v2v_server.motion.plane import MotionOfCuts, MotionOfPictures, motions
 
-__all__ = ["MARGIN_PX", "levels_between", "levels_of", "load", "substeps"]
+__all__ = [
+    "MARGIN_PX",
+    "Cells",
+    "MotionOfCuts",
+    "MotionOfPictures",
+    "Vectors",
+    "cells_of",
+    "levels_between",
+    "levels_of",
+    "load",
+    "motions",
+    "substeps",
+]

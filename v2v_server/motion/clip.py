@@ -17,20 +17,57 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import MOST_SUBSTEPS
 from v2v_server.motion.lanes import CELL_PX
-from v2v_server.motion.matching import UNITS_PER_PX, Vectors, motion, pyramid
+from v2v_server.motion.matching import UNITS_PER_PX, Cells, Vectors, padded
+from v2v_server.motion.plane import motions
 from v2v_server.motion.warping import between
 from v2v_server.simulation.draw import resized_size
-from v2v_server.simulation.view import Frames, contrast_table, crop_place, crop_region, resized
+from v2v_server.simulation.view import Frames, Window, contrast_table, crop_place, crop_region, resized
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
 
 MARGIN_PX = 16
-"""Margin around the crop that motion is estimated on and warped from."""
+"""Margin around the crop that levels are warped from."""
+_LONGEST = 1 << 14
 _LEAST_SHARE = 1 / 256
 _FASTEST_SHARE = 0.1
 
 
+def cells_of(params: SampleParams, recipe: Recipe, picture: Window) -> Cells:
+    """Return the cells that a crop shows.
+
+    Args:
+        params, recipe: the draw and its recipe.
+        picture: the part of the usable picture that the draw is about, less its bars.
+    """
+    (top, rows), (left, columns) = (
+        (int(cells[0]), int(cells[-1] - cells[0]) + 1) for cells in _shown_cells(params, recipe, picture)
+    )
+    return Cells(top, left, rows, columns)
+
+
+def _shown_cells(
+    params: SampleParams, recipe: Recipe, picture: Window
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Return row and column of the cell of the usable picture at the middle of each cell of the crop."""
+
+    def shown(first: int, size: int, start: int, side: int) -> npt.NDArray[np.int64]:
+        middles = first + CELL_PX // 2 + CELL_PX * np.arange(-(-size // CELL_PX))
+        at: npt.NDArray[np.int64] = np.minimum((middles / params.scale).astype(np.int64), side - 1)
+        return (start + at) // CELL_PX
+
+    return (
+        shown(params.crop_top_px, recipe.crop_height_px, picture.top_px, picture.height_px),
+        shown(params.crop_left_px, recipe.crop_width_px, picture.left_px, picture.width_px),
+    )
+
+
 def levels_of(
-    frames: Frames, params: SampleParams, recipe: Recipe, source_index: npt.NDArray[np.int64], substep_px: float
+    frames: Frames,
+    params: SampleParams,
+    recipe: Recipe,
+    source_index: npt.NDArray[np.int64],
+    substep_px: float,
+    vectors: Vectors,
+    picture: Window,
 ) -> Levels | None:
     """Return the levels between the frames of a sample, as its camera sees them.
 
@@ -41,37 +78,50 @@ def levels_of(
         params, recipe: the draw and its recipe.
         source_index: [steps + 1], which frame each position of the clip shows.
         substep_px: longest motion of a sub-step, above 0.
+        vectors: [n, 2, rows, columns] of :func:`cells_of`: the motion to each frame from the one before, in the usable
+            picture.
+        picture: see :func:`cells_of`.
 
     Returns:
         the levels, for ``simulate_clip``; None if no step is divided.
     """
+    if not vectors.any():
+        return None
+    down, across = _shown_cells(params, recipe, picture)
+    vectors = vectors[:, :, down - down[0]][..., across - across[0]]
     top, left = crop_place(params, MARGIN_PX)
     if params.scale != 1.0:
+        vectors = np.clip(np.rint(vectors * params.scale), -_LONGEST, _LONGEST).astype(np.int16)
         size = resized_size(frames.shape[1], frames.shape[2], params.scale)
         row, column, height, width = crop_region(params, recipe, *size, MARGIN_PX)
         frames = np.stack(
             [resized(frame, size, params.scale)[row : row + height, column : column + width] for frame in frames]
         )
     part = top, left, recipe.crop_height_px, recipe.crop_width_px
-    levels = levels_between(frames, part, source_index, substep_px)
+    levels = levels_between(frames, part, source_index, substep_px, vectors)
     if levels is None:
         return None
     grey = levels.grey[:, :, ::-1] if params.flip else levels.grey
     if params.contrast != 0.0:
-        grey = contrast_table(params.contrast, FINE_STEPS)[grey]
+        grey = contrast_table(params.contrast, 255 * FINE_STEPS)[grey]
     return Levels(levels.at, np.ascontiguousarray(grey))
 
 
 def levels_between(
-    pictures: Frames, part: tuple[int, int, int, int], source_index: npt.NDArray[np.int64], substep_px: float
+    pictures: Frames,
+    part: tuple[int, int, int, int],
+    source_index: npt.NDArray[np.int64],
+    substep_px: float,
+    vectors: Vectors,
 ) -> Levels | None:
     """Return the levels between pictures.
 
     Args:
         pictures: [n, h, w] uint8.
         part: top, left, height and width of the part of them that is wanted.
-        source_index: [steps + 1], never decreasing, which picture each position of the clip shows.
+        source_index: [steps + 1], which picture each position of the clip shows: the one before or the next.
         substep_px: longest motion of a sub-step, above 0.
+        vectors: [n, 2, rows, columns], the motion to each picture from the one before, in cells of the part.
 
     Returns:
         the levels; None if no step is divided.
@@ -80,42 +130,41 @@ def levels_between(
     if min(height, width) < CELL_PX:
         return None
     shortest = math.ceil(substep_px * UNITS_PER_PX / 2)
-    steps, vectors, counts = [], [], []
-    later, pyramids = -1, [pyramid(np.ascontiguousarray(pictures[source_index[0]]))]
+    steps, counts = [], []
     for step, (before, after) in enumerate(pairwise(source_index.tolist())):
-        if before == after:
-            continue
-        if later != before and later >= 0:
-            pyramids = [pyramid(np.ascontiguousarray(pictures[before]))]
-        pyramids, later = [*pyramids[-1:], pyramid(np.ascontiguousarray(pictures[after]))], after
-        found = motion(pyramids[0], pyramids[1], shortest)
-        if (count := substeps(found, substep_px)) > 1:
-            steps.append((step, pyramids[0][0], pyramids[1][0]))
-            vectors.append(found)
+        if before != after and (count := substeps(vectors[after], substep_px)) > 1:
+            steps.append((step, after))
             counts.append(count - 1)
     if not steps:
         return None
     grey = np.empty((sum(counts), height, width), np.uint16)
-    first = 0
-    for (_, one, other), found, count in zip(steps, vectors, counts, strict=True):
-        between(one, other, found, top, left, grey[first : first + count])
+    first, shown, later = 0, -1, pictures[:0]
+    for (_, after), count in zip(steps, counts, strict=True):
+        earlier = later if shown == after - 1 else padded(np.ascontiguousarray(pictures[after - 1]))
+        shown, later = after, padded(np.ascontiguousarray(pictures[after]))
+        field = np.ascontiguousarray(vectors[after])
+        between(earlier, later, field, shortest, top, left, grey[first : first + count])
         first += count
-    at = np.repeat([step for step, _, _ in steps], counts)
+    at = np.repeat([step for step, _ in steps], counts)
     share = np.concatenate([np.arange(1, count + 1) / (count + 1) for count in counts])
     return Levels(Moments(at, share), grey)
 
 
 def substeps(vectors: Vectors, substep_px: float) -> int:
     """Return the number of sub-steps of a step with this motion: 1 .. MOST_SUBSTEPS."""
-    squares = (vectors.astype(np.int64) ** 2).sum(axis=0)
-    moving = np.sort(squares[squares > 0])
+    x, y = vectors.astype(np.int32)
+    squares = x * x + y * y
+    shortest = math.ceil(substep_px * UNITS_PER_PX / 2)
+    moving = squares[squares >= max(shortest * shortest, 1)]
     if len(moving) < _LEAST_SHARE * squares.size or not len(moving):
         return 1
-    longest = math.sqrt(int(moving[int(len(moving) * (1 - _FASTEST_SHARE))])) / UNITS_PER_PX
+    which = int(len(moving) * (1 - _FASTEST_SHARE))
+    longest = math.sqrt(int(np.partition(moving, which)[which])) / UNITS_PER_PX
     return 1 + int(min(longest / substep_px, MOST_SUBSTEPS - 1))  # the quotient may be infinite
 
 
 def load() -> None:
     """Load this folder's kernels from numba's cache, or compile them."""
     first = (np.arange(32 * 32) * 37 % 251).astype(np.uint8).reshape(32, 32)
-    levels_between(np.stack([first, np.roll(first, 3, 1)]), (0, 0, 32, 32), np.arange(2), 1.0)
+    pictures = np.stack([first, np.roll(first, 3, 1)])
+    levels_between(pictures, (0, 0, 32, 32), np.arange(2), 1.0, motions(pictures))

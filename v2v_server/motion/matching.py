@@ -14,15 +14,19 @@ with half of the vector, rounded, on each side. The field is smoothed by the med
 minimum of the V through three sums gives 1/UNITS_PER_PX px (equiangular fit). Before the search, the second picture is
 scaled to the mean of the first, so that a lamp that flickers does not look like motion.
 
-A picture that changes by no more than a coder's noise has no motion. A vector is zero where the evidence is for rest:
-it is shorter than the caller's limit, or a shift of less than half a pixel would explain the block as well. Along an
-edge, whole pixels often imitate such a shift.
+A block that changes by no more than a coder's noise rests; most blocks of most videos do, and cost one sum. Other
+vectors are zero where a shift of less than half a pixel would explain the block as well: along an edge, whole pixels
+often imitate such a shift.
+
+The motion of a cell depends on the whole pictures, and not on the cells that are asked for: those that a crop shows
+have the same motion as in the whole video, whose motion a store holds.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -39,46 +43,96 @@ PAD_PX = 16
 """Border of a level: its edge repeated."""
 COST_PER_PX = 4
 _LEVELS = 4
-_STILL_LEVEL = 2  # means of 4 x 4 px
 _TOP_RADIUS_PX = 3
 _SMALLEST_SIDE_PX = 16
 _AROUND_PX = (BLOCK_PX - CELL_PX) // 2
 _LARGEST_SHIFT = 1 << 14
+_REST = BLOCK_PX * BLOCK_PX
+"""Difference of a block that a coder's noise makes: a grey level per pixel."""
 compiled: Any = numba.njit(nogil=True, cache=True, error_model="numpy")
 """Decorator of this folder's compiled functions."""
 
 
-def motion(first: list[Picture], second: list[Picture], shortest: int) -> Vectors:
-    """Return the motion between two pictures, given by their :func:`pyramid`.
+class Cells(NamedTuple):
+    """A rectangle of cells."""
+
+    top: int
+    left: int
+    rows: int
+    columns: int
+
+
+class Pyramid:
+    """A picture and its padded levels, which are made when they are first needed.
 
     Args:
-        first, second: of pictures of one size.
-        shortest: length, in 1/UNITS_PER_PX px, below which a vector becomes zero.
+        picture: [h, w] uint8, C-contiguous, at least CELL_PX on each side.
     """
-    if _is_still(first, second):
-        height, width = (side - 2 * PAD_PX for side in first[0].shape)
-        return np.zeros((2, -(-height // CELL_PX), -(-width // CELL_PX)), np.int16)
-    second, found = _scaled(first, second), np.zeros((2, 1, 1), np.int16)
-    for level in reversed(range(len(first))):
-        radius = _TOP_RADIUS_PX if level == len(first) - 1 else 1
-        found = _median(_search(first[level], second[level], found, radius))
-    _refine(first[0], second[0], found, shortest * shortest)
+
+    def __init__(self, picture: Picture) -> None:
+        self.picture = picture
+
+    @property
+    def cells(self) -> Cells:
+        """All cells of the picture."""
+        height, width = self.picture.shape
+        return Cells(0, 0, -(-height // CELL_PX), -(-width // CELL_PX))
+
+    @cached_property
+    def levels(self) -> list[Picture]:
+        """The picture and its rounded means of four, each with PAD_PX more on each side."""
+        picture, levels = self.picture, [padded(self.picture)]
+        while len(levels) < _LEVELS and min(picture.shape) >= 2 * _SMALLEST_SIDE_PX:
+            picture = _halved(picture)
+            levels.append(padded(picture))
+        return levels
+
+
+def motion(first: Pyramid, second: Pyramid, cells: Cells | None = None) -> Vectors:
+    """Return the motion between two pictures of one size.
+
+    Args:
+        first, second: the pictures.
+        cells: those whose motion is wanted; None: all. The others cost only what these need of them, and change
+            nothing.
+
+    Returns:
+        [2, rows, columns] of these cells.
+    """
+    cells = first.cells if cells is None else cells
+    moves = np.ones(cells[2:], np.bool_)
+    if min(first.picture.shape) >= BLOCK_PX and not _mark_moving(first.picture, second.picture, *cells[:2], moves):
+        return np.zeros((2, *moves.shape), np.int16)
+    one, other = first.levels, _scaled(first.levels, second.levels)
+    needed = [cells]
+    for level in one[1:]:
+        needed.append(_parents(needed[-1], level))
+    found = np.zeros((2, 1, 1), np.int16)
+    for number in reversed(range(len(one))):
+        radius = _TOP_RADIUS_PX if number == len(one) - 1 else 1
+        rest = _REST >> number
+        found = _median(_search(one[number], other[number], found, radius, rest, *needed[number]), *needed[number])
+    top, left, rows, columns = cells
+    found = np.ascontiguousarray(found[:, top : top + rows, left : left + columns])
+    _refine(one[0], other[0], found, moves, top, left)
     return found
 
 
-def pyramid(picture: Picture) -> list[Picture]:
-    """Return the padded levels of a [h, w] uint8 picture, the finest first."""
-    levels = [padded(picture)]
-    while len(levels) < _LEVELS and min(picture.shape) >= 2 * _SMALLEST_SIDE_PX:
-        picture = _halved(picture)
-        levels.append(padded(picture))
-    return levels
+def without_slow(vectors: Vectors, shortest: int) -> Vectors:
+    """Return vectors of any shape [..., 2, rows, columns] with those below a length, 1/UNITS_PER_PX px, set to zero."""
+    x, y = (vectors[..., axis, :, :].astype(np.int32) for axis in (0, 1))
+    return vectors * (x * x + y * y >= shortest * shortest)[..., None, :, :]
 
 
-def _is_still(first: list[Picture], second: list[Picture]) -> bool:
-    """Return whether no mean of a cell changes by more than a grey level: then only a coder's noise does."""
-    one, other = (levels[min(_STILL_LEVEL, len(levels) - 1)].astype(np.int16) for levels in (first, second))
-    return int(np.abs(one - other).max()) <= 1
+def _parents(cells: Cells, level: Picture) -> Cells:
+    """Return the cells of the next coarser level, given with its padding, that a search for some cells looks at."""
+    sides = []
+    for first, count, side in zip(cells[:2], cells[2:], level.shape, strict=True):
+        last = -(-(side - 2 * PAD_PX) // CELL_PX) - 1
+        low = max(min((first - 1) // 2, last) - 1, 0)
+        sides.append((low, min((first + count) // 2 + 1, last) + 1 - low))
+    (top, rows), (left, columns) = sides
+    return Cells(top, left, rows, columns)
 
 
 def _scaled(first: list[Picture], second: list[Picture]) -> list[Picture]:
@@ -89,6 +143,23 @@ def _scaled(first: list[Picture], second: list[Picture]) -> list[Picture]:
         return second
     grey = np.minimum((2 * np.arange(256) * mine + other) // (2 * other), 255).astype(np.uint8)
     return [grey[level] for level in second]
+
+
+@compiled
+def _mark_moving(first, second, top, left, moves):
+    """Mark the cells whose blocks differ by more than a coder's noise, and return whether any does."""
+    height, width = first.shape
+    a, b = first.ravel(), second.ravel()
+    any_moves = False
+    for row in range(moves.shape[0]):
+        y = min(max(CELL_PX * (top + row) - _AROUND_PX, 0), height - BLOCK_PX)
+        for column in range(moves.shape[1]):
+            x = min(max(CELL_PX * (left + column) - _AROUND_PX, 0), width - BLOCK_PX)
+            at = y * width + x
+            differs = block_difference(a, at, b, at, width) > _REST
+            moves[row, column] = differs
+            any_moves |= differs
+    return any_moves
 
 
 @compiled
@@ -127,7 +198,8 @@ def _fits(place, ahead, most):
 
 
 @compiled
-def _search(first, second, coarser, radius):
+def _search(first, second, coarser, radius, rest, top_row, left_column, wanted_rows, wanted_columns):
+    """Return the best vectors of some cells and their neighbours; the others are not set."""
     pitch = first.shape[1]
     lowest, rightmost = first.shape[0] - BLOCK_PX, first.shape[1] - BLOCK_PX
     a, b = first.ravel(), second.ravel()
@@ -135,21 +207,30 @@ def _search(first, second, coarser, radius):
     columns = (first.shape[1] - 2 * PAD_PX + CELL_PX - 1) // CELL_PX
     found = np.empty((2, rows, columns), np.int16)
     last_row, last_column = coarser.shape[1] - 1, coarser.shape[2] - 1
-    for row in range(rows):
-        for column in range(columns):
+    tried = np.empty((2, 5), np.int64)
+    for row in range(max(top_row - 1, 0), min(top_row + wanted_rows + 1, rows)):
+        for column in range(max(left_column - 1, 0), min(left_column + wanted_columns + 1, columns)):
             top, left = PAD_PX + CELL_PX * row - _AROUND_PX, PAD_PX + CELL_PX * column - _AROUND_PX
+            at = top * pitch + left
+            still = block_difference(a, at, b, at, pitch)
+            if still <= rest:
+                found[0, row, column], found[1, row, column] = 0, 0
+                continue
             parent_row, parent_column = min(row // 2, last_row), min(column // 2, last_column)
             expected_x = 2 * np.int64(coarser[0, parent_row, parent_column])
             expected_y = 2 * np.int64(coarser[1, parent_row, parent_column])
             x, y = np.int64(0), np.int64(0)
-            at = top * pitch + left
-            best = block_difference(a, at, b, at, pitch) + COST_PER_PX * (abs(expected_x) + abs(expected_y))
+            best = still + COST_PER_PX * (abs(expected_x) + abs(expected_y))
             for candidate in range(5 + (2 * radius + 1) ** 2):
                 if candidate < 5:
                     r = min(max(parent_row + (candidate == 1) - (candidate == 2), 0), last_row)
                     c = min(max(parent_column + (candidate == 3) - (candidate == 4), 0), last_column)
                     dx, dy = 2 * np.int64(coarser[0, r, c]), 2 * np.int64(coarser[1, r, c])
-                    if dx == x and dy == y:
+                    tried[0, candidate], tried[1, candidate] = dx, dy
+                    is_known = dx == 0 and dy == 0
+                    for earlier in range(candidate):
+                        is_known |= tried[0, earlier] == dx and tried[1, earlier] == dy
+                    if is_known:
                         continue
                 else:
                     if candidate == 5:
@@ -176,19 +257,20 @@ def _ordered(a, b, c):
 
 
 @compiled
-def _median(found):
-    """Return the median of each value and its eight neighbours; the edge is repeated."""
+def _median(found, top, left, wanted_rows, wanted_columns):
+    """Return the median of each value and its eight neighbours in some cells; the edge is repeated."""
     rows, columns = found.shape[1], found.shape[2]
     smooth = np.empty_like(found)
-    lines = np.empty((3, columns + 2), np.int16)
+    lines = np.empty((3, wanted_columns + 2), np.int16)
     for axis in range(2):
-        for row in range(rows):
+        for row in range(top, top + wanted_rows):
             for near in range(3):
                 values = found[axis, min(max(row + near - 1, 0), rows - 1)]
-                lines[near, 1 : columns + 1] = values
-                lines[near, 0], lines[near, columns + 1] = values[0], values[columns - 1]
-            above, here, below, into = lines[0], lines[1], lines[2], smooth[axis, row]
-            for c in range(columns):
+                lines[near, 1 : wanted_columns + 1] = values[left : left + wanted_columns]
+                lines[near, 0] = values[max(left - 1, 0)]
+                lines[near, wanted_columns + 1] = values[min(left + wanted_columns, columns - 1)]
+            above, here, below, into = lines[0], lines[1], lines[2], smooth[axis, row, left:]
+            for c in range(wanted_columns):
                 low0, mid0, high0 = _ordered(above[c], here[c], below[c])
                 low1, mid1, high1 = _ordered(above[c + 1], here[c + 1], below[c + 1])
                 low2, mid2, high2 = _ordered(above[c + 2], here[c + 2], below[c + 2])
@@ -198,17 +280,23 @@ def _median(found):
 
 
 @compiled
-def _refine(first, second, found, shortest_squared):
-    """Make vectors of whole pixels finer, and those without evidence zero."""
+def _refine(first, second, found, moves, top_row, left_column):
+    """Make vectors of whole pixels finer, and those without evidence zero.
+
+    Args:
+        found: [2, rows, columns] of the cells from (top_row, left_column) on; changed.
+        moves: [rows, columns], whether their blocks differ at rest.
+    """
     pitch = first.shape[1]
     lowest, rightmost = first.shape[0] - BLOCK_PX, first.shape[1] - BLOCK_PX
     a, b = first.ravel(), second.ravel()
     for row in range(found.shape[1]):
         for column in range(found.shape[2]):
-            top, left = PAD_PX + CELL_PX * row - _AROUND_PX, PAD_PX + CELL_PX * column - _AROUND_PX
+            top = PAD_PX + CELL_PX * (top_row + row) - _AROUND_PX
+            left = PAD_PX + CELL_PX * (left_column + column) - _AROUND_PX
             dx, dy = np.int64(found[0, row, column]), np.int64(found[1, row, column])
             found[0, row, column], found[1, row, column] = 0, 0
-            if (dx == 0 and dy == 0) or abs(dx) + abs(dy) >= _LARGEST_SHIFT // UNITS_PER_PX:
+            if not moves[row, column] or (dx == 0 and dy == 0) or abs(dx) + abs(dy) >= _LARGEST_SHIFT // UNITS_PER_PX:
                 continue
             at = top * pitch + left
             _, _, rest = _fit(a, at, b, at, pitch)
@@ -224,8 +312,7 @@ def _refine(first, second, found, shortest_squared):
                 continue
             x, y, _ = _fit(a, at - back, b, at + dy * pitch + dx - back, pitch)
             x, y = UNITS_PER_PX * dx + x, UNITS_PER_PX * dy + y
-            if x * x + y * y >= shortest_squared:
-                found[0, row, column], found[1, row, column] = x, y
+            found[0, row, column], found[1, row, column] = x, y
 
 
 @numba.njit(nogil=True, inline="always")

@@ -21,7 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.motion.clip import levels_between
-from v2v_server.motion.matching import UNITS_PER_PX, Picture, Vectors, motion, pyramid
+from v2v_server.motion.matching import UNITS_PER_PX, Pyramid, Vectors, motion, without_slow
+from v2v_server.motion.plane import motions
 from v2v_server.motion.warping import between
 from v2v_server.simulation.intensity import fine_table, log_table
 from v2v_server.simulation.view import Frames
@@ -134,7 +135,8 @@ def predict(pictures: Frames) -> Prediction:
     first_used = max(0, (len(pictures) - MOST_FRAMES) // 2)
     pictures = pictures[first_used : first_used + MOST_FRAMES]
     count, height, width = pictures.shape
-    levels = levels_between(pictures, (0, 0, height, width), np.arange(count), SUBSTEP_PX)
+    vectors = motions(pictures)
+    levels = levels_between(pictures, (0, 0, height, width), np.arange(count), SUBSTEP_PX, vectors)
     fine = pictures.astype(np.uint16) * np.uint16(FINE_STEPS)
     alone = _signed_counts(fine)
     if levels is None:
@@ -146,11 +148,10 @@ def predict(pictures: Frames) -> Prediction:
     rising = np.add.reduceat(np.maximum(along, 0), first, dtype=np.int16)
     falling = -np.add.reduceat(np.minimum(along, 0), first, dtype=np.int16)
     apart = [np.abs(np.maximum(sign * alone, 0) - true).sum() for sign, true in ((1, rising), (-1, falling))]
-    pyramids = [pyramid(np.ascontiguousarray(picture)) for picture in pictures]
-    moving = [_moving(motion(one, other, _SHORTEST)) for one, other in pairwise(pyramids)]
-    guesses = [_guess(pyramids[at - 1], pyramids[at + 1], pictures[at - 1 : at + 2]) for at in range(1, count - 1)]
+    moving = _moving(without_slow(vectors, _SHORTEST))
+    guesses = [_guess(pictures[at - 1 : at + 2]) for at in range(1, count - 1)]
     return Prediction(
-        tuple(np.concatenate(moving).tolist()),
+        tuple(moving.tolist()),
         float(np.abs(alone).sum()),
         float(rising.sum() + falling.sum()),
         float(np.abs(rising - falling).sum()),
@@ -177,15 +178,16 @@ def _signed_counts(fine: npt.NDArray[np.uint16]) -> npt.NDArray[np.int16]:
 
 def _moving(vectors: Vectors) -> npt.NDArray[np.float64]:
     """Return the lengths, px, of the vectors that are not zero."""
-    lengths: npt.NDArray[np.float64] = np.hypot(vectors[0], vectors[1], dtype=np.float64) / UNITS_PER_PX
+    lengths: npt.NDArray[np.float64] = np.hypot(vectors[:, 0], vectors[:, 1], dtype=np.float64) / UNITS_PER_PX
     return lengths[lengths > 0.0]
 
 
-def _guess(before: list[Picture], after: list[Picture], three: Frames) -> tuple[float, float]:
+def _guess(three: Frames) -> tuple[float, float]:
     """Return how far the middle of three pictures is from what the others predict: along the motion, and as a mean."""
     first, middle, last = three.astype(np.float64)
     if np.array_equal(first, middle) or np.array_equal(middle, last):  # a repeated frame is not halfway
         return 0.0, 0.0
     guess = np.empty((1, *middle.shape), np.uint16)
-    between(before[0], after[0], motion(before, after, _SHORTEST), 0, 0, guess)
+    before, after = (Pyramid(np.ascontiguousarray(picture)) for picture in (three[0], three[2]))
+    between(before.levels[0], after.levels[0], motion(before, after), _SHORTEST, 0, 0, guess)
     return float(np.abs(guess[0] / FINE_STEPS - middle).sum()), float(np.abs((first + last) / 2 - middle).sum())

@@ -21,6 +21,7 @@ from v2v_server.motion.matching import PAD_PX, Picture, Vectors, compiled
 FineGrey = npt.NDArray[np.uint16]
 _FRACTIONS = 32
 _SHARES = 256
+_HALF, _FINER = np.uint16(8), np.uint16(4)  # of 2**-8 in 2**-4
 _SHIFT_BITS = 7  # from 1/_SHARES of 1/UNITS_PER_PX px to 1/_FRACTIONS px
 
 
@@ -39,33 +40,48 @@ def _cubic_weights():
 _WEIGHTS = _cubic_weights()
 
 
-def between(first: Picture, second: Picture, vectors: Vectors, top: int, left: int, out: FineGrey) -> None:
+def between(
+    first: Picture, second: Picture, vectors: Vectors, shortest: int, top: int, left: int, out: FineGrey
+) -> None:
     """Write the pictures at the shares 1/(n + 1) .. n/(n + 1) of the time between two pictures.
 
     Args:
         first, second: of one size, padded (``matching.padded``).
-        vectors: the motion between them.
+        vectors: [2, rows, columns], the motion between them in the cells of the part.
+        shortest: length, in 1/UNITS_PER_PX px, below which a cell counts as still.
         top, left: place of the part that is written.
         out: [n, h, w] uint16, C-contiguous, at least CELL_PX on each side: grey levels in 1/16.
     """
-    _between(first, second, vectors, top, left, _WEIGHTS, out)
+    _between(first, second, vectors, max(shortest * shortest, 1), top, left, _WEIGHTS, out)
 
 
 @compiled
-def _between(first, second, vectors, top, left, weights, out):
+def _between(first, second, vectors, shortest_squared, top, left, weights, out):
     pitch = first.shape[1]
     height, width = first.shape[0] - 2 * PAD_PX, first.shape[1] - 2 * PAD_PX
     count, rows, columns = out.shape
     a, b, flat, table = first.ravel(), second.ravel(), out.ravel(), weights.ravel()
+    has_still = False
+    for row in range(vectors.shape[1]):
+        for column in range(vectors.shape[2]):
+            x, y = np.int64(vectors[0, row, column]), np.int64(vectors[1, row, column])
+            has_still |= x * x + y * y < shortest_squared
     for number in range(count):
         share = ((number + 1) * 2 * _SHARES + count + 1) // (2 * (count + 1))
+        if has_still:
+            start = (PAD_PX + top) * pitch + PAD_PX + left
+            _mean(a, b, start, pitch, share, flat[number * rows * columns :], rows, columns)
         for line in range(0, rows, CELL_PX):
             row = min(line, rows - CELL_PX)
-            cell_row = min((top + row + CELL_PX // 2) // CELL_PX, vectors.shape[1] - 1)
+            cell_row = min((row + CELL_PX // 2) // CELL_PX, vectors.shape[1] - 1)
             for each in range(0, columns, CELL_PX):
                 column = min(each, columns - CELL_PX)
-                cell_column = min((left + column + CELL_PX // 2) // CELL_PX, vectors.shape[2] - 1)
+                cell_column = min((column + CELL_PX // 2) // CELL_PX, vectors.shape[2] - 1)
                 x, y = np.int64(vectors[0, cell_row, cell_column]), np.int64(vectors[1, cell_row, cell_column])
+                if x * x + y * y < shortest_squared:
+                    x, y = np.int64(0), np.int64(0)
+                    if row == line and column == each:
+                        continue
                 weight = share
                 at, at_x, at_y, is_first = _place(top + row, left + column, -share * x, -share * y, height, width)
                 rest = _SHARES - share
@@ -76,6 +92,19 @@ def _between(first, second, vectors, top, left, weights, out):
                     a, at, at_x, at_y, b, to, to_x, to_y, table, pitch, weight, flat,
                     (number * rows + row) * columns + column, columns,
                 )  # fmt: skip
+
+
+@compiled
+def _mean(first, second, at, pitch, share, out, rows, columns):
+    """Write the weighted mean of two pictures: what a warp without motion gives."""
+    one_weight, other_weight = np.uint16(_SHARES - share), np.uint16(share)
+    for row in range(rows):
+        one, other = first[at + row * pitch :], second[at + row * pitch :]
+        into = out[row * columns : (row + 1) * columns]
+        for column in range(columns):
+            mean = np.uint16(np.uint16(one[column]) * one_weight)
+            mean = np.uint16(mean + np.uint16(np.uint16(other[column]) * other_weight))
+            into[column] = np.uint16(np.uint16(mean + _HALF) >> _FINER)
 
 
 @compiled

@@ -12,14 +12,27 @@ from pathlib import Path
 from v2v_protocol.errors import V2VError
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES
-from v2v_server.defects.defect import BARS, BLACK, CUTS, DUPLICATES, STILL, Defect
-from v2v_server.store.clips import pictures_of
+from v2v_server.corpus.scenes.findings import (
+    BARS,
+    BLACK,
+    COMBED,
+    CUTS,
+    DUPLICATES,
+    FADES,
+    NOISY,
+    STILL,
+    WHITE,
+    Defect,
+    defects_of,
+)  # fmt: skip
+from v2v_server.store.clips import pictures_of, signal_of
 from v2v_server.store.format import is_store_file
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.system.process import usable_cores
 from v2v_server.video.decode import stream_luma
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.orientation import Window
 
 MOST_VIDEOS = 12
@@ -34,17 +47,27 @@ _SHOWN = 3
 _EFFECTS = {
     DUPLICATES: "duplicated frames",
     CUTS: "hard cuts or jumps",
+    FADES: "fades to or from black",
     BARS: "bars at the sides of the picture",
+    COMBED: "combed pictures",
     STILL: "still stretches",
     BLACK: "black stretches",
+    WHITE: "white stretches",
+    NOISY: "still stretches with much noise",
 }
+_AUTO = "v2v-serve --scene auto"
 _CHANGES = {
-    DUPLICATES: "a repeated frame makes no events, and the next step those of two: leave such videos out, or re-encode "
-    "them once without repeats (ffmpeg -i IN -vf mpdecimate -fps_mode vfr OUT)",
-    CUTS: "a cut, or a jump over missing frames, fills the picture with false events: v2v-serve --scene auto "
-    "lets no sequence cross one",
-    STILL: "only noise makes events there: leave videos out that are still all along",
-    BLACK: "v2v-serve --scene auto leaves black stretches out",
+    DUPLICATES: f"a repeated frame makes no events, and the next step those of two: {_AUTO} drops repeats",
+    CUTS: "a cut, or a jump over missing frames, fills the picture with false events: "
+    f"{_AUTO} lets no sequence cross one",
+    FADES: f"a fade changes every pixel, as no scene does: {_AUTO} lets no sequence cross one",
+    BARS: f"bars make no events: {_AUTO} leaves them out of the picture",
+    COMBED: f"rows of two times make false events: {_AUTO} leaves such pictures out; deinterlacing keeps them "
+    "(ffmpeg -i IN -vf bwdif=send_field OUT)",
+    STILL: f"only noise makes events there: {_AUTO} serves a tenth of still sequences (still_share)",
+    BLACK: f"{_AUTO} leaves black stretches out",
+    WHITE: f"{_AUTO} leaves white stretches out",
+    NOISY: f"a coder or sensor makes the events there: {_AUTO} serves a tenth of still sequences (still_share)",
 }
 
 
@@ -60,8 +83,8 @@ class _Excerpt:
     window: Window
 
 
-_Found = tuple[_Excerpt, int, tuple[Defect, ...]]
-"""An excerpt, its frames that decode, and their defects."""
+_Found = tuple[_Excerpt, int, tuple[Defect, ...], Signal]
+"""An excerpt, its frames that decode, their defects, and what the levels of the video mean."""
 
 
 def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple[str, str, str, str]]:
@@ -82,15 +105,20 @@ def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple
         text += f"; {failed} more did not decode within {_LONGEST_VIDEO_SECONDS:.0f} s"
     yield "ok", "pictures", text, ""
     for kind, effect in _EFFECTS.items():
-        having = [(excerpt, each) for excerpt, _, defects in found for each in defects if each.kind == kind]
+        having = [(excerpt, each) for excerpt, _, defects, _ in found for each in defects if each.kind == kind]
         count = sum(
-            any(each.kind == kind and each.touches(*span) for each in defects) for (_, _, defects), span in sequences
+            any(each.kind == kind and each.touches(*span) for each in defects) for (_, _, defects, _), span in sequences
         )
         if count:
             named = "; ".join(f"{excerpt.id}: {each.text}" for excerpt, each in having[:_SHOWN])
             more = f"; and {len(having) - _SHOWN} more" if len(having) > _SHOWN else ""
             text = f"{count} of {len(sequences)} sequences ({100 * count // len(sequences)}%) have {effect} ({named}"
-            yield "note", "pictures", f"{text}{more})", _CHANGES.get(kind) or _without_bars(having)
+            yield "note", "pictures", f"{text}{more})", _CHANGES[kind]
+    if stated := [(excerpt.id, signal) for excerpt, _, _, signal in found if signal != SDR]:
+        named = "; ".join(f"{id}: {signal}" for id, signal in stated[:_SHOWN])
+        more = f"; and {len(stated) - _SHOWN} more" if len(stated) > _SHOWN else ""
+        text = f"{len(stated)} of {len(found)} videos have other levels than {SDR} ({named}{more})"
+        yield "note", "pictures", text, "v2v-serve --set light=declared uses them; otherwise they are read as 8-bit SDR"
 
 
 def _found(catalogue: Catalogue) -> Iterator[_Found]:
@@ -120,41 +148,27 @@ def _found(catalogue: Catalogue) -> Iterator[_Found]:
         compile_cache(),
     )  # fmt: skip
     for excerpt, result in results:
-        yield (excerpt, 0, ()) if isinstance(result, Died) else (excerpt, *result)
+        yield (excerpt, 0, (), SDR) if isinstance(result, Died) else (excerpt, *result)
 
 
-def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...]]:
-    """Return the number of frames and their defects; no frames where they do not decode."""
+def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal]:
+    """Return the number of frames, their defects, and what their levels mean; no frames where they do not decode."""
     # Import lazily: the process that draws up the report needs no OpenCV.
-    from v2v_server.defects.finder import find_defects
+    from v2v_server.corpus.scenes.analysis import analyse
 
+    path, index, window = excerpt.path, excerpt.index, excerpt.window
     try:
-        if is_store_file(excerpt.path):
-            return find_defects(islice(pictures_of(excerpt.path, excerpt.index, excerpt.window), excerpt.count))
-        return find_defects(stream_luma(excerpt.path, excerpt.index, excerpt.start, excerpt.count, excerpt.window))
+        if is_store_file(path):
+            scene = analyse(islice(pictures_of(path, index, window), excerpt.count))
+        else:
+            scene = analyse(stream_luma(path, index, excerpt.start, excerpt.count, window))
+        signal = signal_of(path, index)
     except V2VError:
-        return 0, ()
+        return 0, (), SDR
+    return scene.end, defects_of(scene), signal
 
 
 def _sequences(frames: int, needed: int) -> list[tuple[int, int]]:
     """Return the sequences of an excerpt; an excerpt shorter than a sequence counts as one."""
     needed = min(frames, needed)
     return [(first, first + needed) for first in range(0, frames - needed + 1, needed)]
-
-
-def _without_bars(having: list[tuple[_Excerpt, Defect]]) -> str:
-    """Return what to do about bars, with the rows that no bar of these videos touches."""
-    top, bottom, at_sides = 0.0, 1.0, False
-    for excerpt, defect in having:
-        if (sides := defect.sides) is not None:
-            first, _, rows, _ = excerpt.window
-            height = excerpt.index.height_px
-            top = max(top, (first + sides.top) / height if sides.top else 0.0)
-            bottom = min(bottom, (first + rows - sides.bottom) / height if sides.bottom else 1.0)
-            at_sides = at_sides or bool(sides.left or sides.right)
-    remedies = []
-    if top or bottom < 1:
-        remedies.append(f"--rows {math.ceil(100 * top) / 100:g}:{math.floor(100 * bottom) / 100:g} leaves them out")
-    if at_sides:
-        remedies.append("crop bars at the left and right once (ffmpeg -i IN -vf crop=W:H:X:Y OUT)")
-    return "bars make no events: " + "; ".join(remedies)

@@ -22,12 +22,15 @@ from v2v_server.motion.prediction import SUBSTEP_PX, Prediction, predict
 from v2v_server.offline.leases import lease_for
 from v2v_server.offline.remake import RemadeSample, Remaker
 from v2v_server.schedule.sequences import VideoSequence
+from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.view import apply_view, without_margin
+from v2v_server.store.clips import signal_of
 from v2v_server.store.format import is_store_file
 from v2v_server.store.reader import StoreFile
 from v2v_server.system.opencv import cv2
 from v2v_server.video.decode import DecodedClip, stream_luma
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import SDR
 from v2v_server.video.orientation import Window
 from v2v_server.worker.produce import Decoded, make_sample, plan_sample
 
@@ -71,8 +74,8 @@ def quiet_voxels(made: RemadeSample) -> npt.NDArray[Any]:
 def predicted_loss(made: RemadeSample) -> Prediction:
     """Predict what a sample loses between its frames."""
     plan, recipe = made.decoded.plan, made.decoded.plan.spec.recipe
-    frames = without_margin(made.decoded.clip.frames, plan.params, recipe, plan.margin_px)
-    return predict(apply_view(frames, plan.params, recipe))
+    frames = eight_bits(made.decoded.clip.frames, made.decoded.clip.signal)
+    return predict(apply_view(without_margin(frames, plan.params, recipe, plan.margin_px), plan.params, recipe))
 
 
 def describe_loss(found: Prediction) -> str:
@@ -165,12 +168,13 @@ class WholePictures:
         index, stride = catalogue.frame_index(video.id), recipe.frame_stride
         count = (len(frames) - 1) * stride + 1
         with catalogue.source.open_local(video.id, video.fingerprint) as path:
+            signal = SDR if recipe.light == "sdr" else signal_of(path, index)._replace(bits=8)
             window = (top, 0, bottom - top, video.width_px)
             taken = _pictures(path, index, sequence.start_frame, count, window)
             for frame, picture in zip(frames, islice(taken, 0, None, stride), strict=True):
                 cv2.resize(picture, (width, height), frame, interpolation=cv2.INTER_AREA)
         seconds = index.seconds(sequence.start_frame, count)[::stride]
-        clip = DecodedClip(frames, seconds, codec="", bit_exact=False)
+        clip = DecodedClip(frames, seconds, codec="", bit_exact=False, signal=signal)
         sample = make_sample(lease, Decoded(plan, clip))
         return Camera.of(sample.arrays, sample.provenance, f"threshold {THRESHOLD:g}, no noise", recipe)
 

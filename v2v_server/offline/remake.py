@@ -73,6 +73,7 @@ class Remaker:
         snapshot: int = 0,
     ) -> None:
         array_layout(spec.recipe, spec.voxel_dtype, arrays)
+        catalogue.facts.require_arrays(arrays)
         self._catalogue, self._spec, self._arrays = catalogue, spec, arrays
         self._quarantine, self._snapshot = quarantine or Quarantine(), snapshot
         table = SequenceTable(catalogue.videos, catalogue.rows, spec)

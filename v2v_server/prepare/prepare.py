@@ -32,6 +32,7 @@ from v2v_server.prepare.report import Report
 from v2v_server.prepare.resume import has_failed, known_records, locked, refuse_overlap, standing_files
 from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode
 from v2v_server.store.encoding import Encoding
+from v2v_server.store.motion import has_planes
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.orientation import Window
@@ -63,6 +64,7 @@ def prepare(
     floor_db: float = DEFAULT_FLOOR_DB,
     frame_floor_db: float | None = None,
     scene: bool = False,
+    planes: tuple[str, ...] = (),
     single: bool = False,
     progress: Progress | None = None,
 ) -> Report:
@@ -77,6 +79,8 @@ def prepare(
         frame_floor_db: lowest PSNR of each frame for the same, dB; None: 5 dB below ``floor_db``.
         scene: also compute the scene statistics; for a video prepared without them they are computed from its source,
             and its file stays.
+        planes: names of the planes to store (:data:`v2v_server.store.motion.MADE_PLANES`); a video prepared without one
+            of them is prepared again.
         single: the source is one video, so the destination may lie in its folder.
         progress: called at the start, after each video whose file was checked, and after each that was done.
 
@@ -84,8 +88,10 @@ def prepare(
         CorpusError: source and destination overlap, the destination holds something else or was prepared with other
             settings or from another source, a prepared file cannot be read, another process works there, the source is
             a prepared folder itself, or the disk is too full.
-        UsageError: a number outside its limits.
+        UsageError: a number outside its limits, or planes of a lossy encoding.
     """
+    if planes and not encoding.is_lossless:
+        raise UsageError(f"planes {', '.join(planes)} with {encoding}: only lossless files hold planes")
     if frame_floor_db is None:
         frame_floor_db = floor_db - DEFAULT_FRAME_FLOOR_BELOW_DB
     if processes < 0 or not math.isfinite(floor_db) or not math.isfinite(frame_floor_db):
@@ -108,15 +114,15 @@ def prepare(
         target.mkdir(parents=True, exist_ok=True)
         with locked(target):
             known = known_records(target, header, catalogue.videos)
-            earlier = _earlier(target, catalogue, known, scene, lambda done: tell(done, total, 0, 0))
-            standing, finished = earlier.standing, earlier.finished
+            earlier = _earlier(target, catalogue, known, scene, planes, lambda done: tell(done, total, 0, 0))
+            standing, finished, lacking = earlier.standing, earlier.finished, earlier.lacking
             left = [video for video in catalogue.videos if video.id not in finished]
             done = total - sum(video.frames for video in left)
             room = _Room(target, catalogue, encoding, left)
             wanted = {video.id for video in catalogue.videos}
             aside = [record for id, record in known.items() if id not in wanted]
             with ManifestWriter(target, header, [*standing.values(), *earlier.failed], aside) as manifest:
-                for video, outcome in _outcomes(catalogue, left, standing, target, encoding, scene, processes):
+                for video, outcome in _outcomes(catalogue, left, earlier, target, encoding, scene, planes, processes):
                     if isinstance(outcome, Refusal):
                         not_looked_at.append(outcome)
                     else:
@@ -135,7 +141,7 @@ def prepare(
         unusable=catalogue.refusals,
         floor_db=floor_db,
         frame_floor_db=frame_floor_db,
-        looked_at=len(made.keys() & standing.keys()),
+        looked_at=len((made.keys() & standing.keys()) - lacking),
         aside=len(aside),
         not_looked_at=tuple(not_looked_at),
     )
@@ -204,24 +210,33 @@ class _Earlier:
     Attributes:
         standing: records by id, whose prepared file exists.
         finished: ids of those that are complete.
+        lacking: ids of those whose files lack a requested plane.
         failed: records without a file. They stay until the video was tried again: a finished folder stays finished.
     """
 
     standing: dict[str, PreparedVideo]
     finished: set[str]
+    lacking: set[str]
     failed: list[PreparedVideo]
 
 
 def _earlier(
-    target: Path, catalogue: Catalogue, known: dict[str, PreparedVideo], scene: bool, tell: Callable[[int], None]
+    target: Path,
+    catalogue: Catalogue,
+    known: dict[str, PreparedVideo],
+    scene: bool,
+    planes: tuple[str, ...],
+    tell: Callable[[int], None],
 ) -> _Earlier:
-    earlier = _Earlier({}, set(), [])
+    earlier = _Earlier({}, set(), set(), [])
     done = 0
     with closing(standing_files(target, catalogue.videos, known)) as files:
         for video, stands in files:
             if stands:
                 record = earlier.standing[video.id] = known[video.id]
-                if record.scene or not scene:
+                if not has_planes(target / video.id, planes):
+                    earlier.lacking.add(video.id)
+                elif record.scene or not scene:
                     earlier.finished.add(video.id)
                     done += video.frames
             elif has_failed(video, known):
@@ -233,27 +248,30 @@ def _earlier(
 def _outcomes(
     catalogue: Catalogue,
     videos: Iterable[VideoEntry],
-    standing: dict[str, PreparedVideo],
+    earlier: _Earlier,
     target: Path,
     encoding: Encoding,
     scene: bool,
+    planes: tuple[str, ...],
     processes: int,
 ) -> Iterator[tuple[VideoEntry, PreparedVideo | Refusal]]:
     """Yield the new record of each video, in order of completion, or a problem if the existing record has to stay."""
     jobs = []
     for video in videos:
         try:
-            jobs.append(_ToPrepare(video, _window(video, catalogue.rows), standing.get(video.id)))
+            window = _window(video, catalogue.rows)
+            jobs.append(_ToPrepare(video, window, earlier.standing.get(video.id), video.id in earlier.lacking))
         except UsageError as error:
             yield video, _record(video, 0, 0, str(error), encoding)
 
     def transcodings() -> Iterator[tuple[_ToPrepare, Transcoding]]:
         for job in jobs:
             id = job.video.id
+            keeps_scene = job.standing is not None and job.standing.scene != ""
             index = catalogue.frame_index(id).to_bytes()
             yield job, Transcoding(
                 id, catalogue.path(id), job.video.fingerprint, job.video.codec, index, job.video.frames_per_second,
-                job.window, encoding, target, target / id, scene,
+                job.window, encoding, target, target / id, scene or keeps_scene, planes,
             )  # fmt: skip
 
     isolated = run_isolated(
@@ -280,11 +298,12 @@ def _outcomes(
 
 @dataclass(frozen=True, slots=True)
 class _ToPrepare:
-    """A video to transcode, or only to analyse if its prepared file exists."""
+    """A video to transcode, or only to analyse if its prepared file exists and lacks no plane."""
 
     video: VideoEntry
     window: Window
     standing: PreparedVideo | None
+    lacks_planes: bool
 
 
 def _window(video: VideoEntry, rows: Rows) -> Window:
@@ -303,7 +322,7 @@ def _deadline_seconds(job: _ToPrepare) -> float:
 def _attempt(job: tuple[_ToPrepare, Transcoding]) -> Made | Scene | str:
     """Return the result of one job, or the reason why there is none."""
     try:
-        return transcode(job[1]) if job[0].standing is None else look_again(job[1])
+        return transcode(job[1]) if job[0].standing is None or job[0].lacks_planes else look_again(job[1])
     except VideoError as error:
         return error.reason if error.frame is None else f"frame {error.frame}: {error.reason}"
     except OSError as error:

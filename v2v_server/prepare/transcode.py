@@ -12,8 +12,9 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,15 +26,20 @@ from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.scenes.analysis import SceneAnalysis
 from v2v_server.corpus.scenes.scene import MOST_FRAMES, Scene
 from v2v_server.prepare.encode import encode_luma
-from v2v_server.store.clips import stored_pictures
+from v2v_server.store.chroma import matrix_of, whole_chroma
+from v2v_server.store.clips import stored_arrays, stored_pictures
+from v2v_server.store.depth import detail_planes, grey_of, same_transfer
 from v2v_server.store.encoding import Encoding
 from v2v_server.store.format import Head, group_frames_for
+from v2v_server.store.motion import with_planes
 from v2v_server.store.packing import SIZES
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter
-from v2v_server.video.decode import BIT_EXACT_CODECS, decode_luma, stream_luma
+from v2v_server.video.collect import LastFrame
+from v2v_server.video.decode import BIT_EXACT_CODECS, decode_luma, stream_decoded, stream_luma
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import MOST_BITS
 from v2v_server.video.orientation import Window
 from v2v_server.video.probe import probe
 
@@ -41,6 +47,7 @@ PARTIAL_SUFFIX = ".v2v-partial"
 HIGHEST_PSNR_DB = 100.0
 """Stands for equality."""
 
+_Frame = tuple[LastFrame, npt.NDArray[Any]]
 _COMPARED_FRAMES = 64
 _LARGEST_DENOMINATOR = 10**6
 
@@ -61,6 +68,7 @@ class Transcoding:
         root: the folder that the target must not leave, resolved.
         target: the file to write; its folder is created if missing.
         scene: whether to compute the scene statistics.
+        planes: names of the planes to store beside the luma, of :data:`v2v_server.store.motion.MADE_PLANES`.
     """
 
     video: str
@@ -74,6 +82,7 @@ class Transcoding:
     root: Path
     target: Path
     scene: bool = False
+    planes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +119,8 @@ def transcode(job: Transcoding) -> Made:
     name = hashlib.sha256(os.fsencode(job.target.name)).hexdigest()[:16]
     hidden = job.target.with_name(f".{name}{PARTIAL_SUFFIX}")
     with write_aside_and_rename(job.target, partial=hidden) as partial:
-        frames = _frames(job, index)
         analysis = SceneAnalysis()
+        frames = _decoded(job, index, MOST_BITS if job.encoding.is_lossless else None)
         if job.scene:
             frames = _watched(frames, analysis)
         made = (
@@ -133,20 +142,27 @@ def look_again(job: Transcoding) -> Scene:
     return analysis.scene()
 
 
-def _watched(frames: Iterator[npt.NDArray[np.uint8]], analysis: SceneAnalysis) -> Iterator[npt.NDArray[np.uint8]]:
+def _watched(frames: Iterator[_Frame], analysis: SceneAnalysis) -> Iterator[_Frame]:
     """Yield the same frames; those at the beginning are analysed as they pass."""
     for number, frame in enumerate(frames):
         if number < MOST_FRAMES:
-            analysis.add(frame)
+            analysis.add(grey_of(*frame))
         yield frame
+
+
+def _decoded(job: Transcoding, index: FrameIndex, most_bits: int | None) -> Iterator[_Frame]:
+    chroma = whole_chroma(job.planes, job.window)
+    return stream_decoded(job.source, index, 0, len(index), job.window, most_bits, chroma)
 
 
 def _frames(job: Transcoding, index: FrameIndex) -> Iterator[npt.NDArray[np.uint8]]:
     return stream_luma(job.source, index, 0, len(index), job.window)
 
 
-def _stored(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[npt.NDArray[np.uint8]]) -> Made:
+def _stored(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[_Frame]) -> Made:
     """Write a store file, and verify it by reading it back."""
+    first = next(frames)
+    signal = first[0].signal
     packing = SIZES[job.encoding.size]
     top, _, rows, width = job.window
     rate = job.frames_per_second
@@ -154,27 +170,35 @@ def _stored(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[np
         video=job.video, fingerprint=job.fingerprint, height_px=index.height_px, width_px=width, top=top, rows=rows,
         first=0, count=len(index), frames=len(index), frames_per_second=0.0 if math.isnan(rate) else rate,
         codec=job.codec, bit_exact=job.codec in BIT_EXACT_CODECS, group=group_frames_for(rows, width),
-        packing=packing.method, index=job.index,
+        packing=packing.method, index=job.index, bits=signal.bits, transfer=signal.transfer,
+        matrix=matrix_of(first[0]),
     )  # fmt: skip
-    wanted, got = xxhash.xxh3_128(), xxhash.xxh3_128()
-    with StoreWriter(made, head, packing) as writer:
-        for picture in frames:
-            wanted.update(np.ascontiguousarray(picture).data)
-            writer.add(picture)
+    names = [*job.planes, *detail_planes(signal)]
+    wanted, got = ({name: xxhash.xxh3_128() for name in ("", *names)} for _ in range(2))
+    with StoreWriter(made, head, packing, names) as writer:
+        for picture, planes in with_planes(same_transfer(head, chain((first,), frames)), names):
+            for name, array in (("", picture), *planes.items()):
+                wanted[name].update(np.ascontiguousarray(array).data)
+            writer.add(picture, planes)
         writer.close(lasting=True)
     with StoreFile(made, job.fingerprint) as stored:
         for picture in stored_pictures(stored, job.window):
-            got.update(np.ascontiguousarray(picture).data)
-    if wanted.digest() != got.digest():
+            got[""].update(np.ascontiguousarray(picture).data)
+        for name in names:
+            for array in stored_arrays(stored, name):
+                got[name].update(array.data)
+    if any(wanted[name].digest() != got[name].digest() for name in wanted):
         raise VideoError(os.fspath(job.source), None, "verification: the stored file does not reproduce the frames")
     return Made(fingerprint(made), made.stat().st_size, HIGHEST_PSNR_DB, HIGHEST_PSNR_DB)
 
 
-def _encoded(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[npt.NDArray[np.uint8]]) -> Made:
+def _encoded(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[_Frame]) -> Made:
     """Encode a video, and compare it with its source."""
     pts, time_base = _times(job, index)
     height, width = job.window[2:]
-    encode_luma(made, frames, job.encoding, height=height, width=width, pts=pts, time_base=time_base)
+    encode_luma(
+        made, (picture for _, picture in frames), job.encoding, height=height, width=width, pts=pts, time_base=time_base
+    )
     verified = _verified(job, index, made, pts, time_base)
     with made.open("rb") as file:
         os.fsync(file.fileno())

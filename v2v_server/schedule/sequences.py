@@ -2,8 +2,8 @@
 
 A sequence is a run of consecutive frames of one video. The sequences of a video start at frame 0, L, 2L ... while
 start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L = frames per sequence). With scene
-"auto" the same holds for each stretch of the video between shot boundaries in which there is something to see. With
-``voxel_seconds``, L is the frames of the longest duration that the recipe can draw, at the video's average rate.
+"auto" the same holds for each run of the video (:mod:`v2v_server.schedule.runs`). With ``voxel_seconds``, L is the
+frames of the longest duration that the recipe can draw, at the video's average rate.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, MOST_STEPS_PER_GRID, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.scenes.runs import SplitVideos
+from v2v_server.corpus.scenes.pieces import SplitVideos
+from v2v_server.corpus.scenes.scene import NO_BARS, Sides
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.corpus.videos import Videos as CatalogueVideos
+from v2v_server.schedule.runs import Cleaning, Runs, SplitSequences
 from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.rows import Rows
 
@@ -56,7 +58,7 @@ class Columns:
         rates: float64 [N], average frames per second; NaN where unknown.
         size: int32 [N], index into ``first_of_size``.
         first_of_size: for each picture size, the first video that has it.
-        split: the videos whose usable frames are not one run of all; None if runs are unknown.
+        split: the videos that are divided into pieces; None if pieces are unknown.
     """
 
     def __init__(self, videos: Videos) -> None:
@@ -77,13 +79,13 @@ def _sizes(height_px: npt.NDArray[np.integer], width_px: npt.NDArray[np.integer]
 
 
 def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], SplitVideos | None]:
-    """Return frames, sizes, and the videos with shot boundaries."""
+    """Return frames, sizes, and the videos that are divided into pieces."""
     frames, heights, widths = (
         np.array([getattr(video, name) for video in videos], np.int64) for name in ("frames", "height_px", "width_px")
     )
     sizes = _sizes(heights, widths)
-    runs = [video.runs for video in videos if video.runs is not None]
-    return frames, sizes, SplitVideos.of(frames, runs) if len(runs) == len(videos) else None
+    pieces = [video.pieces for video in videos if video.pieces is not None]
+    return frames, sizes, SplitVideos.of(pieces) if len(pieces) == len(videos) else None
 
 
 class SequenceTable:
@@ -95,7 +97,7 @@ class SequenceTable:
     Args:
         videos: the catalogue's entries, in its order.
         rows: the usable rows of each picture.
-        spec: determines the frames in a sequence, the size of the crop, and whether shot boundaries count.
+        spec: determines the frames in a sequence, the size of the crop, and what is done about defects.
         columns: columns of the videos; None computes them.
 
     Attributes:
@@ -179,7 +181,7 @@ class SequenceTable:
         stride = int(self._spec.recipe.sequence_at(video.frames_per_second))
         return VideoSequence(video, place * stride if start is None else start)
 
-    def _count(self, first: int, end: int) -> tuple[npt.NDArray[np.int64], _CutSequences | None]:
+    def _count(self, first: int, end: int) -> tuple[npt.NDArray[np.int64], SplitSequences | None]:
         """Count the sequences of each of the videos ``first`` .. ``end`` - 1."""
         columns, spec, recipe = self._columns, self._spec, self._spec.recipe
         rates, size = columns.rates[first:end], columns.size[first:end]
@@ -191,67 +193,16 @@ class SequenceTable:
             counts *= (steps > 0) & (steps <= MOST_STEPS_PER_GRID)
         if spec.scene == "off" or columns.split is None:
             return counts, None
-        cut = _between(columns.split, first, end)
-        strides = np.broadcast_to(strides, counts.shape)[cut.numbers - first]
-        sequences = _CutSequences(cut, counts[cut.numbers - first], strides, spec.max_sequences_per_video)
-        counts[cut.numbers - first] = sequences.counts
+        split = columns.split.between(first, end)
+
+        def suits(size: int, sides: Sides) -> bool:
+            return _too_small(self._all[columns.first_of_size[size]], self._rows, recipe, sides) is None
+
+        at = split.numbers - first
+        of_split = np.broadcast_to(strides, counts.shape)[at]
+        sequences = SplitSequences(split, counts[at], of_split, spec, columns.size[split.numbers], suits)
+        counts[at] = sequences.counts
         return counts, sequences
-
-
-def _between(cut: SplitVideos, first: int, end: int) -> SplitVideos:
-    """Return those of the videos ``first`` .. ``end`` - 1."""
-    low, high = cut.numbers.searchsorted(np.array((first, end), np.int32)).tolist()  # int64 would convert them all
-    runs = slice(*cut.bounds[[low, high]].tolist())
-    return SplitVideos(
-        cut.numbers[low:high], cut.bounds[low : high + 1] - cut.bounds[low], cut.first[runs], cut.end[runs]
-    )
-
-
-class _CutSequences:
-    """Sequences of the videos with shot boundaries: at 0, L, 2L ... of each run.
-
-    Args:
-        cut: these videos.
-        whole: int64 [C], number of sequences that each would have without its shot boundaries.
-        strides: int64 [C], L of each.
-        most: largest number of sequences of one video.
-
-    Attributes:
-        counts: int64 [C], number of sequences of each video.
-    """
-
-    def __init__(
-        self, cut: SplitVideos, whole: npt.NDArray[np.int64], strides: npt.NDArray[np.int64], most: int
-    ) -> None:
-        self._cut, self._whole, self._strides = cut, whole, strides
-        each = np.maximum(cut.end - cut.first - 1, 0) // strides[cut.owners()]
-        self._upto = np.concatenate(([0], np.cumsum(each)))  # sequences before each run, if a video may have any number
-        self._most = np.where(whole > 0, most, 0)
-        self.counts = np.minimum(np.diff(self._upto[cut.bounds]), self._most)
-
-    def spoilt(self) -> int:
-        """Return the number of sequences that are not where they would be without shot boundaries."""
-        cut, owners = self._cut, self._cut.owners()
-        before = self._upto[:-1] - self._upto[cut.bounds[:-1]][owners]
-        each = np.clip(self._most[owners] - before, 0, np.diff(self._upto))
-        strides = self._strides[owners]
-        in_place = np.clip(self._whole[owners] - cut.first // strides, 0, each)
-        return int(self._whole.sum() - in_place[cut.first % strides == 0].sum())
-
-    def too_short(self) -> tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]:
-        """Return the videos that have no sequence because of their shot boundaries, and the frames of the longest run
-        of each.
-        """
-        short = (self._whole > 0) & (self.counts == 0)
-        return self._cut.numbers[short], self._cut.longest()[short]
-
-    def start(self, video: int, place: int) -> int | None:
-        """Return the first frame of a sequence of a video; None if the video has no shot boundaries."""
-        if (at := self._cut.find(video)) is None:
-            return None
-        low, high = self._cut.bounds[at : at + 2].tolist()
-        run = int(self._upto[low:high].searchsorted(self._upto[low] + place, side="right")) - 1 + low
-        return int(self._cut.first[run]) + int(self._strides[at]) * (place - int(self._upto[run] - self._upto[low]))
 
 
 class Refusals(Sequence[Refusal]):
@@ -287,11 +238,7 @@ class Refusals(Sequence[Refusal]):
         if video.frames <= recipe.sequence_at(video.frames_per_second):
             return _too_short(video, recipe)
         unsuited_size = _too_small(video, self._rows, recipe) or _too_large(video, self._rows, self._spec)
-        return unsuited_size or _all_cut(video, _longest_run(video), recipe)
-
-
-def _longest_run(video: VideoEntry) -> int:
-    return max((end - first for first, end in video.runs or ()), default=0)
+        return unsuited_size or _all_cut(video, self._rows, self._spec)
 
 
 def _longest_clip(frames: int, steps: int, recipe: Recipe) -> int:
@@ -335,10 +282,17 @@ def _unsuited_rate(video: VideoEntry, recipe: Recipe) -> Refusal | None:
     return _unsuited(video, f"{reason}, the limit is {MOST_STEPS_PER_GRID}", "shorter voxel_seconds, or frame_stride")
 
 
-def _all_cut(video: VideoEntry, longest_run: int, recipe: Recipe) -> Refusal:
-    most = _longest_clip(longest_run, int(recipe.steps_at(video.frames_per_second)), recipe)
-    reason = f"at most {longest_run} frames without a cut and with something to see, {_needs(video, recipe)}"
-    return _unsuited(video, reason, f"voxels_per_clip at most {most}, or scene off" if most else "scene off")
+def _all_cut(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal:
+    recipe, runs = spec.recipe, Runs(SplitVideos.of([video.pieces or b""]), Cleaning.of(spec))
+    longest, needed = max(runs.frames.tolist(), default=0), int(recipe.sequence_at(video.frames_per_second)) + 1
+    if longest < needed:
+        most = _longest_clip(longest, int(recipe.steps_at(video.frames_per_second)), recipe)
+        reason = f"at most {longest} frames in a row without a defect, {_needs(video, recipe)}"
+        return _unsuited(video, reason, f"voxels_per_clip at most {most}, or scene off" if most else "scene off")
+    for sides in runs.sides[runs.frames >= needed].tolist():
+        if (refusal := _too_small(video, rows, recipe, Sides(*sides))) is not None:
+            return refusal
+    return _unsuited(video, "all its sequences are still", "still_share 1")
 
 
 def _frame_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec) -> int:
@@ -366,16 +320,21 @@ def _too_large(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | Non
     return _unsuited(video, reason, "fewer voxels_per_clip or samples_per_decode, or resize_scale 1")
 
 
-def _too_small(video: VideoEntry, rows: Rows, recipe: Recipe) -> Refusal | None:
+def _too_small(video: VideoEntry, rows: Rows, recipe: Recipe, sides: Sides = NO_BARS) -> Refusal | None:
     try:
         top, bottom = rows.bounds(video.height_px)
     except UsageError as error:
         return _unsuited(video, str(error), "other rows")
-    height, width = bottom - top, video.width_px
+    height, width = bottom - top - sides.top - sides.bottom, video.width_px - sides.left - sides.right
     if admits(recipe, height, width):
         return None
+    bars = " and without its bars" if any(sides) else ""
+    if min(height, width) <= 0:
+        return _unsuited(video, f"nothing is left of the picture after rows {rows}{bars}", "other rows")
     # Round up; otherwise the picture would be a fraction of a pixel too small.
     scale = math.ceil(smallest_scale(recipe, height, width) * 1000) / 1000
-    reason = f"picture {width}x{height} after rows {rows}, the crop is {recipe.crop_width_px}x{recipe.crop_height_px}"
+    reason = (
+        f"picture {width}x{height} after rows {rows}{bars}, the crop is {recipe.crop_width_px}x{recipe.crop_height_px}"
+    )
     larger = f"resize_scale up to {scale:g}, or a smaller crop" if scale <= LARGEST_SCALE else "a smaller crop"
     return _unsuited(video, reason, larger)

@@ -20,11 +20,12 @@ from v2v_protocol.settings import nearest, require_known
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.effects.tolerance import changed_shares, left_out
 from v2v_server.simulation.grey import grey_levels
-from v2v_server.simulation.intensity import log_table_float64
+from v2v_server.simulation.intensity import Intensity, log_table_float64
 from v2v_server.simulation.kernels import KernelInput
 from v2v_server.simulation.precision import AUTO, EFFECTS_MARGIN, check_thresholds, choose, noise_sum
 from v2v_server.simulation.result import Voxels
 from v2v_server.simulation.voxel import Levels, bin_edges, timed_edges
+from v2v_server.video.luma import SDR, Signal
 
 
 def simulate(
@@ -45,6 +46,8 @@ def simulate(
     dtype: str = "int8",
     precision: str = AUTO,
     frames_per_second: float | None = None,
+    bits: int = 8,
+    transfer: str = "",
     **effects: float,
 ) -> Voxels:
     """Simulate an event camera that watches a clip.
@@ -70,6 +73,8 @@ def simulate(
         precision: arithmetic of the pixels: "float32", "float64", or "auto" for the narrowest that keeps the error
             below half a threshold (``precision.py``).
         frames_per_second: frame rate of the frames; needed for an effect in Hz or seconds.
+        bits: 9 to 12 for frames of uint16 [n, H, W] with levels 0 .. 2**bits - 1.
+        transfer: "pq", "hlg", "log100", "log316" or "linear" (``intensity.py``); "" uses gamma.
         effects: values of effects beyond the paper's model, by the recipe's names (``leak_hz=0.1``); zero is off.
 
     Returns:
@@ -81,7 +86,8 @@ def simulate(
     Raises:
         UsageError: an argument of the wrong type, shape or range, or more events than the precision can count.
     """
-    frames = grey_levels(frames)
+    signal = Signal(bits, transfer)
+    frames = grey_levels(frames, signal)
     _check_number("gamma", gamma, positive=True)
     _check_number("log_eps", log_eps, positive=True)
     known = effect_settings()
@@ -96,8 +102,8 @@ def simulate(
     elif any(known[name].unit in TIME_UNITS for name in effects):
         raise UsageError("frames_per_second is missing: effects in Hz or seconds need the time between frames")
     return _simulate_array(
-        frames, (gamma, log_eps), threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma,
-        start_residual, bins, frames_per_bin, seed, dtype, precision, grids_per_frame, effects,
+        frames, Intensity(gamma, log_eps, signal), threshold_pos, threshold_neg, noise_sigma, hot_pixel_count,
+        hot_pixel_sigma, start_residual, bins, frames_per_bin, seed, dtype, precision, grids_per_frame, effects,
         1.0 / (frames_per_second or 1.0),
     )  # fmt: skip
 
@@ -138,25 +144,27 @@ def simulate_log(
 
 
 def simulate_clip(
-    frames: npt.NDArray[np.uint8],
+    frames: npt.NDArray[Any],
     params: SampleParams,
     recipe: Recipe,
     voxel_dtype: str,
     step_seconds: npt.NDArray[np.float64] | None = None,
     out: Mapping[str, npt.NDArray[Any]] | None = None,
     levels: Levels | None = None,
+    signal: Signal = SDR,
     tolerance: float = 0.0,
 ) -> Voxels:
     """Simulate one drawn sample.
 
     Args:
-        frames: [n, H, W] uint8, the decoded frames after ``apply_view``; n is at least the number of different
-            frames the clip shows.
+        frames: [n, H, W] of the signal's dtype, the decoded frames after ``apply_view``; n is at least the number of
+            different frames the clip shows.
         params, recipe: the draw and its recipe.
         voxel_dtype: "int8", "int16" or "float32".
         step_seconds: [steps] duration of each step (``voxel.py``); given exactly when ``recipe.needs_seconds``.
         out: C-contiguous arrays to fill, by name (``kernels.ARRAYS``); None makes the voxels.
-        levels: grey levels between frames; None: log intensity is linear in time there.
+        levels: grey levels between frames, only with 8 bits; None: log intensity is linear in time there.
+        signal: what the levels mean.
         tolerance: share of the events that effects may change which are left out (``effects/tolerance.py``).
 
     Returns:
@@ -170,9 +178,10 @@ def simulate_clip(
     ends = params.ends(recipe)
     steps = int(ends[-1])
     source_index = params.source_index(steps)
-    if frames.ndim != 3 or frames.dtype != np.uint8 or len(frames) <= source_index[-1]:
+    if frames.ndim != 3 or frames.dtype != signal.dtype or len(frames) <= source_index[-1]:
         raise UsageError(
-            f"frames {frames.dtype}{list(frames.shape)}: this draw shows {source_index[-1] + 1} frames, uint8 [n, H, W]"
+            f"frames {frames.dtype}{list(frames.shape)}: this draw shows {source_index[-1] + 1} frames, "
+            f"{signal.dtype} [n, H, W]"
         )
     if (step_seconds is None) == recipe.needs_seconds:
         raise UsageError(
@@ -187,7 +196,8 @@ def simulate_clip(
             f"step_seconds {list(step_seconds.shape)}: give {steps} positive finite durations, one per step"
         )
     check_thresholds(params.threshold_pos, params.threshold_neg)
-    intensity = recipe.gamma, recipe.log_eps[0] if params.log_eps is None else params.log_eps
+    log_eps = recipe.log_eps[0] if params.log_eps is None else params.log_eps
+    intensity = Intensity(recipe.gamma, log_eps, signal)
     edges = (
         timed_edges(ends, recipe.bins, step_seconds)
         if recipe.is_timed
@@ -202,12 +212,12 @@ def simulate_clip(
         gone = left_out(changed_shares(given), tolerance)
         kept = {name: value for name, value in params.effects.items() if name not in gone}
         given = dataclasses.replace(given, params=dataclasses.replace(params, effects=kept))
-    return Voxels.of(given, choose(AUTO, _most_events(given, _log_ends(*intensity))), out)
+    return Voxels.of(given, choose(AUTO, _most_events(given, _log_ends(intensity))), out)
 
 
 def _simulate_array(
     frames: npt.NDArray[Any],
-    intensity: tuple[float, float] | None,
+    intensity: Intensity | None,
     threshold_pos: float,
     threshold_neg: float | None,
     noise_sigma: float,
@@ -223,9 +233,7 @@ def _simulate_array(
     effects: Mapping[str, float] = MappingProxyType({}),
     frame_seconds: float = 1.0,
 ) -> Voxels:
-    """Simulate an array. ``intensity``: gamma and log_eps of grey levels; None: the frames are log intensities, and
-    there are no effects.
-    """
+    """Simulate an array. ``intensity`` None: the frames are log intensities, and there are no effects."""
     threshold_neg = threshold_pos if threshold_neg is None else threshold_neg
     _check_number("threshold_pos", threshold_pos, positive=True)
     _check_number("threshold_neg", threshold_neg, positive=True)
@@ -255,7 +263,7 @@ def _simulate_array(
             "of at least one pixel"
         )
     params = _params(threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma, seed, effects)
-    ends = (float(frames.min()), float(frames.max())) if intensity is None else _log_ends(*intensity)
+    ends = (float(frames.min()), float(frames.max())) if intensity is None else _log_ends(intensity)
     edges = bin_edges(steps, frames_per_bin, grids_per_frame * bins or 1)
     durations = np.ones(steps)
     given = KernelInput(
@@ -280,9 +288,9 @@ def _most_events(given: KernelInput, log_ends: tuple[float, float]) -> float:
     return EFFECTS_MARGIN * most_events(segments, log_ends, thresholds, noise_total)
 
 
-def _log_ends(gamma: float, log_eps: float) -> tuple[float, float]:
+def _log_ends(intensity: Intensity) -> tuple[float, float]:
     # From the table, not from a maths library: the choice of arithmetic must not depend on the host.
-    table = log_table_float64(gamma, log_eps)
+    table = log_table_float64(*intensity)
     return float(table[0]), float(table[-1])
 
 

@@ -17,7 +17,7 @@ from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import noise
 from v2v_server.simulation.effects import prepare
 from v2v_server.simulation.effects.kernel import Outputs, Segments, simulate_general
-from v2v_server.simulation.intensity import fine_table, log_table, log_table_float64
+from v2v_server.simulation.intensity import Intensity, fine_table, log_table, log_table_float64
 from v2v_server.simulation.pixel import simulate_pixels, words
 from v2v_server.simulation.precision import Real
 from v2v_server.simulation.voxel import (
@@ -42,8 +42,9 @@ class KernelInput:
     """Inputs of a kernel.
 
     Attributes:
-        frames: [n, H, W] uint8 grey levels, or floating-point log intensities.
-        intensity: gamma and log_eps of grey levels; None: the frames are log intensities, and there are no effects.
+        frames: [n, H, W] grey levels, uint8, or uint16 if the signal has more than 8 bits; or floating-point log
+            intensities.
+        intensity: of grey levels; None: the frames are log intensities, and there are no effects.
         source_index: [steps + 1] int64, the frame that each position shows; starts at 0.
         params: the draw.
         noise_durations: [steps] duration of each step in the unit of noise and drift.
@@ -52,12 +53,12 @@ class KernelInput:
         edges: the ends of the bins.
         dtype: "int8", "int16" or "float32".
         start_residual: log units; None draws it.
-        levels: intermediate levels, or None.
+        levels: intermediate levels, or None; only with frames of 8 bits.
         grids_have_durations: whether a grid's time is that of ``step_seconds``; else all its steps count as equal.
     """
 
     frames: npt.NDArray[Any]
-    intensity: tuple[float, float] | None
+    intensity: Intensity | None
     source_index: Longs
     params: SampleParams
     noise_durations: Doubles
@@ -210,7 +211,7 @@ class _General:
             (part.place[0] * scale).astype(real), (part.place[1] * scale).astype(real),
         )  # fmt: skip
         self._tables = prepare(
-            params.effects, params.noise_key, given.intensity or (1.0, 1.0),
+            params.effects, params.noise_key, given.intensity or Intensity(1.0, 1.0),
             given.step_seconds[part.step] * part.share, self._pixels, real, _compiled_words,
         )  # fmt: skip
 
@@ -260,7 +261,7 @@ def _hot(params: SampleParams, pixels: int, real: Real) -> tuple[Longs, npt.NDAr
     return position, normal.astype(real) * real(params.hot_pixel_sigma)
 
 
-def _table(intensity: tuple[float, float] | None, real: Real) -> npt.NDArray[Any]:
+def _table(intensity: Intensity | None, real: Real) -> npt.NDArray[Any]:
     if intensity is None:
         return np.empty(0, real)
     return log_table(*intensity) if real is np.float32 else log_table_float64(*intensity)

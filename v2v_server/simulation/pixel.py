@@ -187,8 +187,8 @@ def simulate_pixels(
     """Simulate every pixel of a clip. ``real`` below is float32 or float64, one for all.
 
     Args:
-        frames: [n, pixels] uint8 grey levels, or real log intensities; C-contiguous.
-        table: [256] real, log intensity of each grey level.
+        frames: [n, pixels] uint8 or uint16 grey levels, or real log intensities; C-contiguous.
+        table: [levels] real, log intensity of each grey level; 256 levels for uint8.
         source_index: [steps + 1] int64, the row of ``frames`` each position shows; never decreasing.
         key: [4] uint32, the noise key.
         noise_scale: [steps] real, standard deviation of each step's noise; empty for no noise at all.

@@ -15,6 +15,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation.clip import simulate
 from v2v_server.simulation.precision import EFFECTS_MARGIN, LIMITS
+from v2v_server.video.luma import MOST_BITS, Signal
 
 
 class Variant(NamedTuple):
@@ -25,9 +26,12 @@ class Variant(NamedTuple):
     precision: str
     is_divided: bool = False
     """Whether steps have sub-steps, whose levels the kernels of ``v2v_server.motion`` make."""
+    bits: int = 8
+    """More than 8: for frames of uint16."""
 
     def __str__(self) -> str:
         kind = f"{' by the general kernel' if self.is_general else ''}{' with sub-steps' if self.is_divided else ''}"
+        kind += " of more than 8 bits" if self.bits > 8 else ""
         return f"{self.voxel_dtype} voxels{kind} in {self.precision}"
 
 
@@ -59,21 +63,27 @@ def variants(
     events = recipe.worst_events(step_seconds, thresholds, levels_per_step) * (
         EFFECTS_MARGIN if recipe.has_effects else 1.0
     )
+    depths = [8] if recipe.light == "sdr" or levels_per_step else [8, MOST_BITS]
     precisions = ["float32"] if events <= LIMITS["float32"][1] else list(LIMITS)
     has_times = recipe.grids_per_frame > 0 or recipe.is_timed
     is_general = recipe.has_effects or has_times or levels_per_step > 0 or {"voxels"} != set(arrays)
-    return frozenset(Variant(voxel_dtype, is_general, precision, levels_per_step > 0) for precision in precisions)
+    return frozenset(
+        Variant(voxel_dtype, is_general, precision, levels_per_step > 0, bits)
+        for precision in precisions
+        for bits in depths
+    )
 
 
 def load(variant: Variant) -> None:
     """Load a variant from numba's cache, or compile it."""
     simulate(
-        np.zeros((2, 1, 1), np.uint8),
+        np.zeros((2, 1, 1), Signal(variant.bits).dtype),
         threshold_pos=0.2,
         bins=1,
         dtype=variant.voxel_dtype,
         precision=variant.precision,
         frames_per_second=1.0,
+        bits=variant.bits,
         shot_noise_hz=1.0 if variant.is_general else 0.0,
     )
 

@@ -17,8 +17,10 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation.draw import resized_size
 from v2v_server.system.opencv import cv2
+from v2v_server.video.luma import SDR, Signal
 
-Frames = npt.NDArray[np.uint8]
+Frames = npt.NDArray[Any]
+"""Grey levels: uint8, or uint16 for a signal of more than 8 bits."""
 
 
 class Window(NamedTuple):
@@ -33,26 +35,23 @@ class Window(NamedTuple):
 def source_window(
     params: SampleParams,
     recipe: Recipe,
-    picture_top_px: int,
-    picture_height_px: int,
-    picture_width_px: int,
+    picture: Window,
     margin_px: int | None = 0,
 ) -> Window:
     """Return the part of the video picture that :func:`apply_view` needs.
 
     Args:
         params, recipe: the draw and its recipe.
-        picture_top_px: first usable row of the upright video picture.
-        picture_height_px, picture_width_px: size of the usable picture.
+        picture: the usable part of the upright video picture.
         margin_px: margin around the crop; None: the whole picture.
 
     Returns:
         the crop and its margin at scale 1, otherwise the whole usable picture.
     """
     if params.scale != 1.0:
-        return Window(picture_top_px, 0, picture_height_px, picture_width_px)
-    top, left, height, width = crop_region(params, recipe, picture_height_px, picture_width_px, margin_px)
-    return Window(picture_top_px + top, left, height, width)
+        return picture
+    top, left, height, width = crop_region(params, recipe, picture.height_px, picture.width_px, margin_px)
+    return Window(picture.top_px + top, picture.left_px + left, height, width)
 
 
 def crop_region(
@@ -95,27 +94,28 @@ def without_margin(
 def resized(frame: Frames, size: tuple[int, int], scale: float) -> Frames:
     """Return a picture resized to (height, width)."""
     method = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
-    whole: Frames = np.asarray(cv2.resize(frame, (size[1], size[0]), interpolation=method), np.uint8)
+    whole: Frames = np.asarray(cv2.resize(frame, (size[1], size[0]), interpolation=method), frame.dtype)
     return whole
 
 
-def apply_view(frames: Frames, params: SampleParams, recipe: Recipe) -> Frames:
+def apply_view(frames: Frames, params: SampleParams, recipe: Recipe, signal: Signal = SDR) -> Frames:
     """Return the frames as the virtual camera sees them.
 
     Args:
-        frames: [n, h, w] uint8, the window of :func:`source_window`.
+        frames: [n, h, w] of the signal's dtype, the window of :func:`source_window`.
         params, recipe: the draw and its recipe.
+        signal: what the levels mean.
 
     Returns:
-        [n, crop_height_px, crop_width_px] uint8, C-contiguous.
+        [n, crop_height_px, crop_width_px] of that dtype, C-contiguous.
 
     Raises:
         UsageError: the frames do not hold the crop.
     """
     height, width = recipe.crop_height_px, recipe.crop_width_px
     top, left = params.crop_top_px, params.crop_left_px
-    if frames.ndim != 3 or frames.dtype != np.uint8:
-        raise UsageError(f"frames {frames.dtype}{list(frames.shape)}: give uint8 [n, h, w]")
+    if frames.ndim != 3 or frames.dtype != signal.dtype:
+        raise UsageError(f"frames {frames.dtype}{list(frames.shape)}: give {signal.dtype} [n, h, w]")
     if params.scale == 1.0:
         seen_size, top, left = frames.shape[1:], 0, 0
     else:
@@ -128,22 +128,21 @@ def apply_view(frames: Frames, params: SampleParams, recipe: Recipe) -> Frames:
     if params.scale == 1.0:
         seen = frames[:, :height, :width]
     else:
-        seen = np.empty((len(frames), height, width), np.uint8)
+        seen = np.empty((len(frames), height, width), frames.dtype)
         for frame, target in zip(frames, seen, strict=True):
             target[:] = resized(frame, seen_size, params.scale)[top : top + height, left : left + width]
     if params.flip:
         seen = seen[:, :, ::-1]
     if params.contrast != 0.0:
-        seen = contrast_table(params.contrast)[seen]
+        seen = contrast_table(params.contrast, signal.white)[seen]
     return np.ascontiguousarray(seen)
 
 
-def contrast_table(contrast: float, parts: int = 1) -> npt.NDArray[Any]:
-    """Return clip((F - 127.5) s + 127.5, 0, 255) of every F in 1/``parts`` of a grey level, rounded half up.
+def contrast_table(contrast: float, most: int = 255) -> npt.NDArray[Any]:
+    """Return clip((F - most / 2) s + most / 2, 0, most) of every F from 0 to ``most``, rounded half up.
 
     Returns:
-        [255 parts + 1] uint8, or uint16 for more than one part.
+        [most + 1] uint8, or uint16 if ``most`` is above 255.
     """
-    most = 255 * parts
     levels = [math.floor((level - most / 2) * contrast + (most + 1) / 2) for level in range(most + 1)]
-    return np.array([min(max(level, 0), most) for level in levels], np.uint8 if parts == 1 else np.uint16)
+    return np.array([min(max(level, 0), most) for level in levels], np.uint8 if most == 255 else np.uint16)

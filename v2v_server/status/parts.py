@@ -47,6 +47,11 @@ class LoadPart:
     batches_per_second: float = gauge("Batches sent, over the last ten seconds.", unit="/s")
     bytes_per_second: float = gauge("Bytes of arrays sent, over the last ten seconds.", unit="bytes/s")
     decodes_per_second: float = gauge("Clips decoded, over the last ten seconds.", unit="/s")
+    shared_share: float = gauge(
+        "Share of the samples sent over the last ten seconds that were made for another consumer already.",
+        "shared_ratio",
+        unit="0 to 1",
+    )
     queue: int = gauge("Requested samples that are not leased to a worker.", "queued_samples")
     queued_share: float = gauge(
         "Share of connected consumers with requests that are not leased to a worker.", "waiting_share", unit="0 to 1"

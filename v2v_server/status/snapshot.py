@@ -104,6 +104,7 @@ class Service:
             batches_per_second=window.rate("batches"),
             bytes_per_second=window.rate("bytes"),
             decodes_per_second=window.rate("decodes"),
+            shared_share=window.rate("shared") / max(window.rate("samples"), 1e-9),
             queue=dispatcher.waiting,
             queued_share=dispatcher.waiting_share,
             worker_count=dispatcher.workers,

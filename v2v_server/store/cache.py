@@ -22,22 +22,27 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnreadable
+from v2v_server.store.chroma import CHROMA, chroma_planes, matrix_of, whole_chroma, with_chroma
+from v2v_server.store.depth import detail_planes, read_levels, same_transfer
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
+from v2v_server.store.motion import MOTION, has_planes, read_motion, wants_motion, with_motion, with_planes
 from v2v_server.store.packing import QUICK
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter
 from v2v_server.system.private import make_private
 from v2v_server.system.status_fields import GIB
-from v2v_server.video.collect import Cut
+from v2v_server.video.collect import Cut, LastFrame
 from v2v_server.video.decode import BIT_EXACT_CODECS, DecodedClip, stream_decoded
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import MIXED, Signal
 from v2v_server.video.orientation import Window
 
 _LOCK_SECONDS = 0.06
@@ -91,6 +96,7 @@ class Cache:
         start: int,
         cuts: Sequence[Cut],
         stride: int,
+        most_bits: int | None = None,
     ) -> tuple[DecodedClip, ...] | None:
         """Return several cuts of a video, read from the cache, or decoded and stored in it.
 
@@ -99,7 +105,7 @@ class Cache:
             video, fingerprint: its catalogue id and fingerprint.
             rows: (first, one after the last) usable row; these are stored. The cuts lie within.
             index: its frames, or a part that holds the needed pieces.
-            start, cuts, stride: see :func:`v2v_server.video.decode.decode_cuts`.
+            start, cuts, stride, most_bits: see :func:`v2v_server.video.decode.decode_cuts`.
 
         Returns:
             None if the cache can neither read nor store them; the caller then decodes without the cache.
@@ -112,26 +118,35 @@ class Cache:
         last = start + max((cut.count - 1) * stride for cut in cuts)
         index.position(start, last - start + 1)
         size = piece_frames(rows[1] - rows[0], index.width_px)
-        key = hashlib.sha256(repr((video, fingerprint, rows, size)).encode()).hexdigest()[:32]
+        # Pieces that state their transfer have names of their own: older ones do not state it.
+        named = (video, fingerprint, rows, size) if most_bits is None else (video, fingerprint, rows, size, most_bits)
+        key = hashlib.sha256(repr(named).encode()).hexdigest()[:32]
         pieces = [
             _Piece(self.folder / key[:2] / f"{key}-{number}", number * size, min((number + 1) * size, index.end))
             for number in range(start // size, last // size + 1)
         ]
-        made = self._read(pieces, fingerprint, index, start, cuts, stride)
-        if made is not None:
+        picture = rows[0], 0, rows[1] - rows[0], index.width_px
+        planes = [*([MOTION] if stride == 1 and wants_motion(cuts) else []), *chroma_planes(cuts)]
+        lacking = [piece for piece in pieces if not has_planes(piece.path, planes)]
+        # Keep what other streams stored; otherwise two streams would replace each other's pieces for ever.
+        kept = [name for name in (MOTION, CHROMA) if any(has_planes(piece.path, (name,)) for piece in lacking)]
+        planes = [*dict.fromkeys([*planes, *kept])]
+        made = self._read(pieces, fingerprint, index, start, cuts, stride, picture)
+        if made is not None and not lacking:
             return made
-        missing = [piece for piece in pieces if not piece.path.exists()]
+        missing = [piece for piece in pieces if piece in lacking or not piece.path.exists()]
         if not missing or index.first > missing[0].first or not self._has_room(missing, rows, index):
-            return None
+            return made
         check_fingerprint(path, fingerprint)
         try:
-            self._fill(path, video, fingerprint, rows, index, missing)
+            self._fill(path, video, fingerprint, rows, index, missing, planes, most_bits)
         except OSError as error:
             self._rest(f"cannot be written to: {error.strerror or error}")
-            return None
+            return made
         except VideoError:
-            return None  # the damage may lie beyond the frames that this sample needs
-        made = self._read(pieces, fingerprint, index, start, cuts, stride)
+            return made  # the damage may lie beyond the frames that this sample needs
+        if made is None:
+            made = self._read(pieces, fingerprint, index, start, cuts, stride, picture)
         return None if made is None else tuple(replace(clip, origin="") for clip in made)
 
     @property
@@ -147,34 +162,57 @@ class Cache:
         start: int,
         cuts: Sequence[Cut],
         stride: int,
+        picture: Window,
     ) -> tuple[DecodedClip, ...] | None:
         """Read the cuts if all pieces are present and sound. Damaged pieces are removed."""
-        clips = [np.empty((cut.count, *_window(cut, index)[2:]), np.uint8) for cut in cuts]
-        codec, bit_exact, sound = "", False, True
-        for piece in pieces:
-            try:
-                with StoreFile(piece.path, fingerprint) as stored:
+        clips: list[npt.NDArray[Any]] = []
+        codec, bit_exact, sound, signals = "", False, True, set[Signal]()
+        files: list[tuple[StoreFile, range]] = []
+        with contextlib.ExitStack() as opened:
+            for piece in pieces:
+                try:
+                    stored = opened.enter_context(StoreFile(piece.path, fingerprint))
                     codec, bit_exact = stored.head.codec, stored.head.bit_exact
+                    signal = stored.head.signal
+                    signals.add(signal)
+                    if not clips:
+                        clips = [np.empty((cut.count, *_window(cut, index)[2:]), signal.dtype) for cut in cuts]
+                    # The frames of start, start + stride ... that lie in this piece.
+                    low = max(0, -(-(piece.first - start) // stride))
+                    end = -(-(piece.end - start) // stride)
+                    files.append((stored, range(low, min(end, max(cut.count for cut in cuts)))))
                     for cut, frames in zip(cuts, clips, strict=True):
-                        # The frames of start, start + stride ... that lie in this piece.
-                        low = max(0, -(-(piece.first - start) // stride))
-                        high = min(cut.count, -(-(piece.end - start) // stride))
-                        if low < high:
-                            stored.read(start + low * stride, stride, _window(cut, index), frames[low:high])
-            except VideoUnreadable as error:
-                if not isinstance(error.__cause__, FileNotFoundError):
-                    self.trouble = error.reason
+                        if low < (high := min(cut.count, end)):
+                            place = start + low * stride, stride, _window(cut, index)
+                            read_levels(stored, *place, frames[low:high], signal)
+                except VideoUnreadable as error:
+                    if not isinstance(error.__cause__, FileNotFoundError):
+                        self.trouble = error.reason
+                    return None
+                except (VideoError, UsageError) as error:
+                    self._remove(piece.path, error.reason if isinstance(error, VideoError) else str(error))
+                    sound = False  # continue, so that all damaged pieces are decoded again together
+            if not sound:
                 return None
-            except (VideoError, UsageError) as error:
-                self._remove(piece.path, error.reason if isinstance(error, VideoError) else str(error))
-                sound = False  # continue, so that all damaged pieces are decoded again together
-        if not sound:
-            return None
-        times = [index.seconds(start, (cut.count - 1) * stride + 1)[::stride] for cut in cuts]
-        return tuple(
-            DecodedClip(frames, seconds, codec, bit_exact, "cache")
-            for frames, seconds in zip(clips, times, strict=True)
-        )
+            if len(signals) > 1:
+                signal = signal._replace(transfer=MIXED)
+            times = [index.seconds(start, (cut.count - 1) * stride + 1)[::stride] for cut in cuts]
+            try:
+                vectors = read_motion(files, start, cuts, stride, picture)
+                if not all(stored.planes.issuperset(chroma_planes(cuts)) for stored, _ in files):
+                    return None  # made for a stream without colour
+                read = [
+                    DecodedClip(frames, seconds, codec, bit_exact, "cache", signal=signal)
+                    for frames, seconds in zip(clips, times, strict=True)
+                ]
+                read = list(with_chroma(read, cuts, files, start, stride))
+            except VideoUnreadable as error:
+                self.trouble = error.reason
+                return None
+            except VideoError as error:
+                self._remove(Path(error.video), error.reason)
+                return None
+        return with_motion(read, cuts, vectors)
 
     def _has_room(self, missing: Sequence[_Piece], rows: tuple[int, int], index: FrameIndex) -> bool:
         if time.monotonic() < self._rest_until:
@@ -203,6 +241,8 @@ class Cache:
         rows: tuple[int, int],
         index: FrameIndex,
         missing: Sequence[_Piece],
+        planes: Sequence[str],
+        most_bits: int | None,
     ) -> None:
         """Decode the missing pieces in one pass, and store each.
 
@@ -212,33 +252,40 @@ class Cache:
         """
         top, width = rows[0], index.width_px
         height, begin, end = rows[1] - rows[0], missing[0].first, missing[-1].end
-        with contextlib.closing(stream_decoded(path, index, begin, end - begin, (top, 0, height, width))) as frames:
+        picture_px = top, 0, height, width
+        chroma = whole_chroma(planes, picture_px)
+        decoded = stream_decoded(path, index, begin, end - begin, picture_px, most_bits, chroma)
+        with contextlib.closing(decoded) as frames:
             for piece in missing:
                 for _ in range(begin, piece.first):  # frames of a piece that exists
                     next(frames)
                 begin = piece.end
-                codec, picture = next(frames)
+                stream, picture = next(frames)
+                signal = stream.signal
                 head = Head(
                     video=video, fingerprint=fingerprint, height_px=index.height_px, width_px=width, top=top,
                     rows=height, first=piece.first, count=piece.end - piece.first, frames=piece.end,
-                    frames_per_second=0.0, codec=codec, bit_exact=codec in BIT_EXACT_CODECS,
-                    group=group_frames_for(height, width), packing=QUICK.method,
+                    frames_per_second=0.0, codec=stream.codec, bit_exact=stream.codec in BIT_EXACT_CODECS,
+                    group=group_frames_for(height, width), packing=QUICK.method, bits=signal.bits,
+                    transfer=signal.transfer, matrix=matrix_of(stream),
                 )  # fmt: skip
-                more = (later for _, later in islice(frames, head.count - 1))
-                self._keep(piece.path, head, chain((picture,), more))
+                more = chain(((stream, picture),), islice(frames, head.count - 1))
+                self._keep(piece.path, head, more, [*planes, *detail_planes(signal)])
 
-    def _keep(self, path: Path, head: Head, pictures: Iterable[npt.NDArray[np.uint8]]) -> None:
+    def _keep(
+        self, path: Path, head: Head, pictures: Iterable[tuple[LastFrame, npt.NDArray[Any]]], planes: Sequence[str]
+    ) -> None:
         """Write a piece, and rename it into place if it fits the limit."""
         partial = self.folder / PARTIAL / secrets.token_hex(8)
         try:
             partial.parent.mkdir(exist_ok=True)
             make_private(partial)
-            with StoreWriter(partial, head, QUICK) as writer:
+            with StoreWriter(partial, head, QUICK, planes) as writer:
                 fcntl.flock(
                     writer.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB
                 )  # held for the life of this process: see _remove_abandoned
-                for picture in pictures:
-                    writer.add(picture)
+                for picture, arrays in with_planes(same_transfer(head, pictures), planes):
+                    writer.add(picture, arrays)
                 writer.close()
             with self._waiting():
                 self._quota.add(partial, path)

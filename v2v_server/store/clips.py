@@ -5,17 +5,23 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, VideoError
+from v2v_server.store.chroma import with_chroma
+from v2v_server.store.depth import DETAIL, detail_planes, read_levels
 from v2v_server.store.format import is_store_file
+from v2v_server.store.motion import MotionWatch, read_motion, with_motion
+from v2v_server.store.planes import PLANES
 from v2v_server.store.reader import StoreFile
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip, decode_cuts, stream_luma
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import MOST_BITS, SDR, Signal
 from v2v_server.video.orientation import Window
 from v2v_server.video.probe import VideoFacts, probe
 
@@ -24,33 +30,69 @@ STORE_FORMAT = "v2v store"
 
 
 def clips_of(
-    path: str | os.PathLike[str], fingerprint: str, index: FrameIndex, start: int, cuts: Sequence[Cut], stride: int
+    path: str | os.PathLike[str],
+    fingerprint: str,
+    index: FrameIndex,
+    start: int,
+    cuts: Sequence[Cut],
+    stride: int,
+    rows: tuple[int, int] | None = None,
+    most_bits: int | None = None,
 ) -> tuple[DecodedClip, ...]:
     """Return several cuts of the frames from ``start`` on, see :func:`v2v_server.video.decode.decode_cuts`.
 
     Args:
         path: a video, or a store file.
         fingerprint: of the video, or of the source of the store file.
+        rows: (first, one after the last) usable row, which the cells of a cut count from; None: all rows.
+        most_bits: see :func:`v2v_server.video.decode.decode_cuts`.
 
     Raises:
         UsageError, VideoError: see :func:`v2v_server.video.decode.decode_cuts`; also if the file is, or was made from,
-            another video.
+            another video, or a store file lacks the detail of deeper levels or the colour.
     """
+    top, bottom = rows or (0, index.height_px)
+    picture = top, 0, bottom - top, index.width_px
     if not is_store_file(path):
         check_fingerprint(path, fingerprint)
-        return decode_cuts(path, index, start, cuts, stride=stride)
+        motion = MotionWatch(cuts, picture)
+        return motion.added_to(
+            decode_cuts(path, index, start, cuts, stride=stride, most_bits=most_bits, watch=motion.watch)
+        )
     with StoreFile(path, fingerprint) as stored:
-        return tuple(stored_clip(stored, index, start, cut, stride) for cut in cuts)
+        bits = min(most_bits or SDR.bits, stored.head.bits)
+        signal = SDR if most_bits is None else Signal(bits, stored.head.transfer)
+        if not stored.planes.issuperset(detail_planes(signal)):
+            why = f"the store file lacks the plane {DETAIL} of its {bits} bits: re-create it with v2v-prepare"
+            raise VideoError(os.fspath(path), None, why)
+        clips = tuple(stored_clip(stored, index, start, cut, stride, signal) for cut in cuts)
+        files = [(stored, range(max(cut.count for cut in cuts)))]
+        clips = with_chroma(clips, cuts, files, start, stride)
+        return with_motion(clips, cuts, read_motion(files, start, cuts, stride, picture))
 
 
-def stored_clip(stored: StoreFile, index: FrameIndex, start: int, cut: Cut, stride: int) -> DecodedClip:
+def stored_clip(
+    stored: StoreFile, index: FrameIndex, start: int, cut: Cut, stride: int, signal: Signal = SDR
+) -> DecodedClip:
     """Read one cut from an open store file that holds all of it."""
     head = stored.head
     window = cut.window or (head.top, 0, head.rows, head.width_px)
-    frames = np.empty((cut.count, *window[2:]), np.uint8)
-    stored.read(start, stride, window, frames)
+    frames = np.empty((cut.count, *window[2:]), signal.dtype)
+    read_levels(stored, start, stride, window, frames, signal)
     seconds = index.seconds(start, (cut.count - 1) * stride + 1)[::stride]
-    return DecodedClip(frames, seconds, head.codec, head.bit_exact, "store")
+    return DecodedClip(frames, seconds, head.codec, head.bit_exact, "store", signal=signal)
+
+
+def signal_of(path: str | os.PathLike[str], index: FrameIndex) -> Signal:
+    """Return what the levels of a video mean, by its first frame, or those of the source of a store file.
+
+    Raises:
+        VideoError: see :func:`clips_of`.
+    """
+    if not is_store_file(path):
+        return decode_cuts(path, index, index.first, [Cut(1, (0, 0, 1, 1))], most_bits=MOST_BITS)[0].signal
+    with StoreFile(path) as stored:
+        return stored.head.signal
 
 
 def check_file(path: str | os.PathLike[str], fingerprint: str) -> None:
@@ -81,6 +123,16 @@ def stored_pictures(stored: StoreFile, window: Window) -> Iterator[npt.NDArray[n
         frames = np.empty((head.group_frames(number), *window[2:]), np.uint8)
         stored.read(head.first + number * head.group, 1, window, frames)
         yield from frames
+
+
+def stored_arrays(stored: StoreFile, name: str) -> Iterator[npt.NDArray[Any]]:
+    """Yield the arrays of a plane, one for each frame that an open store file holds."""
+    head = stored.head
+    _, rows, columns = PLANES[name].shape(head.rows, head.width_px)
+    for number in range(head.groups):
+        start, count = head.first + number * head.group, head.group_frames(number)
+        for array in stored.plane(name, start, count, (0, 0, rows, columns)):
+            yield np.ascontiguousarray(array)
 
 
 def facts_of(path: str | os.PathLike[str]) -> VideoFacts:

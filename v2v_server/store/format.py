@@ -27,7 +27,9 @@ import xxhash
 
 from v2v_protocol.errors import ProtocolError, VideoError
 from v2v_server.store.packing import METHODS
+from v2v_server.video.colour.chroma import DEFAULT_MATRIX
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
+from v2v_server.video.luma import MIXED, MOST_BITS, SDR, TRANSFERS, Signal
 
 MAGIC = b"V2VSTOR1"
 BLOCK_ROWS, BLOCK_COLUMNS = 32, 32
@@ -59,6 +61,9 @@ class Head:
         group: frames in a group.
         packing: method of :mod:`v2v_server.store.packing`.
         index: ``FrameIndex.to_bytes()`` of the source; empty in a piece.
+        bits, transfer: of the source (``v2v_server.video.luma.Signal``).
+        matrix: of the plane "chroma" (``v2v_server.video.colour.chroma.Chroma``). These three are left out of the file
+            where they are the defaults.
     """
 
     video: str
@@ -76,6 +81,9 @@ class Head:
     group: int
     packing: str
     index: bytes = b""
+    bits: int = SDR.bits
+    transfer: str = SDR.transfer
+    matrix: str = DEFAULT_MATRIX
 
     def __post_init__(self) -> None:
         kinds = {"str": str, "int": int, "float": float, "bool": bool, "bytes": bytes}
@@ -90,12 +98,20 @@ class Head:
             and 0 <= self.first < self.first + self.count <= self.frames <= LARGEST_FRAMES
             and 1 <= self.group <= GROUP_FRAMES
             and self.packing in METHODS
+            and SDR.bits <= self.bits <= MOST_BITS
+            and self.transfer in (SDR.transfer, MIXED, *TRANSFERS.values())
         )
         if not inside:
             raise ProtocolError(
                 f"{self.count} frames from {self.first} of {self.frames}, rows {self.top} + {self.rows} of "
-                f"{self.width_px}x{self.height_px} px, groups of {self.group}, packed by {self.packing!r:.20}"
+                f"{self.width_px}x{self.height_px} px, groups of {self.group}, packed by {self.packing!r:.20}, "
+                f"{self.bits} bits, transfer {self.transfer!r:.20}"
             )
+
+    @property
+    def signal(self) -> Signal:
+        """What the source's levels mean."""
+        return Signal(self.bits, self.transfer)
 
     @property
     def groups(self) -> int:
@@ -123,7 +139,9 @@ class Head:
 
     def to_bytes(self) -> bytes:
         """Return the bytes in front of the table."""
-        head = msgpack.packb(asdict(self))
+        later = SDR._asdict() | {"matrix": DEFAULT_MATRIX}
+        defaults = {name for name, value in later.items() if getattr(self, name) == value}
+        head = msgpack.packb({name: value for name, value in asdict(self).items() if name not in defaults})
         return _PREFIX.pack(MAGIC, len(head), check(head, 0)) + head
 
 

@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.store.format import BLOCK_ROWS, Head, check, group_frames_for
+from v2v_server.video.colour.chroma import CELL_PX
 from v2v_server.video.orientation import Window
 
 _MAGIC = b"V2VPLAN1"
@@ -104,7 +105,11 @@ class PlaneKind:
         top, _, rows, columns = cells
         bands = pictures.reshape(count, -1, BLOCK_ROWS, columns)[:, :, : self._cell_bytes * self._band]
         parts = bands.reshape(count, bands.shape[1], self.values, size, self._band, columns)
-        array = np.ascontiguousarray(parts.transpose(0, 2, 1, 4, 5, 3)).view(self.dtype)
+        array = np.empty((count, self.values, bands.shape[1], self._band, columns), self.dtype)
+        into = array.view(np.uint8).reshape(*array.shape, size)
+        for value in range(self.values):
+            for byte in range(size):
+                into[:, value, ..., byte] = parts[:, :, value, byte]
         first = top % self._band
         return array.reshape(count, self.values, -1, columns)[:, :, first : first + rows]
 
@@ -113,6 +118,10 @@ PLANES: Mapping[str, PlaneKind] = MappingProxyType(
     {
         # Motion to each frame from the one before (v2v_server.motion), x and y; zero for the first frame of the file.
         "motion": PlaneKind(version=1, dtype="<i2", values=2, cell_px=4),
+        # What 8 bits lack of the levels of deeper luma (v2v_server.store.depth).
+        "detail": PlaneKind(version=1, dtype="i1", values=1, cell_px=1),
+        # Cb and Cr (v2v_server.video.colour.chroma).
+        "chroma": PlaneKind(version=1, dtype="i1", values=2, cell_px=CELL_PX),
     }
 )
 """The kinds of planes, by name."""

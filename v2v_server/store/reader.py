@@ -53,7 +53,7 @@ class BlockReader:
         except OSError as error:
             raise VideoUnreadable(path, None, f"cannot be read: {error.strerror or error}") from error
 
-    def read(self, start: int, stride: int, window: Window, out: npt.NDArray[np.uint8]) -> None:
+    def read(self, start: int, stride: int, window: Window, out: npt.NDArray[np.uint8]) -> bool:
         """Read frames start, start + stride ... of a window.
 
         Args:
@@ -61,6 +61,9 @@ class BlockReader:
             stride: distance between the frames.
             window: (top, left, height, width) in the source's upright picture, pixels.
             out: [n, height, width] uint8, receives them.
+
+        Returns:
+            whether blocks were read; otherwise everything is zero.
 
         Raises:
             UsageError: the file does not hold a requested frame or row.
@@ -77,14 +80,15 @@ class BlockReader:
         )
         if not inside or count < 1 or stride < 1 or out.shape[1:] != (height, width):
             raise UsageError(f"{count} frames from {start}, window {window}, are not in this file, which has {head}")
-        done = 0
+        done, has_blocks = 0, False
         while done < count:
             group, first = divmod(at + done * stride, head.group)
             more = min(count - done, (head.group_frames(group) - 1 - first) // stride + 1)
-            self._read_group(group, first, stride, (down, left, height, width), out[done : done + more])
+            has_blocks |= self._read_group(group, first, stride, (down, left, height, width), out[done : done + more])
             done += more
+        return has_blocks
 
-    def _read_group(self, group: int, first: int, stride: int, window: Window, out: npt.NDArray[np.uint8]) -> None:
+    def _read_group(self, group: int, first: int, stride: int, window: Window, out: npt.NDArray[np.uint8]) -> bool:
         # Import lazily: listing files must not load numba.
         from v2v_server.store.pixels import from_differences
 
@@ -92,9 +96,9 @@ class BlockReader:
         record = self._record(group)
         if self._is_sparse and record.starts[0] == record.starts[-1]:
             out[...] = 0
-            return
+            return False
         frames = head.group_frames(group)
-        columns = range(left // BLOCK_COLUMNS, (left + width - 1) // BLOCK_COLUMNS + 1)
+        columns, has_blocks = range(left // BLOCK_COLUMNS, (left + width - 1) // BLOCK_COLUMNS + 1), False
         for row in range(top // BLOCK_ROWS, (top + height - 1) // BLOCK_ROWS + 1):
             y = row * BLOCK_ROWS
             tall = min(BLOCK_ROWS, head.rows - y)
@@ -105,10 +109,16 @@ class BlockReader:
                 wide = min(BLOCK_COLUMNS, head.width_px - x)
                 here, there = max(left, x), min(left + width, x + wide)
                 part = out[:, upper - top : lower - top, here - left : there - left]
-                if len(block):
-                    from_differences(block, tall, wide, upper - y, here - x, first, stride, part)
-                else:
+                has_blocks |= bool(len(block))
+                if not len(block):
                     part[...] = 0
+                elif head.packing == "raw":
+                    last = first + (len(out) - 1) * stride
+                    pixels = block.reshape(frames, tall, wide)[first : last + 1 : stride]
+                    part[...] = pixels[:, upper - y : lower - y, here - x : there - x]
+                else:
+                    from_differences(block, tall, wide, upper - y, here - x, first, stride, part)
+        return has_blocks
 
     def _record(self, group: int) -> BlockRecord:
         size = self.head.record_bytes
@@ -231,7 +241,8 @@ class StoreFile(BlockReader):
             raise VideoError(self._path, None, f"the store file is corrupt (its plane {name}): {_REMEDY}")
         window = kind.window(cells)
         pictures = np.empty((count, *window[2:]), np.uint8)
-        stored.read(start, 1, window, pictures)
+        if not stored.read(start, 1, window, pictures):
+            return np.zeros((count, kind.values, *cells[2:]), kind.dtype)
         return kind.from_pictures(pictures, cells)
 
     @cached_property

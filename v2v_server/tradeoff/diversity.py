@@ -77,8 +77,9 @@ def _activities(root: Path, lease: Lease) -> list[tuple[SampleParams, _Activity]
     for decoded in decode_for(lease, lease.indices, Folder(root)):
         recipe = decoded.plan.spec.recipe
         params = dataclasses.replace(decoded.plan.params, hot_pixel_count=0)
-        view = apply_view(decoded.clip.frames, params, recipe)
-        voxels, _ = simulate_clip(view, params, recipe, "float32", step_durations(lease, decoded))
+        signal = decoded.clip.signal
+        view = apply_view(decoded.clip.frames, params, recipe, signal)
+        voxels, _ = simulate_clip(view, params, recipe, "float32", step_durations(lease, decoded), signal=signal)
         events = np.abs(voxels).reshape(-1, *voxels.shape[2:])
         # Every fourth pixel of every fourth row: the same coefficient at a sixteenth of the memory.
         made.append((params, (events[:, ::4, ::4].copy(), events.sum(axis=(1, 2)))))

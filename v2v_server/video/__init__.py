@@ -8,6 +8,7 @@ listing      whether they are, by decoding
 frame_index  which frames it has, and where decoding may begin
 decode       a range of frames, exactly
 collect      the asked frames of one pass of a decoder
+colour       colour of the frames
 luma         which grey is meant
 full_range   limited range to full range, compiled
 orientation  how a stored picture must be turned

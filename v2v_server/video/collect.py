@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 from av.video.frame import VideoFrame
 
 from v2v_protocol.errors import VideoError
+from v2v_server.video.colour.chroma import Chroma, ChromaCut, ChromaStack
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import LumaFormat, copy_luma, luma_plane, stretch
+from v2v_server.video.luma import MIXED, SDR, TRANSFERS, LumaFormat, Signal, copy_luma, luma_plane, stretch
 from v2v_server.video.orientation import Window
 
 
@@ -24,10 +25,28 @@ class Cut:
     Attributes:
         count: number of frames, at least 1; with a stride, of those that are taken.
         window: (top, left, height, width) in the upright picture, pixels; None takes all of it.
+        chroma: what it takes of the colour; None takes none.
+        cells: (top, left, rows, columns) of the cells whose motion is wanted (:mod:`v2v_server.motion`); None: none.
     """
 
     count: int
     window: Window | None = None
+    chroma: ChromaCut | None = None
+    cells: Window | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """What else looks at the frames as they are decoded.
+
+    Attributes:
+        window: the part of each picture, as in :class:`Cut`.
+        begin: called when decoding begins, again if it begins again; returns a function that gets the part of each
+            frame, [h, w] uint8: upright, in full range.
+    """
+
+    window: Window
+    begin: Callable[[], Callable[[npt.NDArray[np.uint8]], object]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +54,14 @@ class FrameRange:
     """Which frames of a file are to be decoded.
 
     Attributes:
-        path, index, start, stride: see :func:`v2v_server.video.decode.decode_cuts`.
+        path, index, start, stride, most_bits: see :func:`v2v_server.video.decode.decode_cuts`.
     """
 
     path: str
     index: FrameIndex
     start: int
     stride: int
+    most_bits: int | None = None
 
 
 def window_of(cut: Cut) -> Window:
@@ -53,11 +73,13 @@ def window_of(cut: Cut) -> Window:
 class Stack:
     """Collects the asked frames of one pass, and refuses what is not exactly that."""
 
-    def __init__(self, wanted: FrameRange, cuts: Sequence[Cut]) -> None:
+    def __init__(self, wanted: FrameRange, cuts: Sequence[Cut], watch: Watch | None = None) -> None:
         self.wanted = wanted
+        self._watch, self._show = watch, None if watch is None else watch.begin()
         self.index = index = wanted.index
         self._orientation = index.orientation
         self.codec = ""  # FFmpeg's name, once decoding has begun
+        self.signal = SDR  # of the collected frames
         self.sparse = False  # whether frames before the range are left out on purpose
         self._cuts = cuts
         self._stride = stride = wanted.stride
@@ -68,7 +90,11 @@ class Stack:
         self.taken = 0
         self._cursor = 0  # where the next frame is expected in the index
         self._damaged = False
-        self._parts: list[tuple[Window, npt.NDArray[np.uint8]]] = []  # stored window and frames of each cut
+        size = index.height_px, index.width_px
+        self._colours = [
+            None if cut.chroma is None else ChromaStack(cut.chroma, self._orientation, *size) for cut in cuts
+        ]
+        self._parts: list[tuple[Window, npt.NDArray[np.unsignedinteger]]] = []  # stored window and frames of each cut
 
     def take(self, frame: VideoFrame) -> bool:
         """Look at the next frame that the decoder delivers; True once the last asked one is in."""
@@ -83,6 +109,7 @@ class Stack:
         if self._damaged:
             self.refuse("is damaged, or refers to a damaged or lost frame")
         self._copy(frame)
+        self._collect_colour(frame)
         self.taken += 1
         return self.taken == len(self._expected)
 
@@ -118,6 +145,8 @@ class Stack:
     def _copy(self, frame: VideoFrame) -> None:
         if not self._parts:
             self._luma = LumaFormat.of(frame)
+            if self.wanted.most_bits is not None:
+                self.signal = Signal(min(self._luma.bits, self.wanted.most_bits), TRANSFERS.get(frame.color_trc, ""))
             self._size = self._orientation.size(self.index.height_px, self.index.width_px)
             self._parts = [self._part(cut) for cut in self._cuts]
         if (frame.height, frame.width) != self._size:
@@ -127,17 +156,26 @@ class Stack:
             )
         if not self._luma.describes(frame):
             self.refuse(f"the picture format changes from {self._luma} to {LumaFormat.of(frame)}")
-        self._keep(luma_plane(frame, self._luma))
+        if self.wanted.most_bits is not None and TRANSFERS.get(frame.color_trc, "") != self.signal.transfer:
+            self.signal = self.signal._replace(transfer=MIXED)
+        samples = luma_plane(frame, self._luma)
+        self._keep(samples)
+        if self._watch is not None and self._show is not None:
+            stored = self._orientation.stored_window(self._watch.window, self.index.height_px, self.index.width_px)
+            seen = np.empty((1, *stored[2:]), np.uint8)
+            copy_luma(samples, self._luma, stored, seen[0])
+            stretch(seen, self._luma)
+            self._show(self._orientation.upright(seen)[0])
 
     def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
         for stored, raw in self._parts:
             if self.taken < len(raw):
-                copy_luma(samples, self._luma, stored, raw[self.taken])
+                copy_luma(samples, self._luma, stored, raw[self.taken], self.signal)
 
-    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
+    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.unsignedinteger]]:
         window = window_of(cut)
         stored = self._orientation.stored_window(window, self.index.height_px, self.index.width_px)
-        return stored, np.empty((cut.count, *stored[2:]), np.uint8)
+        return stored, np.empty((cut.count, *stored[2:]), self.signal.dtype)
 
     def refuse(self, why: str) -> NoReturn:
         """Blame the next frame that should have come.
@@ -147,8 +185,17 @@ class Stack:
         """
         raise VideoError(self.wanted.path, self.wanted.start + self.taken * self._stride, why)
 
-    def grey(self) -> Iterator[npt.NDArray[np.uint8]]:
-        """Yield the collected frames of each cut, [count, h, w] uint8: upright, in full range."""
+    def _collect_colour(self, frame: VideoFrame) -> None:
+        for colour in self._colours:
+            if colour is not None:
+                colour.add(frame, self.taken)
+
+    def chroma(self) -> list[Chroma | None]:
+        """Return the collected colour of each cut; None if it takes none."""
+        return [None if colour is None else colour.chroma() for colour in self._colours]
+
+    def grey(self) -> Iterator[npt.NDArray[Any]]:
+        """Yield the collected frames of each cut, [count, h, w] of the signal's dtype: upright, in full range."""
         for _, raw in self._parts:
             stretch(raw, self._luma)
             yield self._orientation.upright(raw)
@@ -159,17 +206,30 @@ class LastFrame(Stack):
 
     def __init__(self, wanted: FrameRange, cut: Cut) -> None:
         super().__init__(wanted, [cut])
+        self.colour: tuple[npt.NDArray[np.int8], str] | None = None  # Cb and Cr of the last frame, and their matrix
+
+    def _collect_colour(self, frame: VideoFrame) -> None:
+        (colour,) = self._colours
+        self.colour = None if colour is None else colour.cells_of(frame)
 
     def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
         ((stored, last),) = self._parts
         self._parts = [(stored, np.empty_like(last))]  # a caller may keep the last one
-        copy_luma(samples, self._luma, stored, self._parts[0][1][0])
+        copy_luma(samples, self._luma, stored, self._parts[0][1][0], self.signal)
+        if self.signal.bits > SDR.bits:
+            self._grey = np.empty(last.shape, np.uint8)
+            copy_luma(samples, self._luma, stored, self._grey[0])
 
-    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.uint8]]:
+    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.unsignedinteger]]:
         return super()._part(replace(cut, count=1))
 
-    def picture(self) -> npt.NDArray[np.uint8]:
-        """Return the last frame that was taken, [h, w] uint8: upright, in full range."""
+    def grey_picture(self) -> npt.NDArray[np.uint8]:
+        """Return the last frame in 8 bits, [h, w], where the signal has more."""
+        upright: npt.NDArray[np.uint8] = self._orientation.upright(self._grey)[0]
+        return upright
+
+    def picture(self) -> npt.NDArray[Any]:
+        """Return the last frame that was taken, [h, w] of the signal's dtype: upright, in full range."""
         (grey,) = self.grey()
-        picture: npt.NDArray[np.uint8] = grey[0]
+        picture: npt.NDArray[Any] = grey[0]
         return picture

@@ -18,6 +18,7 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import chain
+from typing import Any
 
 import av
 import numpy as np
@@ -28,8 +29,10 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.video.collect import Cut, FrameRange, LastFrame, Stack
+from v2v_server.video.collect import Cut, FrameRange, LastFrame, Stack, Watch
+from v2v_server.video.colour.chroma import Chroma, ChromaCut
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
+from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.orientation import Window
 from v2v_server.video.packets import is_unreferenced, length_bytes
 from v2v_server.video.source import opened, packets, reason
@@ -46,18 +49,26 @@ class DecodedClip:
     """A range of frames.
 
     Attributes:
-        frames: [count, h, w] uint8, C-contiguous: full-range luma (see :mod:`v2v_server.video.luma`).
+        frames: [count, h, w], C-contiguous: full-range luma (see :mod:`v2v_server.video.luma`), uint8, or uint16 if the
+            signal has more than 8 bits.
         seconds: [count] float64, presentation times; NaN where unknown.
         codec: FFmpeg's name of the format.
         bit_exact: whether every host decodes these very bytes.
         origin: "" where they were decoded just now; "store" or "cache" where they were read from there.
+        chroma: colour of the frames that the cut names; None without.
+        signal: what the levels mean.
+        motion: [count, 2, rows, columns] int16, the motion to each frame from the one before in the cells of its cut
+            (:mod:`v2v_server.motion`), zero for the first; None if it was not asked for.
     """
 
-    frames: npt.NDArray[np.uint8]
+    frames: npt.NDArray[Any]
     seconds: npt.NDArray[np.float64]
     codec: str
     bit_exact: bool
     origin: str = ""
+    chroma: Chroma | None = None
+    signal: Signal = SDR
+    motion: npt.NDArray[np.int16] | None = None
 
 
 class _SeekFailed(Exception):
@@ -78,6 +89,8 @@ def decode_cuts(
     cuts: Sequence[Cut],
     *,
     stride: int = 1,
+    most_bits: int | None = None,
+    watch: Watch | None = None,
 ) -> tuple[DecodedClip, ...]:
     """Return several cuts of the frames from ``start`` on, from one pass of the decoder.
 
@@ -89,6 +102,9 @@ def decode_cuts(
         start: ordinal of the first frame, presentation order.
         cuts: at least one.
         stride: takes frames start, start + stride ...
+        most_bits: bits of a level to keep of deeper luma, 8 to ``luma.MOST_BITS``; None: 8, and the signal is SDR,
+            whatever the file states.
+        watch: looks at the frames of the longest cut.
 
     Raises:
         UsageError: a range outside the index, or a window outside the picture.
@@ -98,12 +114,17 @@ def decode_cuts(
     for cut in cuts:
         index.position(start, (cut.count - 1) * stride + 1)
     checked = [replace(cut, window=_checked(cut.window, index)) for cut in cuts]
-    taken, codec = _decode(FrameRange(os.fspath(path), index, start, stride), checked)
+    stack = _filled(FrameRange(os.fspath(path), index, start, stride, most_bits), checked, watch)
     return tuple(
         DecodedClip(
-            grey, index.seconds(start, (cut.count - 1) * stride + 1)[::stride], codec, codec in BIT_EXACT_CODECS
+            grey,
+            index.seconds(start, (cut.count - 1) * stride + 1)[::stride],
+            stack.codec,
+            stack.codec in BIT_EXACT_CODECS,
+            signal=stack.signal,
+            chroma=chroma,
         )
-        for grey, cut in zip(taken, checked, strict=True)
+        for grey, chroma, cut in zip(stack.grey(), stack.chroma(), checked, strict=True)
     )
 
 
@@ -120,15 +141,9 @@ def _checked(window: Window | None, index: FrameIndex) -> Window:
     return window
 
 
-def _decode(wanted: FrameRange, cuts: Sequence[Cut]) -> tuple[list[npt.NDArray[np.uint8]], str]:
-    """Return the cuts, [count, h, w] uint8 each, and the codec's name."""
-    stack = _filled(wanted, cuts)
-    return list(stack.grey()), stack.codec
-
-
-def _filled(wanted: FrameRange, cuts: Sequence[Cut]) -> Stack:
+def _filled(wanted: FrameRange, cuts: Sequence[Cut], watch: Watch | None = None) -> Stack:
     for frames_of in (_from_keyframe_on, _from_beginning):
-        stack = Stack(wanted, cuts)
+        stack = Stack(wanted, cuts, watch)
         try:
             for _ in _fill(stack, frames_of(stack)):
                 pass
@@ -157,18 +172,30 @@ def stream_luma(
 
 
 def stream_decoded(
-    path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: Window | None = None
-) -> Generator[tuple[str, npt.NDArray[np.uint8]], None, None]:
-    """FFmpeg's name of the format, and the frame: :func:`stream_luma` for those who want to know both."""
+    path: str | os.PathLike[str],
+    index: FrameIndex,
+    start: int,
+    count: int,
+    window: Window | None = None,
+    most_bits: int | None = None,
+    chroma: ChromaCut | None = None,
+) -> Generator[tuple[LastFrame, npt.NDArray[Any]], None, None]:
+    """Yield the frames of :func:`stream_luma`, each with what collects them: ``codec`` and ``signal`` so far.
+
+    Args:
+        most_bits: see :func:`decode_cuts`.
+        chroma: part of the picture whose colour to collect; None: none.
+    """
     index.position(start, count)
-    cut, wanted, done = Cut(count, _checked(window, index)), FrameRange(os.fspath(path), index, start, 1), 0
+    cut, done = Cut(count, _checked(window, index), chroma), 0
+    wanted = FrameRange(os.fspath(path), index, start, 1, most_bits)
     for frames_of in (_from_keyframe_on, _from_beginning):
         stream = LastFrame(wanted, cut)
         try:
             for _ in _fill(stream, frames_of(stream)):
                 if stream.taken > done:
                     done += 1
-                    yield stream.codec, stream.picture()
+                    yield stream, stream.picture()
             return
         except _SeekFailed:
             continue

@@ -1,10 +1,11 @@
-"""Which grey is meant: the luma Y that the file stores, stretched to the full range 0 .. 255.
+"""Which grey is meant: the luma Y that the file stores, stretched to the full range 0 .. W.
 
-No colour conversion takes place; where a picture has a luma plane, that plane is the picture.
+W is 255, or 2**k - 1 where a caller keeps k of the b bits of a deeper clip. No colour conversion takes place; where a
+picture has a luma plane, that plane is the picture.
 
 * limited ("tv", "mpeg") range, 8 bit:  grey = clip(round((Y - 16) 255 / 219), 0, 255), Y = 16 .. 235 (ITU-R BT.601);
-* limited range, b bit:                 grey = clip(round((Y - 16 s) 255 / (219 s)), 0, 255), s = 2**(b - 8);
-* full ("pc", "jpeg") range:            grey = Y at 8 bit, round(Y 255 / (2**b - 1)) at b bit.
+* limited range, b bit:                 grey = clip(round((Y - 16 s) W / (219 s)), 0, W), s = 2**(b - 8);
+* full ("pc", "jpeg") range:            grey = Y at 8 bit, round(Y W / (2**b - 1)) at b bit.
 
 A file that does not state its range has full range if its pixel format is ``yuvj*`` or ``gray*``, else limited range.
 Conversions that go through red, green and blue give another grey: swscale's to ``gray`` is this one for 8-bit clips
@@ -19,16 +20,59 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from av.video.frame import VideoFrame
-from av.video.reformatter import ColorRange
+from av.video.reformatter import ColorRange, ColorTrc
 
 from v2v_server.video.orientation import Window
 
-_BYTE = np.dtype(np.uint8)
+_BYTE, _WIDE = np.dtype(np.uint8), np.dtype(np.uint16)
 _LUMA_PLANE = re.compile(r"(yuvj?\d{3}p|yuva\d{3}p|gray|nv(12|16|21|24)$)((9|10|12|14|16)(le|be))?$")
+
+TRANSFERS: dict[int, str] = {
+    ColorTrc.LINEAR: "linear",
+    ColorTrc.LOG: "log100",
+    ColorTrc.LOG_SQRT: "log316",
+    ColorTrc.SMPTE2084: "pq",
+    ColorTrc.ARIB_STD_B67: "hlg",
+}
+"""Transfer characteristics that are not a display's gamma, by their code points (ITU-T H.273)."""
+MIXED = "mixed"
+"""Stands for the transfer of a clip whose frames state different ones."""
+MOST_BITS = 12
+"""Largest number of bits that are kept of a level; deeper luma is rounded."""
+
+
+class Signal(NamedTuple):
+    """What the grey levels of a clip mean.
+
+    Attributes:
+        bits: levels are 0 .. 2**bits - 1, 8 to MOST_BITS.
+        transfer: one of TRANSFERS, as the video states it; "" for any other, which is SDR; or MIXED.
+    """
+
+    bits: int = 8
+    transfer: str = ""
+
+    @property
+    def white(self) -> int:
+        """The highest level."""
+        return (1 << self.bits) - 1
+
+    @property
+    def dtype(self) -> np.dtype[np.unsignedinteger]:
+        """dtype of the levels."""
+        return _BYTE if self.bits == 8 else _WIDE
+
+    def __str__(self) -> str:
+        return f"{self.bits} bits, {self.transfer.upper() or 'SDR'}"
+
+
+SDR = Signal()
+"""8 bits, shown by a gamma: the signal of most videos."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,13 +129,14 @@ def _is_full_range(pixel_format: str, color_range: int) -> bool:
 
 
 @cache
-def range_table(bits: int, full_range: bool) -> npt.NDArray[np.uint8]:
-    """[2**bits] uint8: the full-range 8-bit grey of every luma value."""
-    values = np.arange(2**bits, dtype=np.int64)
+def range_table(bits: int, full_range: bool, kept: Signal = SDR) -> npt.NDArray[np.unsignedinteger]:
+    """Return the full-range grey of every luma value, [2**bits] of the dtype of ``kept``."""
+    values, white = np.arange(2**bits, dtype=np.int64), kept.white
     scale = 2 ** (bits - 8)
     black, span = (0, 2**bits - 1) if full_range else (16 * scale, 219 * scale)
-    # Rounding half up in whole numbers: floor((2 * 255 (Y - black) + span) / (2 span)).
-    table: npt.NDArray[np.uint8] = np.clip((510 * (values - black) + span) // (2 * span), 0, 255).astype(np.uint8)
+    # Rounding half up in whole numbers: floor((2 white (Y - black) + span) / (2 span)).
+    levels = np.clip((2 * white * (values - black) + span) // (2 * span), 0, white)
+    table: npt.NDArray[np.unsignedinteger] = levels.astype(kept.dtype)
     table.flags.writeable = False
     return table
 
@@ -107,25 +152,30 @@ def luma_plane(frame: VideoFrame, luma: LumaFormat) -> npt.NDArray[np.unsignedin
 
 
 def copy_luma(
-    samples: npt.NDArray[np.unsignedinteger], luma: LumaFormat, window: Window, out: npt.NDArray[np.uint8]
+    samples: npt.NDArray[np.unsignedinteger],
+    luma: LumaFormat,
+    window: Window,
+    out: npt.NDArray[np.unsignedinteger],
+    kept: Signal = SDR,
 ) -> None:
-    """Copy a window of :func:`luma_plane` to ``out`` [h, w] uint8.
+    """Copy a window of :func:`luma_plane` to ``out`` [h, w].
 
-    8-bit samples are copied as they are (:func:`stretch` maps a whole stack at once); deeper ones are mapped to grey.
+    8-bit samples are copied as they are (:func:`stretch` maps a whole stack at once); deeper ones are mapped to the
+    grey levels of ``kept``.
     """
     top, left, height, width = window
     view = samples[top : top + height, left : left + width]
     if luma.bits == 8:
         out[...] = view
     else:
-        np.take(range_table(luma.bits, luma.full_range), view, out=out)
+        np.take(range_table(luma.bits, luma.full_range, kept), view, out=out)
 
 
-def stretch(frames: npt.NDArray[np.uint8], luma: LumaFormat) -> None:
+def stretch(frames: npt.NDArray[Any], luma: LumaFormat) -> None:
     """Convert frames of :func:`copy_luma` to grey levels in place, unless they are grey levels already.
 
     Args:
-        frames: [n, h, w] uint8, neighbours of a row side by side.
+        frames: [n, h, w], neighbours of a row side by side.
         luma: the format that they were copied from.
     """
     if luma.bits == 8 and not luma.full_range:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -56,7 +56,7 @@ class Orientation:
             left = width - left - columns
         return (left, top, columns, rows) if self.transpose else (top, left, rows, columns)
 
-    def upright(self, frames: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    def upright(self, frames: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Turn stored pictures [n, h, w] upright: [n, h, w] or [n, w, h], C-contiguous."""
         if self.transpose:
             frames = frames.transpose(0, 2, 1)

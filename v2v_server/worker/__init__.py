@@ -4,9 +4,12 @@ conversation   what the worker says: a state machine without I/O
 process        the process that does what the conversation says
 produce        from a lease to its sample: decode, view, simulate
 arrays         functions that fill each array; additional arrays are files beside it
+colour         frames in colour
+labels         boxes and masks
 sidecars       files beside the video that arrays are made from
 decode_cache   one decode for siblings
 output_buffer  memory for a sample, shared with its consumer or private
+cleaning       which frames and which part of the picture are used
 scene_choice   which flow method a clip needs
 warm_up        compiled kernels, compiled once on a host
 logbook        a record of the lease in work that outlives the worker

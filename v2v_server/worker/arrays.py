@@ -25,10 +25,13 @@ from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.flow import FlowClip
 from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.intensity import tone_table
 from v2v_server.simulation.kernels import ARRAYS
 from v2v_server.simulation.result import Voxels
-from v2v_server.simulation.view import Frames
+from v2v_server.simulation.view import Frames, Window
 from v2v_server.simulation.voxel import Levels
+from v2v_server.video.colour.chroma import Chroma, ChromaCut
+from v2v_server.video.luma import SDR, Signal
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,16 +39,25 @@ class SourceClip:
     """Where a sample's frames lie in their video, and what lies beside it.
 
     Attributes:
-        start_frame: number of the clip's first frame in the video, in presentation order from 0. Frame ``n`` of the
-            clip is frame ``start_frame + n * recipe.frame_stride`` of the video.
+        start_frame: number of the clip's first frame in the video, in presentation order from 0.
         seconds: [n] float64, presentation time of each frame of the clip; NaN where unknown.
+        colour: colour of the delivered frames, and how it was cut; None if no array needs it.
         sidecars: the opened sidecars by ending, see :class:`v2v_protocol.sample.FromSidecar`: a file, or a folder in
             the manner of ``pathlib``; None if the video has none.
+        numbers: [steps + 1] int64, number in the video of each frame of the clip and of those that pauses leave out.
+        fingerprints: of the sidecars that the video has, by ending.
+        picture_px: height and width of the upright picture.
+        usable: the part of it that the camera sees, see :mod:`v2v_server.video.rows`.
     """
 
     start_frame: int
     seconds: npt.NDArray[np.float64]
+    colour: tuple[Chroma, ChromaCut] | None
     sidecars: Mapping[str, Traversable | None]
+    numbers: npt.NDArray[np.int64]
+    fingerprints: Mapping[str, str]
+    picture_px: tuple[int, int]
+    usable: Window
 
 
 @dataclass(slots=True)
@@ -57,12 +69,14 @@ class SampleContext:
         clip: the frames' place in the video, their times, and the opened sidecars.
         spec, params: the stream's spec, and the sample's draw.
         source: [steps + 1] int64, which frame of ``view`` each position of the clip shows.
-        view: [n, H, W] uint8, the decoded frames as the camera sees them.
+        view: [n, H, W], the decoded frames as the camera sees them.
+        signal: what the levels of ``view`` mean.
         step_seconds: [steps] float64, duration of each step; None if the recipe does not use it.
         flow: flow of the clip; None if it was not requested.
         levels: grey levels between frames (``substep_px``); None if there are none.
         into: the arrays to fill, by name.
         saturated: number of bins that were clipped, by array; None until the clip is simulated.
+        boxes_dropped: boxes left out because of ``max_boxes``.
         left_out: effects of the draw that were not simulated.
     """
 
@@ -72,11 +86,13 @@ class SampleContext:
     params: SampleParams
     source: npt.NDArray[np.int64]
     view: Frames
+    signal: Signal
     step_seconds: npt.NDArray[np.float64] | None
     flow: FlowClip | None
     levels: Levels | None
     into: Mapping[str, npt.NDArray[Any]]
     saturated: Mapping[str, int] | None = None
+    boxes_dropped: int = 0
     left_out: tuple[str, ...] = ()
 
     @property
@@ -89,6 +105,11 @@ class SampleContext:
         """The spec's recipe."""
         return self.spec.recipe
 
+    @property
+    def target_frames(self) -> list[int]:
+        """Number, in the video, of the frame at the end of each voxel, and of the lead frame."""
+        return [int(frame) for frame in self.clip.numbers[self.source[self.target_steps]]]
+
 
 ArrayBuilder = Callable[[SampleContext, npt.NDArray[Any]], None]
 ARRAY_BUILDERS: dict[str, ArrayBuilder] = {}
@@ -98,8 +119,8 @@ ARRAY_BUILDERS: dict[str, ArrayBuilder] = {}
 def makes(name: str) -> Callable[[ArrayBuilder], ArrayBuilder]:
     """Register a function that fills the array of this name. It gets a C-contiguous output array.
 
-    A function that cannot use a sidecar raises :class:`v2v_protocol.errors.SidecarError`, which reaches the consumer.
-    So does any other error while an array is made from a sidecar.
+    A function that cannot use a sidecar raises :class:`v2v_protocol.errors.SidecarError`. The sample then states the
+    reason and has no labels. So does any other error while an array is made from a sidecar.
     """
 
     def register(builder: ArrayBuilder) -> ArrayBuilder:
@@ -124,6 +145,7 @@ def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Vox
             context.step_seconds,
             out,
             context.levels,
+            context.signal,
             context.spec.tolerance,
         )
     except UsageError as error:
@@ -145,9 +167,30 @@ def simulated(context: SampleContext, out: npt.NDArray[Any]) -> None:
 
 @makes("frames")
 def frames(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in the frame at the end of each voxel, and the lead frame."""
+    """Fill in the frame at the end of each voxel, and the lead frame, tone mapped (``intensity.py``)."""
+    _shown(context, context.source[context.target_steps], out)
+
+
+@makes("frames_u16")
+def frames_u16(context: SampleContext, out: npt.NDArray[Any]) -> None:
+    """Fill in the same frames with the levels that the video stores, 0 .. 65535, without tone mapping."""
+    white = context.signal.white
+    table = ((2 * 65535 * np.arange(white + 1) + white) // (2 * white)).astype(np.uint16)
+    np.take(table, context.view[context.source[context.target_steps]], out=out[:, 0], mode="clip")
+
+
+@makes("frames_all")
+def frames_all(context: SampleContext, out: npt.NDArray[Any]) -> None:
+    """Fill in the frame at the beginning of the clip and at the end of each step, tone mapped."""
+    _shown(context, context.source, out)
+
+
+def _shown(context: SampleContext, numbers: npt.NDArray[np.int64], out: npt.NDArray[Any]) -> None:
     # The indices are valid; checking them again would cost a copy.
-    np.take(context.view, context.source[context.target_steps], axis=0, out=out[:, 0], mode="clip")
+    if context.signal == SDR:
+        np.take(context.view, numbers, axis=0, out=out[:, 0], mode="clip")
+    else:
+        np.take(tone_table(context.recipe.gamma, context.signal), context.view[numbers], out=out[:, 0], mode="clip")
 
 
 @makes("flow")

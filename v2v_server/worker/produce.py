@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+import v2v_server.worker.colour  # registers its arrays
+import v2v_server.worker.labels  # noqa: F401  # registers its arrays
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.errors import ProtocolError, UsageError, VideoError
+from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
 from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
-from v2v_protocol.recipe import Recipe
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.safe_json import parse_json
 from v2v_protocol.sample import (
@@ -30,26 +31,31 @@ from v2v_protocol.sample import (
     SampleId,
     SampleParams,
     array_layout,
+    empty_value,
     new_arrays,
 )
 from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
-from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.corpus.scenes.scene import Scene, Sides
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
-from v2v_server.motion import MARGIN_PX, levels_of
+from v2v_server.motion import MARGIN_PX, cells_of, levels_of
 from v2v_server.simulation.draw import FrameTimes, draw
+from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.kernels import ARRAYS, list_events
 from v2v_server.simulation.variants import Variant, variants
-from v2v_server.simulation.view import apply_view, source_window, without_margin
+from v2v_server.simulation.view import Window, apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache
 from v2v_server.store.clips import clips_of
 from v2v_server.store.format import is_store_file
 from v2v_server.video.collect import Cut
+from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import MIXED, MOST_BITS, SDR
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, simulate
+from v2v_server.worker.cleaning import CleanFrames
 from v2v_server.worker.scene_choice import FlowPlan, plan_flow
 from v2v_server.worker.sidecars import errors_of_sidecar, sidecar_files
 
@@ -62,6 +68,7 @@ class SamplePlan:
         spec: the stream's spec.
         params: the sample's draw.
         source: [steps + 1] int64, which decoded frame each position of the clip shows.
+        frames: the frames of the sequence, and the part of the picture that is used.
         cut: the frames to decode after pauses are removed, cropped as far as possible before the resize.
         margin_px: margin around the crop that ``cut`` includes, for flow and sub-steps; None: the whole picture.
         flow: settings of the flow if the lease asks for it.
@@ -71,6 +78,7 @@ class SamplePlan:
     spec: StreamSpec
     params: SampleParams
     source: npt.NDArray[np.int64]
+    frames: CleanFrames
     cut: Cut
     margin_px: int | None
     flow: FlowSettings | None
@@ -94,29 +102,60 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
     """
     spec = _spec(lease.spec)
     recipe = spec.recipe
-    top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
+    scene = None if spec.scene == "off" else Scene.from_bytes(lease.scene)
+    frames = CleanFrames.of(scene, lease.start_frame, spec, _most_frames(lease, spec))
+    picture = usable_window(lease, frames.sides)
     params = draw(
         recipe,
         seed=lease.seed,
         epoch=lease.epoch,
         index=index,
-        picture_height_px=bottom - top,
-        picture_width_px=lease.width_px,
+        picture_height_px=picture.height_px,
+        picture_width_px=picture.width_px,
         video_id=lease.video,
         video_thresholds=_pair(lease.thresholds),
-        times=_frame_times(lease, spec) if recipe.is_timed else None,
+        times=_frame_times(lease, spec, frames) if recipe.is_timed else None,
     )
     source = params.source_index(int(params.ends(recipe)[-1]))
     flow: FlowSettings | None = None
     margin_px: int | None = MARGIN_PX if spec.substep_px else 0
-    flow_plan = _flow_plan(lease, spec, params, bottom - top)
+    flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture)
     if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
         if flow_plan is not None and flow_plan.still:
             flow = replace(flow, margin_px=0)
         margin_px = None if flow.margin_px is None else max(flow.margin_px, margin_px or 0)
-    window = source_window(params, recipe, top, bottom - top, lease.width_px, margin_px)
-    return SamplePlan(spec, params, source, Cut(int(source[-1]) + 1, window), margin_px, flow, flow_plan)
+    window = source_window(params, recipe, picture, margin_px)
+    chroma = _chroma_cut(lease, params, spec, frames, source) if "frames_rgb" in lease.arrays else None
+    cells = cells_of(params, recipe, _within_rows(lease, frames.sides)) if spec.substep_px else None
+    cut = Cut(frames.count(int(source[-1]) + 1), window, chroma, cells)
+    return SamplePlan(spec, params, source, frames, cut, margin_px, flow, flow_plan)
+
+
+def usable_window(lease: Lease, sides: Sides) -> Window:
+    """Return the part of a lease's upright picture that may be used: its rows without these bars."""
+    top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
+    height, width = bottom - top - sides.top - sides.bottom, lease.width_px - sides.left - sides.right
+    return Window(top + sides.top, sides.left, height, width)
+
+
+def _within_rows(lease: Lease, sides: Sides) -> Window:
+    """Return the window of :func:`usable_window`, counted from the first usable row."""
+    top, _ = Rows.parse(lease.rows).bounds(lease.height_px)
+    usable = usable_window(lease, sides)
+    return usable._replace(top_px=usable.top_px - top)
+
+
+def _chroma_cut(
+    lease: Lease, params: SampleParams, spec: StreamSpec, frames: CleanFrames, source: npt.NDArray[np.int64]
+) -> ChromaCut:
+    """Return which colour to decode: that of the delivered frames, in the crop."""
+    delivered = np.unique(source[params.ends(spec.recipe)[spec.recipe.first_frame :]])
+    if not frames.stride:
+        delivered = frames.numbers[delivered] - frames.numbers[0]
+    top, _ = Rows.parse(lease.rows).bounds(lease.height_px)
+    window = source_window(params, spec.recipe, usable_window(lease, frames.sides))
+    return ChromaCut(tuple(delivered.tolist()), window, top)
 
 
 def decode_for(
@@ -135,22 +174,28 @@ def decode_for(
         ProtocolError: the lease is malformed.
     """
     plans = [plan_sample(lease, index) for index in indices]
-    spec = plans[0].spec
+    frames = plans[0].frames
     _refuse_outside(lease.video)
     try:
-        index, cuts = _frame_index(lease, spec.recipe), [plan.cut for plan in plans]
-        what = index, lease.start_frame, cuts, spec.recipe.frame_stride
+        index, cuts = _frame_index(lease, frames.span), [plan.cut for plan in plans]
+        what = index, lease.start_frame, cuts, frames.stride or 1
+        most_bits = _most_bits(plans[0].spec)
         clips = None
+        rows = Rows.parse(lease.rows).bounds(lease.height_px)
         with source.open_local(lease.video, lease.fingerprint) as path:
             if cache is not None and not is_store_file(path):
-                rows = Rows.parse(lease.rows).bounds(lease.height_px)
-                clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what)
+                clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what, most_bits)
             if clips is None:
-                clips = clips_of(path, lease.fingerprint, *what)
+                clips = clips_of(path, lease.fingerprint, *what, rows, most_bits)
     except VideoError as error:
         # Consumer and log identify videos by id; a path of this host means nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
-    return tuple(Decoded(plan, clip) for plan, clip in zip(plans, clips, strict=True))
+    if clips[0].signal.transfer == MIXED:
+        why = "states different transfer characteristics within a clip: re-encode it with one, or set light to sdr"
+        raise VideoError(lease.video, lease.start_frame, why)
+    return tuple(
+        Decoded(plan, frames.pick(clip, int(plan.source[-1]) + 1)) for plan, clip in zip(plans, clips, strict=True)
+    )
 
 
 def sample_layout(lease: Lease) -> Layout:
@@ -180,7 +225,7 @@ def make_sample(
         sidecars: what :func:`v2v_server.worker.sidecars.open_sidecars` lends; needed if an array is made from one.
 
     Raises:
-        SidecarError: an array cannot be made from its sidecar.
+        SidecarError: this host cannot read a sidecar.
         VideoError: the video's frame rate is unknown and the recipe needs it, or its stated thresholds or time stamps
             are beyond what can be simulated.
         ProtocolError: the lease is malformed.
@@ -188,9 +233,16 @@ def make_sample(
     plan, index = decoded.plan, lease.indices[0]
     arrays = new_arrays(sample_layout(lease)) if into is None else into
     context, irregular = _context(lease, decoded, arrays, sidecars)
+    unlabelled = dict[str, str]()
     for name, array in context.into.items():
-        with errors_of_sidecar(lease.video, name, sidecars):
-            ARRAY_BUILDERS[name](context, array)
+        try:
+            with errors_of_sidecar(lease.video, name, sidecars):
+                ARRAY_BUILDERS[name](context, array)
+        except SidecarError as error:
+            if error.here:
+                raise
+            array[...] = empty_value(name)
+            unlabelled[name] = str(error)
     saturated = dict(context.saturated or {})
     saturated_bins = saturated.pop("voxels", 0)
     return Sample(
@@ -208,7 +260,9 @@ def make_sample(
             decoder=_decoder(decoded.clip),
             quarantine=lease.quarantine,
             scene="" if plan.flow_plan is None else plan.flow_plan.reason,
-            sidecars={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
+            sidecars=dict(context.clip.fingerprints),
+            unlabelled=unlabelled,
+            boxes_dropped=context.boxes_dropped,
             saturated={name: count for name, count in saturated.items() if count},
             grid_seconds=_grid_seconds(context),
             left_out=context.left_out,
@@ -236,19 +290,32 @@ def _context(
     """Return what the arrays are made from, and the number of irregular time stamps."""
     plan = decoded.plan
     params, recipe = plan.params, plan.spec.recipe
-    frames, flow, levels = decoded.clip.frames, None, None
+    frames, signal, flow, levels = decoded.clip.frames, decoded.clip.signal, None, None
     if plan.flow is not None and into:  # events need no flow
         methods = () if plan.flow_plan is None else plan.flow_plan.methods
         part = without_margin(frames, params, recipe, plan.margin_px, plan.flow.margin_px)
-        flow = flow_for(part, params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods)
+        flow = flow_for(
+            eight_bits(part, signal), params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods
+        )
     if plan.spec.substep_px and not (into and into.keys().isdisjoint(ARRAYS)):
         part = without_margin(frames, params, recipe, plan.margin_px, MARGIN_PX)
-        levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px)
+        motion, picture = decoded.clip.motion, _within_rows(lease, plan.frames.sides)
+        assert motion is not None
+        levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px, motion, picture)
     seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
-    view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe)
-    clip = SourceClip(lease.start_frame, decoded.clip.seconds, sidecars)
+    view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe, signal)
+    clip = SourceClip(
+        lease.start_frame,
+        decoded.clip.seconds,
+        None if plan.cut.chroma is None or decoded.clip.chroma is None else (decoded.clip.chroma, plan.cut.chroma),
+        sidecars,
+        fingerprints={ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()},
+        numbers=plan.frames.numbers,
+        picture_px=(lease.height_px, lease.width_px),
+        usable=usable_window(lease, plan.frames.sides),
+    )
     return SampleContext(
-        lease.video, clip, plan.spec, params, plan.source, view, seconds, flow, levels, into
+        lease.video, clip, plan.spec, params, plan.source, view, signal, seconds, flow, levels, into
     ), irregular
 
 
@@ -277,10 +344,18 @@ def _step_seconds(lease: Lease, decoded: Decoded) -> tuple[npt.NDArray[np.float6
     return step_seconds(decoded.clip.seconds, plan.source, lease.frames_per_second / plan.spec.recipe.frame_stride)
 
 
+def _most_bits(spec: StreamSpec) -> int | None:
+    """Return ``most_bits`` of :func:`decode_cuts`. Pictures between frames are made from 8 bits."""
+    if spec.recipe.light == "sdr":
+        return None
+    return SDR.bits if spec.substep_px else MOST_BITS
+
+
 def _decoder(clip: DecodedClip) -> str:
     """Describe the source of the pixels for the provenance."""
+    signal = "" if clip.signal == SDR else f", {clip.signal}"
     host = "" if clip.bit_exact else " (host-dependent)"
-    return f"{clip.codec}{host}, from the {clip.origin}" if clip.origin else f"{clip.codec}{host}"
+    return f"{clip.codec}{host}{signal}" + (f", from the {clip.origin}" if clip.origin else "")
 
 
 def kernels_of(lease: Lease) -> frozenset[Variant]:
@@ -299,7 +374,7 @@ def _variants(
     found = variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds), arrays, levels_per_step)
     if not spec.tolerance:
         return found
-    return found | {variant._replace(is_general=False) for variant in found if not variant.is_divided}
+    return found | {variant._replace(is_general=False, is_divided=False) for variant in found}
 
 
 @lru_cache(maxsize=16)
@@ -316,39 +391,41 @@ def _layout(canonical: bytes, arrays: tuple[str, ...]) -> Layout:
     return array_layout(spec.recipe, spec.voxel_dtype, arrays)
 
 
-def _flow_plan(lease: Lease, spec: StreamSpec, params: SampleParams, height_px: int) -> FlowPlan | None:
-    if spec.scene == "off":
-        return None
-    scene = Scene.from_bytes(lease.scene)
-    return plan_flow(scene, lease.start_frame, params, spec, height_px, lease.width_px)
-
-
 def _pair(thresholds: tuple[float, ...]) -> tuple[float, float] | None:
     return (thresholds[0], thresholds[1]) if thresholds else None
 
 
-def _frame_times(lease: Lease, spec: StreamSpec) -> FrameTimes:
-    """Return the time stamps of the frames that a sample may use: the same for every server, whose index of a lease may
-    hold more.
+def _most_frames(lease: Lease, spec: StreamSpec) -> int:
+    """Return how many frames a sample may use, those in between included: the same for every server, whose index of a
+    lease may hold more.
     """
-    if not lease.frames_per_second:
-        raise VideoError(lease.video, None, "its frame rate is unknown, and voxel_seconds needs it")
     recipe, rate = spec.recipe, lease.frames_per_second
-    index = _frame_index(lease, recipe)
-    reach = int((recipe.reach_at if spec.scene == "off" else recipe.sequence_at)(rate))
-    count = min(reach + 1, index.end - lease.start_frame)
-    return FrameTimes(index.seconds(lease.start_frame, count)[:: recipe.frame_stride], rate / recipe.frame_stride)
+    if not recipe.is_timed:
+        return recipe.frames_needed
+    if not rate:
+        raise VideoError(lease.video, None, "its frame rate is unknown, and voxel_seconds needs it")
+    needed = int(recipe.sequence_at(rate)) + 1
+    if spec.scene != "off":
+        return needed
+    return min(int(recipe.reach_at(rate)) + 1, _frame_index(lease, needed).end - lease.start_frame)
 
 
-def _frame_index(lease: Lease, recipe: Recipe) -> FrameIndex:
-    """Decode the frame index of a lease. Its server may not have checked it.
+def _frame_times(lease: Lease, spec: StreamSpec, frames: CleanFrames) -> FrameTimes:
+    """Return the time stamps of the frames that a sample may use."""
+    seconds = _frame_index(lease, frames.span).seconds(lease.start_frame, frames.span)
+    rate = lease.frames_per_second / spec.recipe.frame_stride
+    return FrameTimes(seconds[frames.numbers - frames.numbers[0]], rate)
+
+
+def _frame_index(lease: Lease, count: int) -> FrameIndex:
+    """Decode the frame index of a lease, for this number of frames. Its server may not have checked it.
 
     Raises:
         VideoError: the index is damaged.
     """
     try:
         frame_index = FrameIndex.from_bytes(lease.frame_index)
-        frame_index.position(lease.start_frame, int(recipe.sequence_at(lease.frames_per_second)) + 1)
+        frame_index.position(lease.start_frame, count)
     except (ProtocolError, UsageError) as error:
         raise VideoError(lease.video, None, f"its index from the server is damaged: {error}") from error
     return frame_index

@@ -28,8 +28,21 @@ import numpy.typing as npt
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.scenes.scene import CHANGE, CLIPPED, DARK, FLICKER, LAG_FRAMES, MOTION, NOISE, TILES, Scene
+from v2v_server.corpus.scenes.scene import (
+    CHANGE,
+    CLIPPED,
+    DARK,
+    FLICKER,
+    LAG_FRAMES,
+    MOTION,
+    NOISE,
+    TILES,
+    Scene,
+    Sides,
+)
 from v2v_server.flow.methods import AUTO, SLOW, SLOW_PX, STILL, STILL_GREY_LEVELS
+from v2v_server.simulation.view import Window
+from v2v_server.worker.cleaning import CleanFrames
 
 MOVING = "dis-fast-lean"
 TOLERANCE_PX = 0.05
@@ -58,30 +71,23 @@ class FlowPlan:
         return bool(self.methods) and all(name == STILL for name in self.methods)
 
 
-def plan_flow(
-    scene: Scene,
-    start_frame: int,
-    params: SampleParams,
-    spec: StreamSpec,
-    picture_height_px: int,
-    picture_width_px: int,
-) -> FlowPlan:
+def plan_flow(scene: Scene, frames: CleanFrames, params: SampleParams, spec: StreamSpec, picture: Window) -> FlowPlan:
     """Choose the flow method of each voxel of one drawn sample.
 
     Args:
-        scene: statistics of the usable picture; they cover at least what the sample shows, as far as analysed.
-        start_frame: first frame of the sequence.
+        scene: statistics of the usable rows; they cover at least what the sample shows, as far as analysed.
+        frames: the frames of the sequence.
         params, spec: the draw, and the spec that it was drawn for.
-        picture_height_px, picture_width_px: size of the usable picture before the resize.
+        picture: the usable part of the upright picture before the resize.
     """
     recipe = spec.recipe
-    tiles = _tiles(params, recipe, picture_height_px, picture_width_px)
+    tiles = _tiles(params, recipe, picture, frames.sides)
     positions = params.ends(recipe)
-    source = start_frame + recipe.frame_stride * params.source_index(int(positions[-1]))
+    source = frames.numbers[params.source_index(int(positions[-1]))]
     ends = source[positions[recipe.lead_voxels :]].tolist()
     methods = tuple(_method(scene, earlier, later, tiles, params.scale) for earlier, later in pairwise(ends))
     values = scene.values(int(source[0]), int(source[-1]))
-    kind, figures = _kind(methods), _figures(values, tiles)
+    kind, figures = _kind(methods), "; ".join(filter(None, (_figures(values, tiles), frames.reason)))
     if spec.flow_method != AUTO:
         return FlowPlan((), f"{kind}; flow {spec.flow_method} as asked; {figures}")
     return FlowPlan(methods, f"{kind}; flow {_counted(methods)}; {figures}")
@@ -104,14 +110,20 @@ def _method(scene: Scene, earlier: int, later: int, tiles: npt.NDArray[np.bool_]
     return AUTO if np.median(pace) < SLOW_PX else MOVING
 
 
-def _tiles(params: SampleParams, recipe: Recipe, height_px: int, width_px: int) -> npt.NDArray[np.bool_]:
-    """Return [16] bool, which tiles of the picture the crop touches."""
-    rows = _touched(params.crop_top_px, recipe.crop_height_px, height_px * params.scale)
-    columns = _touched(params.crop_left_px, recipe.crop_width_px, width_px * params.scale)
+def _tiles(params: SampleParams, recipe: Recipe, picture: Window, sides: Sides) -> npt.NDArray[np.bool_]:
+    """Return [16] bool, which tiles of the analysed picture, bars and all, the crop touches."""
+    height = picture.height_px + sides.top + sides.bottom
+    width = picture.width_px + sides.left + sides.right
+    top, left = (
+        start + before * params.scale
+        for start, before in ((params.crop_top_px, sides.top), (params.crop_left_px, sides.left))
+    )
+    rows = _touched(top, recipe.crop_height_px, height * params.scale)
+    columns = _touched(left, recipe.crop_width_px, width * params.scale)
     return (rows[:, None] & columns).ravel()
 
 
-def _touched(start_px: int, extent_px: int, side_px: float) -> npt.NDArray[np.bool_]:
+def _touched(start_px: float, extent_px: int, side_px: float) -> npt.NDArray[np.bool_]:
     first = min(TILES - 1, math.floor(start_px * TILES / side_px))
     end = max(first + 1, math.ceil((start_px + extent_px) * TILES / side_px))
     numbers = np.arange(TILES)

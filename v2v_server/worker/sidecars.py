@@ -63,11 +63,13 @@ def errors_of_sidecar(video: str, array: str, sidecars: Mapping[str, Traversable
     """
     try:
         yield
-    except V2VError:
+    except (V2VError, MemoryError):
         raise
     except Exception as error:
         for ending in sidecar_endings((array,)):
             if sidecars.get(ending) is not None:
                 reason = f"{type(error).__name__}: {error}"[:_LONGEST_REASON]
-                raise SidecarError(video, ending, reason) from error
+                # A read error is this host's; any other repeats wherever the sidecar is read.
+                here = isinstance(error, OSError) and not isinstance(error, FileNotFoundError)
+                raise SidecarError(video, ending, reason, here) from error
         raise

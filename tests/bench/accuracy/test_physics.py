@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
-import types
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +10,11 @@ import numpy as np
 import pytest
 
 from bench.accuracy import physics
-from bench.accuracy.sensor import Recording, read_recording
 from tests.clips import panned_luma, write_clip
 from tests.oracles.analytic_scenes import PIXELS, START_SHARE, analytic_scenes, moved_photograph
 from tests.oracles.dense import bin_events, dense_events
 from tests.server.simulation import oracle
 from v2v_protocol.errors import UsageError
-from v2v_server.simulation import simulate
-
-SHARED = Path(__file__).parents[4] / "shared" / "data"
 
 
 def test_a_ramp_fires_at_known_times() -> None:
@@ -135,54 +129,6 @@ def test_bars_can_be_missed() -> None:
     film = {"measure": "film", "every": 1, "threshold": 0.1}
     assert len(physics.missed([film | {"differing_bins_ppm": 61.0}])) == 1
     assert physics.missed([film | {"differing_bins_ppm": 60.0}, monotone | {"voxel_error": 0.0}]) == []
-
-
-def made_recording(threshold: float = 0.15) -> Recording:
-    """A camera whose events are exactly those of V2V at that threshold."""
-    frames = panned_luma(3, 60, 80)
-    frames = np.minimum(frames, 240)
-    voxels = simulate(frames, threshold_pos=threshold, gamma=1.0, bins=2, dtype="int16").voxels[0]
-    listed = []
-    for step, row, column in zip(*np.nonzero(voxels), strict=True):
-        count = int(voxels[step, row, column])
-        listed += [(step + 0.5, column, row, count > 0)] * abs(count)
-    return Recording(frames, np.arange(3.0), np.array(listed, [("t", "f8"), ("x", "i8"), ("y", "i8"), ("on", "?")]))
-
-
-def test_a_recording_that_is_a_simulation_is_recognised() -> None:
-    recording = made_recording()
-    found = next(r for r in physics.recorded(recording) if r["gamma"] == 1.0 and r["part"] == "whole picture")
-    assert found["threshold"] == pytest.approx(0.15, rel=0.1)
-    assert found["correlation_signed"] > 0.97
-    assert abs(found["correlation_mirrored"]) < 0.5
-    for key in ("rising_share", "active_share"):
-        assert found[f"{key}_v2v"] == pytest.approx(found[f"{key}_real"], abs=0.03)
-    rising, falling = recording.counts(0.0, 1.0)
-    assert rising.sum() + falling.sum() == np.count_nonzero(recording.events["t"] < 1)
-
-
-def test_recordings_that_cannot_be_read_are_refused(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setitem(sys.modules, "faery", None)
-    with pytest.raises(UsageError, match="needs faery"):
-        read_recording(tmp_path / "a.aedat4")
-    fake = types.ModuleType("faery")
-    fake.aedat = types.SimpleNamespace(Decoder=lambda path: [])  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "faery", fake)
-    with pytest.raises(UsageError, match="no such file"):
-        read_recording(tmp_path / "a.aedat4")
-    (tmp_path / "a.aedat4").touch()
-    with pytest.raises(UsageError, match="0 frames and 0 packets"):
-        read_recording(tmp_path / "a.aedat4")
-
-
-@pytest.mark.skipif(not SHARED.exists(), reason=f"no recording in {SHARED}")
-def test_a_real_recording_is_read() -> None:
-    pytest.importorskip("faery")
-    recording = read_recording(SHARED / "events" / "davis346_aestream.aedat4")
-    assert recording.frames.shape == (3, 260, 346)
-    assert len(recording.events) == 117_667
-    np.testing.assert_allclose(recording.seconds, [0.0, 0.04, 0.08], atol=1e-4)
-    assert recording.events["t"].max() < 0.2
 
 
 def test_a_film_that_is_too_short_or_small_is_refused(tmp_path: Path) -> None:

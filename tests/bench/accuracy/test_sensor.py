@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
 from bench.accuracy import sensor
-from bench.accuracy.sensor import Recording
+from bench.accuracy.sensor import Recording, read_recording
 from tests.server.simulation.test_pixel import moving_frames
+from v2v_protocol.errors import UsageError
 from v2v_server.simulation import simulate
+
+SHARED = Path(__file__).parents[4] / "shared" / "data"
 
 
 @pytest.fixture(scope="module")
@@ -45,3 +53,27 @@ def test_there_is_a_record_for_each_setting(recording: Recording, monkeypatch: p
     monkeypatch.setattr(sensor, "EFFECTS", {"none": {}})
     records = sensor.records_of(recording)
     assert [record["measure"] for record in records] == ["log offset"] * 4 + ["effect"]
+
+
+def test_recordings_that_cannot_be_read_are_refused(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setitem(sys.modules, "faery", None)
+    with pytest.raises(UsageError, match="needs faery"):
+        read_recording(tmp_path / "a.aedat4")
+    fake = types.ModuleType("faery")
+    fake.aedat = types.SimpleNamespace(Decoder=lambda path: [])  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "faery", fake)
+    with pytest.raises(UsageError, match="no such file"):
+        read_recording(tmp_path / "a.aedat4")
+    (tmp_path / "a.aedat4").touch()
+    with pytest.raises(UsageError, match="0 frames and 0 packets"):
+        read_recording(tmp_path / "a.aedat4")
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason=f"no recording in {SHARED}")
+def test_a_real_recording_is_read() -> None:
+    pytest.importorskip("faery")
+    recording = read_recording(SHARED / "events" / "davis346_aestream.aedat4")
+    assert recording.frames.shape == (3, 260, 346)
+    assert len(recording.events) == 117_667
+    np.testing.assert_allclose(recording.seconds, [0.0, 0.04, 0.08], atol=1e-4)
+    assert recording.events["t"].max() < 0.2

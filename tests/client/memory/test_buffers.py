@@ -141,7 +141,6 @@ def test_a_batch_leaves_its_arena_if_a_worker_may_still_write():
             arena.put(row, sample(row))  # as a worker does
         memory.fill(row, None if row in (1, 3) else sample(row), slot_is_free=row != 2)
     assert memory.has_slots
-    assert memory.in_place == 2
     left = memory._left
     whole = memory.finish()
     left.put(2, sample(99))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -16,8 +17,9 @@ from v2v_client.session.connection import Connection
 from v2v_client.session.conversation import Conversation
 from v2v_client.session.liveness import ListeningClock, Patience
 from v2v_client.session.states import TRANSITIONS, Event, State
+from v2v_protocol.arena import Slot
 from v2v_protocol.errors import NoWorkers, ServerLost, UsageError
-from v2v_protocol.messages import Denied, ErrorCode, Goodbye, Hello, Message, Ping, Pong, Want, Welcome
+from v2v_protocol.messages import Denied, ErrorCode, Goodbye, Hello, Message, Ping, Pong, SampleHeader, Want, Welcome
 from v2v_protocol.sample import Provenance, SampleId, SampleParams
 from v2v_protocol.wire import Frames, decode, encode, encode_sample
 
@@ -109,6 +111,22 @@ def test_a_forgotten_session_reopens_once_and_repeats_all_requests() -> None:
     assert [type(message) for message in said(talk)] == [Hello]
     talk.handle_message(WELCOME, [], 1.0)
     assert said(talk) == [Want(0, (0, 1))]
+
+
+@pytest.mark.parametrize("is_second", [False, True])
+def test_a_sample_that_the_server_has_dropped_is_requested_again_in_a_message(is_second: bool) -> None:
+    talk = begun()
+    talk.want([2], {2: Slot("arena", 5)})
+    message = decode(sample(2)[0])
+    assert isinstance(message, SampleHeader)
+    if is_second:
+        assert talk.handle_message(message, sample(2)[1:], 1.0) is not None
+    said(talk)
+    assert talk.handle_message(replace(message, slot=5, arena="1:2:1:" + "0" * 32), [], 1.0) is None
+    assert said(talk) == ([] if is_second else [Want(0, (2,))])
+    arrival = talk.handle_message(message, sample(2)[1:], 1.0)
+    assert arrival is not None
+    assert arrival.slot_is_free
 
 
 # --- silence ----------------------------------------------------------------------------------------------------------

@@ -36,6 +36,7 @@ class Interleaving(RuleBasedStateMachine):
     for has been answered exactly once, and nothing that was said to nobody is left."""
 
     spec: Mapping[str, int] = {}
+    share_bytes = 0
     consumers = st.sampled_from((b"c", b"d"))
     names = st.sampled_from((b"w1", b"w2", b"w3", b"w4"))
 
@@ -51,7 +52,7 @@ class Interleaving(RuleBasedStateMachine):
             remote: workers whose processes cannot be ended.
             lethal: videos that end the worker that begins one, and how it ends; a hung one stays silent.
         """
-        self.at = peers()
+        self.at = peers(share_bytes=self.share_bytes)
         self.at.remote = remote
         self.lethal = lethal
         self.stuck: set[bytes] = set()

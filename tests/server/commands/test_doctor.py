@@ -201,8 +201,9 @@ def test_defects_of_pictures_are_said_with_what_can_be_done(tmp_path: Path, caps
     status, said = told(capsys, *flags)
     assert status == 0
     assert "looked at 5 of 5 videos, at most 8 s and 400 frames of each: 10 sequences\n" in said
-    assert "2 of 10 sequences (20%) have bars at the sides of the picture (boxed.mp4: bars: top 14 px" in said
-    assert "--rows 0.1:0.8 leaves them out; crop bars at the left and right once" in said
+    assert "2 of 10 sequences (20%) have bars at the sides of the picture (boxed.mp4: 100% of the frames have" in said
+    assert "bars: top 14 px, bottom 28 px, left 10 px)" in said
+    assert "bars make no events: v2v-serve --scene auto leaves them out of the picture" in said
     assert "2 of 10 sequences (20%) have duplicated frames (twos.mp4: " in said
     assert "every picture twice" in said
     assert "have hard cuts or jumps (" in said
@@ -212,7 +213,7 @@ def test_defects_of_pictures_are_said_with_what_can_be_done(tmp_path: Path, caps
     assert "have black stretches (black.mp4" in said
     assert "no problems found" not in said
     status, said = told(capsys, *flags, "--rows", "0.1:0.8")
-    assert "have bars at the sides of the picture (boxed.mp4: bars: left 10 px" in said
+    assert "have bars at the sides of the picture (boxed.mp4: 100% of the frames have bars: left 10 px" in said
 
 
 @pytest.mark.slow

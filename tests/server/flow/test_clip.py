@@ -23,7 +23,7 @@ from v2v_protocol.sample import SampleParams
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.flow.methods import STILL, Estimator, guarded
 from v2v_server.simulation.draw import draw, resized_size
-from v2v_server.simulation.view import apply_view, source_window, without_margin
+from v2v_server.simulation.view import Window, apply_view, source_window, without_margin
 
 HEIGHT, WIDTH = 110, 150
 
@@ -46,7 +46,7 @@ def video(frames: int = 9) -> np.ndarray:
 
 
 def window_of(frames: np.ndarray, params: SampleParams, recipe: Recipe, margin: int | None) -> np.ndarray:
-    top, left, height, width = source_window(params, recipe, 0, *frames.shape[1:], margin)
+    top, left, height, width = source_window(params, recipe, Window(0, 0, *frames.shape[1:]), margin)
     return frames[:, top : top + height, left : left + width]
 
 
@@ -107,8 +107,8 @@ def test_the_view_is_the_same_whichever_window_was_decoded(
         assert left + width <= WIDTH
         return picture[:, first : first + height, left : left + width]
 
-    alone = apply_view(decoded(source_window(params, recipe, top, HEIGHT, WIDTH)), params, recipe)
-    window = decoded(source_window(params, recipe, top, HEIGHT, WIDTH, margin))
+    alone = apply_view(decoded(source_window(params, recipe, Window(top, 0, HEIGHT, WIDTH))), params, recipe)
+    window = decoded(source_window(params, recipe, Window(top, 0, HEIGHT, WIDTH), margin))
     np.testing.assert_array_equal(apply_view(without_margin(window, params, recipe, margin), params, recipe), alone)
 
 

@@ -15,10 +15,10 @@ from tests.server.simulation.generic_processor import printed_on_a_generic_proce
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import MOST_SUBSTEPS
-from v2v_server.motion import MARGIN_PX, levels_between, levels_of, substeps
+from v2v_server.motion import MARGIN_PX, cells_of, levels_between, levels_of, motions, substeps
 from v2v_server.motion.matching import UNITS_PER_PX
 from v2v_server.simulation.draw import draw
-from v2v_server.simulation.view import apply_view, source_window, without_margin
+from v2v_server.simulation.view import Window, apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import FINE_STEPS, Levels
 
 HERTZ, THRESHOLD = 30.0, 0.2
@@ -26,7 +26,7 @@ RECIPE = Recipe(voxels_per_clip=1, bins=3, crop_height_px=40, crop_width_px=48, 
 
 
 def sub_steps(frames: np.ndarray, substep_px: float = 1.0) -> Levels | None:
-    return levels_between(frames, (0, 0, *frames.shape[1:]), np.arange(len(frames)), substep_px)
+    return levels_between(frames, (0, 0, *frames.shape[1:]), np.arange(len(frames)), substep_px, motions(frames))
 
 
 def compared(name: str, px: float, side: int, bin_seconds: float, count: int = 5) -> tuple[Errors, Errors]:
@@ -48,7 +48,8 @@ def compared(name: str, px: float, side: int, bin_seconds: float, count: int = 5
 def test_levels_lie_between_the_frames_of_steps_that_move() -> None:
     moving = rendered_scene("gravel", 64, 64, 3.5 * HERTZ).frames(HERTZ, 3)
     clip = np.stack([moving[0], moving[0], moving[1], moving[2]])
-    levels = levels_between(clip, (8, 4, 40, 48), np.array([0, 1, 2, 2, 3]), 1.0)
+    vectors = motions(clip)[:, :, 2:12, 1:13]
+    levels = levels_between(clip, (8, 4, 40, 48), np.array([0, 1, 2, 2, 3]), 1.0, vectors)
     assert levels is not None
     assert levels.at.step.tolist() == [1, 1, 1, 3, 3, 3]
     np.testing.assert_allclose(levels.at.share, [0.25, 0.5, 0.75] * 2)
@@ -110,12 +111,15 @@ def test_a_wider_window_changes_nothing() -> None:
 
 
 def _window(video: np.ndarray, params: SampleParams, margin: int | None) -> np.ndarray:
-    top, left, height, width = source_window(params, RECIPE, 0, *video.shape[1:], margin)
+    top, left, height, width = source_window(params, RECIPE, Window(0, 0, *video.shape[1:]), margin)
     return np.ascontiguousarray(video[:, top : top + height, left : left + width])
 
 
 def _levels(video: np.ndarray, params: SampleParams) -> Levels:
-    levels = levels_of(_window(video, params, MARGIN_PX), params, RECIPE, np.arange(4), 1.0)
+    top, left, rows, columns = cells_of(params, RECIPE, Window(0, 0, *video.shape[1:]))
+    vectors = motions(video)[:, :, top : top + rows, left : left + columns]
+    window = _window(video, params, MARGIN_PX)
+    levels = levels_of(window, params, RECIPE, np.arange(4), 1.0, vectors, Window(0, 0, *video.shape[1:]))
     assert levels is not None
     return levels
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from v2v_server.motion.matching import UNITS_PER_PX, pyramid
+from v2v_server.motion.matching import UNITS_PER_PX, padded
 from v2v_server.motion.warping import between
 
 Reals = npt.NDArray[np.float64]
@@ -46,7 +46,7 @@ def made(first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8], vector: tu
     vectors = np.empty((2, -(-height // 4), -(-width // 4)), np.int16)
     vectors[0], vectors[1] = vector
     out = np.empty((count, height, width), np.uint16)
-    between(pyramid(first)[0], pyramid(second)[0], vectors, 0, 0, out)
+    between(padded(np.ascontiguousarray(first)), padded(np.ascontiguousarray(second)), vectors, 0, 0, 0, out)
     return out / PARTS
 
 

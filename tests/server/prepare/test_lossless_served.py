@@ -170,7 +170,7 @@ def test_another_video_under_the_name_is_refused(pair: tuple[Path, Path], tmp_pa
 
 @pytest.mark.slow
 @pytest.mark.skipif(not FRAMES, reason=f"no MANIFEST.tsv beside {FOLDER}; set V2V_TEST_VIDEOS")
-@pytest.mark.parametrize("size", ["dense", "fast"])
+@pytest.mark.parametrize("size", ["dense", "fast", "raw"])
 def test_samples_of_real_footage(size: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every shared clip, under both of the paper's recipes."""
     monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path))

@@ -14,9 +14,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.pieces import pieces
 from tests.server.named_corpus import SMALL, SMALL_SPEC, video
 from v2v_protocol.recipe import MOST_STEPS_PER_GRID, Recipe, preset
 from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.scenes.pieces import encoded_pieces
+from v2v_server.corpus.scenes.scene import Flag
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.schedule import sequences
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
@@ -106,6 +109,12 @@ def test_lookup_by_rank_equals_the_list(lengths: list[int], most: int, voxels: i
         assert start + recipe.frames_needed <= entry.frames
 
 
+def _divided(ends: list[int]) -> bytes:
+    """Return pieces of which every other one is black, from the first on; without ends, a video that fades."""
+    parts = pieces(*((end, 0 if at % 2 else Flag.BLACK) for at, end in enumerate(ends) if end))
+    return encoded_pieces(parts if ends else pieces((9, Flag.FADE)), max(ends, default=9))
+
+
 @given(st.lists(_runs, max_size=8), st.integers(1, 6), _blocks)
 def test_lookup_by_rank_equals_the_list_between_shot_boundaries(
     stretches: list[list[tuple[int, int]]], most: int, block: int
@@ -115,7 +124,7 @@ def test_lookup_by_rank_equals_the_list_between_shot_boundaries(
     for number, each in enumerate(stretches):
         ends = list(itertools.accumulate(itertools.chain.from_iterable(each)))
         runs = tuple(zip(ends[::2], ends[1::2], strict=True))
-        entry = dataclasses.replace(video(f"v{number}", max(ends, default=9)), runs=runs)
+        entry = dataclasses.replace(video(f"v{number}", max(ends, default=9)), pieces=_divided(ends))
         starts = [
             start
             for first, end in runs
@@ -143,7 +152,8 @@ def test_grids_of_a_duration_have_as_many_frames_as_the_rate_of_their_video_says
     for number, (each, rate) in enumerate(stretches):
         ends = list(itertools.accumulate(itertools.chain.from_iterable(each)))
         runs = tuple(zip(ends[::2], ends[1::2], strict=True))
-        entry = dataclasses.replace(video(f"v{number}", max(ends, default=9), rate=rate), runs=runs)
+        divided = _divided(ends)
+        entry = dataclasses.replace(video(f"v{number}", max(ends, default=9), rate=rate), pieces=divided)
         videos.append(entry)
         if math.isnan(rate) or (steps := max(1, math.floor(seconds * rate / stride + 0.5))) > MOST_STEPS_PER_GRID:
             continue

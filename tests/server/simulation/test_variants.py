@@ -12,10 +12,12 @@ import pytest
 from v2v_protocol.recipe import Recipe, preset
 from v2v_server.simulation.clip import _log_ends, _most_events
 from v2v_server.simulation.draw import draw
+from v2v_server.simulation.intensity import Intensity
 from v2v_server.simulation.kernels import KernelInput
 from v2v_server.simulation.precision import AUTO, choose
 from v2v_server.simulation.variants import USUAL, Variant, variants
 from v2v_server.simulation.voxel import bin_edges
+from v2v_server.video.luma import MOST_BITS, SDR, Signal
 
 LOAD_AND_COUNT = """
 import json
@@ -53,6 +55,7 @@ def test_effects_and_dtypes() -> None:
     assert variants(Recipe(), "float32") == {Variant("float32", False, "float32")}
     assert variants(preset("davis346"), "int16", 0.1) == {Variant("int16", True, "float32")}
     assert variants(Recipe(), "int8", levels_per_step=15) == {Variant("int8", True, "float32", True)}
+    assert {each.bits for each in variants(Recipe(light="declared"), "int8", levels_per_step=15)} == {8}
 
 
 @pytest.mark.parametrize("step_seconds", [1 / 240, 1.0, 60.0])
@@ -61,6 +64,7 @@ def test_effects_and_dtypes() -> None:
     [
         Recipe(threshold=(1e-3, 2e-2)),
         Recipe(threshold=(1e-3, 2e-2), grids_per_frame=3),
+        Recipe(threshold=(1e-3, 2e-2), light="declared"),
         Recipe(threshold=(1e-3, 2e-2), threshold_source="video", threshold_mismatch_sigma=(0.0, 0.1)),
         Recipe(threshold=(1e-3, 2e-2), threshold_source="video", noise_scales_with_threshold=True),
         preset("davis346"),
@@ -78,14 +82,17 @@ def test_every_draw_finds_its_kernel(recipe: Recipe, step_seconds: float) -> Non
                 recipe, seed=1, epoch=0, index=index, picture_height_px=128, picture_width_px=128, video_id="a.mp4",
                 video_thresholds=stated,
             )  # fmt: skip
-            intensity = recipe.gamma, params.log_eps or recipe.log_eps[0]
+            signal = SDR if recipe.light == "sdr" else Signal(10, "pq")
+            intensity = Intensity(recipe.gamma, params.log_eps or recipe.log_eps[0], signal)
             edges = bin_edges(recipe.steps, recipe.frames_per_bin, recipe.grids_per_frame * recipe.bins or 1)
             given = KernelInput(
                 np.empty((1, 1, 1), np.uint8), intensity, np.zeros(recipe.steps + 1, np.int64), params, units, seconds,
                 recipe.bins, edges, "int8",
             )  # fmt: skip
-            real = choose(AUTO, _most_events(given, _log_ends(*intensity)))
-            assert Variant("int8", given.needs_general, real.__name__) in known
+            real = choose(AUTO, _most_events(given, _log_ends(intensity)))
+            kernel = Variant("int8", given.needs_general, real.__name__)
+            assert kernel in known
+            assert (signal == SDR) == (kernel._replace(bits=MOST_BITS) not in known)
 
 
 @pytest.mark.slow

@@ -24,19 +24,19 @@ def params(scale: float = 1.0, top: int = 0, left: int = 0, flip: bool = False, 
 
 
 def seen(view: SampleParams, picture_top_px: int = 0) -> np.ndarray:
-    window = source_window(view, RECIPE, picture_top_px, 60 - picture_top_px, 80)
+    window = source_window(view, RECIPE, Window(picture_top_px, 0, 60 - picture_top_px, 80))
     bottom, right = window.top_px + window.height_px, window.left_px + window.width_px
     return apply_view(PICTURE[:, window.top_px : bottom, window.left_px : right], view, RECIPE)
 
 
 def test_scale_one_decodes_the_crop_alone() -> None:
     view = params(top=5, left=7)
-    assert source_window(view, RECIPE, 10, 50, 80) == Window(15, 7, 24, 32)
+    assert source_window(view, RECIPE, Window(10, 0, 50, 80)) == Window(15, 7, 24, 32)
     np.testing.assert_array_equal(seen(view, 10), PICTURE[:, 15:39, 7:39])
 
 
 def test_other_scales_decode_the_whole_usable_picture() -> None:
-    assert source_window(params(scale=1.5), RECIPE, 10, 50, 80) == Window(10, 0, 50, 80)
+    assert source_window(params(scale=1.5), RECIPE, Window(10, 0, 50, 80)) == Window(10, 0, 50, 80)
 
 
 @pytest.mark.parametrize(("scale", "method"), [(0.5, cv2.INTER_AREA), (1.3, cv2.INTER_LINEAR)])
@@ -80,7 +80,7 @@ def test_every_drawn_view_fits_its_own_window() -> None:
         view = draw(
             recipe, seed=0, epoch=0, index=index, picture_height_px=45, picture_width_px=80, video_id="v"
         )  # fmt: skip
-        window = source_window(view, recipe, 10, 45, 80)
+        window = source_window(view, recipe, Window(10, 0, 45, 80))
         bottom, right = window.top_px + window.height_px, window.left_px + window.width_px
         assert apply_view(PICTURE[:, window.top_px : bottom, window.left_px : right], view, recipe).shape == (3, 24, 32)
 

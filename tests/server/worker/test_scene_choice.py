@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from v2v_protocol.errors import UsageError
+from tests.pieces import shots
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.scenes.scene import CHANGE, COLUMNS, CONTRAST, DARK, MOTION, NOISE, TILES, Scene
-from v2v_server.corpus.videos import VideoEntry
-from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.video.rows import Rows
-from v2v_server.worker.scene_choice import MOVING, plan_flow
+from v2v_server.simulation.view import Window
+from v2v_server.worker.cleaning import CleanFrames
+from v2v_server.worker.scene_choice import MOVING, FlowPlan, plan_flow
 
 RECIPE = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=32)
 AUTO = StreamSpec(recipe=RECIPE, scene="auto")
@@ -30,7 +26,7 @@ SIZE_PX = 128
 def scene(motion_px: float, change: float, *, dark: float = 0.0, segments: int = 4) -> Scene:
     values = np.zeros((segments, COLUMNS))
     values[:, MOTION], values[:, CHANGE], values[:, CONTRAST], values[:, DARK] = motion_px, change, 20.0, dark
-    return Scene.of(16 * segments, (), values)
+    return Scene.of(shots(16 * segments), values)
 
 
 def params(**changes: Any) -> SampleParams:
@@ -43,7 +39,14 @@ def params(**changes: Any) -> SampleParams:
 
 
 def methods(what: Scene, start: int = 0, spec: StreamSpec = AUTO, **changes: Any) -> tuple[str, ...]:
-    return plan_flow(what, start, params(**changes), spec, SIZE_PX, SIZE_PX).methods
+    return plan(what, spec, start, **changes).methods
+
+
+def plan(what: Scene, spec: StreamSpec = AUTO, start: int = 0, **changes: Any) -> FlowPlan:
+    picture = Window(0, 0, SIZE_PX, SIZE_PX)
+    return plan_flow(
+        what, CleanFrames.of(what, start, spec, spec.recipe.frames_needed), params(**changes), spec, picture
+    )
 
 
 def test_still_slow_moving_and_dark_clips_are_decided_apart() -> None:
@@ -76,7 +79,7 @@ def test_a_pause_takes_its_part_of_the_motion_away() -> None:
 def test_only_the_segments_between_the_frames_count() -> None:
     values = scene(0.0, 0.0).segments.copy()
     values[1, MOTION], values[1, CHANGE] = 640, 640  # frames 16 .. 31
-    what = Scene(0, 64, (), values)
+    what = Scene(0, 64, shots(64), values)
     # Frames 0 5 10 15 20: the last voxel reaches into the segment that moves, half of what it touches.
     assert methods(what) == ("zero", "zero", "zero", MOVING)
     assert methods(what, start=32) == ("zero",) * 4
@@ -87,7 +90,7 @@ def test_only_the_segments_between_the_frames_count() -> None:
 def test_only_the_tiles_that_the_crop_touches_count(tile: int) -> None:
     still = scene(0.0, 0.0).segments.copy()
     still[:, tile], still[:, TILES**2 + tile] = 640, 640
-    what = Scene(0, 64, (), still)
+    what = Scene(0, 64, shots(64), still)
     for other in range(TILES**2):
         row, column = divmod(other, TILES)
         found = methods(what, crop_top_px=32 * row, crop_left_px=32 * column)
@@ -99,7 +102,7 @@ def test_only_the_tiles_that_the_crop_touches_count(tile: int) -> None:
 def test_a_clip_that_moves_in_parts_is_left_to_the_look_at_each_pair() -> None:
     values = scene(0.01, 3.0).segments.copy()
     values[:, 0] = 640
-    assert methods(Scene(0, 64, (), values), crop_top_px=16, crop_left_px=16) == ("auto",) * 4
+    assert methods(Scene(0, 64, shots(64), values), crop_top_px=16, crop_left_px=16) == ("auto",) * 4
 
 
 def test_what_was_not_looked_at_is_left_to_the_look_at_each_pair() -> None:
@@ -108,115 +111,30 @@ def test_what_was_not_looked_at_is_left_to_the_look_at_each_pair() -> None:
     assert methods(scene(0.0, 0.0, segments=1)) == ("zero", "zero", "zero", "auto")
     unknown = scene(0.0, 3.0).segments.copy()
     unknown[:, MOTION] = 65535
-    assert methods(Scene(0, 64, (), unknown)) == (MOVING,) * 4
+    assert methods(Scene(0, 64, shots(64), unknown)) == (MOVING,) * 4
 
 
 def test_lead_voxels_have_no_flow() -> None:
     lead = StreamSpec(recipe=RECIPE.replace(lead_voxels=1), scene="auto")
     values = scene(0.0, 0.0).segments.copy()
     values[0, MOTION], values[0, CHANGE] = 640, 640
-    assert methods(Scene(0, 64, (), values), spec=lead, start=11) == ("zero",) * 4
+    assert methods(Scene(0, 64, shots(64), values), spec=lead, start=11) == ("zero",) * 4
 
 
 def test_reasons_state_the_figures() -> None:
     values = np.zeros((4, COLUMNS))
     values[:, MOTION], values[:, CHANGE], values[:, DARK], values[:, NOISE] = 2.0, 40.0, 0.95, 1.5
-    plan = plan_flow(Scene.of(64, (), values), 0, params(pauses=((1, 5),)), AUTO, SIZE_PX, SIZE_PX)
-    assert plan.reason == (
+    made = plan(Scene.of(shots(64), values), pauses=((1, 5),))
+    assert made.reason == (
         f"moving; flow none 1, {MOVING} 3; motion 2.00 px a frame, at most 2.00; change 40.00, flicker 0.00, noise "
         "1.50 grey levels; dark 95.0% (a dark scene), clipped 0.0%"
     )
-    assert "not looked at" in plan_flow(Scene.unknown(), 0, params(), AUTO, SIZE_PX, SIZE_PX).reason
+    assert "not looked at" in plan(Scene.unknown()).reason
 
 
 def test_a_method_that_was_asked_for_is_obeyed() -> None:
     asked = StreamSpec(recipe=RECIPE, scene="auto", flow_method="dis-fast-1")
-    plan = plan_flow(scene(0.0, 0.0), 0, params(), asked, SIZE_PX, SIZE_PX)
-    assert plan.methods == ()
-    assert not plan.still
-    assert plan.reason.startswith("still; flow dis-fast-1 as asked; ")
-
-
-# --- sequences --------------------------------------------------------------------------------------------------------
-
-
-def video(name: str, frames: int, *runs: tuple[int, int]) -> VideoEntry:
-    return VideoEntry(name, "f", frames, 64, 64, 25.0, "h264", runs=runs or ((0, frames),))
-
-
-def starts(table: SequenceTable) -> list[tuple[str, int]]:
-    return [(table[rank].video.id, table[rank].start_frame) for rank in range(table.count)]
-
-
-def test_sequences_are_moved_past_cuts_or_left_out() -> None:
-    # 21 frames a sequence, 20 apart.
-    videos = (
-        video("a", 61), video("b", 61, (0, 30), (30, 61)), video("c", 61, (0, 20), (20, 40), (40, 60)),
-        video("d", 61, (45, 61)), video("e", 100, (10, 52), (60, 100)),
-    )  # fmt: skip
-    table = SequenceTable(videos, Rows(), AUTO)
-    assert starts(table) == [("a", 0), ("a", 20), ("a", 40), ("b", 0), ("b", 30), ("e", 10), ("e", 30), ("e", 60)]
-    assert [item.video for item in table.refusals] == ["c", "d"]
-    assert table.longest_clips == (3, 3)
-    assert table.refusals[0].remedy == "voxels_per_clip at most 3, or scene off"
-    # Of b two are not where they were, of c and d three each, of e (0, 20, 40, 60) three.
-    assert table.spoilt == 11
-    assert starts(SequenceTable(videos, Rows(), OFF))[3:6] == [("b", 0), ("b", 20), ("b", 40)]
-
-
-@given(st.integers(21, 300), st.integers(1, 12))
-def test_without_cuts_there_are_the_same_sequences(frames: int, most: int) -> None:
-    spec = StreamSpec(recipe=RECIPE, scene="auto", max_sequences_per_video=most)
-    plain = StreamSpec(recipe=RECIPE, max_sequences_per_video=most)
-    videos = (video("a", frames), video("b", 40))
-    table = SequenceTable(videos, Rows(), spec)
-    assert starts(table) == starts(SequenceTable(videos, Rows(), plain))
-    assert table.spoilt == 0
-
-
-@given(st.lists(st.integers(1, 299), unique=True, max_size=12), st.integers(1, 12))
-def test_no_sequence_holds_a_cut(cuts: list[int], most: int) -> None:
-    bounds = [0, *sorted(cuts), 300]
-    runs = tuple(pairwise(bounds))
-    spec = StreamSpec(recipe=RECIPE, scene="auto", max_sequences_per_video=most)
-    table = SequenceTable((video("a", 300, *runs), video("z", 21)), Rows(), spec)
-    found = [start for name, start in starts(table) if name == "a"]
-    assert len(found) <= most
-    for start in found:
-        assert not any(start < cut < start + 21 for cut in cuts)
-    assert all(later - earlier >= 20 for earlier, later in pairwise(found))
-
-
-@st.composite
-def stretches(draw: st.DrawFn) -> tuple[tuple[int, int], ...]:
-    """Runs within 300 frames, some of them none at all, side by side or apart."""
-    bounds = sorted(draw(st.lists(st.integers(0, 300), unique=True, max_size=10)))
-    return tuple(run for run in pairwise(bounds) if draw(st.booleans()))
-
-
-@given(st.lists(stretches(), min_size=1, max_size=5), st.integers(1, 12))
-def test_sequences_are_those_that_each_run_gives_in_turn(
-    all_runs: list[tuple[tuple[int, int], ...]], most: int
-) -> None:
-    spec = StreamSpec(recipe=RECIPE, scene="auto", max_sequences_per_video=most)
-    videos = [VideoEntry(str(n), "f", 300, 64, 64, 25.0, "h264", runs=runs) for n, runs in enumerate(all_runs)]
-    whole = VideoEntry("whole", "f", 50, 64, 64, 25.0, "h264", runs=((0, 50),))
-    table = SequenceTable([*videos, whole], Rows(), spec)
-    places = set(range(0, 300 - 21 + 1, 20)[:most])
-    expected, spoilt = [], 0
-    for name, runs in enumerate(all_runs):
-        found = [start for first, end in runs for start in range(first, end - 21 + 1, 20)][:most]
-        expected += [(str(name), start) for start in found]
-        spoilt += len(places - set(found))
-    assert starts(table) == [*expected, *[("whole", 0), ("whole", 20)][:most]]
-    assert table.spoilt == spoilt
-    without = [runs for name, runs in enumerate(all_runs) if str(name) not in dict(expected)]
-    longest = [max((end - first for first, end in runs), default=0) for runs in without]
-    assert table.longest_clips == tuple(voxels for frames in longest if (voxels := max(0, frames - 1) // 5))
-
-
-def test_a_catalogue_without_statistics_says_what_to_do() -> None:
-    plain = VideoEntry("a", "f", 61, 64, 64, 25.0, "h264")
-    with pytest.raises(UsageError, match="--scene auto"):
-        SequenceTable((plain,), Rows(), AUTO)
-    assert SequenceTable((plain,), Rows(), OFF).count == 3
+    made = plan(scene(0.0, 0.0), asked)
+    assert made.methods == ()
+    assert not made.still
+    assert made.reason.startswith("still; flow dis-fast-1 as asked; ")

@@ -210,15 +210,14 @@ class Store:
         row = self._database.execute("SELECT size_bytes, mtime_ns, ctime_ns FROM video WHERE id = ?", (id,)).fetchone()
         return None if row is None else (row[0], row[1], row[2])
 
-    def make_figures(self) -> bool:
-        """Make the table of figures if it is missing; return whether there is also a table of an earlier release.
+    def make_figures(self) -> None:
+        """Make the table of figures if it is missing.
 
         Raises:
             sqlite3.Error: as for :meth:`put`.
         """
         self._database.execute(_FIGURES)
         self._database.execute(_SUMMARIES)
-        return _has_table(self._database, "scene")
 
     def all_figures(self, kind: FigureKind) -> Generator[tuple[str, bytes, bytes], None, None]:
         """Yield (id, summary, encoded figures) by id, of each video with figures for its present fingerprint.
@@ -251,16 +250,14 @@ class Store:
         rows = [(kind.name, kind.version, each.id, each.fingerprint, each.summary, each.data) for each in figures]
         self._change(_insert("figures", _FIGURE_COLUMNS), rows)
 
-    def earlier_scene(self, id: str, fingerprint: str, look: str) -> bytes | None:
-        """Return the encoded scene of a video in the table of releases before 0.2; None if there is none.
-
-        The table stays as it is for servers of these releases that share the file.
+    def has_other_versions(self, name: str, ending: str) -> bool:
+        """Return whether there are figures of this name whose version does not end like this.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
-        query = "SELECT data FROM scene WHERE id = ? AND fingerprint = ? AND look = ?"
-        return _blob(self._database.execute(query, (id, fingerprint, look)).fetchone())
+        query = "SELECT 1 FROM figures WHERE kind = ? AND substr(version, -length(?2)) <> ?2 LIMIT 1"
+        return self._database.execute(query, (name, ending)).fetchone() is not None
 
     def put(self, records: Iterable[IndexRow]) -> None:
         """Add or replace records, in one transaction.

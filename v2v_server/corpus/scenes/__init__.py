@@ -1,7 +1,11 @@
-"""What the videos of a corpus show: statistics that are measured once, by decoding the beginning of each.
+"""What the videos of a corpus show, and what is wrong with it: measured once, by decoding the beginning of each.
 
-scene     the statistics of one video
-analysis  measuring them
-runs      the frames between shot boundaries, of all videos
-collect   the statistics of all videos of a corpus
+scene       the statistics of one video, and its pieces
+analysis    measuring them in one pass
+steps       repeated frames and their pattern
+stretches   still, black and white stretches, fades, combing
+bars        bars at the sides of the picture
+findings    all of it, said for people
+pieces      the pieces of all videos
+collect     the statistics of all videos of a corpus
 """

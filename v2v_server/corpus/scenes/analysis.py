@@ -1,4 +1,4 @@
-"""Measure a :class:`v2v_server.corpus.scenes.scene.Scene`: every frame in blocks, every fourth one for motion.
+"""Measure a :class:`v2v_server.corpus.scenes.scene.Scene` in one pass: every frame in blocks, every fourth for motion.
 
 Shot boundaries. Let m_t be the means of the 8 x 8 blocks of frame t, less their own mean, so that flicker and exposure
 do not count, and d(s, t) = mean |m_s - m_t|. Frame t begins a shot if d(t-1, t) is
@@ -6,18 +6,24 @@ do not count, and d(s, t) = mean |m_s - m_t|. Frame t begins a shot if d(t-1, t)
 - at least 2 grey levels, and 0.35 of what two unrelated pictures of the same contrasts differ by, which is of the order
   of sqrt(var m_t-1 + var m_t): it is another picture;
 - at least 3 times the median over the five steps before and after: not the pace of this shot;
-- not above twice d(t-1, t+1): the next frame does not go back, as after a flash.
+- not above twice d(t-1, t+1): the next frame does not go back, as after a flash;
+- large beside most steps around it (``is_cut``): repeated frames make the median small.
 
-All of this is exact arithmetic, the same everywhere. Slow transitions (fades, dissolves) are no shot boundaries. Motion
-is that of dense inverse search on pictures of a quarter of the size, four frames apart, rounded to 1/64 px a frame.
+All of this is exact arithmetic, the same everywhere. Repeats are found in ``steps``, the other stretches in
+``stretches``; dissolves are not found. Motion is that of dense inverse search on pictures of a quarter of the size,
+four frames apart, rounded to 1/64 px a frame.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import islice
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from v2v_server.corpus.scenes.bars import bars_of
 from v2v_server.corpus.scenes.scene import (
     CHANGE,
     CLIPPED,
@@ -26,12 +32,16 @@ from v2v_server.corpus.scenes.scene import (
     DARK,
     FLICKER,
     LAG_FRAMES,
+    MOST_FRAMES,
     MOTION,
     NOISE,
     SEGMENT_FRAMES,
     TILES,
     Scene,
+    Sides,
 )
+from v2v_server.corpus.scenes.steps import change_of, duplicated, is_cut
+from v2v_server.corpus.scenes.stretches import is_flat, is_still, pieces_of
 from v2v_server.flow.methods import ULTRAFAST, Picture, dis, one_thread
 
 DARK_BELOW_LEVEL = 16
@@ -45,7 +55,17 @@ _LEAST_BOUNDARY_SHARE = 0.35
 _LEAST_BOUNDARY_RATIO = 3.0
 _NEIGHBOURS = 5
 _LARGEST_RETURN = 0.5
+_BARS_EVERY = 8
+"""Frames."""
+_COMB_LEVELS = 5
+"""Least difference of the neighbouring lines of a combed block, grey levels."""
+_COMB_CHANGE = 64
+"""Least change of its mean from one frame to the next, 1/64 grey level."""
+_COMB_BLOCKS = 1000
+"""One of that number of blocks, and two at least, are combed in a combed picture."""
 
+_EVEN_BYTES = np.uint64(0x00FF00FF00FF00FF)
+_EACH_WORD = np.uint64(0x0001000100010001)
 _Tiles = npt.NDArray[np.float64]
 """[16], row by row."""
 
@@ -61,6 +81,12 @@ class SceneAnalysis:
         self._reduced: tuple[int, Picture] | None = None  # the last frame with motion measured, and its number
         self._means: list[float] = []
         self._variances: list[float] = []
+        self._light: list[int] = []  # 1/64 grey level
+        self._step_changes: list[int] = []  # of `change_of`
+        self._still: list[bool] = []
+        self._flat: list[bool] = []
+        self._bars: list[tuple[int, Sides]] = []
+        self._combed: list[tuple[int, bool]] = []
         self._steps: list[float] = []  # d(t-1, t)
         self._returns: list[float] = []  # d(t-1, t+1)
         self._changes: list[_Tiles] = []  # of frame 1, 2 ...: largest change over four frames
@@ -77,8 +103,16 @@ class SceneAnalysis:
         number, self._frames = self._frames, self._frames + 1
         blocks = block_sums(picture)
         self._means.append(float(blocks.mean()) / 64)
-        self._variances.append(float(blocks.var()) / 64**2)
+        self._variances.append(_variance(blocks))
+        self._light.append(int(blocks.sum()) // blocks.size)
+        self._flat.append(is_flat(blocks))
+        self._still.append(is_still(self._blocks[0] if self._blocks else blocks, blocks))
+        if number % _BARS_EVERY == 0 and not self._flat[-1]:
+            self._bars.append((number, bars_of(picture)))
         if self._blocks:
+            self._step_changes.append(change_of(self._blocks[-1], blocks))
+            if number % LAG_FRAMES == 0:
+                self._combed.append((number, _is_combed(picture, np.abs(blocks - self._blocks[-1]))))
             self._steps.append(_difference(self._blocks[-1], blocks))
             self._changes.append(_largest(np.abs(blocks - self._blocks[0])) / 64)
         if len(self._blocks) > 1:
@@ -87,8 +121,8 @@ class SceneAnalysis:
         if number % SEGMENT_FRAMES == 1 and self._last is not None:
             self._noises.append((number, _noise(self._last, picture)))
         if number % LAG_FRAMES == 0:
-            levels = np.cumsum(np.bincount(picture.ravel(), minlength=256)) / picture.size
-            self._shares.append((number, levels[DARK_BELOW_LEVEL - 1], 1 - levels[CLIPPED_FROM_LEVEL - 1]))
+            dark, clipped = map(np.count_nonzero, (picture < DARK_BELOW_LEVEL, picture >= CLIPPED_FROM_LEVEL))
+            self._shares.append((number, dark / picture.size, clipped / picture.size))
             self._measure_motion(number, picture)
         self._last = picture
 
@@ -109,8 +143,14 @@ class SceneAnalysis:
             with one_thread():
                 self._measure_motion(self._frames - 1, self._last)
         boundaries = self._shot_boundaries()
+        repeats = duplicated(self._step_changes, self._blocks[-1].size, boundaries)
+        assert self._last is not None
+        pieces = pieces_of(
+            np.array(self._light), np.array(self._variances), np.array(self._still), np.array(self._flat), repeats,
+            boundaries, self._combed, self._bars, self._last.shape,
+        )  # fmt: skip
         values = np.full((-(-self._frames // SEGMENT_FRAMES), COLUMNS), np.nan)
-        deviations = np.sqrt(self._variances)
+        deviations = np.sqrt(self._variances) / 64
         means = np.array(self._means)
         ripples = np.abs(means[1:-1] - (means[:-2] + means[2:]) / 2)
         for number, row in enumerate(values):
@@ -128,12 +168,12 @@ class SceneAnalysis:
             rippled = ripples[max(0, low - 1) : high - 1]
             row[FLICKER] = rippled.mean() if len(rippled) else 0.0
             row[NOISE] = next((noise for frame, noise in self._noises if low <= frame < high), np.nan)
-        return Scene.of(self._frames, boundaries, values)
+        return Scene.of(pieces, values)
 
     def _shot_boundaries(self) -> tuple[int, ...]:
         boundaries = []
         for at, step in enumerate(self._steps):  # from frame ``at`` to ``at + 1``
-            contrast = self._variances[at] + self._variances[at + 1]
+            contrast = (self._variances[at] + self._variances[at + 1]) / 64**2
             if step < _LEAST_BOUNDARY_LEVELS or step**2 < _LEAST_BOUNDARY_SHARE**2 * contrast:
                 continue
             around = self._steps[max(0, at - _NEIGHBOURS) : at] + self._steps[at + 1 : at + 1 + _NEIGHBOURS]
@@ -143,22 +183,56 @@ class SceneAnalysis:
                 continue  # a flash begins
             if at and self._returns[at - 1] < _LARGEST_RETURN * step:
                 continue  # it ends
+            if not is_cut(self._step_changes, at):
+                continue
             boundaries.append(at + 1)
         return tuple(boundaries)
+
+
+def analyse(pictures: Iterable[Picture]) -> Scene:
+    """Analyse the frames of a video; the first 4096 of them, which are read one by one."""
+    analysis = SceneAnalysis()
+    for picture in islice(pictures, MOST_FRAMES):
+        analysis.add(picture)
+    return analysis.scene()
 
 
 def block_sums(picture: Picture) -> npt.NDArray[np.int64]:
     """Return the means of the 8 x 8 blocks of a picture in 1/64 grey level, without partial blocks."""
     height, width = picture.shape
-    rows, columns = max(1, height // _BLOCK_PX), max(1, width // _BLOCK_PX)
     if height < _BLOCK_PX or width < _BLOCK_PX:
-        picture = cv2.copyMakeBorder(
-            picture, 0, max(0, _BLOCK_PX - height), 0, max(0, _BLOCK_PX - width), cv2.BORDER_REPLICATE
-        ).astype(np.uint8, copy=False)
-    whole = picture[: rows * _BLOCK_PX, : columns * _BLOCK_PX].astype(np.float32)
-    # float32 holds these sums exactly, so the order of summation does not matter.
-    means = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
-    return np.rint(means * 64).astype(np.int64)
+        picture = np.pad(picture, ((0, max(0, _BLOCK_PX - height)), (0, max(0, _BLOCK_PX - width))), mode="edge")
+    rows, columns = (side // _BLOCK_PX for side in picture.shape)
+    # Eight pixels in a word: sums of eight rows fit into 16 bits each, and a product adds the four of them up.
+    words = np.ascontiguousarray(picture[: rows * _BLOCK_PX, : columns * _BLOCK_PX]).view(np.uint64)
+    words = words.reshape(rows, _BLOCK_PX, columns)
+    sums = (words & _EVEN_BYTES).sum(axis=1) + ((words >> np.uint64(8)) & _EVEN_BYTES).sum(axis=1)
+    blocks: npt.NDArray[np.int64] = ((sums * _EACH_WORD) >> np.uint64(48)).astype(np.int64)
+    return blocks
+
+
+def _variance(blocks: npt.NDArray[np.int64]) -> float:
+    """Return the variance of whole numbers, rounded once."""
+    total, squares = int(blocks.sum()), int(np.square(blocks).sum())
+    return (blocks.size * squares - total * total) / blocks.size**2
+
+
+def _is_combed(picture: Picture, change: npt.NDArray[np.int64]) -> bool:
+    """Return whether two fields of different times are woven together.
+
+    Args:
+        picture: [h, w].
+        change: of the means of its blocks from the frame before, 1/64 grey level.
+    """
+    rows, columns = change.shape
+    if picture.shape[0] < 2 * _BLOCK_PX or picture.shape[1] < _BLOCK_PX:
+        return False
+    part = picture[: (rows - 1) * _BLOCK_PX + 2, : columns * _BLOCK_PX]
+    line, field = cv2.absdiff(part[1:-1], part[:-2]), cv2.absdiff(part[2:], part[:-2])
+    size = columns, rows - 1
+    near, far = (cv2.resize(each, size, interpolation=cv2.INTER_AREA).astype(np.int32) for each in (line, field))
+    combed = (near >= _COMB_LEVELS) & (near > 2 * far) & (change[:-1] >= _COMB_CHANGE)
+    return int(np.count_nonzero(combed)) >= max(2, change.size // _COMB_BLOCKS)
 
 
 def _difference(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> float:
@@ -177,7 +251,8 @@ def _largest(blocks: npt.NDArray[np.int64]) -> _Tiles:
 def _most(pace: npt.NDArray[np.float32]) -> _Tiles:
     """Return [16], what 95 % of each tile stays below."""
     tiles = [part for row in _parts(pace, 0) for part in _parts(row, 1)]
-    return np.array([np.quantile(tile, _MOST_OF_THE_PICTURE) for tile in tiles])
+    places = [int(_MOST_OF_THE_PICTURE * (tile.size - 1) + 0.5) for tile in tiles]
+    return np.array([np.partition(tile, place, axis=None)[place] for tile, place in zip(tiles, places, strict=True)])
 
 
 def _parts(values: npt.NDArray[np.float32], axis: int) -> list[npt.NDArray[np.float32]]:

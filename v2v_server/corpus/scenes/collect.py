@@ -1,7 +1,7 @@
 """The statistics of all videos of a corpus: from the index, from a prepared folder's manifest, or from an analysis.
 
 An analysis decodes the beginning of a video once, in a process of its own. The index keeps the result for the file's
-fingerprint and the rows that were analysed, together with the runs that follow from it: a start reads only these.
+fingerprint and the rows that were analysed, and the pieces once more as a summary: a start reads only these.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from v2v_server.corpus.index.columns import VideoTable, joined
 from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.manifest import Manifest
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES, LONGEST_SECONDS, Progress, batches
-from v2v_server.corpus.scenes.runs import SplitVideos
-from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_FRAMES, Scene
+from v2v_server.corpus.scenes.pieces import SplitVideos, encoded_pieces
+from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_FRAMES, PIECE, Scene
+from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.clips import pictures_of
 from v2v_server.system.compile_cache import compile_cache
@@ -33,8 +34,9 @@ from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import Window
 from v2v_server.video.rows import Rows
 
-_PAIR_BYTES = 8
-"""Of the hash and of each run in a summary."""
+_ENDING = f", look {ANALYSIS_VERSION}"
+_HASH_BYTES = 8
+"""At the beginning of a summary; the encoded pieces follow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +56,16 @@ class SceneCollection:
         """Distinguish analyses of one file."""
         is_source = self.manifest is None or self.manifest.lossless
         made = "" if self.manifest is None or is_source else f"prepared {self.manifest.header.rows}, "
-        return FigureKind("scene", f"{made}{self.rows}, look {ANALYSIS_VERSION}")
+        return FigureKind("scene", f"{made}{self.rows}{_ENDING}")
 
     def collect(
-        self, store: Store, source: VideoSource, table: VideoTable, processes: int, progress: Progress | None
+        self,
+        store: Store,
+        source: VideoSource,
+        table: VideoTable,
+        processes: int,
+        progress: Progress | None,
+        notice: Notice | None,
     ) -> bool:
         """Analyse each usable video without a scene in the index, and store the scene unless the analysis fails.
 
@@ -68,13 +76,15 @@ class SceneCollection:
             sqlite3.Error: the index cannot be written.
         """
         missing = np.flatnonzero((table.summaries.lengths == 0) & (table.problem == np.array(None))).tolist()
+        if missing and notice is not None and store.has_other_versions(self.kind.name, _ENDING):
+            notice(f"analysing {len(missing)} videos again: this release finds more in pictures than earlier ones")
         with closing(self._found(store, source, table, missing, processes)) as found:
             for batch in batches(found, len(missing), progress):
                 store.put_figures(self.kind, (figures(*each) for each in batch))
         return bool(missing)
 
     def read(self, store: Store, table: VideoTable, unknown: set[str], digest: str) -> tuple[SplitVideos, str]:
-        """Return the usable runs of videos, and a digest of all scenes.
+        """Return the pieces of videos, and a digest of all scenes.
 
         Args:
             table: the videos of a snapshot, with the summaries of their scenes.
@@ -85,18 +95,17 @@ class SceneCollection:
             sqlite3.Error: the index is damaged.
         """
         lengths = table.summaries.lengths
-        is_known = (lengths >= _PAIR_BYTES) & (lengths % _PAIR_BYTES == 0)
+        is_known = (lengths >= _HASH_BYTES) & (lengths % PIECE.itemsize == _HASH_BYTES)
         is_known[[place for id in unknown if (place := table.ids.find(id)) is not None]] = False
         unknown.update(table.ids[place] for place in np.flatnonzero(~is_known).tolist())
         summaries = table.summaries.where(is_known)
         state = hashlib.sha256(is_known.data)
         state.update(lengths.data)
         state.update(summaries.utf8.data)
-        counts = (summaries.lengths // _PAIR_BYTES).astype(np.int32)
-        pairs = summaries.utf8.view("<i4").reshape(-1, 2)
-        is_run = np.ones(len(pairs), bool)
-        is_run[np.cumsum(counts) - counts] = False  # the hash at the beginning of each summary
-        split = SplitVideos.select(table.frames[is_known], pairs[is_run].astype(np.int32, copy=False), counts - 1)
+        begin = np.cumsum(summaries.lengths) - summaries.lengths
+        is_piece = np.ones(len(summaries.utf8), bool)
+        is_piece[(begin[:, None] + np.arange(_HASH_BYTES)).ravel()] = False
+        split = SplitVideos.select(summaries.utf8[is_piece].view(PIECE), summaries.lengths // PIECE.itemsize)
         split = replace(split, numbers=np.flatnonzero(is_known)[split.numbers].astype(np.int32))
         return split, self._digest(store, table.ids, unknown, digest, state.hexdigest())
 
@@ -114,20 +123,12 @@ class SceneCollection:
         return sha.hexdigest()[:32]
 
     def _found(
-        self,
-        store: Store,
-        source: VideoSource,
-        table: VideoTable,
-        missing: list[int],
-        processes: int,
+        self, store: Store, source: VideoSource, table: VideoTable, missing: list[int], processes: int
     ) -> Generator[tuple[IndexRow | _Job, Scene], None, None]:
-        left, has_earlier = [], store.make_figures()
+        left = []
         for place in missing:
             record = table.row(place)
-            data = self._prepared(record)
-            if data is None and has_earlier:
-                data = store.earlier_scene(record.id, record.fingerprint, self.kind.version)
-            if data is None:
+            if (data := self._prepared(record)) is None:
                 left.append(place)
             else:
                 yield record, Scene.from_bytes(data)
@@ -173,9 +174,9 @@ class SceneCollection:
 
 
 def figures(video: IndexRow | _Job, scene: Scene) -> Figures:
-    """Return what the index keeps of a scene; the summary is a hash of it and the usable runs."""
+    """Return what the index keeps of a scene; the summary is a hash of it and the encoded pieces."""
     data = scene.to_bytes()
-    summary = xxhash.xxh3_64_digest(data) + np.array(scene.runs(video.frames), "<i4").tobytes()
+    summary = xxhash.xxh3_64_digest(data) + encoded_pieces(scene.pieces, video.frames)
     return Figures(video.id, video.fingerprint, summary, data)
 
 

@@ -1,7 +1,8 @@
 """What a video shows, in a few numbers for every sixteen frames: enough to know what of it is worth decoding.
 
 They are measured once (:mod:`v2v_server.corpus.scenes.analysis`) and kept whole, so that they have one encoding, which
-the digest of a catalogue can cover.
+the digest of a catalogue can cover. Beside the numbers there are the video's pieces: stretches of frames that are alike
+in what is wrong with them.
 """
 
 from __future__ import annotations
@@ -9,14 +10,14 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass
-from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError
 
-ANALYSIS_VERSION = 1
+ANALYSIS_VERSION = 2
 """Raise it with every change of what an analysis finds: earlier ones are then repeated."""
 SEGMENT_FRAMES = 16
 """Frames of a segment. Segment i of a video holds frames 16 i .. 16 i + 15."""
@@ -26,8 +27,6 @@ LAG_FRAMES = 4
 """Frames over which motion and change are measured."""
 UNKNOWN = 2**16 - 1
 """A number that could not be measured."""
-EMPTY_CONTRAST_LEVELS = 0.5
-"""A segment whose blocks differ by less (standard deviation) shows nothing: black, white, a fade's end."""
 
 TILES = 4
 """Rows and columns of tiles that a picture is divided into."""
@@ -38,8 +37,75 @@ CONTRAST, DARK, CLIPPED, FLICKER, NOISE = range(2 * TILES**2, 2 * TILES**2 + 5)
 COLUMNS = NOISE + 1
 _UNITS = np.array([64.0] * TILES**2 + [64.0] * TILES**2 + [64.0, 1000.0, 1000.0, 64.0, 64.0])
 """How many of each column's units make one pixel, grey level or whole."""
-_MAGIC = b"VSC1"
-_HEADER = struct.Struct("<4sIIHI")  # magic, first, end, segments, shot boundaries
+_MAGIC = b"VSC2"
+_HEADER = struct.Struct("<4sIIHI")  # magic, first, end, segments, pieces
+
+
+class Flag:
+    """Bits: what the frames of a piece are."""
+
+    CUT = 1
+    """A shot begins with the first of them."""
+    REPEAT = 2
+    """Each repeats the frame before it."""
+    FADE = 4
+    """They fade to or from black."""
+    STILL = 8
+    """Nothing moves for 16 frames or more."""
+    BLACK = 16
+    """There is nothing to see: black, or flat and darker than middle grey."""
+    WHITE = 32
+    """There is nothing to see: white, or flat and brighter than middle grey."""
+    COMBED = 64
+    """Two fields of different times are woven together."""
+
+
+class Sides(NamedTuple):
+    """Bars at the sides of a picture, pixels."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+
+NO_BARS = Sides(0, 0, 0, 0)
+PIECE = np.dtype([("end", "<i4"), ("flags", "<u2"), *((side, "<u2") for side in Sides._fields)])
+"""Frames up to ``end`` - 1, from the end of the piece before; their flags; the bars of their shot, pixels."""
+Pieces = npt.NDArray[np.void]
+"""[n] of :data:`PIECE`."""
+
+
+def sides_of(pieces: Pieces) -> npt.NDArray[np.uint16]:
+    """Return the bars of pieces, [n, 4]: top, bottom, left, right."""
+    return np.stack([pieces[side] for side in Sides._fields], axis=1)
+
+
+def firsts_of(pieces: Pieces, first: int) -> npt.NDArray[np.int64]:
+    """Return the first frame of each piece, [n], if the first of them begins at frame ``first``."""
+    return np.concatenate(([first], pieces["end"]))[:-1].astype(np.int64)
+
+
+def clip_pieces(pieces: Pieces, first: int, start: int, end: int) -> Pieces:
+    """Return the pieces of frames start .. end - 1.
+
+    Args:
+        pieces: they begin at frame ``first``, at or before ``start``; frames after the last one have no flags and no
+            bars.
+    """
+    if not len(pieces) or pieces["end"][-1] < end:
+        rest = np.array([(end, 0, *NO_BARS)], PIECE)
+        if len(pieces) and pieces["flags"][-1] in (0, Flag.CUT) and not sides_of(pieces[-1:]).any():
+            rest["flags"] = pieces["flags"][-1]
+            pieces = pieces[:-1]
+        pieces = np.append(pieces, rest)
+    firsts = firsts_of(pieces, first)
+    inside = (pieces["end"] > start) & (firsts < end)
+    part = pieces[inside].copy()
+    if len(part):
+        part["end"][-1] = end
+        part["flags"][0] &= ~np.uint16(Flag.CUT) if firsts[inside][0] < start else np.uint16(0xFFFF)
+    return part
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +115,7 @@ class Scene:
     Attributes:
         first: ordinal of the first frame of the first segment.
         end: ordinal after the last frame that was analysed.
-        shot_boundaries: ordinals of the frames at which another shot begins, increasing.
+        pieces: [p] of :data:`PIECE`, frames ``first`` .. ``end`` - 1.
         segments: [n, 37] uint16, one row a segment, :data:`UNKNOWN` where a number could not be measured. Of each tile:
 
             MOTION    95th percentile of its motion, the largest of the segment's quarters; 1/64 px a frame
@@ -67,19 +133,29 @@ class Scene:
 
     first: int
     end: int
-    shot_boundaries: tuple[int, ...]
+    pieces: Pieces
     segments: npt.NDArray[np.uint16]
 
     @classmethod
     def unknown(cls) -> Scene:
         """Return the scene of a video that could not be analysed."""
-        return cls(0, 0, (), np.empty((0, COLUMNS), np.uint16))
+        return cls(0, 0, np.empty(0, PIECE), np.empty((0, COLUMNS), np.uint16))
 
     @classmethod
-    def of(cls, end: int, shot_boundaries: tuple[int, ...], values: npt.NDArray[np.float64]) -> Scene:
-        """Make a scene of numbers in px, grey levels and shares of 1: [n, 37] float64, NaN where unknown."""
+    def of(cls, pieces: Pieces, values: npt.NDArray[np.float64]) -> Scene:
+        """Make a scene of pieces from frame 0 on, and of numbers in px, grey levels and shares of 1.
+
+        Args:
+            values: [n, 37] float64, NaN where unknown.
+        """
         units = np.clip(np.rint(values * _UNITS), 0, UNKNOWN - 1)
-        return cls(0, end, shot_boundaries, np.where(np.isnan(units), UNKNOWN, units).astype(np.uint16))
+        return cls(0, int(pieces["end"][-1]), pieces, np.where(np.isnan(units), UNKNOWN, units).astype(np.uint16))
+
+    @property
+    def shot_boundaries(self) -> tuple[int, ...]:
+        """Ordinals of the frames at which another shot begins, increasing."""
+        firsts = firsts_of(self.pieces, self.first)
+        return tuple(firsts[(self.pieces["flags"] & Flag.CUT) != 0].tolist())
 
     def __repr__(self) -> str:
         boundaries = f"{len(self.shot_boundaries)} shot boundaries"
@@ -96,26 +172,20 @@ class Scene:
         part = self.segments[low:high]
         return np.where(part == UNKNOWN, np.nan, part / _UNITS)
 
-    def runs(self, frames: int) -> list[tuple[int, int]]:
-        """Return the stretches of a video of ``frames`` frames between shot boundaries, without its empty segments.
+    def frames_from(self, start: int, count: int) -> npt.NDArray[np.int64]:
+        """Return the ordinals of ``count`` frames from ``start`` on, without those that repeat the one before."""
+        repeats = np.repeat(self.pieces["flags"] & Flag.REPEAT, self.pieces["end"] - firsts_of(self.pieces, self.first))
+        dropped = self.first + np.flatnonzero(repeats)
+        dropped = dropped[dropped >= start]
+        # A dropped frame moves each later one by one; the n-th of them has n frames before it that are dropped.
+        before = dropped - np.arange(len(dropped)) - start
+        wanted = np.arange(count, dtype=np.int64)
+        return start + wanted + before.searchsorted(wanted, side="right")
 
-        Returns:
-            (first frame, frame after the last one) of each, in order.
-        """
-        bounds = [0, *(boundary for boundary in self.shot_boundaries if boundary < frames), frames]
-        empty = np.flatnonzero(self.segments[:, CONTRAST] < EMPTY_CONTRAST_LEVELS * _UNITS[CONTRAST])
-        holes = [(self.first + SEGMENT_FRAMES * int(at), self.first + SEGMENT_FRAMES * (int(at) + 1)) for at in empty]
-        runs = []
-        for start, end in pairwise(bounds):
-            at = start
-            for low, high in holes:
-                if high > at and low < end:
-                    if low > at:
-                        runs.append((at, low))
-                    at = high
-            if at < end:
-                runs.append((at, end))
-        return runs
+    def sides(self, start: int, end: int) -> Sides:
+        """Return the widest bar at each side of frames start .. end - 1."""
+        part = clip_pieces(self.pieces, self.first, start, end)
+        return Sides(*sides_of(part).max(axis=0).tolist())
 
     def slice(self, start: int, count: int) -> Scene:
         """Return the part that frames start .. start + count - 1 touch."""
@@ -124,14 +194,19 @@ class Scene:
             return Scene.unknown()
         low = (start - self.first) // SEGMENT_FRAMES
         high = -((self.first - end) // SEGMENT_FRAMES)
-        boundaries = tuple(boundary for boundary in self.shot_boundaries if start < boundary < end)
-        return Scene(self.first + SEGMENT_FRAMES * low, end, boundaries, self.segments[low:high])
+        first = self.first + SEGMENT_FRAMES * low
+        return Scene(first, end, clip_pieces(self.pieces, self.first, first, end), self.segments[low:high])
 
     def to_bytes(self) -> bytes:
         """Return a compact encoding, the same for equal scenes."""
-        body = np.array(self.shot_boundaries, "<u4").tobytes() + self.segments.astype("<u2").tobytes()
-        head = _HEADER.pack(_MAGIC, self.first, self.end, len(self.segments), len(self.shot_boundaries))
+        body = self.pieces.tobytes() + self.segments.astype("<u2").tobytes()
+        head = _HEADER.pack(_MAGIC, self.first, self.end, len(self.segments), len(self.pieces))
         return head + zlib.compress(body, 6)
+
+    @staticmethod
+    def is_encoding(data: bytes) -> bool:
+        """Return whether data begins like the encodings of this version."""
+        return data.startswith(_MAGIC)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Scene:
@@ -142,15 +217,13 @@ class Scene:
         """
         if len(data) < _HEADER.size:
             raise ProtocolError(f"scene of {len(data)} bytes: shorter than its header of {_HEADER.size}")
-        magic, first, end, rows, boundaries = _HEADER.unpack_from(data)
+        magic, first, end, rows, count = _HEADER.unpack_from(data)
         if magic != _MAGIC:
             raise ProtocolError(f"scene begins with {magic!r} instead of {_MAGIC!r}")
         covered = end <= first + rows * SEGMENT_FRAMES < end + SEGMENT_FRAMES
-        if end > MOST_FRAMES or first % SEGMENT_FRAMES or not covered or boundaries > max(0, end - first):
-            raise ProtocolError(
-                f"scene: frames {first} .. {end - 1} in {rows} segments with {boundaries} shot boundaries"
-            )
-        size = 4 * boundaries + 2 * COLUMNS * rows
+        if end > MOST_FRAMES or first % SEGMENT_FRAMES or not covered or count > max(0, end - first):
+            raise ProtocolError(f"scene: frames {first} .. {end - 1} in {rows} segments and {count} pieces")
+        size = PIECE.itemsize * count + 2 * COLUMNS * rows
         stream = zlib.decompressobj()
         try:
             body = stream.decompress(data[_HEADER.size :], size + 1)
@@ -158,8 +231,9 @@ class Scene:
             raise ProtocolError(f"scene does not decompress: {error}") from error
         if len(body) != size or not stream.eof or stream.unused_data:
             raise ProtocolError(f"scene decompresses to {len(body)} bytes; its header promises {size}")
-        frames = np.frombuffer(body, "<u4", boundaries).astype(np.int64)
-        if boundaries and (frames[0] <= first or frames[-1] >= end or np.any(frames[1:] <= frames[:-1])):
-            raise ProtocolError(f"scene: shot boundaries outside frames {first + 1} .. {end - 1}, or in disorder")
-        segments = np.frombuffer(body, "<u2", offset=4 * boundaries).astype(np.uint16).reshape(rows, COLUMNS)
-        return cls(first, end, tuple(frames.tolist()), segments)
+        pieces = np.frombuffer(body, PIECE, count).copy()
+        ends = np.concatenate(([first], pieces["end"].astype(np.int64)))
+        if ends[-1] != end or np.any(ends[1:] <= ends[:-1]):
+            raise ProtocolError(f"scene: its pieces do not cover frames {first} .. {end - 1} in order")
+        segments = np.frombuffer(body, "<u2", offset=PIECE.itemsize * count).astype(np.uint16).reshape(rows, COLUMNS)
+        return cls(first, end, pieces, segments)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -65,9 +66,9 @@ def local_state(path: Path, id: str) -> str:
     Raises:
         OSError: it cannot be told.
     """
-    if path.is_dir() != id.endswith("/") or not path.exists():
-        return ""
     try:
+        if stat.S_ISDIR(os.stat(path).st_mode) != id.endswith("/"):
+            return ""
         found = [(name, os.stat(str(file))) for name, file in _files(path)]
     except (FileNotFoundError, NotADirectoryError):
         return ""

@@ -42,7 +42,7 @@ import numpy.typing as npt
 
 from v2v_server.simulation import noise
 from v2v_server.simulation.effects.state import Clip
-from v2v_server.simulation.intensity import linear_light
+from v2v_server.simulation.intensity import Intensity, linear_light
 from v2v_server.simulation.precision import Real
 
 EFFECTS: tuple[Any, ...] = tuple(
@@ -62,7 +62,7 @@ EFFECTS: tuple[Any, ...] = tuple(
 def prepare(
     values: Mapping[str, float],
     key: noise.NoiseKey,
-    intensity: tuple[float, float],
+    intensity: Intensity,
     step_seconds: npt.NDArray[np.float64],
     pixels: int,
     real: Real,
@@ -73,7 +73,7 @@ def prepare(
     Args:
         values: the draw, by field; missing fields are off.
         key: key of the sample's noise.
-        intensity: gamma and log_eps.
+        intensity: of the grey levels.
         step_seconds: [steps] duration of each step, which is a segment (``voxel.Timeline``).
         pixels: number of pixels of the picture.
         real: arithmetic of the pixels, float32 or float64.

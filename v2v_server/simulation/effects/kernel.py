@@ -319,7 +319,8 @@ def simulate_general(
     """Simulate every pixel of a clip.
 
     Args:
-        frames: [n, pixels] uint8 grey levels, or real log intensities; C-contiguous. Row 0 is the clip's first frame.
+        frames: [n, pixels] uint8 or uint16 grey levels, or real log intensities; C-contiguous. Row 0 is the clip's
+            first frame.
         between_frames: [K, pixels] uint16, intermediate levels: grey, in 1/FINE_STEPS.
         fine: [255 FINE_STEPS + 1] real, their log intensity (``intensity.fine_table``).
         table, key, hot_position, hot_drift, limit: as in ``pixel.simulate_pixels``.

@@ -25,7 +25,7 @@ DARKEST = 20 / 255
 
 
 class Tables(NamedTuple):
-    """[tables, 2, 256] real, a and b by grey level, no table where there is no low-pass; which of them a step has."""
+    """[tables, 2, levels] real, a and b by grey level, no table without low-pass; which of them a step has."""
 
     low_pass: Any
     table_of_step: Any
@@ -34,11 +34,11 @@ class Tables(NamedTuple):
 def prepare(value: float, clip: Clip) -> Tables:
     """Return the tables, see ``effects/__init__.py``."""
     tables = [low_pass_table(value, clip.light, each) for each in clip.durations] if value > 0.0 else []
-    return Tables(np.array(tables, clip.real).reshape(-1, 2, 256), clip.table_of_step)
+    return Tables(np.array(tables, clip.real).reshape(-1, 2, len(clip.light)), clip.table_of_step)
 
 
 def low_pass_table(photoreceptor_hz: float, light: Doubles, seconds: float) -> Doubles:
-    """Return a and b of a step of that duration, [2, 256] float64."""
+    """Return a and b of a step of that duration, [2, levels] float64."""
     turns = 2.0 * np.pi * photoreceptor_hz * seconds * ((light + DARKEST) / (1.0 + DARKEST))
     a = 1.0 - exponential(-turns)
     return np.stack([a, 1.0 - a / turns])

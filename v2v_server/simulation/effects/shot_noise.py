@@ -32,9 +32,9 @@ _M0, _M1, _M2 = noise.MIX_FACTORS
 class Tables(NamedTuple):
     """
     Attributes:
-        shot: [tables, most, 256] float32 whose bits are uint32: entry k is the chance of more than k events of one
+        shot: [tables, most, levels] float32 whose bits are uint32: entry k is the chance of more than k events of one
             polarity, in units of 2**-32; no table where there is no shot noise.
-        largest: [tables, most] uint32, the largest of each 256.
+        largest: [tables, most] uint32, the largest of all levels.
         table_of_step: [steps] int64, which of the tables holds for the step's duration.
         of_steps: [2, steps] uint32, words of the steps (positive, negative), written at the start of each block.
         drawn: [4, block] uint32: words of the pixels (positive, negative), and of pixels and step.
@@ -49,7 +49,7 @@ class Tables(NamedTuple):
 
 def prepare(value: float, clip: Clip) -> Tables:
     """Return the tables, see ``effects/__init__.py``."""
-    shot = np.empty((0, 0, 256), np.uint32)
+    shot = np.empty((0, 0, len(clip.light)), np.uint32)
     if value > 0.0:
         shot = shot_table(shot_means(value, clip.light, clip.durations))
     drawn, of_steps = np.empty((4, BLOCK_PX), np.uint32), np.empty((2, len(clip.table_of_step)), np.uint32)
@@ -57,7 +57,7 @@ def prepare(value: float, clip: Clip) -> Tables:
 
 
 def shot_means(shot_noise_hz: float, light: Doubles, durations: Doubles) -> Doubles:
-    """Return the mean number of events of one polarity: [durations, 256].
+    """Return the mean number of events of one polarity: [durations, levels].
 
     Raises:
         UsageError: more than LARGEST_SHOT_MEAN.
@@ -73,7 +73,7 @@ def shot_means(shot_noise_hz: float, light: Doubles, durations: Doubles) -> Doub
 
 
 def shot_table(means: Doubles) -> npt.NDArray[np.uint32]:
-    """Return the probability of more than k Poisson events in units of 2**-32: [tables, most, 256], for k = 0, 1 ...
+    """Return the probability of more than k Poisson events in units of 2**-32: [tables, most, levels], for k = 0, 1 ...
     while it is not 0 in those units.
     """
     term = exponential(-means)
@@ -149,8 +149,8 @@ def _fire(chances, largest, shown, drawn, chance, rises, falls, residual):
     The function is compiled separately: inside the kernel its loops would not become vector instructions.
 
     Args:
-        chances, largest: [most, 256] and [most], one duration's part of the tables.
-        shown: [width] uint8, the new frame.
+        chances, largest: [most, levels] and [most], one duration's part of the tables.
+        shown: [width] uint8 or uint16, the new frame.
         drawn: [4, block] uint32, see ``_draw``.
         chance: [block] float32, working space.
         rises, falls, residual: [block] real, changed.

@@ -23,7 +23,7 @@ class Clip(NamedTuple):
     """Inputs of an effect's tables.
 
     Attributes:
-        light: [256] float64, i(F) of every grey level, 0 (black) to 1 (white).
+        light: [levels] float64, i(F) of every grey level, 0 (black) to 1 (white); 256 levels for uint8 frames.
         step_seconds: [steps] float64, duration of each step; for an effect, a step is a segment (``voxel.Timeline``).
         durations: [different] float64, the distinct durations, ascending.
         table_of_step: [steps] int64, index into ``durations`` of each step.
@@ -85,8 +85,8 @@ class At(NamedTuple):
         step: number of the step: a segment, the whole time from frame to frame or a part of it.
         moved: whether it leads to another frame or intermediate level than the one before.
         before, now: rows of ``Block.levels``: log intensity before and after the step.
-        shown: [width] uint8, grey levels of the frame at or after its end; narrower than the block at the end of the
-            picture.
+        shown: [width] uint8 or uint16, grey levels of the frame at or after its end; narrower than the block at the
+            end of the picture.
     """
 
     first: Any

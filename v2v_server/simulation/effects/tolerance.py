@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from v2v_server.simulation.effects.photoreceptor import DARKEST
 from v2v_server.simulation.effects.shot_noise import WHITE_SHOT_NOISE
-from v2v_server.simulation.intensity import linear_light, log_table_float64
+from v2v_server.simulation.intensity import Intensity, linear_light, log_table_float64
 from v2v_server.simulation.kernels import KernelInput, fill
 from v2v_server.simulation.voxel import Longs, bin_edges
 
@@ -63,7 +63,7 @@ def changed_shares(given: KernelInput) -> dict[str, float]:
     pixels, smaller = part.shape[1], min(params.threshold_pos, params.threshold_neg)
     moves = np.flatnonzero(source[1:] > source[:-1])  # other steps show a frame again
     events = _plain_events(given, part)
-    moving, change = events[moves], np.abs(np.diff(_levels(*intensity)[part], axis=0))
+    moving, change = events[moves], np.abs(np.diff(_levels(intensity)[part], axis=0))
     total, fires = int(np.abs(events).sum()), np.count_nonzero(moving, axis=1)
     if not total:
         return {}
@@ -82,7 +82,7 @@ def changed_shares(given: KernelInput) -> dict[str, float]:
             changed[name] = int(np.abs(lost).sum() + 2 * (shifted * (moving != 0)).sum()) / _UNITS
             changed[name] += pixels * _lost_to_noise(given, value, smaller)
         elif name == "shot_noise_hz":
-            shown = np.bincount(part.ravel(), minlength=256)
+            shown = np.bincount(part.ravel(), minlength=len(light))
             rate = value * math.fsum(shown * (1.0 - (1.0 - WHITE_SHOT_NOISE) * light)) / part.size
             changed[name] = rate * (pixels * clip_seconds + later)
         elif name == "leak_hz":
@@ -90,7 +90,7 @@ def changed_shares(given: KernelInput) -> dict[str, float]:
     return {name: MARGINS[name] * number / total for name, number in changed.items()}
 
 
-def _plain_events(given: KernelInput, part: npt.NDArray[np.uint8]) -> Longs:
+def _plain_events(given: KernelInput, part: npt.NDArray[np.unsignedinteger]) -> Longs:
     """Return the signed events of each step without noise and effects, [steps, pixels].
 
     Args:
@@ -120,6 +120,6 @@ def _lost_to_noise(given: KernelInput, refractory: float, threshold: float) -> f
 
 
 @lru_cache(maxsize=64)
-def _levels(gamma: float, log_eps: float) -> Longs:
+def _levels(intensity: Intensity) -> Longs:
     """Return log intensity by grey level, whole numbers of 1/_UNITS."""
-    return np.rint(log_table_float64(gamma, log_eps) * _UNITS).astype(np.int64)
+    return np.rint(log_table_float64(*intensity) * _UNITS).astype(np.int64)

@@ -13,11 +13,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.pieces import pieces, shots
 from v2v_server.corpus import videos as videos_module
 from v2v_server.corpus.index import columns
 from v2v_server.corpus.index.columns import StringColumn, VideoTable, joined
 from v2v_server.corpus.index.file import IndexRow
-from v2v_server.corpus.scenes.runs import SplitVideos
+from v2v_server.corpus.scenes.pieces import SplitVideos
+from v2v_server.corpus.scenes.scene import Flag
 from v2v_server.corpus.videos import NO_THRESHOLDS, Thresholds, Videos
 from v2v_server.video.rows import Rows
 
@@ -153,10 +155,10 @@ def test_videos_are_the_usable_ones_and_have_the_digest_of_all_that_shapes_sampl
     monkeypatch.setattr(videos_module, "CHUNK", 16)
     used = [at for at, record in enumerate(ROWS) if all_usable or record.problem is None]
     thresholds: dict[int, Thresholds] = {3: (0.2, 0.3), 50: (0.25, None)}
-    runs = {4: (), 5: ((0, 3), (4, 9))}
+    divided = {4: pieces((9, Flag.BLACK)).tobytes(), 5: shots(9, 4).tobytes()}
     table = table.where(np.isin(np.arange(len(ROWS)), used))
-    each = [runs.get(number, ((0, frames),)) for number, frames in enumerate(table.frames.tolist())]
-    videos = Videos(table, thresholds, SplitVideos.of(table.frames, each))
+    each = [divided.get(number, b"") for number in range(len(table.frames))]
+    videos = Videos(table, thresholds, SplitVideos.of(each))
     assert len(videos) == len(used) == (200 if all_usable else 171)
     assert [video.id for video in videos] == [NAMES[at] for at in used]
     assert [videos.fingerprints[number] for number in range(len(used))] == [ROWS[at].fingerprint for at in used]
@@ -166,7 +168,7 @@ def test_videos_are_the_usable_ones_and_have_the_digest_of_all_that_shapes_sampl
     assert videos[:2] == (videos[0], videos[1])
     with pytest.raises(IndexError):
         videos[len(used)]
-    assert [video.runs for video in videos] == each
+    assert [video.pieces for video in videos] == each
     sha = hashlib.sha256(f"v2v catalogue 2\n{Rows()}\n".encode())
     for number, at in enumerate(used):
         is_ = ROWS[at]

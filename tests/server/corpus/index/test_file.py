@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.pieces import shots
 from v2v_protocol.errors import IndexUnreadable
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.index.columns import VideoTable, joined
@@ -105,7 +106,7 @@ def test_other_users_cannot_lock_an_index(corpus: Corpus) -> None:
 def test_figures_count_for_their_kind_version_and_fingerprint_only(corpus: Corpus) -> None:
     kinds = [FigureKind(name, version) for name in ("scene", "noise") for version in ("1", "2")]
     with closing(Store(corpus.index)) as store:
-        assert not store.make_figures()
+        store.make_figures()
         for number, kind in enumerate(kinds):
             store.put_figures(kind, [Figures("001.mp4", "0-001.mp4", b"%d" % number, b"data %d" % number)])
         store.put_figures(
@@ -125,12 +126,12 @@ def test_figures_count_for_their_kind_version_and_fingerprint_only(corpus: Corpu
 
 def scene_of(name: str, boundary: int = 200) -> Scene:
     """Return a scene with one shot boundary, at a frame of its own for each video."""
-    return Scene.of(300, (boundary + int(name[:3]),), np.full((19, COLUMNS), 2.0))
+    return Scene.of(shots(300, boundary + int(name[:3])), np.full((19, COLUMNS), 2.0))
 
 
 def scenes(corpus: Corpus) -> tuple[str | None, list[tuple[str, object]]]:
     with closing(corpus.open(scene=True)) as catalogue:
-        return catalogue.scene_digest, [(video.id, video.runs) for video in catalogue.videos]
+        return catalogue.scene_digest, [(video.id, video.pieces) for video in catalogue.videos]
 
 
 def put_scenes(corpus: Corpus, *names: str, boundary: int = 200) -> None:
@@ -142,45 +143,39 @@ def put_scenes(corpus: Corpus, *names: str, boundary: int = 200) -> None:
 def test_scenes_come_from_the_index(corpus: Corpus) -> None:
     put_scenes(corpus, *corpus.names)
     first = scenes(corpus)
-    assert dict(first[1])["007.mp4"] == ((0, 207), (207, 300))
+    assert dict(first[1])["007.mp4"] == shots(300, 207).tobytes()
     assert scenes(corpus) == first
     put_scenes(corpus, "007.mp4", boundary=100)
     digest, runs = scenes(corpus)
     assert digest != first[0]
-    assert dict(runs)["007.mp4"] == ((0, 107), (107, 300))
+    assert dict(runs)["007.mp4"] == shots(300, 107).tobytes()
     (corpus.folder / "003.mp4").unlink()
     fewer = scenes(corpus)
     assert fewer[0] not in (digest, first[0])
     assert fewer[1] == [each for each in runs if each[0] != "003.mp4"]
 
 
-def test_scenes_and_files_of_earlier_releases_are_taken_over(corpus: Corpus) -> None:
-    """Their bytes, and so the digest, stay."""
+def test_files_beside_the_index_of_earlier_releases_are_removed(corpus: Corpus) -> None:
     put_scenes(corpus, *corpus.names)
-    expected = scenes(corpus)
-    with closing(sqlite3.connect(corpus.index)) as database, database:
-        database.execute("DROP TABLE figures")
-        database.execute(
-            "CREATE TABLE scene (id TEXT NOT NULL, fingerprint TEXT NOT NULL, look TEXT NOT NULL, data BLOB NOT NULL, "
-            "PRIMARY KEY (id, look))"
-        )
-        rows = [(name, f"0-{name}", "full, look 1", scene_of(name).to_bytes()) for name in corpus.names]
-        database.executemany("INSERT INTO scene VALUES (?, ?, ?, ?)", rows)
     for suffix in (".columns", ".scenes"):
         corpus.index.with_suffix(suffix).touch()
-    assert scenes(corpus) == expected
+    scenes(corpus)
     assert list(corpus.cache.iterdir()) == [corpus.index]
-    with closing(sqlite3.connect(corpus.index)) as database, database:
-        assert database.execute("SELECT COUNT(*) FROM figures WHERE kind = 'scene'").fetchone() == (40,)
-        database.execute("DROP TABLE scene")
-    assert scenes(corpus) == expected
+
+
+def test_figures_of_other_versions_are_known(corpus: Corpus) -> None:
+    put_scenes(corpus, *corpus.names)
+    with closing(Store(corpus.index)) as store:
+        assert not store.has_other_versions("scene", ", look 2")
+        assert store.has_other_versions("scene", ", look 3")
+        assert not store.has_other_versions("other", ", look 3")
 
 
 def test_damaged_runs_count_as_unknown(corpus: Corpus) -> None:
     put_scenes(corpus, *corpus.names)
     with closing(sqlite3.connect(corpus.index)) as database, database:
         database.execute("UPDATE figures SET summary = x'010203' WHERE id = '005.mp4'")
-    assert dict(scenes(corpus)[1])["005.mp4"] == ((0, 300),)
+    assert dict(scenes(corpus)[1])["005.mp4"] == b""
 
 
 def test_a_summary_of_another_type_is_missing_and_refuses_no_video(corpus: Corpus) -> None:

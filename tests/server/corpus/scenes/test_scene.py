@@ -15,11 +15,12 @@ from hypothesis import strategies as st
 from skimage import data
 
 from tests.clips import damaged, panned_luma, write_clip
+from tests.pieces import pieces, shots
 from tests.server.corpus.failing_storage import failing_opens
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.scenes import collect
-from v2v_server.corpus.scenes.analysis import SceneAnalysis
+from v2v_server.corpus.scenes.analysis import analyse
 from v2v_server.corpus.scenes.scene import (
     CHANGE,
     CLIPPED,
@@ -29,10 +30,13 @@ from v2v_server.corpus.scenes.scene import (
     FLICKER,
     MOST_FRAMES,
     MOTION,
+    NO_BARS,
     NOISE,
     SEGMENT_FRAMES,
     UNKNOWN,
+    Flag,
     Scene,
+    Sides,
 )  # fmt: skip
 from v2v_server.prepare.prepare import prepare
 from v2v_server.store.encoding import Encoding
@@ -40,13 +44,6 @@ from v2v_server.system.isolate import run_isolated
 from v2v_server.video.rows import Rows
 
 Luma = npt.NDArray[np.uint8]
-
-
-def analyse(luma: Luma) -> Scene:
-    analysis = SceneAnalysis()
-    for picture in luma:
-        analysis.add(picture)
-    return analysis.scene()
 
 
 def pan(frames: int, right_px: int, height: int = 96, width: int = 160) -> Luma:
@@ -142,61 +139,39 @@ def test_flashes_flicker_fades_and_starting_motion_are_no_cuts() -> None:
         assert analyse(luma).shot_boundaries == ()
 
 
-def test_runs_lie_between_cuts_and_hold_something_to_see() -> None:
-    black = np.zeros((48, 96, 160), np.uint8)
-    scene = analyse(np.concatenate([black, pan(52, 1), other(60)]))
-    assert scene.shot_boundaries == (48, 100)
-    assert scene.runs(160) == [(48, 100), (100, 160)]
-    # Frames that were not looked at are taken as they come.
-    assert scene.runs(500) == [(48, 100), (100, 500)]
-    assert analyse(black).runs(48) == []
-    assert Scene.unknown().runs(30) == [(0, 30)]
-
-
 @st.composite
 def scenes(draw: st.DrawFn) -> Scene:
     end = draw(st.integers(0, 300))
     rows = -(-end // SEGMENT_FRAMES)
-    cuts = draw(st.sets(st.integers(1, end - 1), max_size=6)) if end > 1 else set()
+    ends = [*sorted(draw(st.sets(st.integers(1, end - 1), max_size=6)) if end > 1 else ()), end][: end and None]
+    parts = pieces(*((at, draw(st.integers(0, 127)), Sides(*draw(st.sampled_from([NO_BARS, (3, 4, 5, 6)]))))
+                     for at in ends))  # fmt: skip
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    return Scene(0, end, tuple(sorted(cuts)), rng.integers(0, UNKNOWN + 1, (rows, COLUMNS)).astype(np.uint16))
-
-
-@given(scenes())
-def test_runs_against_their_definition(scene: Scene) -> None:
-    frames = scene.end + 20
-    empty = scene.segments[:, CONTRAST] < 32
-    usable = [frame >= scene.end or not empty[frame // SEGMENT_FRAMES] for frame in range(frames)]
-    # An empty last segment reaches up to the end of its sixteen frames.
-    for frame in range(scene.end, min(frames, len(empty) * SEGMENT_FRAMES)):
-        usable[frame] = not empty[-1]
-    runs = scene.runs(frames)
-    held = [frame for first, end in runs for frame in range(first, end)]
-    assert held == [frame for frame in range(frames) if usable[frame]]
-    for first, end in runs:
-        assert not any(first < cut < end for cut in scene.shot_boundaries)
-        assert first == 0 or first in scene.shot_boundaries or not usable[first - 1]
+    return Scene(0, end, parts, rng.integers(0, UNKNOWN + 1, (rows, COLUMNS)).astype(np.uint16))
 
 
 @given(scenes(), st.data())
 def test_encoding_and_slices(scene: Scene, data: st.DataObject) -> None:
     back = Scene.from_bytes(scene.to_bytes())
     assert back.to_bytes() == scene.to_bytes()
-    assert (back.first, back.end, back.shot_boundaries) == (scene.first, scene.end, scene.shot_boundaries)
+    assert (back.first, back.end, back.pieces.tobytes()) == (scene.first, scene.end, scene.pieces.tobytes())
     start = data.draw(st.integers(0, 320))
     count = data.draw(st.integers(1, 60))
     part = Scene.from_bytes(scene.slice(start, count).to_bytes())
     low, high = start, min(start + count, scene.end)
     if low < high:
         np.testing.assert_array_equal(part.values(low, high), scene.values(low, high))
-        assert part.shot_boundaries == tuple(cut for cut in scene.shot_boundaries if low < cut < high)
+        assert set(part.shot_boundaries) >= {cut for cut in scene.shot_boundaries if low < cut < high}
+        assert part.sides(low, high) == scene.sides(low, high)
+        within = int(np.count_nonzero(scene.frames_from(low, high - low) < high))
+        np.testing.assert_array_equal(part.frames_from(low, within), scene.frames_from(low, within))
     else:
         assert not len(part.segments)
 
 
 @given(st.binary(max_size=60))
 def test_what_is_no_scene_is_refused(data: bytes) -> None:
-    for content in (data, b"VSC1" + data):
+    for content in (data, b"VSC2" + data):
         with pytest.raises(ProtocolError):
             Scene.from_bytes(content)
 
@@ -205,9 +180,9 @@ def test_a_scene_that_contradicts_itself_is_refused() -> None:
     scene = analyse(pan(40, 1))
     for other_scene in (
         dataclasses.replace(scene, end=60),
-        dataclasses.replace(scene, shot_boundaries=(0,)),
-        dataclasses.replace(scene, shot_boundaries=(9, 9)),
-        dataclasses.replace(scene, shot_boundaries=(41,)),
+        dataclasses.replace(scene, pieces=shots(39)),
+        dataclasses.replace(scene, pieces=shots(40, 9, 9)),
+        dataclasses.replace(scene, pieces=shots(40, 41)),
         dataclasses.replace(scene, first=3),
         dataclasses.replace(scene, end=MOST_FRAMES + 1),
     ):
@@ -256,8 +231,8 @@ def test_a_corpus_is_looked_at_once(folder: Path) -> None:
     looked: list[int] = []
     with opened(folder, progress=lambda done, total: looked.append(total)) as first:
         assert looked.count(3) == 6  # probed, then looked at
-        assert {video.id: video.runs for video in first.videos} == {
-            "broken.mp4": ((0, 50),), "cut.mkv": ((0, 30), (30, 70)), "whole.mp4": ((0, 50),),
+        assert {video.id: video.pieces for video in first.videos} == {
+            "broken.mp4": b"", "cut.mkv": shots(70, 30).tobytes(), "whole.mp4": b"",
         }  # fmt: skip
         # What lies behind the damage is unknown; who is served it finds the same error.
         assert 25 <= first.scene("broken.mp4").end <= 31
@@ -269,7 +244,7 @@ def test_a_corpus_is_looked_at_once(folder: Path) -> None:
     write_clip(folder / "whole.mp4", np.concatenate([pan(20, 1), other(30)]), gop=50)
     with opened(folder, progress=lambda done, total: looked.append(total)) as changed:
         assert looked == [1, 1]
-        assert next(video.runs for video in changed.videos if video.id == "whole.mp4") == ((0, 20), (20, 50))
+        assert next(video.pieces for video in changed.videos if video.id == "whole.mp4") == shots(50, 20).tobytes()
         assert changed.scene_digest != digest
 
 
@@ -283,9 +258,7 @@ def test_storage_that_fails_while_a_video_is_looked_at_is_asked_again(
     left = failing_opens(monkeypatch, cut=2, whole=1)
     with opened(folder) as first:
         assert left == {"cut": 0, "whole": 0}
-        assert {video.id: video.runs for video in first.videos if video.id != "broken.mp4"} == {
-            "cut.mkv": ((0, 70),), "whole.mp4": ((0, 50),),
-        }  # fmt: skip
+        assert not any(video.pieces for video in first.videos)
         assert any("cut.mkv" in note for note in first.notes)
     with opened(folder) as again:
         assert again.scene_digest == digest
@@ -294,11 +267,12 @@ def test_storage_that_fails_while_a_video_is_looked_at_is_asked_again(
 def test_only_the_rows_in_use_are_looked_at(folder: Path) -> None:
     luma = np.concatenate([pan(60, 1, 96), np.repeat(pan(1, 0, 64), 60, axis=0)], axis=1)
     luma[30:, :96] = other(30)
+    still = pieces((60, Flag.STILL)).tobytes()
     write_clip(folder / "below.mkv", luma, codec="ffv1", pixel_format="gray")
-    for rows, runs in (("full", 2), ("0.6:1", 1)):
+    for rows, expected in (("full", shots(60, 30).tobytes()), ("0.6:1", still)):
         with opened(folder, rows=Rows.parse(rows)) as catalogue:
             entry = next(video for video in catalogue.videos if video.id == "below.mkv")
-            assert len(entry.runs or ()) == runs
+            assert entry.pieces == expected
 
 
 @pytest.mark.slow
@@ -316,7 +290,7 @@ def test_a_prepared_folder_has_the_scenes_of_its_source(folder: Path, tmp_path: 
         with opened(target, progress=lambda done, total: looked.append(done)) as prepared:
             for video in source.videos:
                 assert prepared.scene(video.id).to_bytes() == source.scene(video.id).to_bytes()
-            assert [video.runs for video in prepared.videos] == [video.runs for video in source.videos]
+            assert [video.pieces for video in prepared.videos] == [video.pieces for video in source.videos]
 
 
 def test_a_folder_prepared_without_scenes_gets_them_from_its_source(folder: Path, tmp_path: Path) -> None:

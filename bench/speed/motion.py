@@ -1,0 +1,116 @@
+"""Measure what sub-steps cost a worker: samples with ``substep_px`` against those without, from source and store.
+
+    python -m bench motion --video gopro_hero7_walk.mp4 --json motion.json
+
+The walking clip is ``--video``; the still one repeats its first frame. Each is decoded from the source, and read from a
+store without and with the motion. A turn makes the same samples with and without ``substep_px``; times are processor
+times of one thread, and a ratio is the median of those within turns. Baseline: the samples of the same form without
+``substep_px``. Bars: 5 for the walking clip from a store with motion, 2 from its source; 1.05 and 1.03 for the still
+one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.frame import Column, Report, add_positive, add_whole, progress
+from tests.clips import write_clip
+from tests.oracles.leases import open_leases
+from v2v_protocol.command import Parser
+from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.sources.folder import Folder
+from v2v_server.prepare import prepare
+from v2v_server.store.encoding import Encoding
+from v2v_server.video.decode import decode_luma
+from v2v_server.video.probe import probe
+from v2v_server.worker.produce import decode_for, make_sample
+
+BARS = {("walking", "source"): 2.0, ("walking", "motion"): 5.0, ("still", "source"): 1.03, ("still", "motion"): 1.05}
+STILL_FRAMES = 240
+_COLUMNS: tuple[Column, ...] = (
+    ("clip", "clip", "{}", 1),
+    ("form", "form", "{}", 1),
+    ("plain_seconds", "without, ms a sample", "{:.1f}", 1e3),
+    ("divided_seconds", "with sub-steps", "{:.1f}", 1e3),
+    ("ratio", "ratio", "{:.2f}", 1),
+)
+
+
+def forms_of(video: Path, folder: Path) -> Iterator[tuple[str, str, Path]]:
+    """Yield clip, form and corpus folder of each contender, after making it."""
+    facts = probe(video)
+    first = decode_luma(video, facts.index, 0, 1).frames
+    for clip in ("walking", "still"):
+        source = folder / clip / "source"
+        source.mkdir(parents=True)
+        if clip == "walking":
+            os.symlink(video.resolve(), source / video.name)
+        else:
+            write_clip(source / "still.mp4", np.repeat(first, STILL_FRAMES, axis=0), gop=250, rate=30)
+        yield clip, "source", source
+        for form, planes in (("store", ()), ("motion", ("motion",))):
+            progress(f"{clip}: preparing the store with {', '.join(planes) or 'no plane'}")
+            with closing(open_catalogue(source, processes=0)) as catalogue:
+                target = folder / clip / form
+                prepare.prepare(catalogue, target, Encoding.of("lossless"), planes=planes, processes=0)
+            yield clip, form, target
+
+
+def sample_seconds(videos: Path, spec: StreamSpec, count: int) -> float:
+    """Return the processor time of a sample, the mean of the first ones."""
+    with open_leases(videos, "full", spec) as (root, leases):
+        chosen = list(islice(leases, count))
+        begin = time.process_time()
+        for lease in chosen:
+            (decoded,) = decode_for(lease, lease.indices, Folder(root))
+            make_sample(lease, decoded)
+        return (time.process_time() - begin) / count
+
+
+def compared(asked: argparse.Namespace, folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield the record of each clip and form."""
+    plain = StreamSpec()
+    divided = replace(plain, substep_px=asked.substep_px)
+    for clip, form, videos in forms_of(asked.video, folder):
+        progress(f"{clip}, {form}")
+        for spec in (plain, divided):
+            sample_seconds(videos, spec, 1)  # loads or compiles the kernels
+        turns = [[sample_seconds(videos, spec, asked.samples) for spec in (plain, divided)] for _ in range(asked.turns)]
+        yield {
+            "measure": "sub-steps", "clip": clip, "form": form, "substep_px": asked.substep_px,
+            "plain_seconds": min(turn[0] for turn in turns), "divided_seconds": min(turn[1] for turn in turns),
+            "ratio": statistics.median(turn[1] / turn[0] for turn in turns),
+        }  # fmt: skip
+
+
+def add_flags(parser: Parser) -> None:
+    """Add the bench's flags."""
+    parser.add_argument("--video", type=Path, required=True, metavar="FILE", help="film of someone who walks")
+    add_positive(parser, "--substep-px", 1.0, "substep_px of the spec")
+    add_whole(parser, "--samples", 2, "samples of a turn")
+    add_whole(parser, "--turns", 5, "turns")
+
+
+def measure(asked: argparse.Namespace) -> Report:
+    """Run the bench."""
+    with tempfile.TemporaryDirectory(prefix="v2v-motion-") as folder:
+        records = list(compared(asked, Path(folder)))
+    missed = [
+        f"{found['clip']} clip, {found['form']}: {found['ratio']:.2f} times the plain sample; the bar is {bar}"
+        for found in records
+        if (bar := BARS.get((found["clip"], found["form"]))) is not None and found["ratio"] > bar
+    ]
+    return Report(records, [(records, _COLUMNS)], [], missed)

@@ -1,0 +1,84 @@
+"""Measure what equal trainers cost a server that makes equal samples once (``--share-gib``).
+
+    python -m bench sharing --videos CLIPS --json sharing.json
+
+Server and workers, for one trainer and for four with equal samples, in turns. Their clients' time is beside it.
+
+Bar: four take at most 1.2 times the time of one, the median of the turns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from bench.frame import Column, Report, add_changes, add_videos, add_whole, server_flags
+from bench.processes import cpu_seconds_of, roles_of
+from v2v_client.dataset import V2VStreamDataset
+from v2v_client.local_server import LocalServer
+from v2v_protocol.command import Parser
+
+EQUAL_TRAINERS, MOST_RATIO = 4, 1.2
+_SETTLE_SECONDS = 0.3
+_COLUMNS: tuple[Column, ...] = (
+    ("name", "", "{}", 1),
+    ("workers_cpu_seconds_per_batch", "workers ms", "{:.1f}", 1e3),
+    ("broker_cpu_seconds_per_batch", "broker ms", "{:.1f}", 1e3),
+    ("client_cpu_seconds_per_batch", "clients ms", "{:.1f}", 1e3),
+    ("batches_per_second", "batches/s", "{:.1f}", 1),
+    ("ratio_to_one", "of one", "{:.2f}", 1),
+    ("ratio_to_one_lowest", "lowest", "{:.2f}", 1),
+    ("ratio_to_one_highest", "highest", "{:.2f}", 1),
+)
+
+
+def equal_trainers(asked: argparse.Namespace, trainers: int) -> dict[str, Any]:
+    """Return the record of a server from its start, with trainers that take one epoch of equal samples each."""
+    flags = ["--rows", asked.rows, "--share-gib", "2" if trainers > 1 else "0", *server_flags(asked.changes)]
+    with LocalServer(asked.videos, workers=1, flags=flags) as server:
+
+        def take(dataset: V2VStreamDataset) -> int:
+            return sum(1 for _ in dataset)
+
+        datasets = [V2VStreamDataset(server.address, asked.batch_size, rank=0, world_size=1) for _ in range(trainers)]
+        roles = roles_of(server)
+        before, began = cpu_seconds_of(roles), time.perf_counter()
+        with ThreadPoolExecutor(trainers) as threads:
+            batches = max(threads.map(take, datasets))
+        elapsed = time.perf_counter() - began
+        time.sleep(_SETTLE_SECONDS)  # the server still handles the Goodbye
+        after = cpu_seconds_of(roles)
+    return {
+        "name": f"equal trainers: {trainers}",
+        **{f"{role}_cpu_seconds_per_batch": (after[role] - before[role]) / batches for role in roles},
+        "batches_per_second": batches / elapsed,
+    }
+
+
+def add_flags(parser: Parser) -> None:
+    """Add the bench's flags."""
+    add_videos(parser, "clips", rows="top:0.54")
+    add_whole(parser, "--batch-size", 12, "samples of a batch")
+    add_whole(parser, "--turns", 9, "turns of one trainer and of equal ones")
+    add_changes(parser)
+
+
+def measure(asked: argparse.Namespace) -> Report:
+    """Run the bench: medians over the turns."""
+    turns = [[equal_trainers(asked, trainers) for trainers in (1, EQUAL_TRAINERS)] for _ in range(asked.turns)]
+    records = []
+    for runs in zip(*turns, strict=True):
+        keys = [key for key in runs[0] if key != "name"]
+        records.append({"name": runs[0]["name"], **{key: statistics.median(run[key] for run in runs) for key in keys}})
+
+    def server_seconds(run: dict[str, Any]) -> float:
+        return float(run["workers_cpu_seconds_per_batch"] + run["broker_cpu_seconds_per_batch"])
+
+    ratios = [server_seconds(equal) / server_seconds(one) for one, equal in turns]
+    ratio = statistics.median(ratios)
+    records[1] |= {"ratio_to_one": ratio, "ratio_to_one_lowest": min(ratios), "ratio_to_one_highest": max(ratios)}
+    missed = [f"{EQUAL_TRAINERS} trainers take {ratio:.2f} times the time of one; the bar is {MOST_RATIO}"]
+    return Report(records, [(records, _COLUMNS)], missed=missed if ratio > MOST_RATIO else [])

@@ -1,0 +1,129 @@
+"""Sequences of divided videos, against their definition frame by frame."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.pieces import pieces, shots
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.spec import DEFECTS, StreamSpec
+from v2v_server.corpus.scenes.pieces import encoded_pieces
+from v2v_server.corpus.scenes.scene import NO_BARS, Flag, Pieces, Sides
+from v2v_server.corpus.videos import VideoEntry
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.video.rows import Rows
+
+RECIPE = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=32)
+"""21 frames a sequence, 20 apart."""
+AUTO = StreamSpec(recipe=RECIPE, scene="auto", still_share=1.0)
+BARS = Sides(8, 8, 0, 0)
+SKIPPED = {Flag.FADE: "fades", Flag.BLACK: "black", Flag.WHITE: "white", Flag.COMBED: "combed"}
+
+
+def video(name: str, frames: int, parts: Pieces | None = None) -> VideoEntry:
+    divided = b"" if parts is None else encoded_pieces(parts, frames)
+    return VideoEntry(name, "f", frames, 64, 64, 25.0, "h264", pieces=divided)
+
+
+def starts(table: SequenceTable) -> list[tuple[str, int]]:
+    return [(table[rank].video.id, table[rank].start_frame) for rank in range(table.count)]
+
+
+def expected(parts: Pieces, frames: int, spec: StreamSpec) -> list[int]:
+    """Collect runs frame by frame, and return where sequences begin."""
+    kept, runs, before, first = spec.kept_defects, [list[int]()], None, 0
+    for end, flags, *bars in [*parts.tolist(), (frames, 0, *NO_BARS)]:
+        sides = list(NO_BARS) if "bars" in kept else bars
+        if first < end and ((flags & Flag.CUT and "cuts" not in kept) or sides != (before or sides)):
+            runs.append([])
+        for frame in range(first, end):
+            before = sides
+            if any(flags & flag and kind not in kept for flag, kind in SKIPPED.items()):
+                runs.append([])
+            elif not (flags & Flag.REPEAT and "duplicates" not in kept):
+                runs[-1].append(frame)
+        first = end
+    found = [run[at] for run in runs for at in range(0, len(run) - 20, 20)]
+    return found[: spec.max_sequences_per_video]
+
+
+@st.composite
+def divided(draw: st.DrawFn) -> Pieces:
+    ends = sorted(draw(st.sets(st.integers(1, 300), min_size=1, max_size=8)))
+    flags = st.sampled_from([0, 0, Flag.CUT, Flag.REPEAT, Flag.REPEAT, Flag.STILL, *SKIPPED])
+    return pieces(*((end, draw(flags), draw(st.sampled_from([NO_BARS, NO_BARS, BARS]))) for end in ends))
+
+
+@given(st.lists(divided(), min_size=1, max_size=4), st.integers(1, 8), st.sets(st.sampled_from(DEFECTS)))
+def test_sequences_are_those_of_each_run(all_parts: list[Pieces], most: int, kept: set[str]) -> None:
+    spec = StreamSpec(
+        recipe=RECIPE, scene="auto", still_share=1.0, max_sequences_per_video=most, keep_defects=",".join(kept)
+    )
+    videos = [video(str(number), 300, parts) for number, parts in enumerate(all_parts)]
+    table = SequenceTable([*videos, video("whole", 50)], Rows(), spec)
+    each = [expected(parts, 300, spec) for parts in all_parts]
+    found = [(str(number), start) for number, those in enumerate(each) for start in those]
+    assert starts(table) == [*found, *[("whole", 0), ("whole", 20)][:most]]
+    places = set(range(0, 280, 20)[:most])
+    assert table.spoilt == sum(len(places) - len(places & set(those)) for those in each)
+    assert len(table.refusals) == sum(not those for those in each)
+    assert all(refusal.remedy for refusal in table.refusals)
+
+
+def test_what_can_be_done_about_a_video_is_said() -> None:
+    videos = (video("short", 60, shots(60, 20, 40)), video("boxed", 61, pieces((61, 0, Sides(20, 20, 0, 0)))),
+              video("still", 61, pieces((61, Flag.STILL))))  # fmt: skip
+    table = SequenceTable(videos, Rows(), StreamSpec(recipe=RECIPE, scene="auto", still_share=0.0))
+    assert [(refusal.reason, refusal.remedy) for refusal in table.refusals] == [
+        ("at most 20 frames in a row without a defect, the recipe needs 21", "voxels_per_clip at most 3, or scene off"),
+        (
+            "picture 64x24 after rows full and without its bars, the crop is 32x32",
+            "resize_scale up to 1.334, or a smaller crop",
+        ),
+        ("all its sequences are still", "still_share 1"),
+    ]
+    assert table.count == 0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+def test_a_share_of_the_still_sequences_is_served(share: float) -> None:
+    """Still, or still for three quarters; moving ones are all there."""
+    parts = pieces((16_000, Flag.STILL), (16_005, 0), (16_020, Flag.STILL), (20_000, 0))
+    spec = StreamSpec(recipe=RECIPE, scene="auto", still_share=share, max_sequences_per_video=10_000)
+    found = np.array([start for _, start in starts(SequenceTable([video("a", 20_000, parts)], Rows(), spec))])
+    assert np.count_nonzero(found > 16_000) == 198
+    assert abs(np.count_nonzero(found <= 16_000) - share * 801) <= 50
+
+
+@given(st.integers(21, 300), st.integers(1, 12))
+def test_without_defects_there_are_the_same_sequences(frames: int, most: int) -> None:
+    spec = StreamSpec(recipe=RECIPE, scene="auto", max_sequences_per_video=most)
+    plain = StreamSpec(recipe=RECIPE, max_sequences_per_video=most)
+    videos = (video("a", frames), video("b", 40))
+    table = SequenceTable(videos, Rows(), spec)
+    assert starts(table) == starts(SequenceTable(videos, Rows(), plain))
+    assert table.spoilt == 0
+
+
+@given(st.lists(st.integers(1, 299), unique=True, max_size=12), st.integers(1, 12))
+def test_no_sequence_holds_a_cut(cuts: list[int], most: int) -> None:
+    spec = StreamSpec(recipe=RECIPE, scene="auto", max_sequences_per_video=most)
+    table = SequenceTable((video("a", 300, shots(300, *sorted(cuts))), video("z", 21)), Rows(), spec)
+    found = [start for name, start in starts(table) if name == "a"]
+    assert len(found) <= most
+    for start in found:
+        assert not any(start < cut < start + 21 for cut in cuts)
+    assert all(later - earlier >= 20 for earlier, later in pairwise(found))
+
+
+def test_a_catalogue_without_statistics_says_what_to_do() -> None:
+    plain = VideoEntry("a", "f", 61, 64, 64, 25.0, "h264")
+    with pytest.raises(UsageError, match="--scene auto"):
+        SequenceTable((plain,), Rows(), AUTO)
+    assert SequenceTable((plain,), Rows(), StreamSpec(recipe=RECIPE)).count == 3

@@ -1,0 +1,111 @@
+"""Motion is the same from the source, from stores and from caches, with and without a plane of it."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.clips import panned_luma, write_clip
+from tests.oracles.leases import open_leases
+from tests.server.prepare.test_prepare import run
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import Sample
+from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.sources.folder import Folder
+from v2v_server.store import motion
+from v2v_server.store.cache import Cache, make_cache
+from v2v_server.store.encoding import Encoding
+from v2v_server.store.reader import StoreFile
+from v2v_server.worker.produce import decode_for, make_sample
+
+ROWS, LOSSLESS, PLANES = "top:0.9", Encoding.of("lossless"), ("motion",)
+RECIPE = Recipe(
+    voxels_per_clip=3, bins=3, crop_height_px=26, crop_width_px=32, resize_scale=(0.7, 1.3), pause_probability=0.5
+)
+SPECS = [
+    StreamSpec(recipe=RECIPE.replace(resize_scale=(1.0, 1.0)), substep_px=0.5, samples_per_decode=2, sibling_spacing=1),
+    StreamSpec(recipe=RECIPE, substep_px=1.0),
+    StreamSpec(recipe=RECIPE.replace(frame_stride=2, voxels_per_clip=2), substep_px=0.5),
+]
+
+
+@pytest.fixture(autouse=True)
+def small_pieces(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("v2v_server.store.cache.piece_frames", lambda rows, width_px: 7)
+    monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path / "index"))
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("motion")
+    (folder / "source").mkdir()
+    write_clip(folder / "source" / "turned.mov", panned_luma(40, 60, 80), rotation_degrees=90, b_frames=2)
+    assert run(folder / "source", folder / "plain", LOSSLESS, rows=ROWS).complete
+    assert run(folder / "source", folder / "planes", LOSSLESS, rows=ROWS, planes=PLANES).complete
+    return {name: folder / name for name in ("source", "plain", "planes")}
+
+
+def samples(videos: Path, spec: StreamSpec, cache: Cache | None = None, count: int = 5) -> list[Sample]:
+    found = []
+    with open_leases(videos, ROWS, spec) as (root, leases):
+        for lease in islice(leases, count):
+            lease = replace(lease, arrays=("voxels", "event_counts"))
+            for index, decoded in zip(
+                lease.indices, decode_for(lease, lease.indices, Folder(root), cache), strict=True
+            ):
+                found.append(make_sample(replace(lease, indices=(index,)), decoded))
+    return found
+
+
+def require_equal(found: list[Sample], expected: list[Sample]) -> None:
+    for one, other in zip(found, expected, strict=True):
+        assert one.provenance.params == other.provenance.params
+        for name, array in other.arrays.items():
+            np.testing.assert_array_equal(one.arrays[name], array, err_msg=name)
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=["siblings", "resized", "stride"])
+def test_samples_with_sub_steps_are_those_of_the_source(
+    folders: dict[str, Path], spec: StreamSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = samples(folders["source"], spec)
+    plain = samples(folders["source"], replace(spec, substep_px=0.0))
+    assert any(not np.array_equal(a.arrays["voxels"], b.arrays["voxels"]) for a, b in zip(expected, plain, strict=True))
+    assert {sample.provenance.params.flip for sample in expected} == {False, True}
+    require_equal(samples(folders["plain"], spec), expected)
+    make_cache(tmp_path / "cache")
+    cache = Cache(tmp_path / "cache", 1 << 30, 0)
+    samples(folders["source"], replace(spec, substep_px=0.0), cache)
+    full = Cache(tmp_path / "cache", 1, 0)
+    require_equal(samples(folders["source"], spec, full), expected)  # from pieces that cannot get the motion
+    require_equal(samples(folders["source"], spec, cache), expected)
+    if spec.recipe.frame_stride == 1:
+        monkeypatch.delattr(motion.MotionOfCuts, "add")  # the motion is read
+    require_equal(samples(folders["source"], spec, cache), expected)
+    require_equal(samples(folders["planes"], spec), expected)
+
+
+def test_motion_is_added_to_a_store_that_lacks_it(folders: dict[str, Path], tmp_path: Path) -> None:
+    store = Path(shutil.copytree(folders["plain"], tmp_path / "store"))
+    before = (store / "turned.mov").read_bytes()
+    report = run(folders["source"], store, LOSSLESS, rows=ROWS, planes=PLANES)
+    assert report.complete
+    assert (report.kept, report.looked_at) == (0, 0)
+    after = (store / "turned.mov").read_bytes()
+    assert after == (folders["planes"] / "turned.mov").read_bytes()
+    assert after.startswith(before)
+    assert run(folders["source"], store, LOSSLESS, rows=ROWS, planes=PLANES).kept == 1
+    assert run(folders["source"], store, LOSSLESS, rows=ROWS).kept == 1
+    with StoreFile(store / "turned.mov") as stored:
+        assert stored.planes == {"motion"}
+
+
+def test_small_files_hold_no_planes(folders: dict[str, Path], tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="only lossless files hold planes"):
+        run(folders["source"], tmp_path, Encoding.of("h264"), planes=PLANES)

@@ -1,0 +1,127 @@
+"""Colour: the stored samples at the right pixels in all formats and orientations, and red, green and blue from them."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from av.video.frame import VideoFrame
+from av.video.reformatter import ColorRange, Colorspace
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v2v_server.video.collect import ChromaCut
+from v2v_server.video.colour.chroma import ChromaStack
+from v2v_server.video.colour.rgb import add_colour
+from v2v_server.video.luma import LumaFormat, luma_plane, range_table
+from v2v_server.video.orientation import Orientation
+
+FORMATS = ("yuv420p", "yuvj420p", "yuv422p", "yuv444p", "yuv411p", "nv12", "nv21", "nv24", "yuv420p10le", "yuv444p12be")
+ORIENTATIONS = [Orientation(*flags) for flags in product((False, True), repeat=3)]
+
+
+def random_frame(name: str, height: int, width: int, seed: int) -> VideoFrame:
+    frame = VideoFrame(width, height, name)
+    generator = np.random.default_rng(seed)
+    bits = frame.format.components[0].bits
+    for plane in frame.planes:
+        samples = np.frombuffer(memoryview(plane), np.uint8 if bits == 8 else f"{'>' if 'be' in name else '<'}u2")
+        np.asarray(samples)[...] = generator.integers(0, 2**bits, samples.size)
+    return frame
+
+
+def full_size(frame: VideoFrame) -> npt.NDArray[np.int64]:
+    """Cb and Cr of every stored pixel, [2, height, width], of a planar copy that FFmpeg makes."""
+    name = frame.format.name.replace("nv12", "yuv420p").replace("nv21", "yuv420p").replace("nv24", "yuv444p")
+    planar = frame if name == frame.format.name else frame.reformat(format=name)
+    bits = planar.format.components[0].bits
+    found = []
+    for number in (1, 2):
+        plane, component = planar.planes[number], planar.format.components[number]
+        dtype = np.dtype(np.uint8 if bits == 8 else f"{'>' if 'be' in name else '<'}u2")
+        samples = np.frombuffer(memoryview(plane), dtype).reshape(plane.height, -1)[:, : component.width]
+        rows = np.arange(frame.height) // -(-frame.height // component.height)
+        columns = np.arange(frame.width) // -(-frame.width // component.width)
+        found.append(samples[np.ix_(rows, columns)])
+    return np.array(found, np.int64)
+
+
+@given(
+    name=st.sampled_from(FORMATS), orientation=st.sampled_from(ORIENTATIONS), top=st.integers(0, 3),
+    height=st.integers(8, 13), width=st.integers(8, 13), seed=st.integers(0, 99), data=st.data(),
+)  # fmt: skip
+def test_each_pixel_has_the_colour_of_its_cell(
+    name: str, orientation: Orientation, top: int, height: int, width: int, seed: int, data: st.DataObject
+) -> None:
+    frame = random_frame(name, *orientation.size(height, width), seed)
+    y, x = data.draw(st.integers(top, height - 2)), data.draw(st.integers(0, width - 2))
+    window = (y, x, data.draw(st.integers(1, height - y)), data.draw(st.integers(1, width - x)))
+    cut = ChromaCut((1, 3), window, top)
+    stack = ChromaStack(cut, orientation, height, width)
+    for ordinal in range(4):
+        stack.add(random_frame(name, *orientation.size(height, width), 7) if ordinal == 3 else frame, ordinal)
+    chroma = stack.chroma()
+    assert chroma.matrix == "BT.601"
+    luma = LumaFormat.of(frame)
+    scale, stored = 2 ** (luma.bits - 8), full_size(frame)
+    span = 2**luma.bits - 1 if luma.full_range else 224 * scale
+    values = np.clip(np.floor((stored - 128 * scale) * 255 / span + 0.5), -128, 127)
+    upright = orientation.upright(values)
+    expected = upright[
+        :,
+        (top + (window[0] - top + np.arange(window[2])) // 2 * 2)[:, None],
+        (window[1] + np.arange(window[3])) // 2 * 2,
+    ]
+    np.testing.assert_array_equal(cut.pixels(chroma.cells[0]), expected + 128)
+
+
+def rgb_of(frame: VideoFrame) -> npt.NDArray[np.uint8]:
+    height, width = frame.height, frame.width
+    cut = ChromaCut((0,), (0, 0, height, width), 0)
+    stack = ChromaStack(cut, Orientation(), height, width)
+    stack.add(frame, 0)
+    cells, matrix = stack.chroma()
+    luma = LumaFormat.of(frame)
+    grey = range_table(luma.bits, luma.full_range)[luma_plane(frame, luma)]
+    out = np.empty((3, height, width), np.uint8)
+    add_colour(grey, cut.pixels(cells[0]), matrix, 1.0, out)
+    return out
+
+
+@pytest.mark.parametrize("colorspace", [Colorspace.ITU601, Colorspace.ITU709, Colorspace.BT2020])
+@pytest.mark.parametrize("colour_range", [ColorRange.MPEG, ColorRange.JPEG])
+@pytest.mark.parametrize("name", ["yuv420p", "yuv444p10le"])
+def test_colours_come_back_by_the_stated_matrix_and_range(colorspace: Any, colour_range: Any, name: str) -> None:
+    colours = np.random.default_rng(3).integers(0, 256, (8, 8, 3), np.uint8)
+    picture = colours.repeat(16, 0).repeat(16, 1)
+    frame = VideoFrame.from_ndarray(picture, format="rgb24").reformat(
+        format=name, dst_colorspace=colorspace, dst_color_range=colour_range
+    )
+    frame.colorspace, frame.color_range = colorspace, colour_range
+    got = rgb_of(frame).transpose(1, 2, 0)
+    inner = (slice(8, None, 16), slice(8, None, 16))  # not at the borders of a patch
+    assert np.abs(got[inner].astype(int) - colours).max() <= 4
+
+
+@pytest.mark.parametrize("name", ["gray", "rgb24", "yuv420p"])
+def test_a_grey_picture_is_the_same_in_all_channels(name: str) -> None:
+    picture = np.random.default_rng(1).integers(0, 256, (12, 16), np.uint8)
+    frame = VideoFrame.from_ndarray(picture, format="gray").reformat(format=name)
+    if name == "yuv420p":
+        for plane in frame.planes[1:]:
+            np.frombuffer(memoryview(plane), np.uint8)[...] = 128
+    red, green, blue = rgb_of(frame)
+    luma = LumaFormat.of(frame)
+    grey = range_table(luma.bits, luma.full_range)[luma_plane(frame, luma)]
+    for channel in (red, green, blue):
+        np.testing.assert_array_equal(channel, grey)
+
+
+def test_formats_without_planes_have_colour() -> None:
+    colours = np.array([[250, 10, 20], [10, 240, 30], [15, 25, 230]], np.uint8)
+    picture = np.ascontiguousarray(colours.repeat(8, 0)[:, None].repeat(8, 1))
+    got = rgb_of(VideoFrame.from_ndarray(picture, format="rgb24"))
+    assert np.abs(got[:, 2::8, 2].T.astype(int) - colours).max() <= 4

@@ -1,0 +1,157 @@
+"""Boxes and masks of whole samples: they lie where the pictures show their object, and never change other arrays."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from tests.clips import write_clip
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import Sample
+from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.offline.remake import Remaker
+from v2v_server.video.rows import Rows
+
+FRAMES, HEIGHT_PX, WIDTH_PX, SIDE_PX = 40, 48, 64, 14
+RECIPE = Recipe(
+    voxels_per_clip=4, bins=2, crop_height_px=24, crop_width_px=32, lead_frames=1, frame_stride=2,
+    pause_probability=0.3, pause_stay_probability=0.5, resize_scale=(0.6, 1.6),
+)  # fmt: skip
+
+
+def place(frame: int) -> tuple[int, int]:
+    """Where the square of that frame begins: column and row."""
+    return 2 + frame % 41, 4 + frame % 23
+
+
+def pictures(value: int) -> np.ndarray:
+    drawn = np.zeros((FRAMES, HEIGHT_PX, WIDTH_PX), np.uint8)
+    for frame in range(FRAMES):
+        left, top = place(frame)
+        drawn[frame, top : top + SIDE_PX, left : left + SIDE_PX] = value
+    return drawn
+
+
+def boxes_text(extra: tuple[int, ...] = ()) -> str:
+    images = [{"id": frame, "frame_id": frame} for frame in range(FRAMES)]
+    boxes = [
+        {"image_id": frame, "bbox": [*place(frame), side, side], "category_id": 3, "instance_id": number}
+        for frame in range(FRAMES)
+        for number, side in enumerate((SIDE_PX, *extra))
+    ]
+    return json.dumps({"images": images, "annotations": boxes})
+
+
+@pytest.fixture(scope="module")
+def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bright square that moves over black, with its labels."""
+    folder = tmp_path_factory.mktemp("squares")
+    write_clip(folder / "a.mp4", pictures(255), options={"qp": "0"}, full_range=True)
+    (folder / "a.boxes.json").write_text(boxes_text())
+    (folder / "a.masks").mkdir()
+    for frame, picture in enumerate(pictures(3)):
+        Image.fromarray(picture).save(folder / "a.masks" / f"{frame:05}.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def catalogue(corpus: Path) -> Iterator[Catalogue]:
+    with closing(open_catalogue(corpus, processes=0, rows=Rows.parse("0.1:0.9"))) as opened:
+        yield opened
+
+
+def made(catalogue: Catalogue, recipe: Recipe, seed: int, arrays: tuple[str, ...]) -> Sample:
+    return Remaker(catalogue, StreamSpec(recipe=recipe), arrays).sample(seed, 0, 0)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32))
+def test_labels_follow_crop_resize_flip_pauses_and_stride(catalogue: Catalogue, seed: int) -> None:
+    sample = made(catalogue, RECIPE, seed, ("voxels", "frames", "boxes", "masks"))
+    plain = made(catalogue, RECIPE, seed, ("voxels", "frames"))
+    for name in plain.arrays:
+        assert sample.arrays[name].tobytes() == plain.arrays[name].tobytes()
+    assert sample.provenance.params == plain.provenance.params
+    assert sample.provenance.labelled
+    assert set(sample.provenance.sidecars) == {".boxes.json", ".masks/"}
+    height, width = RECIPE.crop_px
+    for frame, boxes, mask in zip(*(sample.arrays[name] for name in ("frames", "boxes", "masks")), strict=True):
+        picture, mask = frame[0], mask[0]
+        assert np.all(mask[picture > 0.76 * 255] == 3)
+        assert np.all(mask[picture < 0.24 * 255] == 0)
+        assert np.all(boxes[1:] == -1)
+        x0, y0, x1, y1, category, track, visible = boxes[0]
+        lit = picture >= 128
+        if category == -1:
+            # Too small a part: a tenth of the square, or a side of less than 2 px.
+            assert lit.sum() <= max(0.15 * (SIDE_PX * 1.6) ** 2, 3 * SIDE_PX * 1.6)
+            continue
+        assert (category, track) == (3, 0)
+        assert 0.1 <= visible <= 1
+        assert 0 <= x0 < x1 <= width
+        assert 0 <= y0 < y1 <= height
+        rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
+        np.testing.assert_allclose([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], [x0, y0, x1, y1], atol=0.6)
+
+
+def test_the_smallest_boxes_are_left_out_and_counted(corpus: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "videos"
+    folder.mkdir()
+    (folder / "a.mp4").symlink_to(corpus / "a.mp4")
+    (folder / "a.boxes.json").write_text(boxes_text((6, 18, 10)))
+    whole = {"crop_height_px": HEIGHT_PX, "crop_width_px": WIDTH_PX, "resize_scale": (1.0, 1.0), "max_boxes": 2}
+    with closing(open_catalogue(folder, processes=0)) as catalogue:
+        sample = made(catalogue, RECIPE.replace(**whole), 0, ("boxes",))
+        assert sample.arrays["boxes"].shape == (5, 2, 7)
+        assert sample.arrays["boxes"][:, :, 5].tolist() == [[2.0, 0.0]] * 5, "the two largest"
+        assert sample.provenance.boxes_dropped == 10
+        assert "boxes_dropped" not in made(catalogue, RECIPE.replace(**whole), 0, ("frames",)).provenance.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("labels", "reason"),
+    [
+        ({}, r"its sidecar \.boxes\.json or \.boxes\.txt or \.boxes/: is missing: add it beside the video"),
+        ({".boxes.json": "{"}, r"its sidecar \.boxes\.json: .*line 1"),
+        ({".boxes.txt": "1,2\n"}, r"its sidecar \.boxes\.txt: line 1 has 2 values"),
+        ({".boxes.json": '{"images": [{"id": 0, "frame_id": 0}], "annotations": []}'}, "has no frame"),
+        ({".boxes.txt": "", ".boxes.json": "{}"}, r"\.boxes\.json or \.boxes\.txt: there are 2: keep one"),
+    ],
+)
+def test_a_video_without_sound_labels_gives_an_unlabelled_sample(
+    corpus: Path, tmp_path: Path, labels: dict[str, str], reason: str
+) -> None:
+    folder = tmp_path / "videos"
+    folder.mkdir()
+    (folder / "a.mp4").symlink_to(corpus / "a.mp4")
+    for ending, text in labels.items():
+        (folder / f"a{ending}").write_text(text)
+    with closing(open_catalogue(folder, processes=0)) as catalogue:
+        sample, plain = (made(catalogue, RECIPE, 7, arrays) for arrays in (("frames", "boxes"), ("frames",)))
+    assert np.all(sample.arrays["boxes"] == -1)
+    assert not sample.provenance.labelled
+    (text,) = sample.provenance.unlabelled.values()
+    assert re.search(reason, text)
+    assert sample.arrays["frames"].tobytes() == plain.arrays["frames"].tobytes()
+    assert (sample.provenance.video, sample.provenance.params) == (plain.provenance.video, plain.provenance.params)
+
+
+def test_a_missing_mask_marks_all_pixels(corpus: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "videos"
+    (folder / "a.masks").mkdir(parents=True)
+    (folder / "a.mp4").symlink_to(corpus / "a.mp4")
+    (folder / "a.masks" / "0.png").symlink_to(corpus / "a.masks" / "00000.png")
+    with closing(open_catalogue(folder, processes=0)) as catalogue:
+        sample = made(catalogue, RECIPE, 7, ("masks",))
+    assert np.all(sample.arrays["masks"] == 255)
+    assert "has no file of frame" in sample.provenance.unlabelled["masks"]

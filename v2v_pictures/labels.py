@@ -1,0 +1,73 @@
+"""Draw boxes and masks over a panel."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_pictures import canvas
+from v2v_pictures.camera import Camera
+from v2v_pictures.canvas import Canvas, Colour
+from v2v_pictures.colours import Image
+
+_COLOURS: tuple[Colour, ...] = (
+    (0, 128, 70),
+    (190, 110, 0),
+    (120, 50, 170),
+    (0, 130, 140),
+    (120, 110, 0),
+    (180, 0, 140),
+)
+"""Colours of the classes, in turn: none is the red or blue of events."""
+_TINT = 0.45
+_NO_OBJECT = (0, 255)
+_TEXT_PT = 12
+
+
+def class_colour(category: int) -> Colour:
+    """Return the colour of a class."""
+    return _COLOURS[category % len(_COLOURS)]
+
+
+def tint(image: Image, mask: npt.NDArray[np.uint8]) -> Image:
+    """Return a picture [H, W, 3] tinted by the classes of a mask [H, W]; classes 0 and 255 leave it as it is."""
+    tinted = image.astype(np.float32)
+    for category in np.unique(mask):
+        if category not in _NO_OBJECT:
+            place = mask == category
+            tinted[place] += _TINT * (np.array(class_colour(int(category)), np.float32) - tinted[place])
+    result: Image = np.rint(tinted).astype(np.uint8)
+    return result
+
+
+def labelled_panel(
+    page: Canvas, camera: Camera, grid: int, x: int, y: int, image: Image, tile_px: int, *, with_text: bool = False
+) -> None:
+    """Draw a panel with the boxes and the mask of one voxel grid's frame.
+
+    Args:
+        camera: has the labels; without any, this is only the panel.
+        grid: number of the voxel grid.
+        x, y, tile_px: place and side of the panel, px.
+        image: [H, W, 3], as large as the camera's frames.
+        with_text: write the class of each box.
+    """
+    if camera.masks is not None:
+        image = tint(image, camera.masks[grid])
+    page.panel(x, y, image, tile_px, tile_px)
+    if camera.boxes is None:
+        return
+    height, width = image.shape[:2]
+    scale = min(tile_px / width, tile_px / height)
+    left, top = x + (tile_px - width * scale) / 2, y + (tile_px - height * scale) / 2
+    for x0, y0, x1, y1, category, *_ in camera.boxes[grid]:
+        if category < 0:
+            continue
+        colour = class_colour(int(category))
+        right, bottom = left + x1 * scale - 1, top + y1 * scale - 1
+        page.frame(left + x0 * scale, top + y0 * scale, right, bottom, colour, 2)
+        if with_text:
+            text = f"{int(category)}"
+            size = canvas.text_width(text, _TEXT_PT) + 4
+            page.box(left + x0 * scale, top + y0 * scale, left + x0 * scale + size, top + y0 * scale + 15, colour)
+            page.text(left + x0 * scale + 2, top + y0 * scale + 1, text, size=_TEXT_PT, colour=canvas.PAPER)

@@ -1,0 +1,159 @@
+"""From figures of every frame to the pieces of a video. Pure, in integer arithmetic.
+
+Still: for 16 frames or more, at most one block in a hundred changes by more than two grey levels over four frames.
+
+Black, white: for four frames or more, 99 % of the blocks lie within 1.5 grey levels of their mean, so there is nothing
+to see. A night scene is not black.
+
+Fade: the light falls from frame to frame for at least 6 frames, to an eighth of what it was, and the contrast with it;
+no single step is half of it. In reverse, the same from black.
+
+Combing: in a block that changes, neighbouring lines differ twice as much as lines of the same field do. A shot is
+combed if an eighth of its frames that were looked at have such blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_server.corpus.scenes.bars import common_bars
+from v2v_server.corpus.scenes.scene import LAG_FRAMES, NO_BARS, PIECE, Flag, Pieces, Sides
+from v2v_server.corpus.scenes.steps import Spans, runs_of
+
+_STILL_CHANGE = 2 * 64
+"""Change of a block, 1/64 grey level."""
+_STILL_SHARE = 100
+"""One of that number of blocks may change by more."""
+_STILL_GAP = 2 * LAG_FRAMES
+"""Frames. A step at a keyframe of low quality, which shows nothing new, spoils the lag's frames and a few after it."""
+_STILL_FRAMES = 16
+_FLAT_SPREAD = 96
+"""1/64 grey level."""
+_FLAT_SHARE = 100
+_FLAT_FRAMES = 4
+_BRIGHT_FROM = 128 * 64
+_FADE_FRAMES = 6
+_FADE_SMOOTH = 2
+"""Frames on either side over which light is averaged."""
+_FADE_LEAST_CONTRAST = (4 * 64) ** 2
+_FADE_LEAST_STEP = 500
+"""Smaller changes than 1/500 of the light are none."""
+_FADE_RATIO = 8
+_COMBED_SHARE = 8
+_COMBED_COUNT = 2
+_COMBED_GAP = 24
+"""Frames between two that are combed: of 24 in 60 fields a second, not every picture is."""
+
+
+def is_still(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> bool:
+    """Return whether two pictures show the same, from the means of their blocks, 1/64 grey level."""
+    moved = int(np.count_nonzero(np.abs(after - before) > _STILL_CHANGE))
+    return moved * _STILL_SHARE <= after.size
+
+
+def is_flat(blocks: npt.NDArray[np.int64]) -> bool:
+    """Return whether a picture shows nothing, from the means of its blocks, 1/64 grey level."""
+    mean = int(blocks.sum()) // blocks.size
+    return int(np.count_nonzero(np.abs(blocks - mean) > _FLAT_SPREAD)) * _FLAT_SHARE <= blocks.size
+
+
+def fades_of(light: npt.NDArray[np.int64], contrast: npt.NDArray[np.int64]) -> Spans:
+    """Return the fades to and from black.
+
+    Args:
+        light: [N] mean of each frame, 1/64 grey level.
+        contrast: [N] variance of its blocks, (1/64 grey level)^2.
+    """
+    count = len(light)
+    if count < _FADE_FRAMES:
+        return ()
+    backward = [(count - end, count - first) for first, end in _falls(light[::-1], contrast[::-1])]
+    return tuple(sorted([*_falls(light, contrast), *backward]))
+
+
+def _falls(light: npt.NDArray[np.int64], contrast: npt.NDArray[np.int64]) -> list[tuple[int, int]]:
+    padded = np.pad(light, _FADE_SMOOTH, mode="edge")
+    smooth = np.lib.stride_tricks.sliding_window_view(padded, 2 * _FADE_SMOOTH + 1).sum(axis=1)
+    drops = smooth[:-1] - smooth[1:]
+    found = []
+    for first, end in runs_of(drops * _FADE_LEAST_STEP > smooth[:-1], _FADE_FRAMES):
+        falls = light[first:end] - light[first + 1 : end + 1]
+        is_dark = light[end] * _FADE_RATIO <= light[first] and contrast[end] * _FADE_RATIO**2 <= contrast[first]
+        if is_dark and contrast[first] >= _FADE_LEAST_CONTRAST and 2 * falls.max() <= light[first] - light[end]:
+            found.append((first, end + 1))
+    return found
+
+
+def combed_runs(looks: Sequence[tuple[int, bool]], first: int, end: int) -> Spans:
+    """Return the stretches of a shot whose pictures are combed.
+
+    Args:
+        looks: (frame, whether it is combed) of the frames that were looked at, of the whole video.
+        first, end: the frames of the shot.
+    """
+    inside = [(frame, combed) for frame, combed in looks if first <= frame < end]
+    combed = [frame for frame, combed in inside if combed]
+    if len(combed) < _COMBED_COUNT or len(combed) * _COMBED_SHARE < len(inside):
+        return ()
+    reach = inside[1][0] - inside[0][0]
+    flags = np.zeros(end - first, bool)
+    for frame in combed:
+        flags[max(0, frame - reach - first) : frame + reach - first] = True
+    return tuple((first + low, first + high) for low, high in runs_of(flags, 1, _COMBED_GAP))
+
+
+def pieces_of(
+    light: npt.NDArray[np.int64],
+    contrast: npt.NDArray[np.int64],
+    still: npt.NDArray[np.bool_],
+    flat: npt.NDArray[np.bool_],
+    repeats: npt.NDArray[np.bool_],
+    boundaries: Sequence[int],
+    combed: Sequence[tuple[int, bool]],
+    bars: Sequence[tuple[int, Sides]],
+    size: tuple[int, int],
+) -> Pieces:
+    """Return the pieces of a video's frames.
+
+    Args:
+        light, contrast: see :func:`fades_of`.
+        still, flat: [N] of each frame.
+        repeats: [N - 1] of each step.
+        boundaries: frames at which another shot begins.
+        combed: see :func:`combed_runs`.
+        bars: (frame, bars) of the frames that were measured.
+        size: height and width of the pictures.
+    """
+    count = len(light)
+    flags = np.zeros(count, np.uint16)
+    flags[1:][repeats] |= Flag.REPEAT
+    bright = light >= _BRIGHT_FROM
+    shots = tuple(pairwise([0, *boundaries, count]))
+    spans = {
+        Flag.FADE: fades_of(light, contrast),
+        Flag.STILL: runs_of(still & ~flat, _STILL_FRAMES, _STILL_GAP),
+        Flag.BLACK: runs_of(flat & ~bright, _FLAT_FRAMES),
+        Flag.WHITE: runs_of(flat & bright, _FLAT_FRAMES),
+        Flag.COMBED: [run for first, end in shots for run in combed_runs(combed, first, end)],
+    }
+    for flag, runs in spans.items():
+        for first, end in runs:
+            flags[first:end] |= flag
+    flags[list(boundaries)] |= Flag.CUT
+    changes = np.flatnonzero(np.diff(flags & ~np.uint16(Flag.CUT))) + 1
+    ends = sorted({*changes.tolist(), *boundaries, count})
+    pieces = np.empty(len(ends), PIECE)
+    pieces["end"] = ends
+    firsts = np.array([0, *ends[:-1]])
+    pieces["flags"] = flags[firsts]
+    for first, end in shots:
+        shot = [sides for frame, sides in bars if first <= frame < end]
+        sides = common_bars(shot, *size) if shot else NO_BARS
+        inside = (firsts >= first) & (firsts < end)
+        for name, depth in zip(Sides._fields, sides, strict=True):
+            pieces[name][inside] = depth
+    return pieces

@@ -1,0 +1,13 @@
+"""Fit a virtual camera to a recording of a real one, and check a recipe as a laboratory does.
+
+recording   what is read of a recording: events and frames of some pixels
+increments  changes of brightness beside events, still stretches, intervals
+interval    estimates with intervals by a bootstrap over blocks
+estimators  each parameter from these measurements
+simulated   the recording's frames through the product's kernel
+statistics  statistics of recording and simulation, and their distance
+fit         the whole fit, fit(); which effects stay
+report      the recipe file and the report in words
+picture     the report as a picture
+lab         a simulated camera on a test bench
+"""

@@ -1,0 +1,285 @@
+"""Fit a camera to a recording: estimate, match with the kernel, and keep the effects that evidence supports."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.recipe import effect_settings
+from v2v_recordings.items import ConvertOptions, Progress
+from v2v_server.fit import estimators
+from v2v_server.fit.increments import Still, increments_of, intervals_us, still_time
+from v2v_server.fit.interval import Doubles, Estimate, bootstrap, sums_by_block, unknown
+from v2v_server.fit.recording import Recorded, read_recording
+from v2v_server.fit.simulated import simulate_recording
+from v2v_server.fit.statistics import Panels, gain, panels_of
+
+LEAST_FRAMES = 3
+USUAL_THRESHOLD = 0.2
+"""Stands in where thresholds cannot be told."""
+_LEAKS_HZ = np.array([0.0, 0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0, 4.0])
+_GREY_OF_STATIC = 136
+"""Grey level of a quarter of white's light: a static scene without frames."""
+_STATIC_LIGHT_DOUBT = 0.3
+_BLOCKS_SIDE = 8
+_NOISE_PANELS = {
+    "shot_noise_hz": ("still", "still_pixels"),
+    "leak_hz": ("still", "still_pixels"),
+    "hot_pixel_share": ("still_pixels",),
+    "dead_pixel_share": ("pixels",),
+}
+"""Statistics that decide about an effect; those of still pixels do not depend on the motion between frames."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedCamera:
+    """A camera fitted to a recording.
+
+    Attributes:
+        estimates: by the recipe's names, and ``threshold_pos``, ``threshold_neg``.
+        left_out: why an effect is not in the recipe, by name.
+        measured, simulated: statistics of the recording and of its simulation; None without frames.
+        facts: what was read: events, pixels, seconds, frames, and the shares of brighter events.
+    """
+
+    estimates: Mapping[str, Estimate]
+    left_out: Mapping[str, str]
+    measured: Panels
+    simulated: Panels | None
+    facts: Mapping[str, float]
+
+    @property
+    def camera(self) -> dict[str, float]:
+        """Values of the parameters in use: told, and not left out."""
+        return _values({name: made for name, made in self.estimates.items() if name not in self.left_out})
+
+
+def fit(
+    recording: str | Path | Recorded,
+    *,
+    static: bool = False,
+    options: ConvertOptions | None = None,
+    progress: Progress = lambda _done, _total: None,
+) -> FittedCamera:
+    """Fit a camera to a recording of events, with or without frames.
+
+    Args:
+        recording: a file or folder of any form that ``v2v-convert`` reads; or what was read already.
+        static: neither the scene nor the camera moved, so all events are noise.
+        options: what the recording lacks, such as the size of its sensor.
+
+    Raises:
+        UsageError: the recording cannot be read, or has no events.
+    """
+    given = recording if isinstance(recording, Recorded) else read_recording(recording, options, progress)
+    has_frames = len(given.frames) >= LEAST_FRAMES
+    if static and not has_frames:
+        given = _with_constant_frames(given)
+    estimates = _estimates(given, static and not has_frames)
+    light = estimators.light_of(np.arange(256.0))
+    begin, end = _span(given)
+    measured = panels_of(given, light, begin, end)
+    left_out = {name: made.note for name, made in estimates.items() if not made.told}
+    left_out |= {
+        name: f"at most {made.high:.3g}, too little to matter"
+        for name, made in estimates.items()
+        if made.is_absent and name in _switches()
+    }
+    simulated = None
+    if len(given.frames) >= LEAST_FRAMES and ("threshold_pos" in _values(estimates) or static):
+        left_out |= _without_evidence(given, estimates, left_out, light, is_blank=static and not has_frames)
+        used = _values({name: made for name, made in estimates.items() if name not in left_out})
+        simulated = panels_of(simulate_recording(given, _complete(used), 2), light, begin, end)
+    facts = {
+        "events": float(given.counts.sum()), "pixels": float(len(given.pixels)), "seconds": given.seconds,
+        "frames": float(len(given.frames) if has_frames else 0),
+        "on_share": float(given.counts[1].sum() / max(given.counts.sum(), 1)),
+    }  # fmt: skip
+    return FittedCamera(estimates, left_out, measured, simulated, facts)
+
+
+def _estimates(given: Recorded, is_blank: bool) -> dict[str, Estimate]:
+    """Estimate all parameters. ``is_blank``: the frames are made up, of one grey level."""
+    blocks, light = given.blocks(_BLOCKS_SIDE), estimators.light_of(np.arange(256.0))
+    period = estimators.refractory(intervals_us(given))
+    has_frames = len(given.frames) >= LEAST_FRAMES
+    longest_us = 1e6 * _frame_seconds(given) if has_frames else 0.0
+    if has_frames and not period.told and math.isfinite(period.high) and not is_blank:
+        period = estimators.refractory_by_change(given, blocks, period, longest_us)
+    made = {"refractory_seconds": period}
+    if not has_frames:
+        note = f"needs at least {LEAST_FRAMES} frames"
+        names = ("threshold_pos", "threshold_neg", "log_eps", "threshold_mismatch_sigma", "photoreceptor_hz")
+        noise = "shot_noise_hz", "leak_hz", "hot_pixel_share", "hot_pixel_sigma"
+        made |= {name: unknown(note) for name in names}
+        made |= {name: unknown(f"{note}, or a static scene (--static)") for name in noise}
+        return made | {"dead_pixel_share": estimators.dead_pixels(given, blocks)}
+    refractory_seconds = period.value if period.told else 0.0
+    still = still_time(given, light)
+    is_hot = estimators.hot_mask(still)
+    increments = increments_of(given, refractory_seconds, longest_us)
+    usual = ~is_hot[increments.pixel]
+    increments = increments.take(usual)
+    regression = estimators.Regression(increments, blocks)
+    made["threshold_pos"], made["threshold_neg"] = regression.positive, regression.negative
+    made["log_eps"] = regression.log_eps
+    made["threshold_mismatch_sigma"] = estimators.mismatch(regression, increments, blocks)
+    made["photoreceptor_hz"] = regression.corner if made["threshold_pos"].told else unknown("needs the thresholds")
+    shot, surplus = estimators.noise_rates(still, blocks, is_hot)
+    if is_blank and shot.told:
+        shot = dataclasses.replace(
+            shot.moved(shot.value, _STATIC_LIGHT_DOUBT * shot.value),
+            note=f"{shot.note}; without frames, for a mean light of 5 to 60 % of white's",
+        )
+    made["shot_noise_hz"] = shot
+    values = _complete(_values(made))
+    thresholds = values["threshold_pos"], values["threshold_neg"]
+    made["hot_pixel_share"], made["hot_pixel_sigma"] = estimators.hot_pixels(
+        still, is_hot, thresholds, refractory_seconds, blocks
+    )
+    if not any(made[name].told for name in ("threshold_pos", "threshold_neg")) and made["hot_pixel_sigma"].told:
+        note = f"{made['hot_pixel_sigma'].note}; in units of a threshold of {USUAL_THRESHOLD}"
+        made["hot_pixel_sigma"] = dataclasses.replace(made["hot_pixel_sigma"], note=note)
+    made["dead_pixel_share"] = estimators.dead_pixels(given, blocks)
+    made["leak_hz"] = _matched_leak(given, values, surplus, blocks, light)
+    return {name: dataclasses.replace(one, low=0.0) if one.is_absent else one for name, one in made.items()}
+
+
+def _matched_leak(
+    given: Recorded, camera: dict[str, float], surplus: Estimate, blocks: npt.NDArray[np.int64], light: Doubles
+) -> Estimate:
+    """Find the leak with which the simulation has the surplus of brighter events that was measured.
+
+    Noise resets a pixel before its leak crosses the threshold, and the motion before a still stretch leaves residuals
+    of its own: only a simulation has both.
+    """
+    if not math.isfinite(surplus.value):
+        return surplus
+    camera = camera | {"hot_pixel_share": 0.0, "dead_pixel_share": 0.0}
+    found = []
+    for number, leak in enumerate(_LEAKS_HZ):
+        simulated = simulate_recording(given, camera | {"leak_hz": float(leak)}, 10 + number)
+        still: Still = still_time(simulated, light)
+        found.append(estimators.noise_rates(still, blocks, np.zeros(len(blocks), bool))[1].value)
+    rising = np.maximum.accumulate(np.array(found)) + 1e-9 * np.arange(len(found))
+    # The simulation is as noisy as the recording.
+    reach = math.sqrt(2.0)
+    wanted = (
+        surplus.value, surplus.value - reach * (surplus.value - surplus.low),
+        surplus.value + reach * (surplus.high - surplus.value),
+    )  # fmt: skip
+    value, low, high = (float(np.interp(end, rising, _LEAKS_HZ)) for end in wanted)
+    if wanted[2] > rising[-1]:
+        high = math.inf
+    made = Estimate(value, low, high, 0.05, f"simulated with leaks up to 4 Hz; {surplus.note}")
+    return made.moved(value, estimators.SYSTEMATIC["leak_hz"] * value) if value > 0.0 else made
+
+
+def _without_evidence(
+    given: Recorded, estimates: Mapping[str, Estimate], left_out: Mapping[str, str], light: Doubles, *, is_blank: bool
+) -> dict[str, str]:
+    """Fit one half of the sensor and return the effects that bring the other half's statistics no closer."""
+    row, column = np.divmod(given.blocks(_BLOCKS_SIDE), _BLOCKS_SIDE)
+    seen = (row + column) % 2 == 0
+    held_out = (np.add.outer(np.arange(_BLOCKS_SIDE), np.arange(_BLOCKS_SIDE)) % 2 == 1).ravel()
+    one, other = given.part(seen), given.part(~seen)
+    # Half of the pixels may be too few for a narrow interval; the value counts all the same.
+    told = {name for name, made in estimates.items() if made.told and name not in left_out}
+    halves = {name: made for name, made in _estimates(one, is_blank).items() if name in told and made.value > 0.0}
+    fitted = _complete(
+        _values({name: dataclasses.replace(made, low=made.value, high=made.value) for name, made in halves.items()})
+    )
+    begin, end = _span(given)
+    measured = panels_of(other, light, begin, end)
+    full = panels_of(simulate_recording(other, fitted, 3), light, begin, end)
+    reasons = {}
+    for name in _switches():
+        if name in left_out or not estimates[name].told:
+            continue
+        if not fitted.get(name):
+            reasons[name] = "half of the sensor shows nothing of it"
+            continue
+        if name in _NOISE_PANELS:
+            without = panels_of(simulate_recording(other, fitted | {name: 0.0}, 3), light, begin, end)
+            by, least = gain(measured, full, without, held_out, _NOISE_PANELS[name])
+        else:
+            by, least = _likelihood_gain(one, other, fitted, name)
+        if least <= 0.0:
+            reasons[name] = f"does not bring the other half of the sensor closer ({by:+.2g}, at least {least:+.2g})"
+    if "hot_pixel_share" in reasons:
+        reasons["hot_pixel_sigma"] = reasons["hot_pixel_share"]
+    return reasons
+
+
+def _likelihood_gain(one: Recorded, other: Recorded, fitted: Mapping[str, float], name: str) -> tuple[float, float]:
+    """Return the mean gain in log likelihood of the other half's frames by an effect, and its interval's lower end.
+
+    The simulation between frames of a low rate is too smooth to judge these effects: frames, given events, are not.
+    """
+    sums = []
+    for is_on in (True, False):
+        period = fitted.get("refractory_seconds", 0.0) if is_on or name != "refractory_seconds" else 0.0
+        pair = []
+        for part in (one, other):
+            made = increments_of(part, period, 1e6 * _frame_seconds(part))
+            large = estimators.is_large(made)
+            pair.append(made.take(large))
+        values = estimators.held_out_likelihood(
+            pair[0], pair[1], fitted["log_eps"],
+            fitted.get("threshold_mismatch_sigma", 0.0) if is_on or name != "threshold_mismatch_sigma" else 0.0,
+            has_corner=fitted.get("photoreceptor_hz", 0.0) > 0.0 and (is_on or name != "photoreceptor_hz"),
+        )  # fmt: skip
+        block = other.blocks(_BLOCKS_SIDE)[pair[1].pixel]
+        sums.append(sums_by_block(block, np.stack([values, np.ones(len(values))], axis=1), _BLOCKS_SIDE**2))
+    table = np.concatenate(sums, axis=1)
+    value, low, _high = bootstrap(
+        table[table[:, 1] > 0], lambda s: np.array([s[0] / max(s[1], 1.0) - s[2] / max(s[3], 1.0)])
+    )
+    return float(value[0]), float(low[0])
+
+
+def _switches() -> tuple[str, ...]:
+    """Return the parameters that switch an effect on."""
+    return (*effect_settings(), "hot_pixel_share")
+
+
+def _values(estimates: Mapping[str, Estimate]) -> dict[str, float]:
+    """Return the values that are told; the corner is estimated as 1 / Hz, and is off where that is negligible."""
+    values = {name: made.value for name, made in estimates.items() if made.told}
+    if "photoreceptor_hz" in values:
+        inverse, limit = values["photoreceptor_hz"], estimates["photoreceptor_hz"].negligible
+        values["photoreceptor_hz"] = 1.0 / inverse if inverse > 0.05 * limit else 0.0
+    if not {"threshold_pos", "threshold_neg"} <= values.keys():
+        values = {name: value for name, value in values.items() if not name.startswith("threshold_")}
+    if not {"hot_pixel_share", "hot_pixel_sigma"} <= values.keys():
+        values = {name: value for name, value in values.items() if not name.startswith("hot_pixel")}
+    return values
+
+
+def _complete(values: Mapping[str, float]) -> dict[str, float]:
+    return {"threshold_pos": USUAL_THRESHOLD, "threshold_neg": USUAL_THRESHOLD, "log_eps": 1e-3, **values}
+
+
+def _frame_seconds(given: Recorded) -> float:
+    return float(np.median(np.diff(given.frame_us))) * 1e-6
+
+
+def _span(given: Recorded) -> tuple[int, int]:
+    """Return the time that recording and simulation have in common, us."""
+    if len(given.frames) >= LEAST_FRAMES:
+        return int(given.frame_us[0]), int(given.frame_us[-1])
+    return given.begin_us, given.begin_us + int(1e6 * given.seconds) + 1
+
+
+def _with_constant_frames(given: Recorded) -> Recorded:
+    """Add frames of one grey level, ten a second."""
+    count = int(np.clip(10 * given.seconds, LEAST_FRAMES, 2000))
+    times = given.begin_us + np.linspace(0.0, 1e6 * given.seconds, count).astype(np.int64)
+    frames = np.full((count, len(given.pixels)), _GREY_OF_STATIC, np.uint8)
+    return dataclasses.replace(given, frames=frames, frame_us=times)

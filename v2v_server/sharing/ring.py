@@ -1,0 +1,127 @@
+"""Keep the newest finished samples up to a limit, in the order in which they arrived.
+
+A sample lies in memory of the server that its worker filled (:mod:`v2v_server.sharing.memory`), or in the frames of its
+message, if its worker or the consumer that asked first is on another host. Consumers get the frames, or the name of
+sealed memory, and thus nothing that a process can write to.
+
+A consumer may open the memory after the ring has dropped the sample. It finds nothing there and asks again without a
+slot; that answer is a message, which holds its bytes itself.
+
+Memory: at most ``most_bytes``, or one sample, and the samples that are being made.
+"""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Container, Hashable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from v2v_protocol.arena import NO_SLOT, Slot
+from v2v_protocol.messages import SampleHeader
+from v2v_protocol.wire import Buffer, Frames, encode
+from v2v_server.sharing.memory import SampleMemory
+
+_FILES_A_SAMPLE = 4
+"""Allowed open files per sample, so that samples use at most a quarter of the process's limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class SharedSample:
+    """A finished sample.
+
+    Attributes:
+        header: as its worker sent it.
+        frames: the raw frames behind the header; empty if the arrays are in ``memory``.
+        memory: sealed.
+    """
+
+    header: SampleHeader
+    frames: Sequence[Buffer]
+    memory: SampleMemory | None
+
+    @property
+    def nbytes(self) -> int:
+        """Size in bytes."""
+        return sum(map(len, self.frames)) if self.memory is None else self.memory.nbytes
+
+    def message(self, slot: Slot | None, *, is_first: bool) -> Frames:
+        """Build the message for a consumer.
+
+        Args:
+            slot: what the consumer's request named; None: it cannot read memory of this host.
+            is_first: whether the work on the sample was done for this consumer.
+        """
+        changes: dict[str, Any] = {} if is_first else {"cpu_seconds": 0.0, "decoded": False, "cache": ""}
+        if slot is not None:
+            changes["slot"] = slot.number
+            if self.memory is not None:
+                return encode(replace(self.header, arena=self.memory.slot.arena, **changes))
+        frames = self.frames if self.memory is None else self.memory.arrays()
+        return [*encode(replace(self.header, **changes)), *frames]
+
+
+class SampleRing:
+    """The newest samples by key, and the memory of those that are being made.
+
+    Args:
+        most_bytes: size limit.
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        self._most_bytes = most_bytes
+        self._samples: dict[Hashable, SharedSample] = {}
+        self._lent: dict[int, SampleMemory] = {}
+        self._bytes = 0
+
+    def get(self, key: Hashable) -> SharedSample | None:
+        """Return a sample; None if the ring does not have it."""
+        return self._samples.get(key)
+
+    def lend(self, lease: int, sizes: Sequence[int]) -> Slot | None:
+        """Return memory for the sample of a lease; None if there is none.
+
+        Args:
+            lease: its number.
+            sizes: bytes of each array.
+        """
+        files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        used = _FILES_A_SAMPLE * (len(self._samples) + len(self._lent))
+        if files != resource.RLIM_INFINITY and used >= files:
+            return None
+        try:
+            self._lent[lease] = SampleMemory(sizes)
+        except OSError:
+            return None
+        return self._lent[lease].slot
+
+    def lent(self, lease: int) -> Slot | None:
+        """Return what was lent for a lease; None if nothing was."""
+        memory = self._lent.get(lease)
+        return None if memory is None else memory.slot
+
+    def release(self, leases: Container[int]) -> None:
+        """Free the memory that was lent for other leases than these."""
+        for lease in [lease for lease in self._lent if lease not in leases]:
+            del self._lent[lease]
+
+    def add(self, key: Hashable, lease: int, header: SampleHeader, frames: Sequence[Buffer]) -> SharedSample:
+        """Add a finished sample; the oldest ones make place for it.
+
+        Args:
+            key: equal for equal samples only.
+            lease: its number.
+            header, frames: the message of its worker.
+        """
+        memory = self._lent.pop(lease, None)
+        if frames:
+            memory = None
+        elif memory is not None and not memory.seal():
+            frames, memory = [bytes(array) for array in memory.arrays()], None
+        sample = SharedSample(replace(header, slot=NO_SLOT), frames, memory)
+        before = self._samples.pop(key, None)
+        self._samples[key] = sample
+        self._bytes += sample.nbytes - (0 if before is None else before.nbytes)
+        while self._bytes > self._most_bytes and len(self._samples) > 1:
+            self._bytes -= self._samples.pop(next(iter(self._samples))).nbytes
+        return sample

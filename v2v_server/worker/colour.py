@@ -1,0 +1,33 @@
+"""Fill the delivered frames in colour."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.errors import VideoError
+from v2v_server.simulation.view import apply_view
+from v2v_server.video.colour.rgb import add_colour
+from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, makes
+
+
+@makes("frames_rgb")
+def frames_rgb(context: SampleContext, out: npt.NDArray[Any]) -> None:
+    """Fill in the delivered frames, [T, 3, H, W]: the grey levels of ``frames`` and the colour of the video."""
+    if context.clip.colour is None:
+        raise VideoError(context.video, None, "was read without its colour")
+    (cells, matrix), cut = context.clip.colour
+    # Colour differences are not grey levels: the contrast is a factor of them.
+    view = dataclasses.replace(context.params, contrast=0.0)
+    grey = np.empty((len(out), 1, *out.shape[2:]), np.uint8)
+    ARRAY_BUILDERS["frames"](context, grey)
+    # The cut names the delivered frames in ascending order.
+    places = np.unique(context.source[context.target_steps], return_inverse=True)[1]
+    before, chroma = -1, np.empty(0, np.uint8)
+    for target, picture, place in zip(out, grey, places.tolist(), strict=True):
+        if place != before:  # a paused camera repeats its frame
+            before, chroma = place, apply_view(cut.pixels(cells[place]), view, context.recipe)
+        add_colour(picture[0], chroma, matrix, context.params.contrast or 1.0, target)
