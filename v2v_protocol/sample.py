@@ -311,6 +311,11 @@ def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> L
     """
     if not arrays or len(set(arrays)) != len(arrays):
         raise UsageError(f"arrays = {list(arrays)}: ask for one or more of {', '.join(ARRAYS)}, each once")
+    if recipe.is_timed and "frames_all" in arrays:
+        raise UsageError(
+            "arrays: frames_all has one shape for all samples, but with voxel_seconds each has another number of "
+            "frames: ask for frames, or set voxel_seconds to 0"
+        )
     for name in arrays:
         if name not in ARRAYS:
             raise UsageError(f"arrays: unknown array {name!r}; known: {', '.join(ARRAYS)}")
