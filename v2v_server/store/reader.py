@@ -208,7 +208,7 @@ class StoreFile(BlockReader):
 
     @cached_property
     def planes(self) -> frozenset[str]:
-        """Names of the planes of this version that the file has.
+        """Return the names of the planes of this version that the file has.
 
         Raises:
             VideoUnreadable, VideoError: see :meth:`plane`.
