@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import VideoError
 from v2v_server.motion import Cells, MotionOfCuts, MotionOfPictures, Pyramid, Vectors
 from v2v_server.store.chroma import CHROMA, chroma_of
 from v2v_server.store.depth import DETAIL, detail_of, grey_of
@@ -68,17 +66,6 @@ class MotionWatch:
 def wants_motion(cuts: Sequence[Cut]) -> bool:
     """Return whether a cut asks for motion."""
     return any(cut.cells is not None for cut in cuts)
-
-
-def has_planes(path: Path, planes: Collection[str]) -> bool:
-    """Return whether a store file has planes; True if it cannot be read, since whatever reads it says why."""
-    if not planes:
-        return True
-    try:
-        with StoreFile(path) as stored:
-            return stored.planes.issuperset(planes)
-    except VideoError:
-        return True
 
 
 def with_motion(
