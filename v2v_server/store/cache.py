@@ -31,10 +31,10 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnread
 from v2v_server.store.chroma import CHROMA, chroma_planes, matrix_of, whole_chroma, with_chroma
 from v2v_server.store.depth import detail_planes, read_levels, same_transfer
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
-from v2v_server.store.motion import MOTION, has_planes, read_motion, wants_motion, with_motion, with_planes
+from v2v_server.store.motion import MOTION, read_motion, wants_motion, with_motion, with_planes
 from v2v_server.store.packing import QUICK
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.reader import StoreFile, has_planes
 from v2v_server.store.writer import StoreWriter
 from v2v_server.system.private import make_private
 from v2v_server.system.status_fields import GIB
