@@ -24,6 +24,7 @@ from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
 from v2v_server.prepare.report import Report
+from v2v_server.store.chroma import CHROMA
 from v2v_server.store.encoding import DEFAULT_GOP, DEFAULT_QUALITY, DEFAULT_SIZE, H264, LOSSLESS, Encoding
 from v2v_server.store.motion import MADE_PLANES
 from v2v_server.store.packing import SIZES
@@ -66,12 +67,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     encoding.add_argument(
         "--size",
         choices=tuple(SIZES),
-        help=f"lossless: {DEFAULT_SIZE} (default), or fast: a third larger, reads faster",
+        help=f"lossless: {DEFAULT_SIZE} (default), fast: a third larger, reads faster, or raw: "
+        "not compressed, reads fastest from memory",
     )
     encoding.add_argument(
-        "--planes", choices=tuple(MADE_PLANES), action="append", default=[],
-        help="lossless: also store the motion between frames, which streams with substep_px then need not find; a "
-        "video prepared without it is prepared again",
+        "--planes", choices=(*MADE_PLANES, CHROMA), action="append", default=[],
+        help="lossless: also store the motion between frames, which streams with substep_px then need not find, or "
+        "chroma, for frames_rgb; a video prepared without it is prepared again",
     )  # fmt: skip
     encoding.add_argument(
         "--quality", type=int, metavar="Q", help=f"h264: rate factor, lower is better and larger ({DEFAULT_QUALITY})"

@@ -30,7 +30,7 @@ from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.listfile import ListEntry
 from v2v_server.corpus.sources.sidecar import sidecar_id
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
-from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos
+from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos, has_chroma
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.system.process import without_collections
@@ -197,7 +197,7 @@ class Catalogue:
     @property
     def facts(self) -> CorpusFacts:
         """What is known in memory: all that a server's dispatcher needs."""
-        has_colour = self.prepared is None
+        has_colour = self.prepared is None or has_chroma(self.source, self.videos.ids)
         return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars, has_colour)
 
     def part(self) -> CorpusPart:
@@ -244,9 +244,13 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
         IndexUnreadable: the index cannot be read at the moment.
         V2VError: the index of this video is damaged, or belongs to another file.
     """
-    video, start, count, part = lease.video, lease.start_frame, spec.recipe.frames_needed, b""
-    if spec.scene != "off":
-        scene = catalogue.scene(video)
+    video, start, recipe, part = lease.video, lease.start_frame, spec.recipe, b""
+    if spec.scene == "off":
+        count = int(recipe.reach_at(lease.frames_per_second)) + 1
+        if recipe.is_timed and (number := catalogue.videos.find(video)) is not None:
+            count = min(count, int(catalogue.videos.frames[number]) - start)
+    else:
+        scene, count = catalogue.scene(video), int(recipe.sequence_at(lease.frames_per_second)) + 1
         if "duplicates" not in spec.kept_defects:
             count = int(scene.frames_from(start, count)[-1]) + 1 - start
         part = scene.slice(start, count).to_bytes()

@@ -13,6 +13,10 @@ from v2v_protocol.sample import sidecar_endings
 from v2v_server.corpus.index.columns import CHUNK, NO_STRINGS, VideoTable
 from v2v_server.corpus.scenes.pieces import SplitVideos
 from v2v_server.corpus.sidecars import Sidecars
+from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.store.chroma import CHROMA
+from v2v_server.store.format import is_store_file
+from v2v_server.store.motion import has_planes
 from v2v_server.video.rows import Rows
 
 Thresholds = tuple[float | None, float | None]
@@ -56,7 +60,8 @@ class Videos(Sequence[VideoEntry]):
         split: the videos that are divided into pieces; None where that is unknown.
 
     Attributes:
-        ids, fingerprints, frames, width_px, height_px, interlaced: columns, one value for each video.
+        ids, fingerprints, frames, frames_per_second, width_px, height_px, interlaced: columns, one value for each
+            video.
         split: as given.
     """
 
@@ -66,6 +71,7 @@ class Videos(Sequence[VideoEntry]):
         self._table = replace(table, summaries=NO_STRINGS)  # tens of MB that only ``split`` is made of
         self._thresholds, self.split = thresholds, split
         self.ids, self.fingerprints, self.frames = table.ids, table.fingerprints, table.frames
+        self.frames_per_second = table.frames_per_second
         self.width_px, self.height_px, self.interlaced = table.width_px, table.height_px, table.interlaced
 
     def find(self, id: str) -> int | None:
@@ -131,7 +137,20 @@ class Videos(Sequence[VideoEntry]):
         )
 
 
-COLOUR_REMEDY = "serve the videos that they were prepared from"
+COLOUR_REMEDY = "prepare them again with v2v-prepare --planes chroma, or serve the videos that they were prepared from"
+_ASKED = 16
+"""Prepared files that are checked for their colour."""
+
+
+def has_chroma(source: VideoSource, ids: Sequence[str]) -> bool:
+    """Return whether some prepared files of this host, evenly spaced, all have their colour."""
+    if not source.is_local:
+        return False
+    for id in ids[:: max(1, len(ids) // _ASKED)]:
+        with source.open_local(id, "") as path:
+            if not is_store_file(path) or not has_planes(path, (CHROMA,)):
+                return False
+    return True
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,10 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
+
 from v2v_protocol.errors import V2VError
+from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES
 from v2v_server.corpus.scenes.findings import (
@@ -26,13 +29,14 @@ from v2v_server.corpus.scenes.findings import (
     Defect,
     defects_of,
 )  # fmt: skip
-from v2v_server.store.clips import pictures_of
+from v2v_server.store.clips import pictures_of, signal_of
 from v2v_server.store.format import is_store_file
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.system.process import usable_cores
 from v2v_server.video.decode import stream_luma
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.orientation import Window
 
 MOST_VIDEOS = 12
@@ -87,8 +91,8 @@ class _Excerpt:
     window: Window
 
 
-_Found = tuple[_Excerpt, int, tuple[Defect, ...]]
-"""An excerpt, its frames that decode, and their defects."""
+_Found = tuple[_Excerpt, int, tuple[Defect, ...], Signal]
+"""An excerpt, its frames that decode, their defects, and what the levels of the video mean."""
 
 
 def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple[str, str, str, str]]:
@@ -108,30 +112,39 @@ def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple
         text += f"; {failed} more did not decode within {_LONGEST_VIDEO_SECONDS:.0f} s"
     yield "ok", "pictures", text, ""
     for kind, effect in _EFFECTS.items():
-        having = [(excerpt, each) for excerpt, _, defects in found for each in defects if each.kind == kind]
+        having = [(excerpt, each) for excerpt, _, defects, _ in found for each in defects if each.kind == kind]
         count = _affected(sequences, kind)
         if count:
             named = "; ".join(f"{excerpt.id}: {each.text}" for excerpt, each in having[:_SHOWN])
             more = f"; and {len(having) - _SHOWN} more" if len(having) > _SHOWN else ""
             text = f"{count} of {len(sequences)} sequences ({100 * count // len(sequences)}%) have {effect} ({named}"
             yield "note", "pictures", f"{text}{more})", _CHANGES[kind]
+    if varying := [excerpt.id for excerpt, _, _, _ in found if _has_variable_rate(excerpt)]:
+        text = f"{len(varying)} of {len(found)} videos have a variable rate ({', '.join(varying[:_SHOWN])})"
+        change = "recipes that state times use the time stamps; a bin of frames then lasts differently long"
+        yield "note", "pictures", text, change
+    if stated := [(excerpt.id, signal) for excerpt, _, _, signal in found if signal != SDR]:
+        named = "; ".join(f"{id}: {signal}" for id, signal in stated[:_SHOWN])
+        more = f"; and {len(stated) - _SHOWN} more" if len(stated) > _SHOWN else ""
+        text = f"{len(stated)} of {len(found)} videos have other levels than {SDR} ({named}{more})"
+        yield "note", "pictures", text, "v2v-serve --set light=declared uses them; otherwise they are read as 8-bit SDR"
 
 
 def check_in_background(
-    catalogue: Catalogue, frames_needed: int, stop: threading.Event, say: Callable[[str], object], processes: int = 1
+    catalogue: Catalogue, spec: StreamSpec, stop: threading.Event, say: Callable[[str], object], processes: int = 1
 ) -> threading.Thread | None:
     """Look for defects in a few videos of a local corpus while a server serves it, and say once what is found.
 
     Args:
-        frames_needed: frames of a sequence.
+        spec: of the server; nothing is looked at with scene "auto".
         stop: set when the server ends.
         say: called in the thread with a line of text; not called if nothing is found.
         processes: of :func:`v2v_server.system.isolate.run_isolated`.
 
     Returns:
-        the thread; None for a corpus on another host.
+        the thread; None where nothing is looked at, as for a corpus on another host.
     """
-    if not catalogue.source.is_local:
+    if spec.scene != "off" or not catalogue.source.is_local:
         return None
     excerpts = list(_excerpts(catalogue, _SERVED_VIDEOS))  # here: the index is open in this thread only
 
@@ -147,7 +160,7 @@ def check_in_background(
         except (OSError, V2VError) as error:
             say(f"pictures: not looked at: {error}")
             return
-        sequences = _sequences_of(results, frames_needed)
+        sequences = _sequences_of(results, spec.recipe.frames_needed)
         shares = [
             f"{100 * count // len(sequences)}% have {effect}"
             for kind, effect in _EFFECTS.items()
@@ -190,11 +203,11 @@ def _found(excerpts: Iterable[_Excerpt], processes: int) -> Iterator[_Found]:
         _look_at, excerpts, processes, lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES, compile_cache()
     )
     for excerpt, result in results:
-        yield (excerpt, 0, ()) if isinstance(result, Died) else (excerpt, *result)
+        yield (excerpt, 0, (), SDR) if isinstance(result, Died) else (excerpt, *result)
 
 
-def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...]]:
-    """Return the number of frames and their defects; no frames where they do not decode."""
+def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal]:
+    """Return the number of frames, their defects, and what their levels mean; no frames where they do not decode."""
     # Import lazily: the process that draws up the report needs no OpenCV.
     from v2v_server.corpus.scenes.analysis import analyse
 
@@ -204,9 +217,18 @@ def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...]]:
             scene = analyse(islice(pictures_of(path, index, window), excerpt.count))
         else:
             scene = analyse(stream_luma(path, index, excerpt.start, excerpt.count, window))
+        signal = signal_of(path, index)
     except V2VError:
-        return 0, ()
-    return scene.end, defects_of(scene)
+        return 0, (), SDR
+    return scene.end, defects_of(scene), signal
+
+
+def _has_variable_rate(excerpt: _Excerpt) -> bool:
+    """Return whether a twentieth of the steps lasts a tenth longer or shorter than the median."""
+    steps = np.diff(excerpt.index.seconds(excerpt.start, excerpt.count))
+    if not len(steps) or np.isnan(steps).any():
+        return False
+    return bool(20 * np.count_nonzero(np.abs(steps / np.median(steps) - 1) > 0.1) > len(steps))
 
 
 def _sequences_of(results: Iterable[_Found], needed: int) -> list[tuple[_Found, tuple[int, int]]]:
@@ -222,5 +244,5 @@ def _sequences_of(results: Iterable[_Found], needed: int) -> list[tuple[_Found, 
 def _affected(sequences: list[tuple[_Found, tuple[int, int]]], kind: str) -> int:
     """Return the number of sequences with a defect of a kind."""
     return sum(
-        any(each.kind == kind and each.touches(*span) for each in defects) for (_, _, defects), span in sequences
+        any(each.kind == kind and each.touches(*span) for each in defects) for (_, _, defects, _), span in sequences
     )

@@ -26,6 +26,7 @@ from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.scenes.analysis import SceneAnalysis
 from v2v_server.corpus.scenes.scene import MOST_FRAMES, Scene
 from v2v_server.prepare.encode import encode_luma
+from v2v_server.store.chroma import matrix_of, whole_chroma
 from v2v_server.store.clips import stored_arrays, stored_pictures
 from v2v_server.store.depth import detail_planes, grey_of, same_transfer
 from v2v_server.store.encoding import Encoding
@@ -150,7 +151,8 @@ def _watched(frames: Iterator[_Frame], analysis: SceneAnalysis) -> Iterator[_Fra
 
 
 def _decoded(job: Transcoding, index: FrameIndex, most_bits: int | None) -> Iterator[_Frame]:
-    return stream_decoded(job.source, index, 0, len(index), job.window, most_bits)
+    chroma = whole_chroma(job.planes, job.window)
+    return stream_decoded(job.source, index, 0, len(index), job.window, most_bits, chroma)
 
 
 def _frames(job: Transcoding, index: FrameIndex) -> Iterator[npt.NDArray[np.uint8]]:
@@ -169,6 +171,7 @@ def _stored(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[_F
         first=0, count=len(index), frames=len(index), frames_per_second=0.0 if math.isnan(rate) else rate,
         codec=job.codec, bit_exact=job.codec in BIT_EXACT_CODECS, group=group_frames_for(rows, width),
         packing=packing.method, index=job.index, bits=signal.bits, transfer=signal.transfer,
+        matrix=matrix_of(first[0]),
     )  # fmt: skip
     names = [*job.planes, *detail_planes(signal)]
     wanted, got = ({name: xxhash.xxh3_128() for name in ("", *names)} for _ in range(2))

@@ -4,6 +4,7 @@ format    layout of a store file
 pixels    the pixels of a block and the differences that are stored for them
 packing   compression of these differences
 planes    named arrays beside the luma
+chroma    the plane of colour
 depth     levels of more than 8 bits
 motion    the plane of motion: made, read, or computed from the pixels
 writer    write a file, frame by frame

@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnreadable
+from v2v_server.store.chroma import CHROMA, chroma_planes, matrix_of, whole_chroma, with_chroma
 from v2v_server.store.depth import detail_planes, read_levels, same_transfer
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
 from v2v_server.store.motion import MOTION, has_planes, read_motion, wants_motion, with_motion, with_planes
@@ -125,8 +126,11 @@ class Cache:
             for number in range(start // size, last // size + 1)
         ]
         picture = rows[0], 0, rows[1] - rows[0], index.width_px
-        planes = (MOTION,) if stride == 1 and wants_motion(cuts) else ()
+        planes = [*([MOTION] if stride == 1 and wants_motion(cuts) else []), *chroma_planes(cuts)]
         lacking = [piece for piece in pieces if not has_planes(piece.path, planes)]
+        # Keep what other streams stored; otherwise two streams would replace each other's pieces for ever.
+        kept = [name for name in (MOTION, CHROMA) if any(has_planes(piece.path, (name,)) for piece in lacking)]
+        planes = [*dict.fromkeys([*planes, *kept])]
         made = self._read(pieces, fingerprint, index, start, cuts, stride, picture)
         if made is not None and not lacking:
             return made
@@ -190,21 +194,24 @@ class Cache:
                     sound = False  # continue, so that all damaged pieces are decoded again together
             if not sound:
                 return None
+            if len(signals) > 1:
+                signal = signal._replace(transfer=MIXED)
+            times = [index.seconds(start, (cut.count - 1) * stride + 1)[::stride] for cut in cuts]
             try:
                 vectors = read_motion(files, start, cuts, stride, picture)
+                if not all(stored.planes.issuperset(chroma_planes(cuts)) for stored, _ in files):
+                    return None  # made for a stream without colour
+                read = [
+                    DecodedClip(frames, seconds, codec, bit_exact, "cache", signal=signal)
+                    for frames, seconds in zip(clips, times, strict=True)
+                ]
+                read = list(with_chroma(read, cuts, files, start, stride))
             except VideoUnreadable as error:
                 self.trouble = error.reason
                 return None
             except VideoError as error:
                 self._remove(Path(error.video), error.reason)
                 return None
-        if len(signals) > 1:
-            signal = signal._replace(transfer=MIXED)
-        times = [index.seconds(start, (cut.count - 1) * stride + 1)[::stride] for cut in cuts]
-        read = [
-            DecodedClip(frames, seconds, codec, bit_exact, "cache", signal=signal)
-            for frames, seconds in zip(clips, times, strict=True)
-        ]
         return with_motion(read, cuts, vectors)
 
     def _has_room(self, missing: Sequence[_Piece], rows: tuple[int, int], index: FrameIndex) -> bool:
@@ -245,7 +252,9 @@ class Cache:
         """
         top, width = rows[0], index.width_px
         height, begin, end = rows[1] - rows[0], missing[0].first, missing[-1].end
-        decoded = stream_decoded(path, index, begin, end - begin, (top, 0, height, width), most_bits)
+        picture_px = top, 0, height, width
+        chroma = whole_chroma(planes, picture_px)
+        decoded = stream_decoded(path, index, begin, end - begin, picture_px, most_bits, chroma)
         with contextlib.closing(decoded) as frames:
             for piece in missing:
                 for _ in range(begin, piece.first):  # frames of a piece that exists
@@ -258,7 +267,7 @@ class Cache:
                     rows=height, first=piece.first, count=piece.end - piece.first, frames=piece.end,
                     frames_per_second=0.0, codec=stream.codec, bit_exact=stream.codec in BIT_EXACT_CODECS,
                     group=group_frames_for(height, width), packing=QUICK.method, bits=signal.bits,
-                    transfer=signal.transfer,
+                    transfer=signal.transfer, matrix=matrix_of(stream),
                 )  # fmt: skip
                 more = chain(((stream, picture),), islice(frames, head.count - 1))
                 self._keep(piece.path, head, more, [*planes, *detail_planes(signal)])

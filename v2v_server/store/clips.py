@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, VideoError
+from v2v_server.store.chroma import with_chroma
 from v2v_server.store.depth import DETAIL, detail_planes, read_levels
 from v2v_server.store.format import is_store_file
 from v2v_server.store.motion import MotionWatch, read_motion, with_motion
@@ -20,7 +21,7 @@ from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip, decode_cuts, stream_luma
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import SDR, Signal
+from v2v_server.video.luma import MOST_BITS, SDR, Signal
 from v2v_server.video.orientation import Window
 from v2v_server.video.probe import VideoFacts, probe
 
@@ -48,7 +49,7 @@ def clips_of(
 
     Raises:
         UsageError, VideoError: see :func:`v2v_server.video.decode.decode_cuts`; also if the file is, or was made from,
-            another video, or a store file lacks the detail of deeper levels.
+            another video, or a store file lacks the detail of deeper levels or the colour.
     """
     top, bottom = rows or (0, index.height_px)
     picture = top, 0, bottom - top, index.width_px
@@ -66,6 +67,7 @@ def clips_of(
             raise VideoError(os.fspath(path), None, why)
         clips = tuple(stored_clip(stored, index, start, cut, stride, signal) for cut in cuts)
         files = [(stored, range(max(cut.count for cut in cuts)))]
+        clips = with_chroma(clips, cuts, files, start, stride)
         return with_motion(clips, cuts, read_motion(files, start, cuts, stride, picture))
 
 
@@ -79,6 +81,18 @@ def stored_clip(
     read_levels(stored, start, stride, window, frames, signal)
     seconds = index.seconds(start, (cut.count - 1) * stride + 1)[::stride]
     return DecodedClip(frames, seconds, head.codec, head.bit_exact, "store", signal=signal)
+
+
+def signal_of(path: str | os.PathLike[str], index: FrameIndex) -> Signal:
+    """Return what the levels of a video mean, by its first frame, or those of the source of a store file.
+
+    Raises:
+        VideoError: see :func:`clips_of`.
+    """
+    if not is_store_file(path):
+        return decode_cuts(path, index, index.first, [Cut(1, (0, 0, 1, 1))], most_bits=MOST_BITS)[0].signal
+    with StoreFile(path) as stored:
+        return stored.head.signal
 
 
 def check_file(path: str | os.PathLike[str], fingerprint: str) -> None:

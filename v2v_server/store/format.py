@@ -27,6 +27,7 @@ import xxhash
 
 from v2v_protocol.errors import ProtocolError, VideoError
 from v2v_server.store.packing import METHODS
+from v2v_server.video.colour.chroma import DEFAULT_MATRIX
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR, TRANSFERS, Signal
 
@@ -60,8 +61,9 @@ class Head:
         group: frames in a group.
         packing: method of :mod:`v2v_server.store.packing`.
         index: ``FrameIndex.to_bytes()`` of the source; empty in a piece.
-        bits, transfer: of the source (``v2v_server.video.luma.Signal``); left out of the file where they are the
-            defaults.
+        bits, transfer: of the source (``v2v_server.video.luma.Signal``).
+        matrix: of the plane "chroma" (``v2v_server.video.colour.chroma.Chroma``). These three are left out of the file
+            where they are the defaults.
     """
 
     video: str
@@ -81,6 +83,7 @@ class Head:
     index: bytes = b""
     bits: int = SDR.bits
     transfer: str = SDR.transfer
+    matrix: str = DEFAULT_MATRIX
 
     def __post_init__(self) -> None:
         kinds = {"str": str, "int": int, "float": float, "bool": bool, "bytes": bytes}
@@ -136,7 +139,8 @@ class Head:
 
     def to_bytes(self) -> bytes:
         """Return the bytes in front of the table."""
-        defaults = {name for name, value in SDR._asdict().items() if getattr(self, name) == value}
+        later = SDR._asdict() | {"matrix": DEFAULT_MATRIX}
+        defaults = {name for name, value in later.items() if getattr(self, name) == value}
         head = msgpack.packb({name: value for name, value in asdict(self).items() if name not in defaults})
         return _PREFIX.pack(MAGIC, len(head), check(head, 0)) + head
 

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import VideoError
 from v2v_server.motion import Cells, MotionOfCuts, MotionOfPictures, Vectors
+from v2v_server.store.chroma import CHROMA, chroma_of
 from v2v_server.store.depth import DETAIL, detail_of, grey_of
 from v2v_server.store.reader import StoreFile
 from v2v_server.video.collect import Cut, LastFrame, Watch
@@ -140,14 +141,16 @@ def with_planes(
     pictures: Iterable[tuple[LastFrame, npt.NDArray[Any]]], planes: Sequence[str]
 ) -> Iterator[tuple[npt.NDArray[np.uint8], dict[str, npt.NDArray[Any]]]]:
     """Yield decoded pictures in 8 bits with their planes: those of :data:`MADE_PLANES`, which are made from them, and
-    the detail of deeper ones.
+    the detail of deeper ones, and the colour.
     """
-    makers = {name: MADE_PLANES[name]() for name in planes if name != DETAIL}
+    makers = {name: MADE_PLANES[name]() for name in planes if name in MADE_PLANES}
     for stream, picture in pictures:
         grey = grey_of(stream, picture)
         arrays = {name: make(grey) for name, make in makers.items()}
         if DETAIL in planes:
             arrays[DETAIL] = detail_of(picture, grey, stream.signal)
+        if CHROMA in planes:
+            arrays[CHROMA] = chroma_of(stream)
         yield grey, arrays
 
 

@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.store.format import BLOCK_ROWS, Head, check, group_frames_for
+from v2v_server.video.colour.chroma import CELL_PX
 from v2v_server.video.orientation import Window
 
 _MAGIC = b"V2VPLAN1"
@@ -119,6 +120,8 @@ PLANES: Mapping[str, PlaneKind] = MappingProxyType(
         "motion": PlaneKind(version=1, dtype="<i2", values=2, cell_px=4),
         # What 8 bits lack of the levels of deeper luma (v2v_server.store.depth).
         "detail": PlaneKind(version=1, dtype="i1", values=1, cell_px=1),
+        # Cb and Cr (v2v_server.video.colour.chroma).
+        "chroma": PlaneKind(version=1, dtype="i1", values=2, cell_px=CELL_PX),
     }
 )
 """The kinds of planes, by name."""

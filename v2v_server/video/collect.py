@@ -109,9 +109,7 @@ class Stack:
         if self._damaged:
             self.refuse("is damaged, or refers to a damaged or lost frame")
         self._copy(frame)
-        for colour in self._colours:
-            if colour is not None:
-                colour.add(frame, self.taken)
+        self._collect_colour(frame)
         self.taken += 1
         return self.taken == len(self._expected)
 
@@ -187,6 +185,11 @@ class Stack:
         """
         raise VideoError(self.wanted.path, self.wanted.start + self.taken * self._stride, why)
 
+    def _collect_colour(self, frame: VideoFrame) -> None:
+        for colour in self._colours:
+            if colour is not None:
+                colour.add(frame, self.taken)
+
     def chroma(self) -> list[Chroma | None]:
         """Return the collected colour of each cut; None if it takes none."""
         return [None if colour is None else colour.chroma() for colour in self._colours]
@@ -203,6 +206,11 @@ class LastFrame(Stack):
 
     def __init__(self, wanted: FrameRange, cut: Cut) -> None:
         super().__init__(wanted, [cut])
+        self.colour: tuple[npt.NDArray[np.int8], str] | None = None  # Cb and Cr of the last frame, and their matrix
+
+    def _collect_colour(self, frame: VideoFrame) -> None:
+        (colour,) = self._colours
+        self.colour = None if colour is None else colour.cells_of(frame)
 
     def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
         ((stored, last),) = self._parts

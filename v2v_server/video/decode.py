@@ -30,7 +30,7 @@ from av.video.stream import VideoStream
 
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.video.collect import Cut, FrameRange, LastFrame, Stack, Watch
-from v2v_server.video.colour.chroma import Chroma
+from v2v_server.video.colour.chroma import Chroma, ChromaCut
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.orientation import Window
@@ -178,14 +178,16 @@ def stream_decoded(
     count: int,
     window: Window | None = None,
     most_bits: int | None = None,
+    chroma: ChromaCut | None = None,
 ) -> Generator[tuple[LastFrame, npt.NDArray[Any]], None, None]:
     """Yield the frames of :func:`stream_luma`, each with what collects them: ``codec`` and ``signal`` so far.
 
     Args:
         most_bits: see :func:`decode_cuts`.
+        chroma: part of the picture whose colour to collect; None: none.
     """
     index.position(start, count)
-    cut, done = Cut(count, _checked(window, index)), 0
+    cut, done = Cut(count, _checked(window, index), chroma), 0
     wanted = FrameRange(os.fspath(path), index, start, 1, most_bits)
     for frames_of in (_from_keyframe_on, _from_beginning):
         stream = LastFrame(wanted, cut)

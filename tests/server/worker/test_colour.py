@@ -17,12 +17,21 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.clips import panned_luma, write_clip
+from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
+from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.offline.leases import lease_for
 from v2v_server.offline.remake import Remaker
+from v2v_server.prepare.prepare import prepare
+from v2v_server.schedule.epoch import Schedule
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.store.cache import Cache, make_cache
+from v2v_server.store.encoding import Encoding
 from v2v_server.video.rows import Rows
+from v2v_server.worker.produce import decode_for, make_sample
 
 RECIPE = Recipe(
     voxels_per_clip=4, bins=2, crop_height_px=24, crop_width_px=32, lead_frames=1, pause_probability=0.3,
@@ -102,3 +111,44 @@ def test_a_grey_video_has_equal_channels(tmp_path: Path) -> None:
     with closing(open_catalogue(tmp_path, processes=0)) as catalogue:
         sample = made(catalogue, RECIPE.replace(contrast_probability=1.0), ("frames", "frames_rgb"))
     assert np.array_equal(sample.arrays["frames_rgb"], sample.arrays["frames"].repeat(3, axis=1))
+
+
+def samples_of(folder: Path, recipe: Recipe = RECIPE) -> list[bytes]:
+    with closing(open_catalogue(folder, processes=0, rows=Rows.parse("0.1:0.9"))) as catalogue:
+        samples = [made(catalogue, recipe, ("frames", "frames_rgb"), seed) for seed in range(4)]
+    return [sample.arrays["frames_rgb"].tobytes() for sample in samples]
+
+
+@pytest.mark.parametrize("recipe", [RECIPE, RECIPE.replace(frame_stride=2, resize_scale=(0.7, 1.6))])
+def test_a_prepared_folder_with_chroma_gives_the_same_colour(tmp_path: Path, recipe: Recipe) -> None:
+    source, prepared, grey = (tmp_path / name for name in ("source", "prepared", "grey"))
+    source.mkdir()
+    write_coloured(source / "a.mp4", coloured(40))
+    with closing(open_catalogue(source, processes=0, rows=Rows.parse("0.1:0.9"))) as catalogue:
+        prepare(catalogue, prepared, Encoding(size="fast"), processes=0, planes=("chroma",))
+        prepare(catalogue, grey, Encoding(size="fast"), processes=0)
+    assert samples_of(prepared, recipe) == samples_of(source, recipe)
+    with pytest.raises(UsageError, match=r"frames_rgb needs colour, .*: prepare them again with v2v-prepare --planes"):
+        samples_of(grey, recipe)
+
+
+def test_the_cache_keeps_colour_once_a_stream_needs_it(tmp_path: Path) -> None:
+    folder = tmp_path / "videos"
+    folder.mkdir()
+    write_coloured(folder / "a.mp4", coloured(40))
+    make_cache(tmp_path / "cache")
+    cache = Cache(tmp_path / "cache", 1 << 30, 0)
+    spec = StreamSpec(recipe=RECIPE)
+    origins = []
+    with closing(open_catalogue(folder, processes=0)) as catalogue:
+        schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, spec), spec)
+        for arrays in (("frames",), ("frames", "frames_rgb"), ("frames", "frames_rgb"), ("frames",)):
+            lease = lease_for(
+                Request(b"", 0, 1), sequence=schedule.candidate(0, 0, 1, 0), catalogue=catalogue, spec=spec, seed=0,
+                arrays=arrays,
+            )  # fmt: skip
+            plain, cached = (decode_for(lease, lease.indices, catalogue.source, each)[0] for each in (None, cache))
+            origins.append(cached.clip.origin)
+            for name, array in make_sample(lease, plain).arrays.items():
+                assert make_sample(lease, cached).arrays[name].tobytes() == array.tobytes()
+    assert origins == ["", "", "cache", "cache"]

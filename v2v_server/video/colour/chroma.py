@@ -26,6 +26,7 @@ from v2v_server.video.luma import LumaFormat
 from v2v_server.video.orientation import Orientation, Window
 
 CELL_PX = 2
+DEFAULT_MATRIX = "BT.601"
 _STATED = {int(Colorspace.ITU709): "BT.709", int(Colorspace.BT2020): "BT.2020", 10: "BT.2020"}
 
 
@@ -95,20 +96,27 @@ class ChromaStack:
         self._frames = frozenset(cut.frames)
         self._cells = np.zeros((len(cut.frames), 2, rows, columns), np.int8)
         self._count = 0
-        self._matrix = "BT.601"
+        self._matrix = DEFAULT_MATRIX
 
     def add(self, frame: VideoFrame, ordinal: int) -> None:
         """Look at a frame; ``ordinal`` is its number in the cut."""
         if ordinal not in self._frames:
             return
-        planes, table, matrix = _planes_of(frame)
+        cells, matrix = self.cells_of(frame)
         if not self._count:
             self._matrix = matrix
+        self._cells[self._count] = cells
+        self._count += 1
+
+    def cells_of(self, frame: VideoFrame) -> tuple[npt.NDArray[np.int8], str]:
+        """Return Cb and Cr of one frame, [2, rows, columns], and the matrix."""
+        planes, table, matrix = _planes_of(frame)
+        cells = np.zeros(self._cells.shape[1:], np.int8)
         for plane, (samples, down, across) in enumerate(planes):
             rows, columns = self._stored[0] // down, self._stored[1] // across
             values = table[samples[rows][:, columns]]
-            self._cells[self._count, plane] = values.T if self._transpose else values
-        self._count += 1
+            cells[plane] = values.T if self._transpose else values
+        return cells, matrix
 
     def chroma(self) -> Chroma:
         """Return what was collected."""
@@ -125,13 +133,13 @@ def _planes_of(frame: VideoFrame) -> tuple[Sequence[_Plane], npt.NDArray[np.int8
     """
     luma = LumaFormat.of(frame)
     if luma.pixel_format.startswith("gray"):
-        return (), _table(8, True), "BT.601"
-    matrix = _STATED.get(int(frame.colorspace), "BT.601")
+        return (), _table(8, True), DEFAULT_MATRIX
+    matrix = _STATED.get(int(frame.colorspace), DEFAULT_MATRIX)
     if not luma.has_plane:
         frame = frame.reformat(
             format="yuv444p", dst_colorspace=Colorspace.ITU601, dst_color_range=ColorRange.JPEG
         )  # has its own matrix, whatever the source states
-        luma, matrix = LumaFormat(frame.format.name, int(ColorRange.JPEG), 8, True, True), "BT.601"
+        luma, matrix = LumaFormat(frame.format.name, int(ColorRange.JPEG), 8, True, True), DEFAULT_MATRIX
     planes = []
     name = frame.format.name
     size = luma.sample.itemsize
