@@ -57,9 +57,12 @@ $(PICTURE)/.ready: pyproject.toml constraints.txt
 test: $(READY) $(CLIPS)
 	$(BIN)/python -m pytest -q -n 3 --dist worksteal -m "not slow"
 
+# Only the files with the mark: importing all of them takes each process ten seconds.
+marked = $(shell grep -rl 'mark\.$(1)\b' tests --include='test_*.py')
+
 test-slow: $(READY) $(CLIPS)
-	$(BIN)/python -m pytest -q -n 3 --dist worksteal -m "slow and not alone"
-	$(BIN)/python -m pytest -q -m alone
+	$(BIN)/python -m pytest -q -n 3 --dist worksteal -m "slow and not alone" $(call marked,slow)
+	$(BIN)/python -m pytest -q -m alone $(call marked,alone)
 
 $(OLD_NUMPY)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(OLD_NUMPY)

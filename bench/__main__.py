@@ -39,6 +39,7 @@ BENCHES = {
     "extremes": "accuracy.extremes",
     "sensor": "accuracy.sensor",
     "scene": "accuracy.scene",
+    "defects": "accuracy.defects",
     "flow": "accuracy.flow",
     "learn": "accuracy.learn",
     "chaos": "chaos.chaos",

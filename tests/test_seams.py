@@ -74,7 +74,7 @@ from v2v_server.worker.arrays import makes
 
 @makes("depth")
 def depth(context, out):
-    out[:, 0] = 255.0 - context.view[context.source[list(context.recipe.target_steps)]]
+    out[:, 0] = 255.0 - context.view[context.source[context.target_steps]]
 '''
 ARRAY_LINES = (
     ("v2v_protocol/sample.py", '    "flow_valid": lambda',

@@ -113,7 +113,8 @@ class Batch:
         """Return the voxel grids: [B, T + lead_voxels, bins, H, W] in the spec's ``voxel_dtype``.
 
         Positive counts are ON events. Voxel t spans frames t - 1 -> t of the target sequence. With ``grids_per_frame``
-        n, [B, (T + lead_voxels) n, bins, H, W], and :attr:`frame_grids` says which grid ends at which frame.
+        n, [B, (T + lead_voxels) n, bins, H, W], and :attr:`frame_grids` says which grid ends at which frame. With
+        ``voxel_seconds``, ``provenance[b].grid_seconds`` has the durations of the grids.
 
         Raises:
             UsageError: the dataset did not request this array.

@@ -52,7 +52,7 @@ class Camera:
         flow: [T, 2, H, W], px, or None.
         title: written beside the camera, for instance the recipe's name.
         provenance: where the clip came from, and the draw.
-        steps_per_frame: of the recipe; a pause is a run of repeated frames.
+        steps_per_frame: of the recipe, unless the draw has ``grid_steps``; a pause is a run of repeated frames.
         lead_voxels: voxel grids of the clip in front of the first one here.
         whole: [rows, columns] uint8, the video's picture that the camera's crop was taken from, or None.
         quiet: as ``rates``, of the same draw without noise, or None: not measured.
@@ -126,12 +126,14 @@ class Camera:
     def paused(self) -> npt.NDArray[np.bool_]:
         """[T * bins] bool: True where every frame of the bin repeats the one before."""
         grids, bins = self.voxels.shape[:2]
-        still = np.zeros((self.lead_voxels + grids) * self.steps_per_frame, np.bool_)
-        for first, length in self.provenance.params.pauses:
+        params = self.provenance.params
+        ends = np.cumsum(params.grid_steps or (self.steps_per_frame,) * (self.lead_voxels + grids))
+        still = np.zeros(ends[-1], np.bool_)
+        for first, length in params.pauses:
             still[first - 1 : first - 1 + length] = True  # positions count from 1
         # A bin holds several steps, or a step several bins.
-        parts = np.repeat(still, bins).reshape(-1, self.steps_per_frame)
-        return np.asarray(parts.all(axis=1))[self.lead_voxels * bins :]
+        parts = [np.repeat(steps, bins).reshape(bins, -1).all(axis=1) for steps in np.split(still, ends[:-1])]
+        return np.concatenate(parts)[self.lead_voxels * bins :]
 
     def moments(self, count: int) -> list[int]:
         """Choose voxel grids to show: the most active one of each of ``count`` equal stretches of time.
@@ -194,6 +196,8 @@ class Camera:
             parts.append("mirrored")
         if params.contrast:
             parts.append(f"contrast {params.contrast:.2f}")
+        if params.voxel_seconds:
+            parts.append(f"grids of {1e3 * params.voxel_seconds:.3g} ms")
         effects = params.to_dict().get("effects", {})
         parts += [_with_unit(name, value) for name, value in effects.items() if value]
         return "   ".join(parts)

@@ -26,6 +26,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.bounds import LARGEST_EVENTS, most_events, pixel_thresholds
 from v2v_protocol.errors import RecipeError
 from v2v_protocol.presets import DEFAULT_PRESET, PRESET_FIELDS
 from v2v_protocol.settings import (
@@ -52,16 +56,12 @@ EFFECTS = "Effects beyond the paper's model; zero is off"
 TIME_UNITS = ("Hz", "s")
 """An effect in one of these needs the time between frames."""
 _LARGEST_FRAMES = 1_000_001
-SMALLEST_THRESHOLD_SHARE = 0.25
-"""Lower limit of a pixel's threshold under mismatch, as a share of the nominal threshold."""
-LARGEST_NORMAL = 6.56
-"""No noise deviates by more standard deviations (``v2v_server.simulation.noise``)."""
-LATER_FIELDS = ("grids_per_frame", "max_boxes", "light")
+LATER_FIELDS = ("grids_per_frame", "max_boxes", "light", "voxel_seconds")
 """Fields that the plain form leaves out at their defaults, so that older digests hold."""
+MOST_STEPS_PER_GRID = 1024
+"""Largest number of steps between video frames that a grid of ``voxel_seconds`` may span."""
 BRIGHTEST = 50.0
 """Upper limit of light where a recipe uses the transfer that a video states; white is 1. PQ reaches 49.3."""
-LARGEST_EVENTS = 2.0**49
-"""Largest number of events of a pixel in a clip. With more, float64 no longer resolves a threshold."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +80,12 @@ class Recipe:
     grids_per_frame: int = whole(
         0, 0, 1024, "n voxel grids in each step between video frames; 0: a grid spans bins x frames_per_bin steps"
     )
+    voxel_seconds: Range = span(
+        (0.0, 0.0), 1e-6, 100.0,
+        "duration of a voxel grid: it spans the number of steps between video frames that comes nearest, and its bins "
+        "are equal parts of its time; 0: a grid spans bins x frames_per_bin steps",
+        unit="s", off=True,
+    )  # fmt: skip
     lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
     lead_voxels: int = whole(0, 0, 1, "1 adds one voxel grid before the first (ERAFT)")
     frame_stride: int = whole(1, 1, 1000, "use every n-th frame, as if the video had 1/n of its frame rate")
@@ -163,7 +169,13 @@ class Recipe:
                 f"recipe frames_per_bin = {self.frames_per_bin}: bins are parts of a step if grids_per_frame is set "
                 f"({self.grids_per_frame}): set frames_per_bin to 1, or grids_per_frame to 0"
             )
-        if self.frames_needed > _LARGEST_FRAMES:
+        for name, alone in (("frames_per_bin", 1), ("grids_per_frame", 0)):
+            if self.is_timed and getattr(self, name) != alone:
+                raise RecipeError(
+                    f"recipe {name} = {getattr(self, name)}: the duration of a grid is that of voxel_seconds "
+                    f"({format_value(self.voxel_seconds)}): set {name} to {alone}, or voxel_seconds to 0"
+                )
+        if not self.is_timed and self.frames_needed > _LARGEST_FRAMES:
             raise RecipeError(
                 f"recipe needs {self.frames_needed} frames a sample (voxels_per_clip x bins x frames_per_bin x "
                 f"frame_stride + 1); the limit is {_LARGEST_FRAMES}"
@@ -190,8 +202,17 @@ class Recipe:
 
     @property
     def needs_seconds(self) -> bool:
-        """Whether a simulation needs the time between frames: noise per second, or an effect in Hz or seconds."""
-        return self.noise_unit == "second" or self.timed_effects
+        """Whether a simulation needs the time between frames: noise per second, an effect in Hz or seconds, or grids of
+        a duration.
+        """
+        return self.noise_unit == "second" or self.timed_effects or self.is_timed
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether a grid has a duration (``voxel_seconds``), and the video's frame rate decides how many steps it
+        spans. The properties that count steps and frames are then upper bounds over all videos.
+        """
+        return self.voxel_seconds[1] > 0.0
 
     @property
     def crop_px(self) -> tuple[int, int]:
@@ -201,7 +222,31 @@ class Recipe:
     @property
     def steps_per_frame(self) -> int:
         """Steps between consecutive video frames from one delivered frame to the next."""
+        if self.is_timed:
+            return MOST_STEPS_PER_GRID
         return 1 if self.grids_per_frame else self.bins * self.frames_per_bin
+
+    def steps_at(self, frames_per_second: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Return ``steps_per_frame`` in videos of these rates. With ``voxel_seconds``: in the longest grid that the
+        recipe can draw, which may be more than MOST_STEPS_PER_GRID, and 0 where a rate is not above 0.
+        """
+        if not self.is_timed:
+            return np.asarray(self.steps_per_frame, np.int64)
+        rates = np.nan_to_num(np.asarray(frames_per_second, np.float64), nan=0.0)
+        steps = np.floor(np.minimum(self.voxel_seconds[1] * rates / self.frame_stride, 2.0**31) + 0.5)
+        return np.where(rates > 0.0, np.maximum(steps, 1.0), 0.0).astype(np.int64)
+
+    def sequence_at(self, frames_per_second: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Return ``frames_per_sequence`` of videos of these rates (:meth:`steps_at`)."""
+        return self.steps_at(frames_per_second) * (self.spans * self.frame_stride)
+
+    def reach_at(self, frames_per_second: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Return the largest number of frames after its first one that a sample of videos of these rates may use.
+
+        With ``voxel_seconds`` twice :meth:`sequence_at`: where the frame rate varies, time stamps may be closer than
+        the average rate says.
+        """
+        return self.sequence_at(frames_per_second) * (2 if self.is_timed else 1)
 
     @property
     def voxel_grids(self) -> int:
@@ -212,17 +257,26 @@ class Recipe:
     def frame_grids(self) -> tuple[int, ...]:
         """Number of the voxel grid that ends at each delivered frame; -1 for a lead frame before the first grid."""
         grids = max(1, self.grids_per_frame)
-        return tuple(step // self.steps_per_frame * grids - 1 for step in self.target_steps)
+        return tuple(end * grids - 1 for end in range(self.first_frame, self.spans + 1))
+
+    @property
+    def spans(self) -> int:
+        """Spans from one delivered frame to the next in a sample, lead voxel included."""
+        return self.voxels_per_clip + self.lead_voxels
+
+    @property
+    def first_frame(self) -> int:
+        """Number of the span that begins at the first delivered frame."""
+        return self.lead_voxels + 1 - self.lead_frames
 
     @property
     def steps(self) -> int:
         """Differences between consecutive frames in a sample, lead voxel included."""
-        return (self.voxels_per_clip + self.lead_voxels) * self.steps_per_frame
+        return self.spans * self.steps_per_frame
 
-    @property
-    def most_segments(self) -> int:
-        """Largest number of segments that the pixels of a sample are simulated in (``Timeline``)."""
-        return self.steps * max(1, self.grids_per_frame * self.bins)
+    def most_segments(self, steps: int) -> int:
+        """Return the largest number of segments (``Timeline``) of a sample with this number of steps."""
+        return steps + self.spans * self.bins if self.is_timed else steps * max(1, self.grids_per_frame * self.bins)
 
     @property
     def frames_needed(self) -> int:
@@ -236,10 +290,14 @@ class Recipe:
 
     @property
     def target_steps(self) -> tuple[int, ...]:
-        """Frame positions (0 .. steps) of the delivered frames: the end of each voxel, and the lead frame."""
-        span = self.steps_per_frame
-        first = (self.lead_voxels + 1 - self.lead_frames) * span
-        return tuple(range(first, self.steps + 1, span))
+        """Frame positions (0 .. steps) of the delivered frames: the end of each voxel, and the lead frame.
+
+        Raises:
+            RecipeError: they depend on the sample (``voxel_seconds``): use ``SampleParams.ends``.
+        """
+        if self.is_timed:
+            raise RecipeError("recipe voxel_seconds: frames lie at other steps in each sample; use SampleParams.ends")
+        return tuple(range(self.first_frame * self.steps_per_frame, self.steps + 1, self.steps_per_frame))
 
     @property
     def smallest_and_largest_threshold(self) -> tuple[float, float]:
@@ -276,10 +334,9 @@ class Recipe:
         ends = math.log(self.log_eps[0]), math.log1p(self.log_eps[1] + (brightest - 1.0))
         unit = step_seconds if self.noise_unit == "second" else 1.0
         leak = self.leak_hz[1] * largest * step_seconds
-        segments = self.most_segments + self.steps * levels_per_step
-        return most_events(
-            segments, ends, (smallest, largest), self.steps * (sigma * math.sqrt(unit) + hot * unit + leak)
-        )
+        steps = self.spans * int(self.steps_at(self.frame_stride / step_seconds))
+        segments = self.most_segments(steps) + steps * levels_per_step
+        return most_events(segments, ends, (smallest, largest), steps * (sigma * math.sqrt(unit) + hot * unit + leak))
 
     def to_dict(self) -> dict[str, Any]:
         """Return all fields as plain values (ranges as lists), in a stable order."""
@@ -291,8 +348,9 @@ class Recipe:
         low, high = self.log_eps
         if low == high:
             values["log_eps"] = low
-        later = {name: settings_of(Recipe)[name].default for name in LATER_FIELDS}
-        return {name: value for name, value in values.items() if name not in later or value != later[name]}
+        defaults = {name: settings_of(Recipe)[name].default for name in LATER_FIELDS}
+        plain = {name: list(value) if isinstance(value, tuple) else value for name, value in defaults.items()}
+        return {name: value for name, value in values.items() if name not in plain or value != plain[name]}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:
@@ -321,30 +379,6 @@ class Recipe:
 def effect_settings() -> dict[str, Setting]:
     """Return the fields of a recipe that switch on an effect beyond the paper's model."""
     return {name: setting for name, setting in settings_of(Recipe).items() if setting.group == EFFECTS}
-
-
-def pixel_thresholds(smallest: float, largest: float, mismatch_sigma: float) -> tuple[float, float]:
-    """Return the limits of any pixel's threshold, for nominal thresholds between two values."""
-    spread = LARGEST_NORMAL * mismatch_sigma
-    return smallest * max(1.0 - spread, SMALLEST_THRESHOLD_SHARE), largest * (1.0 + spread)
-
-
-def most_events(steps: int, log_ends: tuple[float, float], thresholds: tuple[float, float], noise_sum: float) -> float:
-    """Return an upper bound of the events that one pixel can fire in a clip; it determines the arithmetic that is
-    needed.
-
-    ((steps + 1) (largest threshold + range of L) + largest noise and hot drift of all steps + largest |L|), in units of
-    the smallest threshold: no step changes dL by more, and the start and the rounding of L count as one step more.
-
-    Args:
-        steps: differences between frames, or segments of them.
-        log_ends: smallest and largest log intensity L.
-        thresholds: smallest and largest contrast threshold, log units.
-        noise_sum: standard deviations of noise and of hot drift, and the leak, summed over the steps, log units.
-    """
-    low, high = log_ends
-    change = (steps + 1) * (max(thresholds) + (high - low)) + LARGEST_NORMAL * noise_sum
-    return (change + max(abs(low), abs(high))) / min(thresholds)
 
 
 PRESETS: dict[str, Recipe] = {name: Recipe(**fields) for name, fields in PRESET_FIELDS.items()}

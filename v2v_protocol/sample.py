@@ -144,6 +144,8 @@ class SampleParams:
         effects: what the camera does beyond the paper's pixel model: the values drawn for those fields of the recipe
             that switch an effect on; empty for the paper's pixel.
         log_eps: epsilon inside the logarithm where the recipe gives a range; None where it gives one value.
+        voxel_seconds: drawn duration of a voxel grid; 0 if the recipe states none.
+        grid_steps: steps between frames that each grid of this duration spans; empty if the recipe states none.
     """
 
     threshold_pos: float
@@ -160,6 +162,20 @@ class SampleParams:
     noise_key: tuple[int, int, int, int]
     effects: Mapping[str, float] = dataclasses.field(default_factory=dict)
     log_eps: float | None = None
+    voxel_seconds: float = 0.0
+    grid_steps: tuple[int, ...] = ()
+
+    def ends(self, recipe: Recipe) -> npt.NDArray[np.int64]:
+        """Return the positions in the clip (0 .. steps) between which its spans lie, from one delivered frame to the
+        next.
+
+        Returns:
+            [recipe.spans + 1] int64, from 0 to the number of steps; the delivered frames are those from
+            ``recipe.first_frame`` on.
+        """
+        if self.grid_steps:
+            return np.concatenate(([0], np.cumsum(self.grid_steps, dtype=np.int64)))
+        return np.arange(0, recipe.steps + 1, recipe.steps_per_frame)
 
     def source_index(self, steps: int) -> npt.NDArray[np.int64]:
         """Return which decoded frame each position of the clip shows.
@@ -174,13 +190,10 @@ class SampleParams:
         return np.cumsum(advance)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for the provenance; ``effects`` and ``log_eps`` are left out if they are empty."""
+        """Return plain values for the provenance; fields after ``noise_key`` are left out if they are empty."""
         values = _fields(self)
-        if not self.effects:
-            del values["effects"]
-        if self.log_eps is None:
-            del values["log_eps"]
-        return values
+        optional = ("effects", "log_eps", "voxel_seconds", "grid_steps")
+        return {name: value for name, value in values.items() if value or name not in optional}
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,6 +218,7 @@ class Provenance:
         sidecars: fingerprints of the sidecars that its arrays were made from, by ending.
         unlabelled: reason by array, for each requested array that could not be made from the video's sidecars.
         boxes_dropped: boxes that ``max_boxes`` left out, in all frames of the sample.
+        grid_seconds: actual duration of each voxel grid, where the recipe states ``voxel_seconds``.
     """
 
     id: SampleId
@@ -223,6 +237,7 @@ class Provenance:
     sidecars: Mapping[str, str] = dataclasses.field(default_factory=dict)
     unlabelled: Mapping[str, str] = dataclasses.field(default_factory=dict)
     boxes_dropped: int = 0
+    grid_seconds: tuple[float, ...] = ()
 
     @property
     def labelled(self) -> bool:
@@ -246,7 +261,7 @@ class Provenance:
             "refusals": tuple(refusal.to_dict() for refusal in self.refusals),
             "params": self.params.to_dict(),
         }
-        optional = ("scene", "saturated", "sidecars", "unlabelled", "boxes_dropped")
+        optional = ("scene", "saturated", "sidecars", "unlabelled", "boxes_dropped", "grid_seconds")
         return {name: value for name, value in values.items() if value or name not in optional}
 
     @classmethod
@@ -261,6 +276,8 @@ class Provenance:
             params = dict(rest.pop("params"))
             params["pauses"] = tuple((int(first), int(length)) for first, length in params["pauses"])
             params["noise_key"] = tuple(int(word) for word in params["noise_key"])
+            params["grid_steps"] = tuple(map(int, params.get("grid_steps", ())))
+            rest["grid_seconds"] = tuple(map(float, rest.get("grid_seconds", ())))
             known = effect_settings()
             params["effects"] = {
                 name: known[name].single.check(name, value) for name, value in params.get("effects", {}).items()
@@ -286,13 +303,16 @@ def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> L
     """Return dtype and shape of each requested array of one sample, as :data:`ARRAYS` states them.
 
     Raises:
-        UsageError: an unknown array, an array requested twice, or an empty request.
+        UsageError: an unknown array, an array requested twice, an empty request, or ``frames_all`` with
+            ``voxel_seconds``.
     """
     if not arrays or len(set(arrays)) != len(arrays):
         raise UsageError(f"arrays = {list(arrays)}: ask for one or more of {', '.join(ARRAYS)}, each once")
     for name in arrays:
         if name not in ARRAYS:
             raise UsageError(f"arrays: unknown array {name!r}; known: {', '.join(ARRAYS)}")
+    if recipe.is_timed and "frames_all" in arrays:
+        raise UsageError("arrays: frames_all has another length in each sample with voxel_seconds: ask for frames")
     return {name: ARRAYS[name](recipe, voxel_dtype) for name in arrays}
 
 

@@ -57,6 +57,7 @@ from v2v_server.system.clock import Clock
 from v2v_server.system.log import Level, Log
 from v2v_server.system.process import keep_freed_memory, open_many_files, usable_cores
 from v2v_server.system.service import stop_on_signals, utc_now, write_port_file
+from v2v_server.system.start_times import StartTimes
 from v2v_server.system.status_fields import GIB
 from v2v_server.video.rows import Rows
 
@@ -107,8 +108,11 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
     return catalogue
 
 
-def serve(config: ServeConfig) -> None:
+def serve(config: ServeConfig, times: StartTimes | None = None) -> None:
     """Run a server until SIGINT or SIGTERM.
+
+    Args:
+        times: completed and perhaps logged once the first sample is sent.
 
     Raises:
         CorpusError: the corpus gives no sequence.
@@ -118,7 +122,10 @@ def serve(config: ServeConfig) -> None:
     keep_freed_memory()
     open_many_files()
     log = Log(is_json=config.log_format == "json")
+    times = times or StartTimes()
+    times.mark("imports")
     catalogue = load_catalogue(config)
+    times.mark("catalogue")
     for note in catalogue.notes:
         log.say(note)
     table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
@@ -150,6 +157,7 @@ def serve(config: ServeConfig) -> None:
         make_cache(folder)
         worker_flags += ["--cache", str(folder), "--cache-gib", str(config.cache_gib)]
     worker_flags += catalogue.source.worker_flags()
+    worker_flags += ["--debug"] if times.is_logged else []
     label = f"w{secrets.token_hex(4)}"
     keys = KeyFolder(Path(config.keys)) if config.keys else None
     stop = threading.Event()
@@ -164,12 +172,15 @@ def serve(config: ServeConfig) -> None:
             local_bind=_private_address(label),
         )
         page = PageProcess(config.page_host, config.page, config.page_names) if config.page else None
-        server = Server(config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file, page=page)
+        server = Server(
+            config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file, page=page, times=times
+        )
         try:
             if pool.is_local and (question := question_workers(config.most_workers, usable_cores())):
                 log.say(question, "warning")
             pool.start(sockets.local_address if pool.is_local else sockets.worker_address)
             pool.scale(config.least_workers)
+            times.mark("schedule and sockets")
             if page is not None:
                 page.start(sockets.local_address)
                 log.say(f"page: {page.url}")
@@ -191,6 +202,7 @@ class Server:
         quarantine_file: file that new entries are written to.
         clock: returns the time, seconds; None: a :class:`v2v_server.system.clock.Clock`.
         page: the status page; None: no page.
+        times: see :func:`serve`.
     """
 
     def __init__(
@@ -204,8 +216,10 @@ class Server:
         quarantine_file: Path,
         clock: Callable[[], float] | None = None,
         page: PageProcess | None = None,
+        times: StartTimes | None = None,
     ) -> None:
         self._page = page
+        self._times = times or StartTimes()
         self._log = Log(is_json=config.log_format == "json")
         self._config = config
         self._catalogue = catalogue
@@ -359,6 +373,11 @@ class Server:
                 write_port_file(self._config.port_file, address)
                 self._port_file = Path(self._config.port_file)
             self._publisher.is_ready = True
+            self._times.mark("first worker")
+        if self._times.is_logged and self._dispatcher.counters.samples:
+            self._times.is_logged = False
+            self._times.mark("first sample")
+            self._say(str(self._times))
         if self._announced and self._view.is_due(now):
             self._view.show(now, self._publisher.status(now))
 

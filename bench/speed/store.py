@@ -27,7 +27,7 @@ from v2v_protocol.command import Parser
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.store.format import Head, group_frames_for
-from v2v_server.store.packing import DENSE, FAST, QUICK, Packing
+from v2v_server.store.packing import DENSE, FAST, QUICK, RAW, Packing
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter
 from v2v_server.video.decode import decode_luma, stream_luma
@@ -35,7 +35,7 @@ from v2v_server.video.rows import Rows
 
 Luma = npt.NDArray[np.uint8]
 CROP = (149, 128, 128)  # Frames, rows and columns
-FORMS = {"store dense": DENSE, "store fast": FAST, "cache": QUICK}
+FORMS = {"store dense": DENSE, "store fast": FAST, "store raw": RAW, "cache": QUICK}
 _MOST_FRAMES = 450
 _COLUMNS: tuple[Column, ...] = (
     ("form", "", "{}", 1.0),

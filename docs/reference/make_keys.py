@@ -48,6 +48,7 @@ SOURCES = dict.fromkeys(
     "frame_stride": _OURS,
     "max_boxes": _OURS,
     "grids_per_frame": _OURS,
+    "voxel_seconds": _OURS,
     "noise_unit": _OURS,
 }  # fmt: skip
 """The source of a recipe's field and its default; those of the effects are on another page."""

@@ -103,7 +103,7 @@ def test_output_written_while_it_is_read_is_not_lost(program):
         + POLITE
     )
     with LocalServer("videos") as server:
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + 60.0
         while "line 0599" not in server.last_lines() and time.monotonic() < deadline:
             pass  # as often as possible
         assert os.fstat(server._errors.fileno()).st_size == 600 * len("line 0000\n")

@@ -19,12 +19,13 @@ import numpy as np
 import numpy.typing as npt
 
 from tests.oracles.dense import Trace, trace
-from v2v_protocol.recipe import most_events
+from v2v_protocol.bounds import most_events
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.precision import AUTO, Real, choose, error_bound, noise_sum
 from v2v_server.simulation.voxel import rounding_tolerance
+from v2v_server.video.luma import SDR, Signal
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Camera:
     gamma: float = 2.2
     log_eps: float = 1e-3
     seed: int = 0
+    signal: Signal = SDR
 
 
 @dataclass(frozen=True)
@@ -74,12 +76,12 @@ def balance(camera: Camera, frames: npt.NDArray[Any]) -> Balance:
 
     Args:
         camera: the virtual camera.
-        frames: [n, h, w] uint8 grey levels, or floating point log intensities.
+        frames: [n, h, w] grey levels, uint8 or uint16, or floating point log intensities.
 
     Raises:
         UsageError: the simulation refuses the camera.
     """
-    steps, pixels, grey = len(frames) - 1, frames[0].size, frames.dtype == np.uint8
+    steps, pixels, grey = len(frames) - 1, frames[0].size, frames.dtype.kind == "u"
     real, events = arithmetic(camera, frames)
     settings: dict[str, Any] = {
         "threshold_pos": camera.threshold_pos, "threshold_neg": camera.threshold_neg,
@@ -88,7 +90,10 @@ def balance(camera: Camera, frames: npt.NDArray[Any]) -> Balance:
     }  # fmt: skip
     # A recipe has at most 1024 bins; the library has not, so a long clip may be one voxel.
     if grey:
-        voxels = simulate(frames, bins=steps, gamma=camera.gamma, log_eps=camera.log_eps, **settings).voxels
+        voxels = simulate(
+            frames, bins=steps, gamma=camera.gamma, log_eps=camera.log_eps, bits=camera.signal.bits,
+            transfer=camera.signal.transfer, **settings,
+        ).voxels  # fmt: skip
     else:
         voxels = simulate_log(frames, bins=steps, **settings).voxels
     again = trace_of(camera, frames, real)
@@ -103,8 +108,8 @@ def balance(camera: Camera, frames: npt.NDArray[Any]) -> Balance:
 
 def arithmetic(camera: Camera, frames: npt.NDArray[Any]) -> tuple[Real, float]:
     """Return the arithmetic in which a clip is simulated, and ``most_events`` of it."""
-    if frames.dtype == np.uint8:
-        table = log_table_float64(camera.gamma, camera.log_eps)
+    if frames.dtype.kind == "u":
+        table = log_table_float64(camera.gamma, camera.log_eps, camera.signal)
         ends = float(table[0]), float(table[-1])
     else:
         ends = float(frames.min()), float(frames.max())
@@ -118,9 +123,9 @@ def trace_of(camera: Camera, frames: npt.NDArray[Any], real: Real) -> Trace:
     """Follow the clip pixel by pixel in the given arithmetic."""
     steps, pixels, key = len(frames) - 1, frames[0].size, noise_key_of_seed(camera.seed)
     flat = frames.reshape(len(frames), pixels)
-    if frames.dtype == np.uint8:
+    if frames.dtype.kind == "u":
         table = log_table if real is np.float32 else log_table_float64
-        levels: npt.NDArray[Any] = table(camera.gamma, camera.log_eps)[flat]
+        levels: npt.NDArray[Any] = table(camera.gamma, camera.log_eps, camera.signal)[flat]
     else:
         levels = flat.astype(real)
     noisy = np.empty((0, 0), real)
@@ -139,7 +144,7 @@ def imbalance(camera: Camera, frames: npt.NDArray[Any], seen: Trace) -> float:
     """Return the largest difference of the two sides of the balance, log units."""
     steps, pixels, key = len(frames) - 1, frames[0].size, noise_key_of_seed(camera.seed)
     ends = frames[[0, -1]].reshape(2, pixels)
-    level = log_table_float64(camera.gamma, camera.log_eps)[ends] if frames.dtype == np.uint8 else ends
+    level = log_table_float64(camera.gamma, camera.log_eps, camera.signal)[ends] if frames.dtype.kind == "u" else ends
     normals = noise.standard_normals(key, steps, pixels).astype(np.float64) if camera.noise_sigma else None
     position, hot_normal = noise.hot_pixels(key, camera.hot_pixel_count, pixels)
     hot = np.zeros(pixels)

@@ -18,18 +18,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tests.oracles import extremes_in_time as in_time
 from tests.oracles.balance import Camera, balance, imbalance, trace_of
 from tests.oracles.dense import trace
-from tests.oracles.extremes_in_time import excess_of_divided_steps, steps_of_any_duration
+from v2v_protocol.bounds import most_events
 from v2v_protocol.errors import RecipeError, UsageError
-from v2v_protocol.recipe import Recipe, most_events, preset
+from v2v_protocol.recipe import Recipe, preset
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.draw import draw, noise_key_of_seed
 from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.precision import LIMITS, error_bound
 from v2v_server.simulation.voxel import rounding_tolerance
+from v2v_server.video.luma import SDR, Signal
 
-Frames = npt.NDArray[np.uint8]
+Frames = npt.NDArray[Any]
 HEIGHT_PX, WIDTH_PX, STEPS = 6, 8, 60
 LONG_STEPS = 999_999
 LARGEST_Z = 5.0
@@ -81,16 +83,16 @@ def record_of(row: Row) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def texture(steps: int = STEPS, height: int = HEIGHT_PX, width: int = WIDTH_PX) -> Frames:
+def texture(steps: int = STEPS, height: int = HEIGHT_PX, width: int = WIDTH_PX, signal: Signal = SDR) -> Frames:
     """Return uncorrelated grey levels: every pixel jumps at every step."""
     shape = (steps + 1, height, width)
-    return np.random.default_rng(1).integers(0, 256, shape, np.uint8)
+    return np.random.default_rng(1).integers(0, signal.white + 1, shape, signal.dtype.type)
 
 
-def flicker(steps: int = STEPS) -> Frames:
+def flicker(steps: int = STEPS, signal: Signal = SDR) -> Frames:
     """Return frames that are black and white in turns."""
-    frames = np.zeros((steps + 1, HEIGHT_PX, WIDTH_PX), np.uint8)
-    frames[1::2] = 255
+    frames = np.zeros((steps + 1, HEIGHT_PX, WIDTH_PX), signal.dtype)
+    frames[1::2] = signal.white
     return frames
 
 
@@ -333,7 +335,7 @@ def divided_rows() -> list[Row]:
     }
 
     def check(setting: tuple[Any, ...]) -> Finding:
-        return Finding(*excess_of_divided_steps(*setting))
+        return Finding(*in_time.excess_of_divided_steps(*setting))
 
     quantity = "more than a threshold left, log units"
     return [Row(name, "counted", quantity, partial(check, setting)) for name, setting in asked.items()]
@@ -352,6 +354,13 @@ def rows() -> list[Row]:
         camera = Camera(0.05, 0.06, 0.1, 2, 5.0, gamma, eps)
         name = f"gamma {gamma:g}, eps {eps:g}"
         made.append(Row(name, "counted", error, partial(balanced, camera, texture())))
+    deep, pq = Signal(10), Signal(10, "pq")
+    made += [  # slow: another compiled kernel
+        Row("10 bits, eps 1e-12", "counted", error, lambda: balanced(
+            Camera(0.05, 0.06, 0.1, 2, 5.0, log_eps=1e-12, signal=deep), texture(signal=deep)), slow=True),
+        Row("PQ of 0 and 10,000 cd/m2 in turns, eps 1e-12", "counted", error, lambda: balanced(
+            Camera(0.05, 0.05, log_eps=1e-12, signal=pq), flicker(signal=pq)), slow=True),
+    ]  # fmt: skip
     cameras = {
         "thresholds 1e-6": Camera(1e-6, 1e-6),
         "thresholds 1e3": Camera(1e3, 1e3, 100.0),
@@ -384,7 +393,9 @@ def rows() -> list[Row]:
         Row("more than float64 can count", "refused", "calls not refused", beyond_float64),
         Row("recipes beyond float64", "refused", "calls not refused", recipe_beyond_float64),
         *divided_rows(),
-        Row("steps of 1 us and 1 h", "counted", "violations", lambda: Finding(steps_of_any_duration(), 0.0)),
+        Row("steps of 1 us and 1 h", "counted", "violations", lambda: Finding(in_time.steps_of_any_duration(), 0.0)),
+        Row("time stamps of any kind", "counted", "violations", lambda: Finding(in_time.any_time_stamps(), 0.0)),
+        Row("float16 above 2,048 events", "counted", wrong, lambda: Finding(in_time.large_float16(), 0.0)),
         Row("table of gamma 4, eps 0.1", "counted", "falls of log intensity", table_never_falls),
     ]  # fmt: skip
 

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.recipe import most_events
-from v2v_server.simulation import simulate
+from v2v_protocol.bounds import most_events
+from v2v_protocol.recipe import Recipe
+from v2v_server.simulation import simulate, simulate_log
+from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.draw import FrameTimes, draw
 from v2v_server.simulation.intensity import log_table_float64
 from v2v_server.simulation.kernels import KernelInput, fill
 from v2v_server.simulation.precision import AUTO, choose, error_bound
-from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
+from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, step_seconds
 
 Doubles = npt.NDArray[np.float64]
 HOUR, MICROSECOND = 3600.0, 1e-6
@@ -84,4 +87,48 @@ def steps_of_any_duration() -> int:
     wrong += int((long > 1).sum())
     leaked = counts(np.full_like(frames, 90), leak_hz=leak)
     wrong += int(leaked[:, 0].any()) + int((np.abs(leaked[:, 1].sum(axis=0) - leak * seconds.sum()) > 2).sum())
+    return wrong
+
+
+def any_time_stamps() -> int:
+    """Count violations with time stamps that are zero, repeat, fall or are missing, and grids of any duration.
+
+    No duration changes the events of a pixel whose change is counted without noise: only the bin that holds them.
+    """
+    count, wrong = 41, 0
+    frames = np.random.default_rng(6).integers(0, 256, (count, 8, 8), np.uint8)
+    even = np.arange(count) / 30
+    hostile = {
+        "zero": np.zeros(count), "missing": np.full(count, np.nan), "repeated": np.repeat(even, 2)[:count],
+        "falling": even[::-1], "mixed": np.where(np.arange(count) % 3, even, np.nan),
+        "apart": np.where(np.arange(count) < 20, MICROSECOND, HOUR) * np.arange(count),
+    }  # fmt: skip
+    plain = Recipe(
+        voxels_per_clip=40, bins=1, crop_height_px=8, crop_width_px=8, noise_sigma=0.0, hot_pixel_share=0.0,
+        pause_probability=0.0, threshold=0.1, threshold_ratio=1.0, flip_probability=0.0,
+    )  # fmt: skip
+    for stamps in hostile.values():
+        for duration in (MICROSECOND, 0.1, 100.0):
+            recipe = plain.replace(voxels_per_clip=5, bins=3, voxel_seconds=duration)
+            params = draw(
+                recipe, seed=0, epoch=0, index=0, picture_height_px=8, picture_width_px=8, video_id="",
+                times=FrameTimes(stamps, 30.0),
+            )  # fmt: skip
+            steps = int(params.ends(recipe)[-1])
+            seconds, _ = step_seconds(stamps, np.arange(steps + 1), 30.0)
+            voxels = simulate_clip(frames, params, recipe, "float32", seconds).voxels
+            by_step = simulate_clip(frames, params, plain.replace(voxels_per_clip=steps), "float32").voxels
+            wrong += int(np.count_nonzero(voxels.sum(axis=(0, 1)) != by_step.sum(axis=(0, 1))))
+            wrong += int(voxels.shape != (5, 3, 8, 8)) + int(min(params.grid_steps) < 1 or steps >= count)
+    return wrong
+
+
+def large_float16() -> int:
+    """Count float16 grids that are not the nearest float16 number, above 2,048 events and above float16's largest."""
+    wrong = 0
+    for events in (2047.0, 2049.0, 65503.0, 65521.0, 1e5):
+        made = simulate_log(np.array([0.0, events + 0.5])[:, None, None], threshold_pos=1.0, bins=1, start_residual=0.0)
+        arrays, clipped = fill(made.given, made.real, {"voxels_bilinear": None})
+        wrong += int(arrays["voxels_bilinear"].item() != np.float16(min(events, 65504.0)))
+        wrong += int(clipped["voxels_bilinear"] != (events > 65504))
     return wrong

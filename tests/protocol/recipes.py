@@ -7,8 +7,9 @@ from typing import Any
 
 from hypothesis import strategies as st
 
+from v2v_protocol.bounds import LARGEST_EVENTS
 from v2v_protocol.errors import RecipeError
-from v2v_protocol.recipe import LARGEST_EVENTS, Recipe
+from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, MOST_SUBSTEPS, ON_BAD_VIDEO, VOXEL_DTYPES, StreamSpec
 
 
@@ -26,7 +27,9 @@ _COUNTED = ("threshold", "threshold_ratio", "noise_sigma", "hot_pixel_sigma", "l
 def _recipe(milder: Sequence[str], **values: object) -> Recipe:
     """Values that are fine each by itself may make more events together than can be counted: then the fields that count
     most take their defaults, one after another in the order ``milder``. Nothing is drawn in vain."""
-    if values["grids_per_frame"]:
+    if values["voxel_seconds"] != (0.0, 0.0):
+        values["grids_per_frame"] = 0
+    if values["grids_per_frame"] or values["voxel_seconds"] != (0.0, 0.0):
         values["frames_per_bin"] = 1
     for name in milder:
         try:
@@ -45,6 +48,7 @@ recipes = st.builds(
     bins=st.integers(1, 20),
     frames_per_bin=st.integers(1, 20),
     grids_per_frame=st.just(0) | st.integers(1, 20),
+    voxel_seconds=st.just((0.0, 0.0)) | _range(1e-6, 100.0),
     lead_frames=st.integers(0, 1),
     lead_voxels=st.integers(0, 1),
     frame_stride=st.integers(1, 3),

@@ -22,6 +22,7 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "bins": 6,
     "frames_per_bin": 2,
     "grids_per_frame": 4,
+    "voxel_seconds": [0.02, 0.1],
     "lead_frames": 1,
     "lead_voxels": 1,
     "crop_height_px": 129,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -61,13 +62,16 @@ def clips_with_a_broken_one(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _no_process_left() -> Iterator[None]:
-    """Whatever a test starts is gone when it ends."""
+    """Check that each process that a test started has ended; kill the others, so that the next test starts without."""
     before = set(psutil.Process().children(recursive=True))
     yield
     left = [process for process in psutil.Process().children(recursive=True) if process not in before]
     left = [process for process in left if "resource_tracker" not in _command(process)]
-    psutil.wait_procs(left, timeout=10)
-    assert not [process for process in left if process.is_running()]
+    _, alive = psutil.wait_procs(left, timeout=30)
+    for process in alive:
+        with suppress(psutil.NoSuchProcess):
+            process.kill()
+    assert not alive
 
 
 def server_workers(pid: int) -> list[psutil.Process]:

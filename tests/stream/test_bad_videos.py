@@ -11,6 +11,7 @@ from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import SampleUnavailable
+from v2v_protocol.recipe import Recipe
 
 SHARED_VIDEOS = Path(__file__).parents[3] / "shared" / "data" / "videos"
 CORRUPT = "decord_corrupted.mp4"
@@ -46,12 +47,11 @@ def _four_epochs(address: str) -> None:
 
 @pytest.mark.skipif(not SHARED_VIDEOS.is_dir(), reason=f"needs the real clips in {SHARED_VIDEOS}")
 @pytest.mark.slow
-@pytest.mark.parametrize("voxels", [40, 5])
-def test_every_real_clip_that_is_long_enough_is_served(voxels: int) -> None:
-    long_enough = set(_long_enough(25 * voxels // 5 + 1 if voxels == 5 else 201))
+def test_every_real_clip_that_is_long_enough_is_served() -> None:
+    recipe = Recipe(voxels_per_clip=5)
+    long_enough = set(_long_enough(recipe.steps + 1))
     served: set[str] = set()
     refused: dict[str, str] = {}
-    recipe = {"preset": "paper", "voxels_per_clip": voxels}
     with LocalServer(SHARED_VIDEOS, workers=2) as server:
         dataset = V2VStreamDataset(server.address, batch_size=4, recipe=recipe, shuffle=False)
         for batch in dataset:

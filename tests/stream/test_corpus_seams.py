@@ -1,4 +1,4 @@
-"""An array from a sidecar and a kind of source, added to a copy of the packages as `docs/extending.md` says."""
+"""An array from a sidecar and a kind of source, added to the packages as `docs/extending.md` says."""
 
 from __future__ import annotations
 
@@ -64,6 +64,24 @@ def open_source(name, options):
     return Toy(name) if name.startswith("toy:") else None
 '''
 SOURCE_LINE = ("v2v_server/corpus/sources/source.py", '"copies", "prepared"', '"toy", ')
+
+OVERLAY = '''
+"""Import a module from this folder if it is there. All others, the kernels too, are those of the packages."""
+
+import sys
+from importlib.util import spec_from_file_location
+from pathlib import Path
+
+
+class Overlay:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        file = Path(__file__).parent.joinpath(*name.split(".")).with_suffix(".py")
+        return spec_from_file_location(name, file) if file.is_file() else None
+
+
+sys.meta_path.insert(0, Overlay)
+'''
 
 USE_SIDECAR = """
 import json, sys
@@ -172,10 +190,13 @@ assert {each.video for batch in batches for each in batch.provenance} == {"toys/
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the packages with both additions, and two clips."""
+    """The files with both additions, which an import prefers to those of the packages, and two clips."""
     tmp_path = tmp_path_factory.mktemp("tree")
-    for package in ("v2v_protocol", "v2v_server", "v2v_client", "v2v_pictures"):
-        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("v2v_server/worker", "v2v_server/corpus/sources", "v2v_protocol"):
+        (tmp_path / name).mkdir(parents=True)
+    for name, *_ in (*DEPTH_LINES, SOURCE_LINE):
+        shutil.copy(ROOT / name, tmp_path / name)
+    (tmp_path / "sitecustomize.py").write_text(OVERLAY)
     (tmp_path / "clips").mkdir()
     for name in ("a.mp4", "b.mp4"):
         write_clip(tmp_path / "clips" / name, panned_luma(30, 16, 24), gop=12)
@@ -186,7 +207,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(tree: Path, program: str) -> None:
-    environment = os.environ | {"PYTHONPATH": str(tree)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tree), str(ROOT)])}
     done = subprocess.run(
         [sys.executable, "-c", program, str(tree / "clips"), str(tree / "cache")], env=environment, cwd=tree,
         capture_output=True, text=True, timeout=500, check=False,

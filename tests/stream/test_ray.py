@@ -64,7 +64,7 @@ def workers() -> list[psutil.Process]:
     found = []
     for process in psutil.Process().children(recursive=True):
         try:
-            if "v2v_server.commands.worker" in process.cmdline():
+            if "v2v_server.commands.worker" in process.cmdline() and raylets_of(process):
                 found.append(process)
         except psutil.NoSuchProcess:
             continue
@@ -130,7 +130,7 @@ def log_of(server: LocalServer) -> str:
 
 def test_a_cluster_grows_while_a_consumer_waits_and_shrinks_again(clips: Path, cluster: Any) -> None:
     epochs: list[list[str]] = []
-    flags = [*flags_for(cluster), "--scale-seconds", "6", "--workers", "2:6"]
+    flags = [*flags_for(cluster), "--scale-seconds", "6", "--workers", "1:2"]
     with LocalServer(clips, flags=flags) as server:
         dataset = V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3)
 
@@ -143,13 +143,12 @@ def test_a_cluster_grows_while_a_consumer_waits_and_shrinks_again(clips: Path, c
                     time.sleep(pause)
             assert len(workers()) == count
 
+        until_there_are(1, 0.0)
         until_there_are(2, 0.0)
-        until_there_are(6, 0.0)
-        until_there_are(2, 1.5)  # far from what two can do, on a busy machine too
+        until_there_are(1, 1.5)  # far from what one can do, on a busy machine too
         said = log_of(server)
     changes = [int(found) for found in re.findall(r"workers: (\d+) from now on, because", said)]
-    assert changes[:3] == [3, 5, 6]
-    assert changes[2:] == sorted(changes[2:], reverse=True)
+    assert changes[:2] == [2, 1]
     assert "its leases go to other workers" not in said  # who was sent away left in order
     with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as fixed:
         for epoch in {0, len(epochs) // 2, len(epochs) - 1}:
@@ -157,8 +156,13 @@ def test_a_cluster_grows_while_a_consumer_waits_and_shrinks_again(clips: Path, c
     assert {len(epoch) for epoch in epochs} == {8}
 
 
+def raylets_of(process: psutil.Process) -> list[int]:
+    return [parent.pid for parent in process.parents() if parent.name() == "raylet"]
+
+
 def raylet_of(process: psutil.Process) -> int:
-    return next(parent.pid for parent in process.parents() if parent.name() == "raylet")
+    (raylet,) = raylets_of(process)
+    return raylet
 
 
 def pid_of_raylet(node: Any) -> int:

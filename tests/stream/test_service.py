@@ -98,10 +98,10 @@ def test_a_signal_stops_everything_cleanly(clips: Path, tmp_path: Path, number: 
         workers = server_workers(server.pid)
         assert len(workers) == 2
         server.send_signal(number)
-        assert server.wait(timeout=20) == 0
+        assert server.wait(timeout=60) == 0
     finally:
         _end(server)
-    assert not psutil.wait_procs(workers, timeout=10)[1]
+    assert not psutil.wait_procs(workers, timeout=60)[1]
     assert not port_file.exists()
     with socket.socket() as probe:
         host, port = address.removeprefix("tcp://").split(":")
@@ -115,10 +115,10 @@ def test_workers_do_not_outlive_a_killed_server(clips: Path, tmp_path: Path) -> 
         _wait_for(server, port_file)
         workers = server_workers(server.pid)
         server.kill()
-        server.wait(timeout=20)
+        server.wait(timeout=60)
     finally:
         _end(server)
-    assert not psutil.wait_procs(workers, timeout=10)[1]
+    assert not psutil.wait_procs(workers, timeout=60)[1]
 
 
 BAD_SETTINGS = [
@@ -198,7 +198,7 @@ def test_the_start_says_which_videos_give_nothing_and_what_would_admit_them(clip
         _wait_for(server, port_file)
     finally:
         server.terminate()
-        said = server.communicate(timeout=20)[1]
+        said = server.communicate(timeout=60)[1]
     assert "2 videos" in said
     assert "1 give 2 sequences of 21 frames" in said
     assert "short.mp4: 12 frames, the recipe needs 21" in said
@@ -224,4 +224,4 @@ def _wait_for(server: subprocess.Popen[str], port_file: Path) -> None:
 def _end(server: subprocess.Popen[str]) -> None:
     if server.poll() is None:
         server.kill()
-    server.communicate(timeout=20)
+    server.communicate(timeout=60)

@@ -154,6 +154,7 @@ class Admission:
             spec.samples_per_decode,
             recipe.frames_per_sequence,
             recipe.frame_stride,
+            recipe.voxel_seconds[1],
             recipe.crop_height_px,
             recipe.crop_width_px,
             recipe.resize_scale,

@@ -320,11 +320,12 @@ def work_seconds(spec: StreamSpec, arrays: tuple[str, ...], video: VideoEntry) -
         video: its catalogue entry; pictures are decoded whole.
     """
     recipe, picture_px = spec.recipe, video.width_px * video.height_px
-    seconds = _DECODE_SECONDS * picture_px * recipe.frames_needed
-    parts = max(recipe.frames_needed, recipe.most_segments)
+    frames = int(recipe.reach_at(video.frames_per_second)) + 1
+    seconds = _DECODE_SECONDS * picture_px * frames
+    parts = max(frames, recipe.most_segments(frames // recipe.frame_stride))
     seconds += _SIMULATION_SECONDS * recipe.crop_height_px * recipe.crop_width_px * parts
     if not {"flow", "flow_valid"}.isdisjoint(arrays):
-        seconds += _FLOW_SECONDS * picture_px * (recipe.frames_needed - 1)
+        seconds += _FLOW_SECONDS * picture_px * (frames - 1)
     return float(math.floor(seconds * spec.samples_per_decode))
 
 

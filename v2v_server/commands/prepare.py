@@ -67,7 +67,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     encoding.add_argument(
         "--size",
         choices=tuple(SIZES),
-        help=f"lossless: {DEFAULT_SIZE} (default), or fast: a third larger, reads faster",
+        help=f"lossless: {DEFAULT_SIZE} (default), fast: a third larger, reads faster, or raw: "
+        "not compressed, reads fastest from memory",
     )
     encoding.add_argument(
         "--planes", choices=(*MADE_PLANES, CHROMA), action="append", default=[],

@@ -12,6 +12,7 @@ from v2v_server.commands.spec_flags import add_spec
 from v2v_server.config import SERVE_KEYS, ServeConfig, recipe_setting
 from v2v_server.serve import serve
 from v2v_server.system.log import report_errors
+from v2v_server.system.start_times import StartTimes
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,7 +41,7 @@ def _run(arguments: argparse.Namespace) -> None:
     with report_errors(lambda: arguments.log_format):
         config = ServeConfig.load(arguments.config, flags, settings)
         arguments.log_format = config.log_format  # the file may ask for JSON
-        serve(config)
+        serve(config, StartTimes(is_logged=arguments.debug))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from v2v_protocol.errors import UsageError, V2VError
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_source
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.system.log import LOG_FORMATS, Log, report_errors
+from v2v_server.system.start_times import StartTimes
 from v2v_server.system.status_fields import GIB
 from v2v_server.worker.process import run_worker, unshared_name
 
@@ -73,7 +74,10 @@ def _work(arguments: argparse.Namespace) -> None:
             make_cache(folder)
         cache = Cache(folder, int(arguments.cache_gib * GIB))
     log = Log(is_json=arguments.log_format == "json")
-    run_worker(arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log)
+    run_worker(
+        arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log,
+        StartTimes(is_logged=arguments.debug),
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

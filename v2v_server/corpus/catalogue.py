@@ -244,9 +244,13 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
         IndexUnreadable: the index cannot be read at the moment.
         V2VError: the index of this video is damaged, or belongs to another file.
     """
-    video, start, count, part = lease.video, lease.start_frame, spec.recipe.frames_needed, b""
-    if spec.scene != "off":
-        scene = catalogue.scene(video)
+    video, start, recipe, part = lease.video, lease.start_frame, spec.recipe, b""
+    if spec.scene == "off":
+        count = int(recipe.reach_at(lease.frames_per_second)) + 1
+        if recipe.is_timed and (number := catalogue.videos.find(video)) is not None:
+            count = min(count, int(catalogue.videos.frames[number]) - start)
+    else:
+        scene, count = catalogue.scene(video), int(recipe.sequence_at(lease.frames_per_second)) + 1
         if "duplicates" not in spec.kept_defects:
             count = int(scene.frames_from(start, count)[-1]) + 1 - start
         part = scene.slice(start, count).to_bytes()

@@ -60,7 +60,8 @@ class Videos(Sequence[VideoEntry]):
         split: the videos that are divided into pieces; None where that is unknown.
 
     Attributes:
-        ids, fingerprints, frames, width_px, height_px, interlaced: columns, one value for each video.
+        ids, fingerprints, frames, frames_per_second, width_px, height_px, interlaced: columns, one value for each
+            video.
         split: as given.
     """
 
@@ -70,6 +71,7 @@ class Videos(Sequence[VideoEntry]):
         self._table = replace(table, summaries=NO_STRINGS)  # tens of MB that only ``split`` is made of
         self._thresholds, self.split = thresholds, split
         self.ids, self.fingerprints, self.frames = table.ids, table.fingerprints, table.frames
+        self.frames_per_second = table.frames_per_second
         self.width_px, self.height_px, self.interlaced = table.width_px, table.height_px, table.interlaced
 
     def find(self, id: str) -> int | None:

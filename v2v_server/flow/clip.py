@@ -93,7 +93,9 @@ def flow_for(
     count, height, width = recipe.voxels_per_clip, recipe.crop_height_px, recipe.crop_width_px
     if settings.first_voxel > count:
         raise UsageError(f"flow from voxel {settings.first_voxel}: the clip has {count} voxels")
-    source = params.source_index(recipe.steps)
+    positions = params.ends(recipe)
+    source = params.source_index(int(positions[-1]))
+    ends = source[positions[recipe.lead_voxels :]].tolist()
     pictures = _Pictures(frames, params, recipe, settings.margin_px, int(source[-1]) + 1)
     flow = np.zeros((count, 2, height, width), np.float16)
     valid = np.zeros((count, 1, height, width), np.uint8) if validity else None
@@ -101,16 +103,14 @@ def flow_for(
     estimators: dict[str, Estimator] = {}
     with one_thread():
         for voxel in range(settings.first_voxel, count):
-            span = recipe.steps_per_frame
-            start = (recipe.lead_voxels + voxel) * span
-            ends = int(source[start]), int(source[start + span])
+            start, end = ends[voxel : voxel + 2]
             planned = plan[voxel] if plan else settings.method
-            if ends[0] == ends[1] or (plan and planned == STILL):
-                methods.append(PAUSED if ends[0] == ends[1] else STILL)
+            if start == end or (plan and planned == STILL):
+                methods.append(PAUSED if start == end else STILL)
                 if valid is not None:
                     valid[voxel] = 1
                 continue
-            earlier, later = pictures.pair(*ends)
+            earlier, later = pictures.pair(start, end)
             first, second = (earlier, later) if settings.direction == "forward" else (later, earlier)
             name = choose(first, second) if planned == AUTO else planned
             methods.append(name)

@@ -9,6 +9,8 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import islice
 
+import numpy as np
+
 from v2v_protocol.errors import CorpusError, V2VError
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
@@ -68,7 +70,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
     for note in catalogue.notes:
         yield "note", "corpus", note, ""
     yield from _how_videos_are_stored(catalogue)
-    yield from look_at_pictures(catalogue, spec.recipe.frames_needed)
+    yield from look_at_pictures(catalogue, int(np.median(spec.recipe.sequence_at(found.frames_per_second))) + 1)
     table = SequenceTable(found, catalogue.rows, spec)
     useless = len(found) - table.videos
     if useless:

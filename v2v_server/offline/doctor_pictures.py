@@ -25,13 +25,14 @@ from v2v_server.corpus.scenes.findings import (
     Defect,
     defects_of,
 )  # fmt: skip
-from v2v_server.store.clips import pictures_of
+from v2v_server.store.clips import pictures_of, signal_of
 from v2v_server.store.format import is_store_file
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.system.process import usable_cores
 from v2v_server.video.decode import stream_luma
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.orientation import Window
 
 MOST_VIDEOS = 12
@@ -82,8 +83,8 @@ class _Excerpt:
     window: Window
 
 
-_Found = tuple[_Excerpt, int, tuple[Defect, ...]]
-"""An excerpt, its frames that decode, and their defects."""
+_Found = tuple[_Excerpt, int, tuple[Defect, ...], Signal]
+"""An excerpt, its frames that decode, their defects, and what the levels of the video mean."""
 
 
 def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple[str, str, str, str]]:
@@ -104,15 +105,20 @@ def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple
         text += f"; {failed} more did not decode within {_LONGEST_VIDEO_SECONDS:.0f} s"
     yield "ok", "pictures", text, ""
     for kind, effect in _EFFECTS.items():
-        having = [(excerpt, each) for excerpt, _, defects in found for each in defects if each.kind == kind]
+        having = [(excerpt, each) for excerpt, _, defects, _ in found for each in defects if each.kind == kind]
         count = sum(
-            any(each.kind == kind and each.touches(*span) for each in defects) for (_, _, defects), span in sequences
+            any(each.kind == kind and each.touches(*span) for each in defects) for (_, _, defects, _), span in sequences
         )
         if count:
             named = "; ".join(f"{excerpt.id}: {each.text}" for excerpt, each in having[:_SHOWN])
             more = f"; and {len(having) - _SHOWN} more" if len(having) > _SHOWN else ""
             text = f"{count} of {len(sequences)} sequences ({100 * count // len(sequences)}%) have {effect} ({named}"
             yield "note", "pictures", f"{text}{more})", _CHANGES[kind]
+    if stated := [(excerpt.id, signal) for excerpt, _, _, signal in found if signal != SDR]:
+        named = "; ".join(f"{id}: {signal}" for id, signal in stated[:_SHOWN])
+        more = f"; and {len(stated) - _SHOWN} more" if len(stated) > _SHOWN else ""
+        text = f"{len(stated)} of {len(found)} videos have other levels than {SDR} ({named}{more})"
+        yield "note", "pictures", text, "v2v-serve --set light=declared uses them; otherwise they are read as 8-bit SDR"
 
 
 def _found(catalogue: Catalogue) -> Iterator[_Found]:
@@ -142,11 +148,11 @@ def _found(catalogue: Catalogue) -> Iterator[_Found]:
         compile_cache(),
     )  # fmt: skip
     for excerpt, result in results:
-        yield (excerpt, 0, ()) if isinstance(result, Died) else (excerpt, *result)
+        yield (excerpt, 0, (), SDR) if isinstance(result, Died) else (excerpt, *result)
 
 
-def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...]]:
-    """Return the number of frames and their defects; no frames where they do not decode."""
+def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal]:
+    """Return the number of frames, their defects, and what their levels mean; no frames where they do not decode."""
     # Import lazily: the process that draws up the report needs no OpenCV.
     from v2v_server.corpus.scenes.analysis import analyse
 
@@ -156,9 +162,10 @@ def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...]]:
             scene = analyse(islice(pictures_of(path, index, window), excerpt.count))
         else:
             scene = analyse(stream_luma(path, index, excerpt.start, excerpt.count, window))
+        signal = signal_of(path, index)
     except V2VError:
-        return 0, ()
-    return scene.end, defects_of(scene)
+        return 0, (), SDR
+    return scene.end, defects_of(scene), signal
 
 
 def _sequences(frames: int, needed: int) -> list[tuple[int, int]]:

@@ -22,13 +22,15 @@ from v2v_server.motion.prediction import SUBSTEP_PX, Prediction, predict
 from v2v_server.offline.leases import lease_for
 from v2v_server.offline.remake import RemadeSample, Remaker
 from v2v_server.schedule.sequences import VideoSequence
-from v2v_server.simulation.draw import draw
+from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.view import apply_view, without_margin
+from v2v_server.store.clips import signal_of
 from v2v_server.store.format import is_store_file
 from v2v_server.store.reader import StoreFile
 from v2v_server.system.opencv import cv2
 from v2v_server.video.decode import DecodedClip, stream_luma
 from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import SDR
 from v2v_server.video.orientation import Window
 from v2v_server.worker.produce import Decoded, make_sample, plan_sample
 
@@ -72,8 +74,8 @@ def quiet_voxels(made: RemadeSample) -> npt.NDArray[Any]:
 def predicted_loss(made: RemadeSample) -> Prediction:
     """Predict what a sample loses between its frames."""
     plan, recipe = made.decoded.plan, made.decoded.plan.spec.recipe
-    frames = without_margin(made.decoded.clip.frames, plan.params, recipe, plan.margin_px)
-    return predict(apply_view(frames, plan.params, recipe))
+    frames = eight_bits(made.decoded.clip.frames, made.decoded.clip.signal)
+    return predict(apply_view(without_margin(frames, plan.params, recipe, plan.margin_px), plan.params, recipe))
 
 
 def describe_loss(found: Prediction) -> str:
@@ -154,23 +156,26 @@ class WholePictures:
             crop_height_px=height, crop_width_px=width, resize_scale=(1.0, 1.0), flip_probability=0.0,
             pause_probability=0.0, contrast_probability=0.0, threshold=(THRESHOLD, THRESHOLD),
             threshold_ratio=(1.0, 1.0), threshold_source="sample", lead_frames=0, lead_voxels=0,
-            **dict.fromkeys(effect_settings(), (0.0, 0.0)),
+            voxel_seconds=recipe.voxel_seconds[1], **dict.fromkeys(effect_settings(), (0.0, 0.0)),
         )  # fmt: skip
         spec = StreamSpec.from_dict({"recipe": recipe})
         lease = lease_for(
             Request(b"", 0, 0), sequence=sequence, catalogue=catalogue, spec=spec, seed=0, arrays=("voxels", "frames")
         )
         lease = replace(lease, rows="full", height_px=height, width_px=width, thresholds=())
-        frames = np.empty((recipe.steps + 1, height, width), np.uint8)
+        plan = plan_sample(lease, 0)
+        frames = np.empty((len(plan.source), height, width), np.uint8)
         index, stride = catalogue.frame_index(video.id), recipe.frame_stride
+        count = (len(frames) - 1) * stride + 1
         with catalogue.source.open_local(video.id, video.fingerprint) as path:
+            signal = SDR if recipe.light == "sdr" else signal_of(path, index)._replace(bits=8)
             window = (top, 0, bottom - top, video.width_px)
-            taken = _pictures(path, index, sequence.start_frame, recipe.frames_needed, window)
+            taken = _pictures(path, index, sequence.start_frame, count, window)
             for frame, picture in zip(frames, islice(taken, 0, None, stride), strict=True):
                 cv2.resize(picture, (width, height), frame, interpolation=cv2.INTER_AREA)
-        seconds = index.seconds(sequence.start_frame, recipe.frames_needed)[::stride]
-        clip = DecodedClip(frames, seconds, codec="", bit_exact=False)
-        sample = make_sample(lease, Decoded(plan_sample(lease, 0), clip))
+        seconds = index.seconds(sequence.start_frame, count)[::stride]
+        clip = DecodedClip(frames, seconds, codec="", bit_exact=False, signal=signal)
+        sample = make_sample(lease, Decoded(plan, clip))
         return Camera.of(sample.arrays, sample.provenance, f"threshold {THRESHOLD:g}, no noise", recipe)
 
     def estimate(self, sequence: VideoSequence, seed: int) -> CropEstimate:
@@ -180,17 +185,19 @@ class WholePictures:
             VideoError: see :meth:`camera`.
         """
         recipe, video = self._stream.recipe, sequence.video
-        first, end = self._catalogue.rows.bounds(video.height_px)
-        params = draw(
-            recipe, seed=seed, epoch=0, index=0, picture_height_px=end - first, picture_width_px=video.width_px,
-            video_id=video.id,
+        lease = lease_for(
+            Request(b"", 0, 0), sequence=sequence, catalogue=self._catalogue, spec=self._stream, seed=seed,
+            arrays=("voxels",),
         )  # fmt: skip
+        plan = plan_sample(replace(lease, thresholds=()), 0)
+        params = plan.params
         left, top = params.crop_left_px / params.scale, params.crop_top_px / params.scale
         width, height = recipe.crop_width_px / params.scale, recipe.crop_height_px / params.scale
-        whole = self.camera(sequence).voxels
-        bins = whole.reshape(-1, *whole.shape[2:])
-        steps = recipe.voxels_per_clip * recipe.steps_per_frame
-        seen = int(params.source_index(recipe.steps)[-1]) * len(bins) // steps  # pauses leave the rest out
+        whole = self.camera(sequence)
+        bins = whole.voxels.reshape(-1, *whole.voxels.shape[2:])
+        steps = sum(params.grid_steps[recipe.lead_voxels :]) or recipe.voxels_per_clip * recipe.steps_per_frame
+        shown = whole.provenance.params.ends(recipe)[-1] if recipe.is_timed else steps
+        seen = int(plan.source[-1]) * len(bins) // int(shown)  # pauses leave the rest out
         scale = bins.shape[-1] / video.width_px
         rows, columns = (
             slice(int(at * scale), int((at + size) * scale)) for at, size in ((top, height), (left, width))

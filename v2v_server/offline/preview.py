@@ -30,8 +30,10 @@ from v2v_server.motion.prediction import Prediction
 from v2v_server.offline.motion import WholePictures, describe_loss, moving_seeds, predicted_loss, quiet_voxels
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
-from v2v_server.store.clips import clips_of
+from v2v_server.simulation.intensity import tone_table
+from v2v_server.store.clips import clips_of, signal_of
 from v2v_server.video.collect import Cut
+from v2v_server.video.luma import SDR
 
 LABELS = ("boxes", "masks")
 """Arrays that are drawn if the videos have their sidecars."""
@@ -174,21 +176,35 @@ def _camera(
     arrays = ("voxels", "frames", *(("flow",) if with_flow else ()), *labels)
     made = Remaker(catalogue, stream, arrays).made(shot.seed, 0, 0)
     provenance = made.sample.provenance
-    whole = _whole_picture(catalogue, provenance)
+    if note := _signal_note(catalogue, provenance, stream.recipe):
+        notes.setdefault(note, []).append(title)
+    whole = _whole_picture(catalogue, provenance, stream.recipe)
     camera = Camera.of(made.sample.arrays, provenance, title, stream.recipe, whole)
     quiet_grids = quiet_voxels(made).reshape(-1, *camera.voxels.shape[1:])
     quiet = dataclasses.replace(camera, voxels=quiet_grids[camera.lead_voxels :])
     return dataclasses.replace(camera, quiet=quiet.rates), predicted_loss(made)
 
 
-def _whole_picture(catalogue: Catalogue, provenance: Provenance) -> npt.NDArray[np.uint8]:
-    """Read the video's rows at the clip's first frame: [rows, columns] uint8."""
+def _signal_note(catalogue: Catalogue, provenance: Provenance, recipe: Recipe) -> str:
+    """Return what the video states about its levels, and whether the recipe uses it; "" for 8 bits of SDR."""
+    id = provenance.video
+    with catalogue.source.open_local(id, provenance.fingerprint) as path:
+        signal = signal_of(path, catalogue.frame_index(id))
+    if signal == SDR or recipe.light == "declared":
+        return "" if signal == SDR else f"{id} has {signal}"
+    return f"{id} has {signal}, and is read as {SDR}: --set light=declared uses what it has"
+
+
+def _whole_picture(catalogue: Catalogue, provenance: Provenance, recipe: Recipe) -> npt.NDArray[np.uint8]:
+    """Read the video's rows at the clip's first frame: [rows, columns] uint8, tone mapped as ``frames`` are."""
     index = catalogue.frame_index(provenance.video)
     top, bottom = catalogue.rows.bounds(index.height_px)
     cut = Cut(1, (top, 0, bottom - top, index.width_px))
     with catalogue.source.open_local(provenance.video, provenance.fingerprint) as path:
-        (clip,) = clips_of(path, provenance.fingerprint, index, provenance.start_frame, [cut], 1)
-    picture: npt.NDArray[np.uint8] = clip.frames[0]
+        most_bits = None if recipe.light == "sdr" else SDR.bits
+        what = provenance.fingerprint, index, provenance.start_frame, [cut], 1
+        (clip,) = clips_of(path, *what, most_bits=most_bits)
+    picture: npt.NDArray[np.uint8] = tone_table(recipe.gamma, clip.signal)[clip.frames[0]]
     return picture
 
 

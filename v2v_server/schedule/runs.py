@@ -90,7 +90,7 @@ class Runs:
         frames: _Int64 = self.piece_first[piece] + place - self._piece_begin[piece]
         return frames
 
-    def still(self, first: _Int64, count: int) -> _Int64:
+    def still(self, first: _Int64, count: _Int64) -> _Int64:
         """Return how many of ``count`` usable frames from each place on are still."""
         return self._still_upto(first + count - 1) - self._still_upto(first - 1)
 
@@ -107,6 +107,7 @@ class SplitSequences:
     Args:
         split: these videos.
         whole: [C], how many sequences each would have if all its frames were one run.
+        strides: [C], frames from the first of a sequence to the first of the next.
         spec: determines the frames of a sequence and what is done about defects.
         sizes: [C], a number of each video's picture size.
         suits: return whether a picture of the size of that number, less these bars, is large enough.
@@ -119,15 +120,15 @@ class SplitSequences:
         self,
         split: SplitVideos,
         whole: _Int64,
+        strides: _Int64,
         spec: StreamSpec,
         sizes: npt.NDArray[np.integer],
         suits: Callable[[int, Sides], bool],
     ) -> None:
         self._split, self._whole = split, whole
-        recipe = spec.recipe
-        self._stride = recipe.frames_per_sequence
+        self._strides = strides
         self._runs = runs = Runs(split, Cleaning.of(spec))
-        each = np.maximum((runs.frames - recipe.frames_needed) // self._stride + 1, 0)
+        each = np.maximum((runs.frames - 1) // strides[runs.owners], 0)
         each[whole[runs.owners] == 0] = 0
         barred = np.flatnonzero(runs.sides.any(axis=1))
         pictures = np.column_stack((sizes[runs.owners[barred]], runs.sides[barred]))
@@ -136,11 +137,12 @@ class SplitSequences:
         each[barred] *= fits[kind.ravel()]
         number = np.repeat(np.arange(len(each)), each)
         within = np.arange(len(number)) - np.repeat(np.cumsum(each) - each, each)
-        places = runs.first[number] + self._stride * within
         owners = runs.owners[number]
+        places = runs.first[number] + strides[owners] * within
         starts = runs.frame(places) if len(places) else places
         if spec.still_share < 1 and len(places):
-            is_still = 4 * runs.still(places, recipe.frames_needed) >= 3 * recipe.frames_needed
+            needed = strides[owners] + 1
+            is_still = 4 * runs.still(places, needed) >= 3 * needed
             kept = ~is_still | (_hash(split.numbers[owners], starts) < spec.still_share)
             owners, starts = owners[kept], starts[kept]
         found = np.bincount(owners, minlength=len(split)) if len(owners) else np.zeros(len(split), np.int64)
@@ -158,15 +160,16 @@ class SplitSequences:
         owners = np.repeat(np.arange(len(self.counts)), self.counts)
         within = np.arange(len(owners)) - np.repeat(np.cumsum(self.counts) - self.counts, self.counts)
         starts = self._starts[self._begin[owners] + within] if len(owners) else within
-        in_place = (starts % self._stride == 0) & (starts // self._stride < self._whole[owners])
+        strides = self._strides[owners]
+        in_place = (starts % strides == 0) & (starts // strides < self._whole[owners])
         return int(self._whole.sum() - in_place.sum())
 
-    def too_short(self) -> list[int]:
-        """Return the frames of the longest run of each video that has no sequence because it is divided."""
+    def too_short(self) -> tuple[npt.NDArray[np.integer], _Int64]:
+        """Return the videos that have no sequence because they are divided, and the frames of their longest runs."""
         longest = np.zeros(len(self._split), np.int64)
         np.maximum.at(longest, self._runs.owners, self._runs.frames)
-        left_out: list[int] = longest[(self._whole > 0) & (self.counts == 0)].tolist()
-        return left_out
+        short = (self._whole > 0) & (self.counts == 0)
+        return self._split.numbers[short], longest[short]
 
 
 def _hash(numbers: npt.NDArray[np.integer], starts: _Int64) -> npt.NDArray[np.float64]:

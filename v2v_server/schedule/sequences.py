@@ -2,7 +2,8 @@
 
 A sequence is a run of consecutive frames of one video. The sequences of a video start at frame 0, L, 2L ... while
 start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L = frames per sequence). With scene
-"auto" the same holds for each run of the video (:mod:`v2v_server.schedule.runs`).
+"auto" the same holds for each run of the video (:mod:`v2v_server.schedule.runs`). With ``voxel_seconds``, L is the
+frames of the longest duration that the recipe can draw, at the video's average rate.
 """
 
 from __future__ import annotations
@@ -10,13 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from typing import overload
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import LARGEST_SCALE, Recipe
+from v2v_protocol.recipe import LARGEST_SCALE, MOST_STEPS_PER_GRID, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.scenes.pieces import SplitVideos
@@ -53,6 +55,7 @@ class Columns:
 
     Attributes:
         frames: int64 [N], frames of each video.
+        rates: float64 [N], average frames per second; NaN where unknown.
         size: int32 [N], index into ``first_of_size``.
         first_of_size: for each picture size, the first video that has it.
         split: the videos that are divided into pieces; None if pieces are unknown.
@@ -61,8 +64,10 @@ class Columns:
     def __init__(self, videos: Videos) -> None:
         if isinstance(videos, CatalogueVideos):
             self.frames, sizes, self.split = videos.frames, _sizes(videos.height_px, videos.width_px), videos.split
+            self.rates = videos.frames_per_second
         else:
             self.frames, sizes, self.split = _columns(videos)
+            self.rates = np.array([video.frames_per_second for video in videos], np.float64)
         _, first, size = np.unique(sizes, return_index=True, return_inverse=True)
         self.size = size.astype(np.int32)
         self.first_of_size = tuple(first.tolist())
@@ -110,8 +115,12 @@ class SequenceTable:
                 f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '
                 "start the server with --scene auto"
             )
-        suits = [_unsuited_size(videos[first], rows, spec) is None for first in self._columns.first_of_size]
-        self._suits = np.array(suits, bool)
+        shown = [videos[first] for first in self._columns.first_of_size]
+        self._suits = np.array([_too_small(video, rows, spec.recipe) is None for video in shown], bool)
+        self._most_steps = np.array(
+            [_most_steps(video, rows, spec) if suits else 0 for video, suits in zip(shown, self._suits, strict=True)],
+            np.int64,
+        )
         counts, _ = self._count(0, len(videos))
         self.videos = int(np.count_nonzero(counts))
         ends = np.cumsum(counts)
@@ -134,10 +143,18 @@ class SequenceTable:
     @property
     def longest_clips(self) -> tuple[int, ...]:
         """The ``voxels_per_clip`` that each of the videos that are too short is long enough for."""
-        frames, recipe = self._columns.frames, self._spec.recipe
+        columns, recipe = self._columns, self._spec.recipe
         _, cut = self._count(0, len(self._all))
-        runs = [] if cut is None else cut.too_short()
-        clips = (_longest_clip(each, recipe) for each in [*frames[frames < recipe.frames_needed].tolist(), *runs])
+        steps = recipe.steps_at(columns.rates)
+        short = columns.frames <= recipe.sequence_at(columns.rates)
+        if recipe.is_timed:
+            short &= steps <= MOST_STEPS_PER_GRID
+        videos, frames = np.flatnonzero(short), columns.frames[short]
+        if cut is not None:
+            videos, frames = (np.concatenate(both) for both in zip((videos, frames), cut.too_short(), strict=True))
+        clips = map(
+            _longest_clip, frames.tolist(), np.broadcast_to(steps, short.shape)[videos].tolist(), repeat(recipe)
+        )
         return tuple(voxels for voxels in clips if voxels)
 
     def __getitem__(self, rank: int) -> VideoSequence:
@@ -160,25 +177,31 @@ class SequenceTable:
         at = int(ends.searchsorted(within, side="right"))
         place = within - (int(ends[at - 1]) if at else 0)
         start = None if cut is None else cut.start(first + at, place)
-        stride = self._spec.recipe.frames_per_sequence
-        return VideoSequence(self._all[first + at], place * stride if start is None else start)
+        video = self._all[first + at]
+        stride = int(self._spec.recipe.sequence_at(video.frames_per_second))
+        return VideoSequence(video, place * stride if start is None else start)
 
     def _count(self, first: int, end: int) -> tuple[npt.NDArray[np.int64], SplitSequences | None]:
         """Count the sequences of each of the videos ``first`` .. ``end`` - 1."""
-        columns, spec = self._columns, self._spec
-        counts = (columns.frames[first:end] - spec.recipe.frames_needed) // spec.recipe.frames_per_sequence + 1
-        counts = np.minimum(np.maximum(counts, 0), spec.max_sequences_per_video)
-        counts *= self._suits[columns.size[first:end]]
+        columns, spec, recipe = self._columns, self._spec, self._spec.recipe
+        rates, size = columns.rates[first:end], columns.size[first:end]
+        strides = np.maximum(recipe.sequence_at(rates), 1)
+        counts = np.clip((columns.frames[first:end] - 1) // strides, 0, spec.max_sequences_per_video)
+        counts *= self._suits[size] & (recipe.reach_at(rates) <= self._most_steps[size] * recipe.frame_stride)
+        if recipe.is_timed:
+            steps = recipe.steps_at(rates)
+            counts *= (steps > 0) & (steps <= MOST_STEPS_PER_GRID)
         if spec.scene == "off" or columns.split is None:
             return counts, None
         split = columns.split.between(first, end)
 
         def suits(size: int, sides: Sides) -> bool:
-            return _too_small(self._all[columns.first_of_size[size]], self._rows, spec.recipe, sides) is None
+            return _too_small(self._all[columns.first_of_size[size]], self._rows, recipe, sides) is None
 
-        whole, sizes = counts[split.numbers - first], columns.size[split.numbers]
-        sequences = SplitSequences(split, whole, spec, sizes, suits)
-        counts[split.numbers - first] = sequences.counts
+        at = split.numbers - first
+        of_split = np.broadcast_to(strides, counts.shape)[at]
+        sequences = SplitSequences(split, counts[at], of_split, spec, columns.size[split.numbers], suits)
+        counts[at] = sequences.counts
         return counts, sequences
 
 
@@ -210,16 +233,22 @@ class Refusals(Sequence[Refusal]):
 
     def _why(self, place: int) -> Refusal:
         video, recipe = self._videos[place], self._spec.recipe
-        if video.frames < recipe.frames_needed:
+        if recipe.is_timed and (refusal := _unsuited_rate(video, recipe)) is not None:
+            return refusal
+        if video.frames <= recipe.sequence_at(video.frames_per_second):
             return _too_short(video, recipe)
-        return _unsuited_size(video, self._rows, self._spec) or _all_cut(video, self._rows, self._spec)
+        unsuited_size = _too_small(video, self._rows, recipe) or _too_large(video, self._rows, self._spec)
+        return unsuited_size or _all_cut(video, self._rows, self._spec)
 
 
-def _longest_clip(frames: int, recipe: Recipe) -> int:
+def _longest_clip(frames: int, steps: int, recipe: Recipe) -> int:
     """Return the largest ``voxels_per_clip`` that this number of frames is enough for; 0 if it is not enough for
     any.
+
+    Args:
+        steps: from one delivered frame to the next.
     """
-    return max(0, (frames - 1) // (recipe.steps_per_frame * recipe.frame_stride) - recipe.lead_voxels)
+    return max(0, (frames - 1) // (steps * recipe.frame_stride) - recipe.lead_voxels)
 
 
 def _unsuited(video: VideoEntry, reason: str, remedy: str) -> Refusal:
@@ -227,41 +256,66 @@ def _unsuited(video: VideoEntry, reason: str, remedy: str) -> Refusal:
 
 
 def _too_short(video: VideoEntry, recipe: Recipe) -> Refusal:
-    most = _longest_clip(video.frames, recipe)
-    remedy = f"voxels_per_clip at most {most}" if most else "fewer bins, frames_per_bin or frame_stride, no lead_voxels"
+    most = _longest_clip(video.frames, int(recipe.steps_at(video.frames_per_second)), recipe)
+    shorter = "shorter voxel_seconds" if recipe.is_timed else "fewer bins, frames_per_bin"
+    remedy = f"voxels_per_clip at most {most}" if most else f"{shorter} or frame_stride, no lead_voxels"
     if video.frames < 2:
         remedy = "none: a voxel grid needs two frames"
-    return _unsuited(video, f"{video.frames} frames, the recipe needs {recipe.frames_needed}", remedy)
+    return _unsuited(video, f"{video.frames} frames, {_needs(video, recipe)}", remedy)
+
+
+def _needs(video: VideoEntry, recipe: Recipe) -> str:
+    needed = f"the recipe needs {recipe.sequence_at(video.frames_per_second) + 1}"
+    return f"{needed} at {video.frames_per_second:g} frames/s" if recipe.is_timed else needed
+
+
+def _unsuited_rate(video: VideoEntry, recipe: Recipe) -> Refusal | None:
+    """Return a refusal if the number of steps in a grid of ``voxel_seconds`` is unknown or too large."""
+    steps = int(recipe.steps_at(video.frames_per_second))
+    if not steps:
+        return _unsuited(video, "its frame rate is unknown, and voxel_seconds needs it", "voxel_seconds 0")
+    if steps <= MOST_STEPS_PER_GRID:
+        return None
+    reason = (
+        f"a voxel grid of {recipe.voxel_seconds[1]:g} s spans {steps} steps at {video.frames_per_second:g} frames/s"
+    )
+    return _unsuited(video, f"{reason}, the limit is {MOST_STEPS_PER_GRID}", "shorter voxel_seconds, or frame_stride")
 
 
 def _all_cut(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal:
-    runs = Runs(SplitVideos.of([video.pieces or b""]), Cleaning.of(spec))
-    longest, needed = max(runs.frames.tolist(), default=0), spec.recipe.frames_needed
+    recipe, runs = spec.recipe, Runs(SplitVideos.of([video.pieces or b""]), Cleaning.of(spec))
+    longest, needed = max(runs.frames.tolist(), default=0), int(recipe.sequence_at(video.frames_per_second)) + 1
     if longest < needed:
-        most = _longest_clip(longest, spec.recipe)
-        reason = f"at most {longest} frames in a row without a defect, the recipe needs {needed}"
+        most = _longest_clip(longest, int(recipe.steps_at(video.frames_per_second)), recipe)
+        reason = f"at most {longest} frames in a row without a defect, {_needs(video, recipe)}"
         return _unsuited(video, reason, f"voxels_per_clip at most {most}, or scene off" if most else "scene off")
     for sides in runs.sides[runs.frames >= needed].tolist():
-        if (refusal := _too_small(video, rows, spec.recipe, Sides(*sides))) is not None:
+        if (refusal := _too_small(video, rows, recipe, Sides(*sides))) is not None:
             return refusal
     return _unsuited(video, "all its sequences are still", "still_share 1")
 
 
-def _unsuited_size(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:
-    return _too_small(video, rows, spec.recipe) or _too_large(video, rows, spec)
-
-
-def _too_large(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:
-    """Return a refusal if the decoded frames of a lease exceed the limit. They are held whole until they are resized,
+def _frame_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec) -> int:
+    """Return the size of one decoded frame of all samples of a lease. Frames are held whole until they are resized,
     however small the sample is.
     """
     recipe = spec.recipe
     top, bottom = rows.bounds(video.height_px)
     cropped = recipe.resize_scale == (1.0, 1.0)
     frame = recipe.crop_height_px * recipe.crop_width_px if cropped else (bottom - top) * video.width_px
-    size = frame * (recipe.steps + 1) * spec.samples_per_decode
-    if size <= MOST_CLIP_BYTES:
+    return frame * spec.samples_per_decode
+
+
+def _most_steps(video: VideoEntry, rows: Rows, spec: StreamSpec) -> int:
+    """Return the largest number of steps whose decoded frames a lease may hold."""
+    return MOST_CLIP_BYTES // _frame_bytes(video, rows, spec) - 1
+
+
+def _too_large(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:
+    steps = int(spec.recipe.reach_at(video.frames_per_second)) // spec.recipe.frame_stride
+    if steps <= _most_steps(video, rows, spec):
         return None
+    size = _frame_bytes(video, rows, spec) * (steps + 1)
     reason = f"one sample takes {size >> 20} MiB of decoded frames, the limit is {MOST_CLIP_BYTES >> 20} MiB"
     return _unsuited(video, reason, "fewer voxels_per_clip or samples_per_decode, or resize_scale 1")
 

@@ -22,9 +22,14 @@ def corpus_summary(
         list_refused: whether to name all of those videos, not only the first few.
     """
     recipe = spec.recipe
+    span = (
+        f"{recipe.spans} grids of {recipe.voxel_seconds[1]:g} s"
+        if recipe.is_timed
+        else f"{recipe.frames_needed} frames"
+    )
     lines = [
         f"{len(catalogue.videos)} videos in {catalogue.source}: {table.videos} give {table.count} sequences of "
-        f"{recipe.frames_needed} frames (at most {spec.max_sequences_per_video} a video), rows {catalogue.rows}"
+        f"{span} (at most {spec.max_sequences_per_video} a video), rows {catalogue.rows}"
     ]
     if spec.scene != "off":
         split = 0 if catalogue.videos.split is None else len(catalogue.videos.split)

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from v2v_protocol.bounds import most_events, pixel_thresholds
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import TIME_UNITS, Recipe, effect_settings, most_events, pixel_thresholds
+from v2v_protocol.recipe import TIME_UNITS, Recipe, effect_settings
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.settings import nearest, require_known
 from v2v_server.simulation.draw import noise_key_of_seed
@@ -22,7 +23,7 @@ from v2v_server.simulation.intensity import Intensity, log_table_float64
 from v2v_server.simulation.kernels import KernelInput
 from v2v_server.simulation.precision import AUTO, EFFECTS_MARGIN, check_thresholds, choose, noise_sum
 from v2v_server.simulation.result import Voxels
-from v2v_server.simulation.voxel import Levels, bin_edges
+from v2v_server.simulation.voxel import Levels, bin_edges, timed_edges
 from v2v_server.video.luma import SDR, Signal
 
 
@@ -170,7 +171,9 @@ def simulate_clip(
         UsageError: too few frames, ``step_seconds`` missing, unwanted or of the wrong length, or a draw beyond what
             float64 can count (``precision.py``).
     """
-    source_index = params.source_index(recipe.steps)
+    ends = params.ends(recipe)
+    steps = int(ends[-1])
+    source_index = params.source_index(steps)
     if frames.ndim != 3 or frames.dtype != signal.dtype or len(frames) <= source_index[-1]:
         raise UsageError(
             f"frames {frames.dtype}{list(frames.shape)}: this draw shows {source_index[-1] + 1} frames, "
@@ -179,22 +182,27 @@ def simulate_clip(
     if (step_seconds is None) == recipe.needs_seconds:
         raise UsageError(
             f"step_seconds is {'missing' if step_seconds is None else 'unwanted'}: noise_unit is "
-            f"{recipe.noise_unit!r}, and there {'is an' if recipe.timed_effects else 'is no'} effect in Hz or seconds"
+            f"{recipe.noise_unit!r}, voxel_seconds is {recipe.voxel_seconds[1]:g}, and there "
+            f"{'is an' if recipe.timed_effects else 'is no'} effect in Hz or seconds"
         )
     if step_seconds is None:
-        step_seconds = np.ones(recipe.steps)
-    elif step_seconds.shape != (recipe.steps,) or not (np.isfinite(step_seconds) & (step_seconds > 0)).all():
+        step_seconds = np.ones(steps)
+    elif step_seconds.shape != (steps,) or not (np.isfinite(step_seconds) & (step_seconds > 0)).all():
         raise UsageError(
-            f"step_seconds {list(step_seconds.shape)}: give {recipe.steps} positive finite durations, one per step"
+            f"step_seconds {list(step_seconds.shape)}: give {steps} positive finite durations, one per step"
         )
     check_thresholds(params.threshold_pos, params.threshold_neg)
     log_eps = recipe.log_eps[0] if params.log_eps is None else params.log_eps
     intensity = Intensity(recipe.gamma, log_eps, signal)
+    edges = (
+        timed_edges(ends, recipe.bins, step_seconds)
+        if recipe.is_timed
+        else bin_edges(steps, recipe.frames_per_bin, recipe.grids_per_frame * recipe.bins or 1)
+    )
     given = KernelInput(
         frames, intensity, source_index, params,
-        step_seconds if recipe.noise_unit == "second" else np.ones(recipe.steps), step_seconds, recipe.bins,
-        bin_edges(recipe.steps, recipe.frames_per_bin, recipe.grids_per_frame * recipe.bins or 1), voxel_dtype,
-        levels=levels,
+        step_seconds if recipe.noise_unit == "second" else np.ones(steps), step_seconds, recipe.bins, edges,
+        voxel_dtype, levels=levels, grids_have_durations=recipe.is_timed,
     )  # fmt: skip
     return Voxels.of(given, choose(AUTO, _most_events(given, _log_ends(intensity))), out)
 

@@ -17,14 +17,17 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
+import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Range, Recipe, effect_settings
 from v2v_protocol.sample import SampleParams
+from v2v_server.simulation.voxel import step_seconds
 
 _SAMPLE_KEY = 0x7632762073616D70
 _LEAST_CONTRAST = 2.0**-60
@@ -44,6 +47,7 @@ class Purpose(IntEnum):
     CONTRAST = 8
     NOISE_KEY = 9
     LOG_EPS = 16
+    VOXEL_SECONDS = 17
 
 
 _LOG_EPS_STEPS = 32
@@ -57,6 +61,19 @@ _FIRST_EFFECTS = {
 _Stream = Callable[[int, int], list[int]]
 
 
+@dataclass(frozen=True, slots=True)
+class FrameTimes:
+    """When the frames of a video are shown that a clip may use.
+
+    Attributes:
+        seconds: [n] float64, time stamp of each frame of the clip, the stride applied; NaN where unknown.
+        frames_per_second: average rate, divided by the stride; used where two time stamps do not increase.
+    """
+
+    seconds: npt.NDArray[np.float64]
+    frames_per_second: float
+
+
 def draw(
     recipe: Recipe,
     *,
@@ -67,6 +84,7 @@ def draw(
     picture_width_px: int,
     video_id: str,
     video_thresholds: tuple[float, float] | None = None,
+    times: FrameTimes | None = None,
 ) -> SampleParams:
     """Draw the virtual camera and view of one sample.
 
@@ -77,12 +95,13 @@ def draw(
         video_id: the catalogue id; used with ``threshold_source="video"`` only.
         video_thresholds: (threshold_pos, threshold_neg) that the list file states for the video, or None; used with
             ``threshold_source="video"`` only.
+        times: of the frames that the clip may use, at least ``recipe.spans + 1``; used with ``voxel_seconds`` only.
 
     Returns:
         the draw; its thresholds are float32 values.
 
     Raises:
-        UsageError: the crop does not fit into the picture at the largest allowed scale.
+        UsageError: the crop does not fit into the picture at the largest allowed scale, or ``times`` are missing.
     """
     if not admits(recipe, picture_height_px, picture_width_px):
         needed = smallest_scale(recipe, picture_height_px, picture_width_px)
@@ -106,13 +125,13 @@ def draw(
     top, left = stream(Purpose.CROP, 2)
     degraded, contrast = stream(Purpose.CONTRAST, 2)
     first, second = stream(Purpose.NOISE_KEY, 2)
-    return SampleParams(
+    params = SampleParams(
         threshold_pos=threshold_pos,
         threshold_neg=threshold_neg,
         noise_sigma=noise_sigma * threshold_pos if recipe.noise_scales_with_threshold else noise_sigma,
         hot_pixel_count=_rounded(_in_range(recipe.hot_pixel_share, share) * crop),
         hot_pixel_sigma=_in_range(recipe.hot_pixel_sigma, sigma),
-        pauses=_pauses(recipe, stream),
+        pauses=() if recipe.is_timed else _pauses(recipe, stream, recipe.steps),
         scale=scale,
         crop_top_px=_below(height - recipe.crop_height_px + 1, top),
         crop_left_px=_below(width - recipe.crop_width_px + 1, left),
@@ -130,6 +149,50 @@ def draw(
         },
         log_eps=_log_eps(recipe.log_eps, stream(Purpose.LOG_EPS, 1)[0]),
     )
+    return _timed(params, recipe, stream, times) if recipe.is_timed else params
+
+
+def grid_steps(durations: npt.NDArray[np.float64], seconds: float, grids: int) -> tuple[int, ...]:
+    """Return how many steps each of consecutive grids spans: as many as come nearest to a duration, at least one.
+
+    If the steps do not last long enough for all grids, what is left is divided among those that are left.
+
+    Args:
+        durations: [n] of the steps, all above 0, n at least ``grids``.
+        seconds: wanted duration of a grid.
+        grids: number of grids.
+    """
+    ends = np.concatenate(([0.0], np.cumsum(durations)))
+    spans: list[int] = []
+    at, last = 0, len(durations)
+    for left in range(grids, 0, -1):
+        wanted = ends[at] + min(seconds, (ends[last] - ends[at]) / left)
+        most = last - left + 1  # a step is left for each later grid
+        after = min(int(ends.searchsorted(wanted)), most)
+        is_nearer = bool(wanted - ends[after - 1] < ends[after] - wanted)
+        spans.append(max(after - is_nearer - at, 1))
+        at += spans[-1]
+    return tuple(spans)
+
+
+def _timed(params: SampleParams, recipe: Recipe, stream: _Stream, times: FrameTimes | None) -> SampleParams:
+    """Draw the duration of a grid, and fit grids and pauses to the time stamps."""
+    if times is None or len(times.seconds) <= recipe.spans:
+        count = 0 if times is None else len(times.seconds)
+        raise UsageError(
+            f"time stamps of {count} frames: {recipe.spans} grids of voxel_seconds need those of {recipe.spans + 1}"
+        )
+    steps = len(times.seconds) - 1
+    params = replace(params, pauses=_pauses(recipe, stream, steps))
+    durations, _ = step_seconds(times.seconds, params.source_index(steps), times.frames_per_second)
+    seconds = _in_range(recipe.voxel_seconds, stream(Purpose.VOXEL_SECONDS, 1)[0])
+    spans = grid_steps(durations, seconds, recipe.spans)
+    return replace(params, voxel_seconds=seconds, grid_steps=spans, pauses=_until(params.pauses, sum(spans)))
+
+
+def _until(pauses: Sequence[tuple[int, int]], steps: int) -> tuple[tuple[int, int], ...]:
+    """Return the pauses of a clip that ends earlier."""
+    return tuple((first, min(length, steps + 1 - first)) for first, length in pauses if first <= steps)
 
 
 def smallest_scale(recipe: Recipe, picture_height_px: int, picture_width_px: int) -> float:
@@ -187,13 +250,13 @@ def _stream_of(effect: str) -> int:
     return _FIRST_EFFECTS.get(effect) or 2**32 + int.from_bytes(digest, "little")
 
 
-def _pauses(recipe: Recipe, stream: _Stream) -> tuple[tuple[int, int], ...]:
-    """Draw runs of repeated frames from a Markov chain that starts in the running state."""
+def _pauses(recipe: Recipe, stream: _Stream, steps: int) -> tuple[tuple[int, int], ...]:
+    """Draw runs of repeated frames from a Markov chain that starts in the running state; fewer steps give a prefix."""
     if recipe.pause_probability == 0.0:
         return ()
     runs: list[tuple[int, int]] = []
     first = 0  # position of the current run's first repeat; 0 while the camera runs
-    for position, raw in enumerate(stream(Purpose.PAUSES, recipe.steps), start=1):
+    for position, raw in enumerate(stream(Purpose.PAUSES, steps), start=1):
         paused = _unit(raw) < (recipe.pause_stay_probability if first else recipe.pause_probability)
         if paused and not first:
             first = position
@@ -201,7 +264,7 @@ def _pauses(recipe: Recipe, stream: _Stream) -> tuple[tuple[int, int], ...]:
             runs.append((first, position - first))
             first = 0
     if first:
-        runs.append((first, recipe.steps + 1 - first))
+        runs.append((first, steps + 1 - first))
     return tuple(runs)
 
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from v2v_protocol.bounds import pixel_thresholds
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList, check_duration, whole_edges
-from v2v_protocol.recipe import pixel_thresholds
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import noise
@@ -54,6 +54,7 @@ class KernelInput:
         dtype: "int8", "int16" or "float32".
         start_residual: log units; None draws it.
         levels: intermediate levels, or None; only with frames of 8 bits.
+        grids_have_durations: whether a grid's time is that of ``step_seconds``; else all its steps count as equal.
     """
 
     frames: npt.NDArray[Any]
@@ -67,6 +68,7 @@ class KernelInput:
     dtype: str
     start_residual: float | None = None
     levels: Levels | None = None
+    grids_have_durations: bool = False
 
     def __post_init__(self) -> None:
         if self.dtype not in LARGEST_COUNT:
@@ -75,7 +77,8 @@ class KernelInput:
     @property
     def needs_general(self) -> bool:
         """Whether the voxels alone need the general kernel."""
-        return bool(self.params.effects) or self.levels is not None or bool(self.edges.share.any())
+        is_divided = self.grids_have_durations or bool(self.edges.share.any())
+        return bool(self.params.effects) or self.levels is not None or is_divided
 
     @property
     def segments(self) -> int:
@@ -85,9 +88,8 @@ class KernelInput:
 
     def timeline(self) -> Timeline:
         """Divide the clip into segments."""
-        return timeline(
-            self.edges, self.bins, np.ones(len(self.step_seconds)), None if self.levels is None else self.levels.at
-        )
+        durations = self.step_seconds if self.grids_have_durations else np.ones(len(self.step_seconds))
+        return timeline(self.edges, self.bins, durations, None if self.levels is None else self.levels.at)
 
     def form(self, name: str) -> tuple[str, tuple[int, ...]]:
         """Return dtype and shape of one of :data:`ARRAYS`."""

@@ -65,7 +65,8 @@ def variants(
     )
     depths = [8] if recipe.light == "sdr" or levels_per_step else [8, MOST_BITS]
     precisions = ["float32"] if events <= LIMITS["float32"][1] else list(LIMITS)
-    is_general = recipe.has_effects or recipe.grids_per_frame > 0 or levels_per_step > 0 or {"voxels"} != set(arrays)
+    has_times = recipe.grids_per_frame > 0 or recipe.is_timed
+    is_general = recipe.has_effects or has_times or levels_per_step > 0 or {"voxels"} != set(arrays)
     return frozenset(
         Variant(voxel_dtype, is_general, precision, levels_per_step > 0, bits)
         for precision in precisions

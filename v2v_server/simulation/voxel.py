@@ -3,7 +3,8 @@
 Steps. Step s (0 .. steps-1) is the change from frame s to frame s+1 of the clip. Bin b of voxel t sums the signed event
 counts of the ``frames_per_bin`` consecutive steps that start at ``(t * bins + b) * frames_per_bin``; so voxel t spans
 frames ``t * bins * frames_per_bin`` to ``(t + 1) * bins * frames_per_bin``, its ends included. With ``grids_per_frame``
-n, each step has n grids, and its n x bins bins are equal parts of its time.
+n, each step has n grids, and its n x bins bins are equal parts of its time. With ``voxel_seconds``, a grid spans whole
+steps, and its bins are equal parts of its time.
 
 Time. Within a step the log intensity is linear in time, between the frames or between intermediate levels if there are
 any. Noise, hot drift and leak of the step are spread evenly over it. So a step is a row of segments (:class:`Timeline`)
@@ -56,6 +57,8 @@ class Moments(NamedTuple):
     share: Doubles
 
 
+_SHORTEST_SHARE = 1e-6
+"""Part of a step's time below which the end of a bin counts as that of the step."""
 FINE_STEPS = 16
 """Parts of a grey level that levels between frames are known to."""
 
@@ -100,6 +103,27 @@ def bin_edges(steps: int, frames_per_bin: int, bins_per_step: int = 1) -> Moment
     """Return the ends of equal bins, the clip's start included: of ``frames_per_bin`` steps, or of a part of a step."""
     parts = np.arange(0, steps * bins_per_step + 1, frames_per_bin)
     return Moments(parts // bins_per_step, parts % bins_per_step / bins_per_step)
+
+
+def timed_edges(ends: Longs, bins: int, durations: Doubles) -> Moments:
+    """Return the ends of bins that are equal parts of the time of their grid, the clip's start included.
+
+    Args:
+        ends: [grids + 1] positions of the clip between which the grids lie.
+        bins: bins of a grid.
+        durations: [steps] of each step.
+    """
+    since = np.concatenate(([0.0], np.cumsum(durations)))
+    first, last = since[ends[:-1], None], since[ends[1:], None]
+    inner = first + (last - first) * (np.arange(1, bins) / bins)
+    step = np.searchsorted(since, inner, side="right") - 1
+    share = (inner - since[step]) / durations[step]
+    # A frame may lie at the end of a bin; rounding must not make a segment between them.
+    is_next = share > 1.0 - _SHORTEST_SHARE
+    step, share = step + is_next, np.where(is_next | (share < _SHORTEST_SHARE), 0.0, share)
+    steps = np.column_stack([step, ends[1:]]).ravel()
+    shares = np.column_stack([share, np.zeros(len(ends) - 1)]).ravel()
+    return Moments(np.concatenate(([0], steps)), np.concatenate(([0.0], shares)))
 
 
 def timeline(edges: Moments, bins: int, durations: Doubles, levels: Moments | None = None) -> Timeline:

@@ -21,7 +21,7 @@ from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip, decode_cuts, stream_luma
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import SDR, Signal
+from v2v_server.video.luma import MOST_BITS, SDR, Signal
 from v2v_server.video.orientation import Window
 from v2v_server.video.probe import VideoFacts, probe
 
@@ -81,6 +81,18 @@ def stored_clip(
     read_levels(stored, start, stride, window, frames, signal)
     seconds = index.seconds(start, (cut.count - 1) * stride + 1)[::stride]
     return DecodedClip(frames, seconds, head.codec, head.bit_exact, "store", signal=signal)
+
+
+def signal_of(path: str | os.PathLike[str], index: FrameIndex) -> Signal:
+    """Return what the levels of a video mean, by its first frame, or those of the source of a store file.
+
+    Raises:
+        VideoError: see :func:`clips_of`.
+    """
+    if not is_store_file(path):
+        return decode_cuts(path, index, index.first, [Cut(1, (0, 0, 1, 1))], most_bits=MOST_BITS)[0].signal
+    with StoreFile(path) as stored:
+        return stored.head.signal
 
 
 def check_file(path: str | os.PathLike[str], fingerprint: str) -> None:

@@ -1,4 +1,5 @@
-"""Compress blocks of differences: densely (zstd), or for reading in half the time (LZ4HC).
+"""Compress blocks of differences: densely (zstd), or for reading in half the time (LZ4HC). Blocks of a raw file are
+the pixels themselves.
 
 Blocks are checked before they are unpacked, and unpacked into a known number of bytes.
 """
@@ -20,7 +21,7 @@ class Packing:
     """How blocks are compressed; reading them needs only the method.
 
     Attributes:
-        method: "zstd" or "lz4".
+        method: "zstd", "lz4", or "raw", which stores pixels instead of differences.
         search: zstd: match search settings, as ``ZstdCompressionParameters`` takes them.
         level: level of LZ4HC.
     """
@@ -34,6 +35,8 @@ class Packing:
         if self.method == "zstd":
             parameters = zstandard.ZstdCompressionParameters(write_content_size=False, **dict(self.search))
             return zstandard.ZstdCompressor(compression_params=parameters).compress
+        if self.method == "raw":
+            return bytes
         return lambda block: lz4.block.compress(
             block, mode="high_compression", compression=self.level, store_size=False
         )
@@ -51,15 +54,17 @@ QUICK = _zstd(zstandard.STRATEGY_FAST, 6, 7, 1)
 """Packing of the cache: 4 % larger than :data:`DENSE`, and written six times as fast."""
 FAST = Packing("lz4", level=6)
 
-SIZES = {"dense": DENSE, "fast": FAST}
-METHODS = ("zstd", "lz4")
+RAW = Packing("raw")
+
+SIZES = {"dense": DENSE, "fast": FAST, "raw": RAW}
+METHODS = ("zstd", "lz4", "raw")
 
 
 class UnpackingError(Exception):
     """A block does not unpack to the expected bytes."""
 
 
-def unpack(method: str, packed: Bytes, size: int) -> bytes:
+def unpack(method: str, packed: Bytes, size: int) -> Bytes:
     """Return the ``size`` bytes of a block.
 
     Raises:
@@ -71,7 +76,9 @@ def unpack(method: str, packed: Bytes, size: int) -> bytes:
             claimed = zstandard.frame_content_size(packed)
             if claimed > size:
                 raise UnpackingError(f"claims {claimed} bytes instead of {size}")
-            block = _decompressor().decompress(packed, max_output_size=size)
+            block: Bytes = _decompressor().decompress(packed, max_output_size=size)
+        elif method == "raw":
+            block = packed
         else:
             block = lz4.block.decompress(packed, uncompressed_size=size)
     except (zstandard.ZstdError, lz4.block.LZ4BlockError) as error:

@@ -109,11 +109,15 @@ class BlockReader:
                 wide = min(BLOCK_COLUMNS, head.width_px - x)
                 here, there = max(left, x), min(left + width, x + wide)
                 part = out[:, upper - top : lower - top, here - left : there - left]
-                if len(block):
-                    from_differences(block, tall, wide, upper - y, here - x, first, stride, part)
-                    has_blocks = True
-                else:
+                has_blocks |= bool(len(block))
+                if not len(block):
                     part[...] = 0
+                elif head.packing == "raw":
+                    last = first + (len(out) - 1) * stride
+                    pixels = block.reshape(frames, tall, wide)[first : last + 1 : stride]
+                    part[...] = pixels[:, upper - y : lower - y, here - x : there - x]
+                else:
+                    from_differences(block, tall, wide, upper - y, here - x, first, stride, part)
         return has_blocks
 
     def _record(self, group: int) -> BlockRecord:

@@ -22,11 +22,13 @@ from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.motion.prediction import Prediction, predict
 from v2v_server.simulation.clip import simulate, simulate_clip
-from v2v_server.simulation.view import apply_view
+from v2v_server.simulation.intensity import eight_bits
+from v2v_server.simulation.view import Frames, apply_view
 from v2v_server.store.clips import clips_of
 from v2v_server.tradeoff.errors import Tally, Voxels, compare
 from v2v_server.video.collect import Cut
-from v2v_server.worker.produce import decode_for, plan_sample
+from v2v_server.video.luma import Signal
+from v2v_server.worker.produce import decode_for, plan_sample, step_durations
 
 THRESHOLDS = (0.05, 0.2, 0.5, 1.0, 2.0)
 
@@ -39,20 +41,24 @@ class CameraView:
     """What one camera sees.
 
     Attributes:
-        frames: [n, H, W] uint8, after the view.
+        frames: [n, H, W], after the view.
         params: the draw.
         recipe: of the draw.
+        step_seconds: duration of each step; None if the recipe does not use it.
         other_params: another sample's draw, for scale.
+        signal: what the levels of the frames mean.
     """
 
-    frames: npt.NDArray[np.uint8]
+    frames: Frames
     params: SampleParams
     recipe: Recipe
+    step_seconds: npt.NDArray[np.float64] | None
     other_params: SampleParams
+    signal: Signal
 
     def voxels(self, params: SampleParams) -> Voxels:
         """Return voxels [T, B, H, W] float32 of a camera with these thresholds, noise and key."""
-        return simulate_clip(self.frames, params, self.recipe, "float32").voxels
+        return simulate_clip(self.frames, params, self.recipe, "float32", self.step_seconds, signal=self.signal).voxels
 
 
 def seen(root: Path, lease: Lease) -> CameraView:
@@ -60,8 +66,14 @@ def seen(root: Path, lease: Lease) -> CameraView:
     (decoded,) = decode_for(lease, lease.indices[:1], Folder(root))
     recipe = decoded.plan.spec.recipe
     params = dataclasses.replace(decoded.plan.params, hot_pixel_count=0)
+    signal = decoded.clip.signal
     return CameraView(
-        apply_view(decoded.clip.frames, params, recipe), params, recipe, plan_sample(lease, lease.indices[1]).params
+        apply_view(decoded.clip.frames, params, recipe, signal),
+        params,
+        recipe,
+        step_durations(lease, decoded),
+        plan_sample(lease, lease.indices[1]).params,
+        signal,
     )
 
 
@@ -112,7 +124,8 @@ def accuracy(works: Mapping[str, tuple[Path, Sequence[Lease]]], reference: str, 
 
 def predicted_loss(root: Path, leases: Sequence[Lease]) -> Prediction:
     """Predict what the first sample of each lease loses between its frames."""
-    return sum((predict(seen(root, lease).frames) for lease in leases), Prediction())
+    views = (seen(root, lease) for lease in leases)
+    return sum((predict(eight_bits(view.frames, view.signal)) for view in views), Prediction())
 
 
 def spurious(stills: Catalogue, crop_px: tuple[int, int]) -> dict[float, float]:

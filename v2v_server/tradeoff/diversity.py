@@ -28,7 +28,7 @@ from v2v_server.corpus.sources.folder import Folder
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.view import apply_view
 from v2v_server.tradeoff.errors import correlation
-from v2v_server.worker.produce import decode_for
+from v2v_server.worker.produce import decode_for, step_durations
 
 _Activity = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
 
@@ -77,7 +77,9 @@ def _activities(root: Path, lease: Lease) -> list[tuple[SampleParams, _Activity]
     for decoded in decode_for(lease, lease.indices, Folder(root)):
         recipe = decoded.plan.spec.recipe
         params = dataclasses.replace(decoded.plan.params, hot_pixel_count=0)
-        voxels, _ = simulate_clip(apply_view(decoded.clip.frames, params, recipe), params, recipe, "float32")
+        signal = decoded.clip.signal
+        view = apply_view(decoded.clip.frames, params, recipe, signal)
+        voxels, _ = simulate_clip(view, params, recipe, "float32", step_durations(lease, decoded), signal=signal)
         events = np.abs(voxels).reshape(-1, *voxels.shape[2:])
         # Every fourth pixel of every fourth row: the same coefficient at a sixteenth of the memory.
         made.append((params, (events[:, ::4, ::4].copy(), events.sum(axis=(1, 2)))))

@@ -117,9 +117,7 @@ def _link(catalogue: Catalogue, spec: StreamSpec, most: int, folder: Path) -> No
         raise UsageError(f"--videos {catalogue.folder}: a prepared corpus; give its source")
     table = SequenceTable(catalogue.videos, catalogue.rows, spec)
     if not table.count:
-        raise CorpusError(
-            f"--videos {catalogue.folder}: no video gives a sequence of {spec.recipe.frames_needed} frames"
-        )
+        raise CorpusError(f"--videos {catalogue.folder}: no video gives a sequence: {table.refusals[0]}")
     unusable = {refusal.video for refusal in table.refusals}
     distinct = {video.fingerprint: video for video in reversed(catalogue.videos) if video.id not in unusable}
     folder.mkdir(parents=True)

@@ -94,6 +94,11 @@ class SampleContext:
     boxes_dropped: int = 0
 
     @property
+    def target_steps(self) -> npt.NDArray[np.int64]:
+        """Return the positions of the delivered frames in the clip, [T + lead_frames]."""
+        return self.params.ends(self.recipe)[self.recipe.first_frame :]
+
+    @property
     def recipe(self) -> Recipe:
         """The spec's recipe."""
         return self.spec.recipe
@@ -101,7 +106,7 @@ class SampleContext:
     @property
     def target_frames(self) -> list[int]:
         """Number, in the video, of the frame at the end of each voxel, and of the lead frame."""
-        return [int(frame) for frame in self.clip.numbers[self.source[list(self.recipe.target_steps)]]]
+        return [int(frame) for frame in self.clip.numbers[self.source[self.target_steps]]]
 
 
 ArrayBuilder = Callable[[SampleContext, npt.NDArray[Any]], None]
@@ -158,7 +163,7 @@ def simulated(context: SampleContext, out: npt.NDArray[Any]) -> None:
 @makes("frames")
 def frames(context: SampleContext, out: npt.NDArray[Any]) -> None:
     """Fill in the frame at the end of each voxel, and the lead frame, tone mapped (``intensity.py``)."""
-    _shown(context, context.source[list(context.recipe.target_steps)], out)
+    _shown(context, context.source[context.target_steps], out)
 
 
 @makes("frames_u16")
@@ -166,7 +171,7 @@ def frames_u16(context: SampleContext, out: npt.NDArray[Any]) -> None:
     """Fill in the same frames with the levels that the video stores, 0 .. 65535, without tone mapping."""
     white = context.signal.white
     table = ((2 * 65535 * np.arange(white + 1) + white) // (2 * white)).astype(np.uint16)
-    np.take(table, context.view[context.source[list(context.recipe.target_steps)]], out=out[:, 0], mode="clip")
+    np.take(table, context.view[context.source[context.target_steps]], out=out[:, 0], mode="clip")
 
 
 @makes("frames_all")

@@ -19,7 +19,7 @@ class CleanFrames:
     """The frames of a sequence.
 
     Attributes:
-        numbers: int64 [steps + 1], their ordinals in the video.
+        numbers: int64 [n], their ordinals in the video; more than a sample of ``voxel_seconds`` may use.
         stride: distance of these frames, if it is the same for all; 0 where repeated frames are left out.
         sides: bars outside of the usable picture.
     """
@@ -29,19 +29,20 @@ class CleanFrames:
     sides: Sides
 
     @classmethod
-    def of(cls, scene: Scene | None, start_frame: int, spec: StreamSpec) -> CleanFrames:
+    def of(cls, scene: Scene | None, start_frame: int, spec: StreamSpec, count: int) -> CleanFrames:
         """Return the frames of the sequence that begins at ``start_frame``.
 
         Args:
             scene: statistics of what the sequence shows; None with scene "off".
+            count: frames of the sequence, those that the stride leaves out included.
         """
-        recipe, kept = spec.recipe, spec.kept_defects
-        numbers = start_frame + np.arange(recipe.frames_needed, dtype=np.int64)
+        stride, kept = spec.recipe.frame_stride, spec.kept_defects
+        numbers = start_frame + np.arange(count, dtype=np.int64)
         if scene is not None and "duplicates" not in kept:
-            numbers = scene.frames_from(start_frame, recipe.frames_needed)
-        is_even = int(numbers[-1]) - start_frame < recipe.frames_needed
+            numbers = scene.frames_from(start_frame, count)
+        is_even = int(numbers[-1]) - start_frame < count
         sides = NO_BARS if scene is None or "bars" in kept else scene.sides(start_frame, int(numbers[-1]) + 1)
-        return cls(numbers[:: recipe.frame_stride], recipe.frame_stride if is_even else 0, sides)
+        return cls(numbers[::stride], stride if is_even else 0, sides)
 
     @property
     def span(self) -> int:

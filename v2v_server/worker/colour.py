@@ -25,7 +25,7 @@ def frames_rgb(context: SampleContext, out: npt.NDArray[Any]) -> None:
     grey = np.empty((len(out), 1, *out.shape[2:]), np.uint8)
     ARRAY_BUILDERS["frames"](context, grey)
     # The cut names the delivered frames in ascending order.
-    places = np.unique(context.source[list(context.recipe.target_steps)], return_inverse=True)[1]
+    places = np.unique(context.source[context.target_steps], return_inverse=True)[1]
     before, chroma = -1, np.empty(0, np.uint8)
     for target, picture, place in zip(out, grey, places.tolist(), strict=True):
         if place != before:  # a paused camera repeats its frame

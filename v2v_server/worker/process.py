@@ -37,6 +37,7 @@ from v2v_server.system.process import (
     take_long_turns,
 )
 from v2v_server.system.sandbox import confine
+from v2v_server.system.start_times import StartTimes
 from v2v_server.worker.conversation import (
     CREDIT,
     Action,
@@ -330,6 +331,7 @@ def run_worker(
     cache: Cache | None = None,
     keys: str | None = None,
     log: Log | None = None,
+    times: StartTimes | None = None,
 ) -> None:
     """Run one worker in this process until the server stops it.
 
@@ -342,6 +344,7 @@ def run_worker(
         cache: cache of decoded clips for later epochs; None stores nothing.
         keys: file of its key; None reads the file that ``V2V_KEYS`` names, "" uses no key.
         log: log for people.
+        times: completed and perhaps logged once the worker is connected.
 
     Raises:
         UsageError: the socket cannot connect to the address, or the server rejects the key.
@@ -349,6 +352,8 @@ def run_worker(
     """
     if parent_pid is not None:
         die_with_parent(parent_pid)
+    times = times or StartTimes()
+    times.mark("imports")
     key_for(address, "worker", keys)  # reports a wrong key at once
     keep_freed_memory()
     limit_memory(LARGEST_MEMORY_BYTES)
@@ -356,6 +361,7 @@ def run_worker(
     os.environ["OPENCV_FOR_THREADS_NUM"] = "1"
     # Compile or load the kernels first, so that a worker that says hello works at full speed.
     warm_up_in_turn()
+    times.mark("kernels")
     # Exclude objects that exist by now from collections, which then take a fraction of a millisecond.
     gc.collect()
     gc.freeze()
@@ -364,4 +370,7 @@ def run_worker(
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # After ZeroMQ's threads have started, which should run without delay.
     take_long_turns()
+    times.mark("sandbox and socket")
+    if times.is_logged:
+        (log or Log()).say(f"worker {name}: {times}")
     worker.run()

@@ -39,7 +39,7 @@ from v2v_server.corpus.scenes.scene import Scene, Sides
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.motion import MARGIN_PX, cells_of, levels_of
-from v2v_server.simulation.draw import draw
+from v2v_server.simulation.draw import FrameTimes, draw
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.kernels import ARRAYS, list_events
 from v2v_server.simulation.variants import Variant, variants
@@ -98,13 +98,15 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
 
     Raises:
         ProtocolError: the lease is malformed.
+        VideoError: the recipe needs time stamps that the lease does not state.
     """
     spec = _spec(lease.spec)
+    recipe = spec.recipe
     scene = None if spec.scene == "off" else Scene.from_bytes(lease.scene)
-    frames = CleanFrames.of(scene, lease.start_frame, spec)
+    frames = CleanFrames.of(scene, lease.start_frame, spec, _most_frames(lease, spec))
     picture = usable_window(lease, frames.sides)
     params = draw(
-        spec.recipe,
+        recipe,
         seed=lease.seed,
         epoch=lease.epoch,
         index=index,
@@ -112,8 +114,9 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
         picture_width_px=picture.width_px,
         video_id=lease.video,
         video_thresholds=_pair(lease.thresholds),
+        times=_frame_times(lease, spec, frames) if recipe.is_timed else None,
     )
-    source = params.source_index(spec.recipe.steps)
+    source = params.source_index(int(params.ends(recipe)[-1]))
     flow: FlowSettings | None = None
     margin_px: int | None = MARGIN_PX if spec.substep_px else 0
     flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture)
@@ -122,9 +125,9 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
         if flow_plan is not None and flow_plan.still:
             flow = replace(flow, margin_px=0)
         margin_px = None if flow.margin_px is None else max(flow.margin_px, margin_px or 0)
-    window = source_window(params, spec.recipe, picture, margin_px)
+    window = source_window(params, recipe, picture, margin_px)
     chroma = _chroma_cut(lease, params, spec, frames, source) if "frames_rgb" in lease.arrays else None
-    cells = cells_of(params, spec.recipe, _within_rows(lease, frames.sides)) if spec.substep_px else None
+    cells = cells_of(params, recipe, _within_rows(lease, frames.sides)) if spec.substep_px else None
     cut = Cut(frames.count(int(source[-1]) + 1), window, chroma, cells)
     return SamplePlan(spec, params, source, frames, cut, margin_px, flow, flow_plan)
 
@@ -147,7 +150,7 @@ def _chroma_cut(
     lease: Lease, params: SampleParams, spec: StreamSpec, frames: CleanFrames, source: npt.NDArray[np.int64]
 ) -> ChromaCut:
     """Return which colour to decode: that of the delivered frames, in the crop."""
-    delivered = np.unique(source[list(spec.recipe.target_steps)])
+    delivered = np.unique(source[params.ends(spec.recipe)[spec.recipe.first_frame :]])
     if not frames.stride:
         delivered = frames.numbers[delivered] - frames.numbers[0]
     top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
@@ -261,6 +264,7 @@ def make_sample(
             unlabelled=unlabelled,
             boxes_dropped=context.boxes_dropped,
             saturated={name: count for name, count in saturated.items() if count},
+            grid_seconds=_grid_seconds(context),
         ),
     )
 
@@ -312,6 +316,22 @@ def _context(
     return SampleContext(
         lease.video, clip, plan.spec, params, plan.source, view, signal, seconds, flow, levels, into
     ), irregular
+
+
+def step_durations(lease: Lease, decoded: Decoded) -> npt.NDArray[np.float64] | None:
+    """Return the duration of each step of a sample, [steps] float64, s; None if the recipe does not use it.
+
+    Raises:
+        VideoError: the video's frame rate is unknown.
+    """
+    return _step_seconds(lease, decoded)[0] if decoded.plan.spec.recipe.needs_seconds else None
+
+
+def _grid_seconds(context: SampleContext) -> tuple[float, ...]:
+    """Return the actual duration of each voxel grid if the recipe states one."""
+    if not context.recipe.is_timed or context.step_seconds is None:
+        return ()
+    return tuple(np.add.reduceat(context.step_seconds, context.params.ends(context.recipe)[:-1]).tolist())
 
 
 def _step_seconds(lease: Lease, decoded: Decoded) -> tuple[npt.NDArray[np.float64], int]:
@@ -371,15 +391,37 @@ def _pair(thresholds: tuple[float, ...]) -> tuple[float, float] | None:
     return (thresholds[0], thresholds[1]) if thresholds else None
 
 
-def _frame_index(lease: Lease, frames: int) -> FrameIndex:
-    """Decode the frame index of a lease. Its server may not have checked it.
+def _most_frames(lease: Lease, spec: StreamSpec) -> int:
+    """Return how many frames a sample may use, those in between included: the same for every server, whose index of a
+    lease may hold more.
+    """
+    recipe, rate = spec.recipe, lease.frames_per_second
+    if not recipe.is_timed:
+        return recipe.frames_needed
+    if not rate:
+        raise VideoError(lease.video, None, "its frame rate is unknown, and voxel_seconds needs it")
+    needed = int(recipe.sequence_at(rate)) + 1
+    if spec.scene != "off":
+        return needed
+    return min(int(recipe.reach_at(rate)) + 1, _frame_index(lease, needed).end - lease.start_frame)
+
+
+def _frame_times(lease: Lease, spec: StreamSpec, frames: CleanFrames) -> FrameTimes:
+    """Return the time stamps of the frames that a sample may use."""
+    seconds = _frame_index(lease, frames.span).seconds(lease.start_frame, frames.span)
+    rate = lease.frames_per_second / spec.recipe.frame_stride
+    return FrameTimes(seconds[frames.numbers - frames.numbers[0]], rate)
+
+
+def _frame_index(lease: Lease, count: int) -> FrameIndex:
+    """Decode the frame index of a lease, for this number of frames. Its server may not have checked it.
 
     Raises:
         VideoError: the index is damaged.
     """
     try:
         frame_index = FrameIndex.from_bytes(lease.frame_index)
-        frame_index.position(lease.start_frame, frames)
+        frame_index.position(lease.start_frame, count)
     except (ProtocolError, UsageError) as error:
         raise VideoError(lease.video, None, f"its index from the server is damaged: {error}") from error
     return frame_index

@@ -82,9 +82,9 @@ def plan_flow(scene: Scene, frames: CleanFrames, params: SampleParams, spec: Str
     """
     recipe = spec.recipe
     tiles = _tiles(params, recipe, picture, frames.sides)
-    source = frames.numbers[params.source_index(recipe.steps)]
-    span = recipe.steps_per_frame
-    ends = source[recipe.lead_voxels * span :: span].tolist()
+    positions = params.ends(recipe)
+    source = frames.numbers[params.source_index(int(positions[-1]))]
+    ends = source[positions[recipe.lead_voxels :]].tolist()
     methods = tuple(_method(scene, earlier, later, tiles, params.scale) for earlier, later in pairwise(ends))
     values = scene.values(int(source[0]), int(source[-1]))
     kind, figures = _kind(methods), "; ".join(filter(None, (_figures(values, tiles), frames.reason)))

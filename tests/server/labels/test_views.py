@@ -56,7 +56,7 @@ def drawn(box: tuple[int, int, int, int], value: int) -> npt.NDArray[np.uint8]:
 
 
 def viewed(picture: npt.NDArray[np.uint8], recipe: Recipe, params: SampleParams, usable: Window) -> Any:
-    window = source_window(params, recipe, usable.top_px, usable.height_px, usable.width_px)
+    window = source_window(params, recipe, usable)
     rows = slice(window.top_px, window.top_px + window.height_px)
     return apply_view(picture[None, rows, window.left_px : window.left_px + window.width_px], params, recipe)[0]
 

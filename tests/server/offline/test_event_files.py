@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import faery
@@ -15,11 +16,19 @@ from v2v_protocol.events import EventList
 from v2v_server.commands import simulate as command
 from v2v_server.offline.event_files import FORMS, write_events
 from v2v_server.simulation import simulate
+from v2v_server.simulation.result import Voxels
 
 BIN_US = 7000.0
-SIMULATED = simulate(np.random.default_rng(1).integers(0, 256, (16, 12, 16), np.uint8), threshold_pos=1.0)
-EVENTS = SIMULATED.to_events(BIN_US)
-NO_EVENTS = simulate(np.zeros((6, 4, 4), np.uint8), threshold_pos=1.0, start_residual=0.0).to_events(100)
+
+
+@cache
+def simulated() -> Voxels:
+    return simulate(np.random.default_rng(1).integers(0, 256, (16, 12, 16), np.uint8), threshold_pos=1.0)
+
+
+@cache
+def some_events() -> EventList:
+    return simulated().to_events(BIN_US)
 
 
 def read(path: Path) -> EventList:
@@ -40,17 +49,17 @@ def read(path: Path) -> EventList:
 
 @pytest.mark.parametrize("ending", FORMS)
 def test_what_is_read_is_what_was_written(ending: str, tmp_path: Path) -> None:
-    path, events = tmp_path / f"events{ending}", EVENTS
+    path, events = tmp_path / f"events{ending}", some_events()
     write_events(path, events)
     back = read(path)
     for column in "xytp":
         np.testing.assert_array_equal(getattr(back, column), getattr(events, column))
     assert (back.width_px, back.height_px) == (16, 12)
-    np.testing.assert_array_equal(back.voxels(3, 5, BIN_US, "int8"), SIMULATED.voxels)
+    np.testing.assert_array_equal(back.voxels(3, 5, BIN_US, "int8"), simulated().voxels)
 
 
 def test_the_index_of_milliseconds_is_that_of_dsec(tmp_path: Path) -> None:
-    write_events(tmp_path / "e.h5", EVENTS)
+    write_events(tmp_path / "e.h5", some_events())
     with h5py.File(tmp_path / "e.h5") as file:
         t, first = file["events/t"][:], file["ms_to_idx"][:]
     assert len(first) == t[-1] // 1000 + 2
@@ -61,15 +70,16 @@ def test_the_index_of_milliseconds_is_that_of_dsec(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", FORMS)
 def test_no_events_make_a_file_too(ending: str, tmp_path: Path) -> None:
-    write_events(tmp_path / f"none{ending}", NO_EVENTS)
+    none = simulate(np.zeros((6, 4, 4), np.uint8), threshold_pos=1.0, start_residual=0.0).to_events(100)
+    write_events(tmp_path / f"none{ending}", none)
     assert (tmp_path / f"none{ending}").stat().st_size > 0
 
 
 def test_a_name_that_says_no_form_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"ends in \.h5"):
-        write_events(tmp_path / "events.bin", EVENTS)
+        write_events(tmp_path / "events.bin", some_events())
     with pytest.raises(UsageError, match="No such file"):
-        write_events(tmp_path / "nowhere" / "events.npz", EVENTS)
+        write_events(tmp_path / "nowhere" / "events.npz", some_events())
 
 
 @pytest.mark.parametrize(("grids", "bin_us"), [(0, 40_000.0), (3, 40_000 / 15)])

@@ -182,7 +182,7 @@ def test_the_page_ends_with_its_server_even_when_that_is_killed(clips: Path) -> 
         until(lambda: got(port, "/healthz")[0] == 200)
         os.kill(server.pid, signal.SIGKILL)
         server.wait(30)
-        assert psutil.wait_procs([page], timeout=10)[1] == []
+        assert psutil.wait_procs([page], timeout=60)[1] == []
         PageProcess("127.0.0.1", port).stop()  # the port is free
     finally:
         server.kill()

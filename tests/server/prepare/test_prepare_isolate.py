@@ -21,7 +21,7 @@ from v2v_server.system.isolate import Died, run_isolated
 @pytest.fixture(autouse=True)
 def _no_process_left() -> Iterator[None]:
     yield
-    assert not psutil.wait_procs(children(), timeout=10)[1]
+    assert not psutil.wait_procs(children(), timeout=60)[1]
 
 
 def children() -> list[psutil.Process]:

@@ -44,7 +44,7 @@ def source(tmp_path: Path) -> Path:
 @pytest.fixture(autouse=True)
 def _no_process_left() -> Iterator[None]:
     yield
-    assert not psutil.wait_procs(children(), timeout=10)[1]
+    assert not psutil.wait_procs(children(), timeout=60)[1]
 
 
 def inodes(folder: Path) -> dict[str, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 import re
 import tracemalloc
 from typing import Any
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 
 from tests.pieces import pieces
 from tests.server.named_corpus import SMALL, SMALL_SPEC, video
-from v2v_protocol.recipe import Recipe, preset
+from v2v_protocol.recipe import MOST_STEPS_PER_GRID, Recipe, preset
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.scenes.pieces import encoded_pieces
 from v2v_server.corpus.scenes.scene import Flag
@@ -108,6 +109,12 @@ def test_lookup_by_rank_equals_the_list(lengths: list[int], most: int, voxels: i
         assert start + recipe.frames_needed <= entry.frames
 
 
+def _divided(ends: list[int]) -> bytes:
+    """Return pieces of which every other one is black, from the first on; without ends, a video that fades."""
+    parts = pieces(*((end, 0 if at % 2 else Flag.BLACK) for at, end in enumerate(ends) if end))
+    return encoded_pieces(parts if ends else pieces((9, Flag.FADE)), max(ends, default=9))
+
+
 @given(st.lists(_runs, max_size=8), st.integers(1, 6), _blocks)
 def test_lookup_by_rank_equals_the_list_between_shot_boundaries(
     stretches: list[list[tuple[int, int]]], most: int, block: int
@@ -117,10 +124,7 @@ def test_lookup_by_rank_equals_the_list_between_shot_boundaries(
     for number, each in enumerate(stretches):
         ends = list(itertools.accumulate(itertools.chain.from_iterable(each)))
         runs = tuple(zip(ends[::2], ends[1::2], strict=True))
-        parts = pieces(*((end, 0 if at % 2 else Flag.BLACK) for at, end in enumerate(ends) if end))
-        frames = max(ends, default=9)
-        divided = encoded_pieces(parts if runs else pieces((9, Flag.FADE)), frames)
-        entry = dataclasses.replace(video(f"v{number}", frames), pieces=divided)
+        entry = dataclasses.replace(video(f"v{number}", max(ends, default=9)), pieces=_divided(ends))
         starts = [
             start
             for first, end in runs
@@ -130,6 +134,56 @@ def test_lookup_by_rank_equals_the_list_between_shot_boundaries(
         expected += [(entry.id, start) for start in starts[:most]]
     with mock.patch.object(sequences, "_BLOCK", block):
         assert listed(table(*videos, spec=spec)) == expected
+
+
+@given(
+    st.lists(st.tuples(_runs, st.sampled_from((1.0, 24.0, 30_000 / 1001, 60.0, 240.0, math.nan, 1e5))), max_size=8),
+    st.floats(0.01, 0.5),
+    st.integers(1, 3),
+    st.sampled_from(("off", "auto")),
+    _blocks,
+)
+def test_grids_of_a_duration_have_as_many_frames_as_the_rate_of_their_video_says(
+    stretches: list[tuple[list[tuple[int, int]], float]], seconds: float, stride: int, scene: str, block: int
+) -> None:
+    recipe = SMALL.replace(voxel_seconds=(0.001, seconds), frame_stride=stride)
+    spec = StreamSpec(recipe=recipe, max_sequences_per_video=5, scene=scene)
+    videos, expected, admitted = [], [], set()
+    for number, (each, rate) in enumerate(stretches):
+        ends = list(itertools.accumulate(itertools.chain.from_iterable(each)))
+        runs = tuple(zip(ends[::2], ends[1::2], strict=True))
+        divided = _divided(ends)
+        entry = dataclasses.replace(video(f"v{number}", max(ends, default=9), rate=rate), pieces=divided)
+        videos.append(entry)
+        if math.isnan(rate) or (steps := max(1, math.floor(seconds * rate / stride + 0.5))) > MOST_STEPS_PER_GRID:
+            continue
+        length = steps * stride * recipe.voxels_per_clip
+        stretch = runs if scene == "auto" else ((0, entry.frames),)
+        starts = [start for first, end in stretch for start in range(first, end - length, length)]
+        expected += [(entry.id, start) for start in starts[:5]]
+        admitted |= {entry.id} if starts else set()
+    with mock.patch.object(sequences, "_BLOCK", block):
+        found = table(*videos, spec=spec)
+        assert listed(found) == expected
+    assert {refusal.video for refusal in found.refusals} == {entry.id for entry in videos} - admitted
+
+
+@pytest.mark.parametrize(
+    ("rate", "frames", "reason", "remedy"),
+    [
+        (math.nan, 100, "its frame rate is unknown, and voxel_seconds needs it", "voxel_seconds 0"),
+        (10_000.0, 10**6, r"a voxel grid of 10 s spans 100000 steps at 10000 frames/s, the limit is 1024", "shorter"),
+        (30.0, 500, r"500 frames, the recipe needs 601 at 30 frames/s", "voxels_per_clip at most 1"),
+        (30.0, 200, r"200 frames, the recipe needs 601 at 30 frames/s", "shorter voxel_seconds or frame_stride"),
+    ],
+)
+def test_a_duration_that_a_video_cannot_give_is_refused(rate: float, frames: int, reason: str, remedy: str) -> None:
+    found = table(video("a", frames, rate=rate), spec=StreamSpec(recipe=SMALL.replace(voxel_seconds=10.0)))
+    (refusal,) = found.refusals
+    assert refusal.reason == reason
+    assert refusal.remedy.startswith(remedy)
+    assert found.count == 0
+    assert found.longest_clips == ((1,) if frames == 500 else ())
 
 
 def test_tables_of_a_thousand_geometries_take_little_memory() -> None:

@@ -15,8 +15,9 @@ from bench.accuracy import extremes
 from tests.oracles.balance import Camera, arithmetic, balance, imbalance, trace_of
 from tests.oracles.extremes import Finding, Row, record_of, refused, rows, texture
 from tests.server.simulation import oracle, reference
+from v2v_protocol.bounds import LARGEST_EVENTS, LARGEST_NORMAL, most_events
 from v2v_protocol.errors import RecipeError, UsageError
-from v2v_protocol.recipe import LARGEST_EVENTS, LARGEST_NORMAL, PRESETS, Recipe, most_events
+from v2v_protocol.recipe import PRESETS, Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation import noise, simulate, simulate_clip
 from v2v_server.simulation.draw import noise_key_of_seed

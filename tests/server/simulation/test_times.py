@@ -15,11 +15,14 @@ from hypothesis import strategies as st
 from tests.oracles.in_time import bilinear_of, counts_of, stacked_histogram, watch
 from tests.server.simulation.generic_processor import printed_on_a_generic_processor
 from tests.server.simulation.test_pixel import moving_frames
+from tests.server.video.test_real_videos import FOLDER as REAL_VIDEOS
 from v2v_protocol.errors import UsageError
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.kernels import ARRAYS, fill, list_events
 from v2v_server.simulation.result import Voxels
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, bin_edges, rounding_tolerance, timeline
+from v2v_server.video.decode import decode_luma
+from v2v_server.video.probe import probe
 
 FPS = 25.0
 ALL = {
@@ -44,13 +47,13 @@ def again(made: Voxels, *names: str, precision: Any = None, **changes: Any) -> d
     noise_sigma=st.sampled_from([0.0, 0.1]),
     hot_count=st.integers(0, 1),
     start_residual=st.none() | st.floats(-0.2, 0.2),
-    dtype=st.sampled_from(["int8", "float32"]),
-    precision=st.sampled_from(["float32", "float64"]),
+    form=st.sampled_from([("int8", "float32"), ("float32", "float32"), ("float32", "float64")]),
     seed=st.integers(0, 2**64 - 1),
 )
 def test_it_counts_the_events_of_the_papers_kernel(
-    size: Any, noise_sigma: float, hot_count: int, start_residual: float | None, dtype: str, precision: str, seed: int
+    size: Any, noise_sigma: float, hot_count: int, start_residual: float | None, form: tuple[str, str], seed: int
 ) -> None:
+    dtype, precision = form
     made = simulate(
         moving_frames(21, *size, seed=seed % 256), threshold_pos=0.2, threshold_neg=0.25, noise_sigma=noise_sigma,
         hot_pixel_count=hot_count, hot_pixel_sigma=2.0, start_residual=start_residual, bins=5, frames_per_bin=2,
@@ -81,7 +84,7 @@ def test_kernel_equals_the_oracle(data: Any, precision: str, grids: int) -> None
     sigma = data.draw(st.sampled_from([0.0, 0.1]))
     made = simulate(
         moving_frames(steps + 1, 4, 6, seed % 256), threshold_pos=0.2, threshold_neg=0.25, noise_sigma=sigma,
-        hot_pixel_count=2, hot_pixel_sigma=0.5, bins=bins, grids_per_frame=grids, seed=seed, dtype="int16",
+        hot_pixel_count=2, hot_pixel_sigma=0.5, bins=bins, grids_per_frame=grids, seed=seed, dtype="float32",
         precision=precision, frames_per_second=FPS, **effects,
     )  # fmt: skip
     at = Moments(np.array([0, 0, 2, 3, 3, 3]), np.array([0.25, 0.7, 1 / 3, 0.1, 0.5, 0.9]))
@@ -228,12 +231,20 @@ def test_arrays_and_events_agree(effects: dict[str, float], grids: int) -> None:
     np.testing.assert_allclose(bilinear[grid, :, 11, 20], expected, atol=0.01)
 
 
+def real_frames(name: str) -> np.ndarray:
+    """Return 21 frames of the middle of a real video, [21, 30, 40]."""
+    if not (REAL_VIDEOS / name).is_file():
+        pytest.skip(f"no {name} in {REAL_VIDEOS}; set V2V_TEST_VIDEOS")
+    index = probe(REAL_VIDEOS / name).index
+    return decode_luma(REAL_VIDEOS / name, index.slice(30, 21), 30, 21, (100, 100, 30, 40)).frames
+
+
 @pytest.mark.parametrize("grids", [0, 2])
-def test_the_published_stacked_histogram_of_the_events_is_the_array(grids: int) -> None:
+@pytest.mark.parametrize("video", ["", "gopro_hero7_walk.mp4"])
+def test_the_published_stacked_histogram_of_the_events_is_the_array(video: str, grids: int) -> None:
     """Its bins reach from the first to the last event. A column beside the picture has one at either end of a grid."""
-    made = simulate(
-        moving_frames(21, 30, 40, 5), threshold_pos=0.1, bins=10, grids_per_frame=grids, dtype="int16", seed=4
-    )
+    frames = real_frames(video) if video else moving_frames(21, 30, 40, 5)
+    made = simulate(frames, threshold_pos=0.1, bins=10, grids_per_frame=grids, dtype="int16", seed=4)
     counts, bin_us = made.array("event_counts"), 5000
     events = made.to_events(bin_us)
     for grid, expected in enumerate(counts):
@@ -335,7 +346,7 @@ digest = hashlib.sha256()
 for effects in ({}, ALL):
     for precision in ("float32", "float64"):
         made = simulate(
-            moving_frames(9, 5, 8, 3), threshold_pos=0.2, noise_sigma=0.1, bins=3, grids_per_frame=2, dtype="int16",
+            moving_frames(9, 5, 8, 3), threshold_pos=0.2, noise_sigma=0.1, bins=3, grids_per_frame=2, dtype="float32",
             seed=5, frames_per_second=FPS, precision=precision, **effects,
         )
         for array in fill(dataclasses.replace(made.given, levels=levels), made.real, dict.fromkeys(ARRAYS))[0].values():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -79,9 +78,7 @@ def verdicts(
             while not trouble and not client.get_status()["totals"]["samples"]:
                 stop.wait(0.2)
             stop.wait(WINDOW_SECONDS + 2.0)
-            until = time.monotonic() + 3.0
-            while time.monotonic() < until:
-                said.append(client.get_status()["waiting"])
+            said += [client.get_status()["waiting"] for _ in range(3)]
     finally:
         stop.set()
         consumer.join(30)

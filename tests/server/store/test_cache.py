@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,9 +89,9 @@ def pieces(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob("??/*") if path.is_file())
 
 
-@pytest.mark.parametrize("stride", [1, 2])
-def test_first_a_miss_then_hits(source: Path, folder: Path, stride: int) -> None:
-    spec = SPEC if stride == 1 else StreamSpec(recipe=replace(SPEC.recipe, voxels_per_clip=2, frame_stride=2))
+@pytest.mark.parametrize("changes", [{}, {"voxels_per_clip": 2, "frame_stride": 2}, {"voxel_seconds": (0.04, 0.2)}])
+def test_first_a_miss_then_hits(source: Path, folder: Path, changes: dict[str, Any]) -> None:
+    spec = StreamSpec(recipe=SPEC.recipe.replace(**changes))
     first = epoch(source, Cache(folder, 1 << 30, 0), 8, spec)
     assert first[0] == "miss"
     assert set(first) <= {"hit", "miss"}

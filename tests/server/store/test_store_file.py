@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 
 from v2v_protocol.errors import ProtocolError, UsageError, VideoChanged, VideoError, VideoUnreadable
 from v2v_server.store.format import GROUP_FRAMES, Head, group_frames_for, is_store_file, pack_record
-from v2v_server.store.packing import DENSE, FAST, QUICK, Packing, UnpackingError, unpack
+from v2v_server.store.packing import DENSE, FAST, QUICK, RAW, Packing, UnpackingError, unpack
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter
 
-PACKINGS = st.sampled_from([DENSE, FAST, QUICK])
+PACKINGS = st.sampled_from([DENSE, FAST, QUICK, RAW])
 in_folder = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
@@ -213,9 +213,9 @@ def test_heads_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
         replace(head_of(np.zeros((4, 8, 8), np.uint8)), **wrong)
 
 
-@pytest.mark.parametrize("method", ["zstd", "lz4"])
+@pytest.mark.parametrize("method", ["zstd", "lz4", "raw"])
 def test_a_block_is_unpacked_into_the_bytes_that_it_should_have_and_no_more(method: str) -> None:
-    packing = {"zstd": DENSE, "lz4": FAST}[method]
+    packing = {"zstd": DENSE, "lz4": FAST, "raw": RAW}[method]
     packed = packing.packer()(bytes(1000))
     assert unpack(method, packed, 1000) == bytes(1000)
     for size in (10, 999, 1001):

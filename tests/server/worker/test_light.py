@@ -23,11 +23,17 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.folder import Folder
+from v2v_server.offline.doctor_pictures import look_at_pictures
+from v2v_server.offline.motion import WholePictures, predicted_loss
+from v2v_server.offline.preview import _signal_note
+from v2v_server.offline.remake import Remaker
 from v2v_server.simulation.intensity import light_table
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.depth import detail_of, levels_of
 from v2v_server.store.encoding import Encoding
+from v2v_server.tradeoff.accuracy import seen
 from v2v_server.video.luma import Signal, range_table
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.produce import make_sample
@@ -136,6 +142,32 @@ def test_store_and_cache_keep_transfer_and_bits(tmp_path: Path, is_deep: bool) -
             decoded, _ = clips.take(lease)
             assert clips.said_of_cache(decoded) == said
     require_equal(make_sample(lease, decoded), exact, "cache")
+
+
+def test_preview_and_doctor_name_what_a_video_has(tmp_path: Path) -> None:
+    ten_bits(tmp_path / "clips", ColorTrc.SMPTE2084)
+    provenance = sample_of(tmp_path / "clips", SDR).provenance
+    with closing(open_catalogue(tmp_path / "clips", processes=0)) as catalogue:
+        assert _signal_note(catalogue, provenance, DECLARED) == "a.mkv has 10 bits, PQ"
+        note = _signal_note(catalogue, provenance, SDR)
+        lines = list(look_at_pictures(catalogue, 7))
+    assert note.startswith("a.mkv has 10 bits, PQ, and is read as 8 bits, SDR: --set light=declared")
+    assert lines[-1][2] == "1 of 1 videos have other levels than 8 bits, SDR (a.mkv: 10 bits, PQ)"
+
+
+@pytest.mark.slow  # another compiled kernel
+def test_deep_clips_offline(tmp_path: Path) -> None:
+    """The parts of preview and tradeoff that simulate by themselves."""
+    ten_bits(tmp_path / "clips", ColorTrc.SMPTE2084)
+    spec = StreamSpec(recipe=DECLARED)
+    with closing(open_catalogue(tmp_path / "clips", processes=0)) as catalogue:
+        remaker = Remaker(catalogue, spec)
+        made = remaker.made(0, 0, 0)
+        assert predicted_loss(made).errors("linear").lost >= 0
+        whole = WholePictures(catalogue, spec).camera(remaker.sequence(0, 0, 0))
+        view = seen(tmp_path / "clips", replace(made.lease, indices=(0, 1)))
+    assert whole.voxels.any()
+    np.testing.assert_array_equal(view.voxels(made.sample.provenance.params), made.sample.arrays["voxels"])
 
 
 def test_sub_steps_are_made_of_8_bits(tmp_path: Path) -> None:

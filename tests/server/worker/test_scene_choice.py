@@ -44,7 +44,9 @@ def methods(what: Scene, start: int = 0, spec: StreamSpec = AUTO, **changes: Any
 
 def plan(what: Scene, spec: StreamSpec = AUTO, start: int = 0, **changes: Any) -> FlowPlan:
     picture = Window(0, 0, SIZE_PX, SIZE_PX)
-    return plan_flow(what, CleanFrames.of(what, start, spec), params(**changes), spec, picture)
+    return plan_flow(
+        what, CleanFrames.of(what, start, spec, spec.recipe.frames_needed), params(**changes), spec, picture
+    )
 
 
 def test_still_slow_moving_and_dark_clips_are_decided_apart() -> None:

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import threading
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ KEY = "key"
 
 
 def is_held(folder: Path) -> bool:
-    """Whether somebody has the lock."""
+    """Return whether a process has the lock."""
     with (folder / f"{KEY}.lock").open("ab") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -77,13 +78,13 @@ def test_one_that_fails_leaves_the_work_to_the_next(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_confined_process_compiles_in_its_own_memory(tmp_path: Path) -> None:
-    """A stream that needs an unusual kernel may come to workers on a host where nobody compiled it yet."""
+    """A stream that needs an unusual kernel may come to workers on a host that has not compiled it yet."""
     code = (
         "import sys\nfrom pathlib import Path\n"
         "from v2v_server.simulation.variants import Variant\n"
         "from v2v_server.system.sandbox import can_confine, confine\n"
         "from v2v_server.worker.warm_up import is_compiled, load_in_turn\n"
-        "variant = Variant('int16', True, 'float32')\n"
+        "variant = Variant('int16', False, 'float64')\n"
         "assert not is_compiled(variant)\n"
         "assert confine([Path(sys.argv[1])], network=False).calls == can_confine().calls\n"
         "load_in_turn(variant)\nassert is_compiled(variant)\n"
@@ -187,3 +188,16 @@ def test_the_compiler_dies_with_its_worker(tmp_path: Path) -> None:
         finally:
             worker.kill()
     until(lambda: all(map(has_ended, seen)))
+
+
+def test_scipy_cannot_be_imported_while_kernels_are_loaded_unless_it_was_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delitem(sys.modules, "scipy", raising=False)
+    with module._without_scipy(), pytest.raises(ImportError):
+        import_module("scipy")
+    assert "scipy" not in sys.modules
+    monkeypatch.setitem(sys.modules, "scipy", sys)
+    with module._without_scipy():
+        assert import_module("scipy") is sys
+    assert sys.modules["scipy"] is sys

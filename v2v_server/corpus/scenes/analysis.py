@@ -57,13 +57,15 @@ _NEIGHBOURS = 5
 _LARGEST_RETURN = 0.5
 _BARS_EVERY = 8
 """Frames."""
-_COMB_LEVELS = 6
+_COMB_LEVELS = 5
 """Least difference of the neighbouring lines of a combed block, grey levels."""
 _COMB_CHANGE = 64
 """Least change of its mean from one frame to the next, 1/64 grey level."""
-_COMB_BLOCKS = 200
-"""One of that number of blocks, and three at least, are combed in a combed picture."""
+_COMB_BLOCKS = 1000
+"""One of that number of blocks, and two at least, are combed in a combed picture."""
 
+_EVEN_BYTES = np.uint64(0x00FF00FF00FF00FF)
+_EACH_WORD = np.uint64(0x0001000100010001)
 _Tiles = npt.NDArray[np.float64]
 """[16], row by row."""
 
@@ -119,8 +121,8 @@ class SceneAnalysis:
         if number % SEGMENT_FRAMES == 1 and self._last is not None:
             self._noises.append((number, _noise(self._last, picture)))
         if number % LAG_FRAMES == 0:
-            levels = np.cumsum(np.bincount(picture.ravel(), minlength=256)) / picture.size
-            self._shares.append((number, levels[DARK_BELOW_LEVEL - 1], 1 - levels[CLIPPED_FROM_LEVEL - 1]))
+            dark, clipped = map(np.count_nonzero, (picture < DARK_BELOW_LEVEL, picture >= CLIPPED_FROM_LEVEL))
+            self._shares.append((number, dark / picture.size, clipped / picture.size))
             self._measure_motion(number, picture)
         self._last = picture
 
@@ -140,9 +142,8 @@ class SceneAnalysis:
         if self._last is not None and (self._frames - 1) % LAG_FRAMES:
             with one_thread():
                 self._measure_motion(self._frames - 1, self._last)
-        blocks = self._blocks[-1].size
-        repeats = duplicated(self._step_changes, blocks)
         boundaries = self._shot_boundaries()
+        repeats = duplicated(self._step_changes, self._blocks[-1].size, boundaries)
         assert self._last is not None
         pieces = pieces_of(
             np.array(self._light), np.array(self._variances), np.array(self._still), np.array(self._flat), repeats,
@@ -199,15 +200,15 @@ def analyse(pictures: Iterable[Picture]) -> Scene:
 def block_sums(picture: Picture) -> npt.NDArray[np.int64]:
     """Return the means of the 8 x 8 blocks of a picture in 1/64 grey level, without partial blocks."""
     height, width = picture.shape
-    rows, columns = max(1, height // _BLOCK_PX), max(1, width // _BLOCK_PX)
     if height < _BLOCK_PX or width < _BLOCK_PX:
-        picture = cv2.copyMakeBorder(
-            picture, 0, max(0, _BLOCK_PX - height), 0, max(0, _BLOCK_PX - width), cv2.BORDER_REPLICATE
-        ).astype(np.uint8, copy=False)
-    whole = picture[: rows * _BLOCK_PX, : columns * _BLOCK_PX].astype(np.float32)
-    # float32 holds these sums exactly, so the order of summation does not matter.
-    means = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
-    return np.rint(means * 64).astype(np.int64)
+        picture = np.pad(picture, ((0, max(0, _BLOCK_PX - height)), (0, max(0, _BLOCK_PX - width))), mode="edge")
+    rows, columns = (side // _BLOCK_PX for side in picture.shape)
+    # Eight pixels in a word: sums of eight rows fit into 16 bits each, and a product adds the four of them up.
+    words = np.ascontiguousarray(picture[: rows * _BLOCK_PX, : columns * _BLOCK_PX]).view(np.uint64)
+    words = words.reshape(rows, _BLOCK_PX, columns)
+    sums = (words & _EVEN_BYTES).sum(axis=1) + ((words >> np.uint64(8)) & _EVEN_BYTES).sum(axis=1)
+    blocks: npt.NDArray[np.int64] = ((sums * _EACH_WORD) >> np.uint64(48)).astype(np.int64)
+    return blocks
 
 
 def _variance(blocks: npt.NDArray[np.int64]) -> float:
@@ -230,8 +231,8 @@ def _is_combed(picture: Picture, change: npt.NDArray[np.int64]) -> bool:
     line, field = cv2.absdiff(part[1:-1], part[:-2]), cv2.absdiff(part[2:], part[:-2])
     size = columns, rows - 1
     near, far = (cv2.resize(each, size, interpolation=cv2.INTER_AREA).astype(np.int32) for each in (line, field))
-    combed = (near >= _COMB_LEVELS) & (2 * near > 3 * far) & (change[:-1] >= _COMB_CHANGE)
-    return int(np.count_nonzero(combed)) >= max(3, change.size // _COMB_BLOCKS)
+    combed = (near >= _COMB_LEVELS) & (near > 2 * far) & (change[:-1] >= _COMB_CHANGE)
+    return int(np.count_nonzero(combed)) >= max(2, change.size // _COMB_BLOCKS)
 
 
 def _difference(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> float:
@@ -250,7 +251,8 @@ def _largest(blocks: npt.NDArray[np.int64]) -> _Tiles:
 def _most(pace: npt.NDArray[np.float32]) -> _Tiles:
     """Return [16], what 95 % of each tile stays below."""
     tiles = [part for row in _parts(pace, 0) for part in _parts(row, 1)]
-    return np.array([np.quantile(tile, _MOST_OF_THE_PICTURE) for tile in tiles])
+    places = [int(_MOST_OF_THE_PICTURE * (tile.size - 1) + 0.5) for tile in tiles]
+    return np.array([np.partition(tile, place, axis=None)[place] for tile, place in zip(tiles, places, strict=True)])
 
 
 def _parts(values: npt.NDArray[np.float32], axis: int) -> list[npt.NDArray[np.float32]]:

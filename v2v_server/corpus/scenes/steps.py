@@ -1,18 +1,22 @@
 """Duplicated frames and their pattern.
 
 The change of a step is the sum of the squared changes of the means of 8 x 8 blocks, of those that change by more than a
-grey level. Means of blocks hold little coder noise, and squares give most weight to moving edges. A step is a duplicate
-if its change is at most 1/25 (so 1/5 of the amplitude) of the largest one of the four steps before it, and of the four
-after it. Where motion comes to rest or begins, only one side is that large; beside a cut, too. Near the first and the
-last frame one side is enough.
+grey level. Means of blocks hold little coder noise, and squares give most weight to moving edges. It is compared with
+the steps around it, up to four on either side.
 
-Coders with few bits blend a repeat with its neighbours. So 1/5 (almost half of the amplitude) suffices where repeats
-come in a regular pattern.
+In a regular pattern a step is a repeat if its change is at most 1/5 (almost half of the amplitude) of the second
+largest around it: coders with few bits blend a repeat with its neighbours. A pattern is a period of 2 to 12 steps in
+which four fifths of the steps at some places are such repeats, and at most half at the other places, in one shot.
+
+Elsewhere a step is a repeat if its change is at most 1/6 of the median before it and of that after it, and either at
+most 1/25 of the largest on either side, or the next step makes up for it. Where motion comes to rest or begins, only
+one side is that large.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +25,8 @@ Spans = tuple[tuple[int, int], ...]
 """(first frame, frame after the last) of each stretch."""
 
 _RATIO = 25
-_BLENDED_RATIO = 5
+_MEDIAN_RATIO = 6
+_PATTERN_RATIO = 5
 _REACH = 4
 _CUT_REACH = 8
 _NOISE = 64
@@ -44,28 +49,60 @@ def change_of(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> in
     return int(np.square(difference, where=np.abs(difference) > _NOISE, out=np.zeros_like(difference)).sum())
 
 
-def duplicated(changes: Sequence[int], blocks: int) -> npt.NDArray[np.bool_]:
+def duplicated(changes: Sequence[int], blocks: int, boundaries: Sequence[int] = ()) -> npt.NDArray[np.bool_]:
     """Return which steps repeat a frame.
 
     Args:
         changes: [N] sums of squares, (1/64 grey level)^2.
         blocks: number of blocks in each sum.
+        boundaries: frames at which another shot begins.
 
     Returns:
-        [N]; all False where there are too few to be more than chance.
+        [N]; repeats outside of patterns are False where there are too few to be more than chance.
     """
-    moving = np.zeros(len(changes), np.int64)
-    for at in range(len(changes)):
-        before, after = changes[max(0, at - _REACH) : at], changes[at + 1 : at + 1 + _REACH]
-        sides = max(before, default=0), max(after, default=0)
-        moving[at] = min(sides) if len(before) == len(after) else max(sides)
-    is_moving, each = moving >= _LEAST_CHANGE * blocks, np.array(changes, np.int64)
-    blended = is_moving & (_BLENDED_RATIO * each <= moving)
-    if blended.sum() >= 2 * _LEAST_COUNT and _period(blended):
-        return blended
-    flags = is_moving & (_RATIO * each <= moving)
-    count = int(flags.sum())
-    return flags if count >= _LEAST_COUNT and 1000 * count >= _LEAST_PER_MILLE * len(flags) else np.zeros_like(flags)
+    each, least = np.array(changes, np.int64), _LEAST_CHANGE * blocks
+    flags, others = np.zeros(len(each), bool), np.zeros(len(each), bool)
+    for first, end in pairwise([0, *boundaries, len(each) + 1]):
+        shot = slice(first, end - 1)  # the steps between its frames
+        pattern = _in_pattern(each[shot], least)
+        flags[shot] = pattern
+        if not pattern.any():
+            others[shot] = [_is_repeat(changes[shot], at, least) for at in range(end - 1 - first)]
+    count = int(others.sum())
+    return flags | others if count >= _LEAST_COUNT and 1000 * count >= _LEAST_PER_MILLE * len(each) else flags
+
+
+def _in_pattern(changes: npt.NDArray[np.int64], least: int) -> npt.NDArray[np.bool_]:
+    """Return which steps of a shot repeat a frame in a regular pattern."""
+    count, none = len(changes), np.zeros(len(changes), bool)
+    if not count:
+        return none
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(changes, _REACH), 2 * _REACH + 1)
+    largest = np.partition(around, -2, axis=1)[:, -2]
+    moves = largest >= least
+    small = moves & (_PATTERN_RATIO * changes <= largest)
+    for period in range(2, min(_LONGEST_PERIOD, count // 4) + 1):
+        shares = [(int(small[place::period].sum()), len(small[place::period])) for place in range(period)]
+        repeats = [5 * found >= 4 * steps for found, steps in shares]
+        others = [2 * found <= steps for found, steps in shares]
+        enough = sum(found for (found, _), repeat in zip(shares, repeats, strict=True) if repeat) >= _LEAST_COUNT
+        if enough and any(others) and all(one or other for one, other in zip(repeats, others, strict=True)):
+            pattern: npt.NDArray[np.bool_] = moves & np.resize(repeats, count)
+            return pattern
+    return none
+
+
+def _is_repeat(changes: Sequence[int], at: int, least: int) -> bool:
+    """Return whether a step of a shot repeats a frame outside of any pattern."""
+    before, after = changes[max(0, at - _REACH) : at], changes[at + 1 : at + 1 + _REACH]
+    sides = sorted(before), sorted(after)
+    if not all(sides):
+        return False
+    largest, median = min(side[-1] for side in sides), min(side[len(side) // 2] for side in sides)
+    if largest < least or _MEDIAN_RATIO * changes[at] > median:
+        return False
+    around = sorted([*before, *after])
+    return _RATIO * changes[at] <= largest or 2 * after[0] >= 3 * around[len(around) // 2]
 
 
 def is_cut(changes: Sequence[int], step: int) -> bool:

@@ -8,7 +8,7 @@ to see. A night scene is not black.
 Fade: the light falls from frame to frame for at least 6 frames, to an eighth of what it was, and the contrast with it;
 no single step is half of it. In reverse, the same from black.
 
-Combing: in a block that changes, neighbouring lines differ by half more than lines of the same field do. A shot is
+Combing: in a block that changes, neighbouring lines differ twice as much as lines of the same field do. A shot is
 combed if an eighth of its frames that were looked at have such blocks.
 """
 
@@ -39,7 +39,7 @@ _BRIGHT_FROM = 128 * 64
 _FADE_FRAMES = 6
 _FADE_SMOOTH = 2
 """Frames on either side over which light is averaged."""
-_FADE_LEAST_LEVEL = 8 * 64
+_FADE_LEAST_CONTRAST = (4 * 64) ** 2
 _FADE_LEAST_STEP = 500
 """Smaller changes than 1/500 of the light are none."""
 _FADE_RATIO = 8
@@ -83,7 +83,7 @@ def _falls(light: npt.NDArray[np.int64], contrast: npt.NDArray[np.int64]) -> lis
     for first, end in runs_of(drops * _FADE_LEAST_STEP > smooth[:-1], _FADE_FRAMES):
         falls = light[first:end] - light[first + 1 : end + 1]
         is_dark = light[end] * _FADE_RATIO <= light[first] and contrast[end] * _FADE_RATIO**2 <= contrast[first]
-        if is_dark and light[first] >= _FADE_LEAST_LEVEL and 2 * falls.max() <= light[first] - light[end]:
+        if is_dark and contrast[first] >= _FADE_LEAST_CONTRAST and 2 * falls.max() <= light[first] - light[end]:
             found.append((first, end + 1))
     return found
 

@@ -16,7 +16,19 @@ from skimage import data
 from tests.clips import write_clip
 from v2v_protocol.errors import VideoError
 from v2v_server.corpus.scenes.analysis import analyse
-from v2v_server.corpus.scenes.findings import BARS, BLACK, CUTS, DUPLICATES, STILL, Defect, defects_of
+from v2v_server.corpus.scenes.findings import (
+    BARS,
+    BLACK,
+    COMBED,
+    CUTS,
+    DUPLICATES,
+    FADES,
+    NOISY,
+    STILL,
+    WHITE,
+    Defect,
+    defects_of,
+)  # fmt: skip
 from v2v_server.corpus.scenes.scene import Sides
 from v2v_server.video.decode import stream_luma
 from v2v_server.video.probe import probe
@@ -152,6 +164,38 @@ def test_black_stretches(rate: str, tmp_path: Path) -> None:
     defects = found(luma, tmp_path, rate)
     assert {BLACK} <= set(defects) <= {BLACK, CUTS}
     assert defects[BLACK].spans == ((40, 60),)
+
+
+@pytest.mark.parametrize("rate", BIT_RATES)
+@pytest.mark.parametrize("frames", [12, 40])
+def test_fades_to_and_from_black(frames: int, rate: str, tmp_path: Path) -> None:
+    gain = np.interp(np.arange(FRAMES), (44 - frames, 44, 50, 50 + frames), (1, 0, 0, 1))[:, None, None]
+    defects = found(np.rint(film() * gain).astype(np.uint8), tmp_path, rate)
+    assert {FADES} <= set(defects) <= {FADES, BLACK}
+    (out, _), (_, back) = defects[FADES].spans[0], defects[FADES].spans[-1]
+    assert abs(out - (44 - frames)) <= 4
+    assert abs(back - (50 + frames)) <= 4
+
+
+@pytest.mark.parametrize("rate", BIT_RATES)
+def test_combing_is_found_where_something_moves(rate: str, tmp_path: Path) -> None:
+    moving = film(frames=2 * FRAMES)
+    woven = moving[::2].copy()
+    woven[:, 1::2] = moving[1::2, 1::2]
+    defects = found(woven, tmp_path, rate)
+    assert set(defects) == {COMBED}
+    assert defects[COMBED].per_mille > 700
+
+
+def test_white_and_noisy_stretches() -> None:
+    luma = film().copy()
+    luma[20:40] = 250
+    noise = 2.0 * np.random.default_rng(3).standard_normal(luma[:40].shape)
+    luma[56:] = np.clip(np.rint(luma[56] + noise), 0, 255)
+    defects = {defect.kind: defect for defect in defects_of(analyse(luma))}
+    assert {WHITE, NOISY, STILL} <= set(defects) <= {WHITE, NOISY, STILL, CUTS}
+    assert defects[WHITE].spans == ((20, 40),)
+    assert defects[NOISY].spans[-1][1] == FRAMES
 
 
 def test_frames_without_anything_to_compare() -> None:

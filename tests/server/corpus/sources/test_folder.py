@@ -14,6 +14,7 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.sources import asking
 from v2v_server.corpus.sources.asking import answers, by_parts
 from v2v_server.corpus.sources.folder import MOST_PATHS, PSEUDO, Folder, video_files
 from v2v_server.corpus.sources.listfile import ListEntry, read_list
@@ -88,37 +89,42 @@ def test_what_comes_late_holds_up_no_other_question_and_keeps_its_place() -> Non
     assert [file for file, in_time in answers(question, range(1000)) if in_time] == list(range(1000))
 
 
-def test_storage_that_answers_at_once_is_asked_by_one_thread_and_another_by_many() -> None:
-    now, most, seconds = [0], [0], [0.0]
+def test_storage_that_answers_at_once_is_asked_by_one_thread_and_another_by_many(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now, most, sixteen = set[int](), [0], threading.Barrier(16, timeout=60.0)
 
     def question(part: Sequence[int]) -> int:
-        now[0] += 1
-        most[0] = max(most[0], now[0])
-        time.sleep(seconds[0])
-        now[0] -= 1
+        now.add(part[0])
+        most[0] = max(most[0], len(now))
+        if is_slow:
+            sixteen.wait()  # answers once sixteen parts are asked at a time
+        now.discard(part[0])
         return sum(part)
 
-    for seconds[0], expected in (0.0, 1), (0.06, 16):
-        most[0] = 0
-        found = list(by_parts(question, range(64 * 40)))
-        assert [each for part, _ in found for each in part] == list(range(64 * 40))
+    for is_slow, soon_seconds in (False, 60.0), (True, 0.001):
+        monkeypatch.setattr(asking, "_SOON_SECONDS", soon_seconds)
+        found = list(by_parts(question, range(64 * 48)))
+        assert [each for part, _ in found for each in part] == list(range(64 * 48))
         assert all(answer == sum(part) for part, answer in found)
-        assert most[0] == expected
+        assert most[0] == (16 if is_slow else 1)
 
 
-def test_storage_that_was_slow_for_a_while_is_asked_by_one_thread_again() -> None:
+def test_storage_that_was_slow_for_a_while_is_asked_by_one_thread_again(monkeypatch: pytest.MonkeyPatch) -> None:
     at_once: dict[int, int] = {}
-    now: set[int] = set()
+    now, ten = set[int](), threading.Barrier(10, timeout=60.0)
+    monkeypatch.setattr(asking, "_SOON_SECONDS", 0.001)
 
     def question(part: Sequence[int]) -> None:
         now.add(part[0])
         at_once[part[0]] = len(now)
         if part[0] < 640:
-            time.sleep(0.06)
+            ten.wait()  # the ten first parts answer once all of them are asked
+            monkeypatch.setattr(asking, "_SOON_SECONDS", 60.0)
         now.discard(part[0])
 
     list(by_parts(question, range(64 * 1000)))
-    assert max(at_once.values()) > 8
+    assert max(at_once.values()) >= 10
     assert all(count == 1 for first, count in at_once.items() if first > 64 * 400)
 
 
