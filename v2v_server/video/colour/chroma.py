@@ -58,7 +58,7 @@ class ChromaCut:
 
     @property
     def cells(self) -> Window:
-        """The cells that hold the window: (top, left, rows, columns)."""
+        """Return the cells that hold the window: (top, left, rows, columns)."""
         _, left, _, width = self.window
         rows, first_column = self._rows, left // CELL_PX
         first_row = int(rows[0])
@@ -66,8 +66,10 @@ class ChromaCut:
 
     @property
     def _rows(self) -> npt.NDArray[np.int64]:
-        """Row of cells of each row of the window. As many are stored as the usable rows fill, so the last row of an
-        even number that begins at an odd one has the colour of the row before.
+        """Return the row of cells of each row of the window.
+
+        As many rows of cells are stored as the rows in use fill. If an even number of rows begins at an odd one, the
+        last has the colour of the row before.
         """
         top, _, height, _ = self.window
         first, count = self.usable_px
