@@ -50,7 +50,7 @@ class FromSidecar:
 
     @property
     def endings(self) -> tuple[str, ...]:
-        """All endings that the array can be made from."""
+        """Return all endings that the array can be made from."""
         return self.ending, *self.or_else
 
 
@@ -243,7 +243,7 @@ class Provenance:
 
     @property
     def labelled(self) -> bool:
-        """Whether all requested labels could be made."""
+        """Return whether all requested labels could be made."""
         return not self.unlabelled
 
     def __repr__(self) -> str:

@@ -149,7 +149,7 @@ class StreamSpec:
 
     @property
     def kept_defects(self) -> frozenset[str]:
-        """The defects that are served as they are: all with scene "off"."""
+        """Return the defects that are served as they are: all with scene "off"."""
         return frozenset(DEFECTS if self.scene == "off" else filter(None, self.keep_defects.split(",")))
 
     def spaced(self, stride: int) -> StreamSpec:

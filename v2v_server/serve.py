@@ -40,6 +40,7 @@ from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus_actions import CorpusActions
 from v2v_server.keys.folder import KeyFolder
+from v2v_server.offline.doctor_pictures import check_in_background
 from v2v_server.page.child import PageProcess
 from v2v_server.quarantine.file import quarantine_path, read_quarantine
 from v2v_server.quarantine.snapshots import Quarantine
@@ -181,6 +182,8 @@ def serve(config: ServeConfig, times: StartTimes | None = None) -> None:
             pool.start(sockets.local_address if pool.is_local else sockets.worker_address)
             pool.scale(config.least_workers)
             times.mark("schedule and sockets")
+            if config.spec.scene == "off":
+                check_in_background(catalogue, config.spec.recipe.frames_needed, stop, log.say)
             if page is not None:
                 page.start(sockets.local_address)
                 log.say(f"page: {page.url}")

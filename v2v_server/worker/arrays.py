@@ -102,7 +102,7 @@ class SampleContext:
 
     @property
     def recipe(self) -> Recipe:
-        """The spec's recipe."""
+        """Return the spec's recipe."""
         return self.spec.recipe
 
     @property
