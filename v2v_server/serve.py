@@ -126,10 +126,9 @@ def serve(config: ServeConfig, times: StartTimes) -> None:
     times.mark("imports")
     catalogue = load_catalogue(config)
     times.mark("catalogue")
-    for note in catalogue.notes:
-        log.say(note)
     table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
-    for line in corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused):
+    summary = corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused)
+    for line in (*catalogue.notes, *summary):
         log.say(line)
     catalogue.fail_fast()
     if not table.count:
@@ -150,8 +149,7 @@ def serve(config: ServeConfig, times: StartTimes) -> None:
         share_bytes=int(config.share_gib * GIB),
     )
     # Workers of this host use an address that requires no key.
-    worker_flags = ["--keys", ""] if config.engine == "local" else []
-    worker_flags += ["--log-format", config.log_format]
+    worker_flags = [*(["--keys", ""] if config.engine == "local" else []), "--log-format", config.log_format]
     if config.cache:
         folder = Path(config.cache).absolute()
         make_cache(folder)
@@ -181,8 +179,7 @@ def serve(config: ServeConfig, times: StartTimes) -> None:
             pool.start(sockets.local_address if pool.is_local else sockets.worker_address)
             pool.scale(config.least_workers)
             times.mark("schedule and sockets")
-            if config.spec.scene == "off":
-                check_in_background(catalogue, config.spec.recipe.frames_needed, stop, log.say)
+            check_in_background(catalogue, config.spec, stop, log.say)
             if page is not None:
                 page.start(sockets.local_address)
                 log.say(f"page: {page.url}")

@@ -1,6 +1,6 @@
 """The motion of a clip, read beside its pixels or found from them.
 
-:mod:`v2v_server.motion` is imported where it is used: a server, which finds no motion, must not load numba.
+:mod:`v2v_server.motion` is imported lazily: listing files must not load numba.
 """
 
 from __future__ import annotations
