@@ -16,6 +16,7 @@ from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.chroma import CHROMA
 from v2v_server.store.format import is_store_file
+from v2v_server.store.reader import has_planes
 from v2v_server.video.rows import Rows
 
 Thresholds = tuple[float | None, float | None]
@@ -143,9 +144,6 @@ _ASKED = 16
 
 def has_chroma(source: VideoSource, ids: Sequence[str]) -> bool:
     """Return whether some prepared files of this host, evenly spaced, all have their colour."""
-    # Import lazily: a dispatcher must not load numba.
-    from v2v_server.store.motion import has_planes
-
     if not source.is_local:
         return False
     for id in ids[:: max(1, len(ids) // _ASKED)]:
