@@ -128,7 +128,7 @@ class Cache:
         picture = rows[0], 0, rows[1] - rows[0], index.width_px
         planes = [*([MOTION] if stride == 1 and wants_motion(cuts) else []), *chroma_planes(cuts)]
         lacking = [piece for piece in pieces if not has_planes(piece.path, planes)]
-        # Keep what other streams stored; otherwise two streams would replace each other's pieces for ever.
+        # Keep what other streams stored; otherwise two streams would keep replacing each other's pieces.
         kept = [name for name in (MOTION, CHROMA) if any(has_planes(piece.path, (name,)) for piece in lacking)]
         planes = [*dict.fromkeys([*planes, *kept])]
         made = self._read(pieces, fingerprint, index, start, cuts, stride, picture)
