@@ -14,6 +14,9 @@ The pixel model (section 3 of the paper), per pixel, with F in 0..255:
     residual(t) = dL(t) - threshold_pos N+ + threshold_neg N-
     V(bin)     += N+ - N-
 
+With ``light`` = declared, F has the bits of the video, and the transfer that it states may replace (F / 255) ** gamma
+(``v2v_server/simulation/intensity.py``).
+
 Effects beyond it (mismatch, shot noise, leak, refractory period, low-pass, dead pixels) are off in ``paper``; their
 equations and sources are in ``docs/effects.md``.
 """
@@ -190,12 +193,12 @@ class Recipe:
 
     @property
     def has_effects(self) -> bool:
-        """Whether a draw may switch on an effect beyond the paper's model."""
+        """Return whether a draw may switch on an effect beyond the paper's model."""
         return any(getattr(self, name)[1] > 0.0 for name in effect_settings())
 
     @property
     def timed_effects(self) -> bool:
-        """Whether a draw may switch on an effect that is stated in Hz or seconds."""
+        """Return whether a draw may switch on an effect that is stated in Hz or seconds."""
         return any(
             getattr(self, name)[1] > 0.0 for name, setting in effect_settings().items() if setting.unit in TIME_UNITS
         )

@@ -108,12 +108,12 @@ class Pyramid:
 
     @property
     def cells(self) -> Cells:
-        """All cells of the picture."""
+        """Return all cells of the picture."""
         return Cells(0, 0, -(-self.height // CELL_PX), -(-self.width // CELL_PX))
 
     @cached_property
     def levels(self) -> list[Picture]:
-        """The picture and its rounded means of four, each with PAD_PX more on each side."""
+        """Return the picture and its rounded means of four, each with PAD_PX more on each side."""
         picture = self.part((0, 0, self.height, self.width))
         levels = [padded(picture)]
         while len(levels) < _LEVELS and min(picture.shape) >= 2 * _SMALLEST_SIDE_PX:

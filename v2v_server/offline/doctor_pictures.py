@@ -1,15 +1,19 @@
-"""The picture check of `v2v-doctor`: defects in a sample of a corpus, and what can be done about each kind."""
+"""Defects in a sample of a corpus, and what can be done about each kind: said by `v2v-doctor`, and once by a server."""
 
 from __future__ import annotations
 
 import math
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
+
 from v2v_protocol.errors import V2VError
+from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES
 from v2v_server.corpus.scenes.findings import (
@@ -44,6 +48,10 @@ _LONGEST_SECONDS = 60.0
 """After this time no other video is begun."""
 _LONGEST_VIDEO_SECONDS = 30.0
 _SHOWN = 3
+_SERVED_VIDEOS = 4
+"""Videos that a server looks at."""
+_SERVER_WAITS_SECONDS = 20.0
+"""Time from the start of a server, which its first samples have for themselves."""
 _EFFECTS = {
     DUPLICATES: "duplicated frames",
     CUTS: "hard cuts or jumps",
@@ -96,9 +104,8 @@ def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple
     if not catalogue.source.is_local:
         yield "ok", "pictures", "not looked at: these videos lie on another host", ""
         return
-    results = sorted(_found(catalogue), key=lambda each: each[0].id)
-    found = [each for each in results if each[1]]
-    sequences = [(each, span) for each in found for span in _sequences(each[1], frames_needed)]
+    results = sorted(_found(_excerpts(catalogue, MOST_VIDEOS), usable_cores()), key=lambda each: each[0].id)
+    found, sequences = [each for each in results if each[1]], _sequences_of(results, frames_needed)
     text = f"looked at {len(found)} of {len(catalogue.videos)} videos, at most {SECONDS_OF_EACH} s and "
     text += f"{_MOST_FRAMES} frames of each: {len(sequences)} sequences"
     if failed := len(results) - len(found):
@@ -106,14 +113,16 @@ def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple
     yield "ok", "pictures", text, ""
     for kind, effect in _EFFECTS.items():
         having = [(excerpt, each) for excerpt, _, defects, _ in found for each in defects if each.kind == kind]
-        count = sum(
-            any(each.kind == kind and each.touches(*span) for each in defects) for (_, _, defects, _), span in sequences
-        )
+        count = _affected(sequences, kind)
         if count:
             named = "; ".join(f"{excerpt.id}: {each.text}" for excerpt, each in having[:_SHOWN])
             more = f"; and {len(having) - _SHOWN} more" if len(having) > _SHOWN else ""
             text = f"{count} of {len(sequences)} sequences ({100 * count // len(sequences)}%) have {effect} ({named}"
             yield "note", "pictures", f"{text}{more})", _CHANGES[kind]
+    if varying := [excerpt.id for excerpt, _, _, _ in found if _has_variable_rate(excerpt)]:
+        text = f"{len(varying)} of {len(found)} videos have a variable rate ({', '.join(varying[:_SHOWN])})"
+        change = "recipes that state times use the time stamps; a bin of frames then lasts differently long"
+        yield "note", "pictures", text, change
     if stated := [(excerpt.id, signal) for excerpt, _, _, signal in found if signal != SDR]:
         named = "; ".join(f"{id}: {signal}" for id, signal in stated[:_SHOWN])
         more = f"; and {len(stated) - _SHOWN} more" if len(stated) > _SHOWN else ""
@@ -121,32 +130,78 @@ def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple
         yield "note", "pictures", text, "v2v-serve --set light=declared uses them; otherwise they are read as 8-bit SDR"
 
 
-def _found(catalogue: Catalogue) -> Iterator[_Found]:
+def check_in_background(
+    catalogue: Catalogue, spec: StreamSpec, stop: threading.Event, say: Callable[[str], object], processes: int = 1
+) -> threading.Thread | None:
+    """Look for defects in a few videos of a local corpus while a server serves it, and say once what is found.
+
+    Args:
+        spec: of the server; nothing is looked at with scene "auto".
+        stop: set when the server ends.
+        say: called in the thread with a line of text; not called if nothing is found.
+        processes: of :func:`v2v_server.system.isolate.run_isolated`.
+
+    Returns:
+        the thread; None where nothing is looked at, as for a corpus on another host.
+    """
+    if spec.scene != "off" or not catalogue.source.is_local:
+        return None
+    excerpts = list(_excerpts(catalogue, _SERVED_VIDEOS))  # here: the index is open in this thread only
+
+    def check() -> None:
+        if stop.wait(_SERVER_WAITS_SECONDS):
+            return
+        results = list[_Found]()
+        try:
+            for each in _found(excerpts, processes):
+                if stop.is_set():
+                    return
+                results.append(each)
+        except (OSError, V2VError) as error:
+            say(f"pictures: not looked at: {error}")
+            return
+        sequences = _sequences_of(results, spec.recipe.frames_needed)
+        shares = [
+            f"{100 * count // len(sequences)}% have {effect}"
+            for kind, effect in _EFFECTS.items()
+            if (count := _affected(sequences, kind))
+        ]
+        if shares:
+            say(
+                f"pictures: of {len(sequences)} sequences of {len(results)} videos, {', '.join(shares)}: "
+                "--scene auto leaves these out; v2v-doctor --videos names the videos"
+            )
+
+    thread = threading.Thread(target=check, name="picture check", daemon=True)
+    thread.start()
+    return thread
+
+
+def _excerpts(catalogue: Catalogue, most: int) -> Iterator[_Excerpt]:
+    """Yield the middle of some videos, spread over the catalogue, for a limited time."""
+    begun, videos = time.monotonic(), catalogue.videos
+    many = min(most, len(videos))
+    for video in (videos[at * len(videos) // many] for at in range(many)):
+        if time.monotonic() - begun > _LONGEST_SECONDS:
+            return
+        try:
+            index = catalogue.frame_index(video.id)
+            top, bottom = catalogue.rows.bounds(index.height_px)
+        except V2VError:
+            continue  # reported with the other checks of this corpus
+        rate = video.frames_per_second
+        rate = rate if rate and math.isfinite(rate) else _ASSUMED_RATE
+        count = max(1, min(len(index), _MOST_FRAMES, round(SECONDS_OF_EACH * rate)))
+        start = (len(index) - count) // 2 if index.seekable else 0
+        window = top, 0, bottom - top, index.width_px
+        yield _Excerpt(video.id, catalogue.path(video.id), index, start, count, window)
+
+
+def _found(excerpts: Iterable[_Excerpt], processes: int) -> Iterator[_Found]:
     """Yield what was found in each video; no frames where it does not decode in time."""
-    begun = time.monotonic()
-
-    def excerpts() -> Iterator[_Excerpt]:
-        videos = catalogue.videos
-        many = min(MOST_VIDEOS, len(videos))
-        for video in (videos[at * len(videos) // many] for at in range(many)):
-            if time.monotonic() - begun > _LONGEST_SECONDS:
-                return
-            try:
-                index = catalogue.frame_index(video.id)
-                top, bottom = catalogue.rows.bounds(index.height_px)
-            except V2VError:
-                continue  # reported with the other checks of this corpus
-            rate = video.frames_per_second
-            rate = rate if rate and math.isfinite(rate) else _ASSUMED_RATE
-            count = max(1, min(len(index), _MOST_FRAMES, round(SECONDS_OF_EACH * rate)))
-            start = (len(index) - count) // 2 if index.seekable else 0
-            window = top, 0, bottom - top, index.width_px
-            yield _Excerpt(video.id, catalogue.path(video.id), index, start, count, window)
-
     results = run_isolated(
-        _look_at, excerpts(), usable_cores(), lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES,
-        compile_cache(),
-    )  # fmt: skip
+        _look_at, excerpts, processes, lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES, compile_cache()
+    )
     for excerpt, result in results:
         yield (excerpt, 0, (), SDR) if isinstance(result, Died) else (excerpt, *result)
 
@@ -168,7 +223,26 @@ def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal]:
     return scene.end, defects_of(scene), signal
 
 
-def _sequences(frames: int, needed: int) -> list[tuple[int, int]]:
-    """Return the sequences of an excerpt; an excerpt shorter than a sequence counts as one."""
-    needed = min(frames, needed)
-    return [(first, first + needed) for first in range(0, frames - needed + 1, needed)]
+def _has_variable_rate(excerpt: _Excerpt) -> bool:
+    """Return whether a twentieth of the steps lasts a tenth longer or shorter than the median."""
+    steps = np.diff(excerpt.index.seconds(excerpt.start, excerpt.count))
+    if not len(steps) or np.isnan(steps).any():
+        return False
+    return bool(20 * np.count_nonzero(np.abs(steps / np.median(steps) - 1) > 0.1) > len(steps))
+
+
+def _sequences_of(results: Iterable[_Found], needed: int) -> list[tuple[_Found, tuple[int, int]]]:
+    """Return the sequences of the excerpts that decode; an excerpt shorter than a sequence counts as one."""
+    return [
+        (each, (first, first + min(each[1], needed)))
+        for each in results
+        if each[1]
+        for first in range(0, each[1] - min(each[1], needed) + 1, min(each[1], needed))
+    ]
+
+
+def _affected(sequences: list[tuple[_Found, tuple[int, int]]], kind: str) -> int:
+    """Return the number of sequences with a defect of a kind."""
+    return sum(
+        any(each.kind == kind and each.touches(*span) for each in defects) for (_, _, defects, _), span in sequences
+    )

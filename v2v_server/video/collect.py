@@ -84,7 +84,7 @@ class FrameRange:
 
 
 def window_of(cut: Cut) -> Window:
-    """Of a cut that was checked."""
+    """Return the window of a cut that was checked."""
     assert cut.window is not None
     return cut.window
 
@@ -133,7 +133,7 @@ class Stack:
         return self.taken == len(self._expected)
 
     def _after_a_gap(self, frame: VideoFrame) -> bool:
-        """Whether the decoder skipped a frame that the index lists before this one."""
+        """Return whether the decoder skipped a frame that the index lists before this one."""
         pts, at = self._pts, self._cursor
         if not self.index.seekable or frame.pts is None or frame.pts < pts[0]:
             return False
@@ -158,7 +158,7 @@ class Stack:
         return False
 
     def _is_passed_over(self, pts: int) -> bool:
-        """Whether a frame before the next one to take is one that the stride skips."""
+        """Return whether a frame before the next one to take is one that the stride skips."""
         return self._stride > 1 and pts in self._pts
 
     def _copy(self, frame: VideoFrame) -> None:

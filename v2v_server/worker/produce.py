@@ -39,7 +39,7 @@ from v2v_server.corpus.scenes.scene import Scene, Sides
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.motion import MARGIN_PX, cells_of, levels_of
-from v2v_server.simulation.draw import FrameTimes, draw
+from v2v_server.simulation.draw import FrameTimes, choose_crop, draw
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.kernels import ARRAYS, list_events
 from v2v_server.simulation.variants import Variant, variants
@@ -56,7 +56,7 @@ from v2v_server.video.luma import MIXED, MOST_BITS, SDR
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, simulate
 from v2v_server.worker.cleaning import CleanFrames
-from v2v_server.worker.scene_choice import FlowPlan, plan_flow
+from v2v_server.worker.scene_choice import FlowPlan, crop_weight, plan_flow
 from v2v_server.worker.sidecars import errors_of_sidecar, sidecar_files
 
 
@@ -116,6 +116,18 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
         video_thresholds=_pair(lease.thresholds),
         times=_frame_times(lease, spec, frames) if recipe.is_timed else None,
     )
+    if scene is not None and spec.moving_share:
+        params = choose_crop(
+            params,
+            recipe,
+            seed=lease.seed,
+            epoch=lease.epoch,
+            index=index,
+            share=spec.moving_share,
+            picture_height_px=picture.height_px,
+            picture_width_px=picture.width_px,
+            weigh=crop_weight(scene, frames, params.scale, recipe, picture),
+        )
     source = params.source_index(int(params.ends(recipe)[-1]))
     flow: FlowSettings | None = None
     margin_px: int | None = MARGIN_PX if spec.substep_px else 0
@@ -153,9 +165,9 @@ def _chroma_cut(
     delivered = np.unique(source[params.ends(spec.recipe)[spec.recipe.first_frame :]])
     if not frames.stride:
         delivered = frames.numbers[delivered] - frames.numbers[0]
-    top, _ = Rows.parse(lease.rows).bounds(lease.height_px)
+    top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
     window = source_window(params, spec.recipe, usable_window(lease, frames.sides))
-    return ChromaCut(tuple(delivered.tolist()), window, top)
+    return ChromaCut(tuple(delivered.tolist()), window, (top, bottom - top))
 
 
 def decode_for(
@@ -265,6 +277,7 @@ def make_sample(
             boxes_dropped=context.boxes_dropped,
             saturated={name: count for name, count in saturated.items() if count},
             grid_seconds=_grid_seconds(context),
+            left_out=context.left_out,
         ),
     )
 
@@ -370,7 +383,10 @@ def _variants(
     spec = _spec(canonical)
     step_seconds = spec.recipe.frame_stride / frames_per_second
     levels_per_step = MOST_SUBSTEPS - 1 if spec.substep_px else 0
-    return variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds), arrays, levels_per_step)
+    found = variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds), arrays, levels_per_step)
+    if not spec.tolerance:
+        return found
+    return found | {variant._replace(is_general=False, is_divided=False) for variant in found}
 
 
 @lru_cache(maxsize=16)

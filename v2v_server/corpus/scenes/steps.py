@@ -31,8 +31,9 @@ _REACH = 4
 _CUT_REACH = 8
 _NOISE = 64
 """Change of a block that may be coder noise: a grey level, in 1/64."""
-_LEAST_CHANGE = (2 * 64) ** 2 // 100
-"""Of a block in the mean, (1/64 grey level)^2: one block in a hundred changes by two levels."""
+_LEAST_CHANGE = (5 * 64) ** 2 // 150
+"""Of a block in the mean, (1/64 grey level)^2: one block in 150 changes by five levels. Smaller steps, of few blocks
+above the noise, come and go by rounding."""
 _LEAST_PER_MILLE = 30
 _LEAST_COUNT = 4
 _LONGEST_PERIOD = 12
