@@ -126,10 +126,11 @@ def read_motion(
     for cut in cuts:
         assert cut.cells is not None
         cells = Cells(*cut.cells)
-        of_cut = np.empty((cut.count, 2, *cells[2:]), np.int16)
+        parts = []
         for stored, held in files:
             if frames := range(held.start, min(held.stop, cut.count)):
-                of_cut[frames.start : frames.stop] = stored.plane(MOTION, start + frames.start, len(frames), cells)
+                parts.append(stored.plane(MOTION, start + frames.start, len(frames), cells))
+        of_cut = parts[0] if len(parts) == 1 else np.concatenate(parts)
         of_cut[0] = 0
         for (before, _), (after, frames) in pairwise(files):
             if frames.start < cut.count:  # the first frame of a file has no motion in it
