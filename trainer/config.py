@@ -69,7 +69,7 @@ class StreamConfig:
 
     @property
     def resolved_recipe(self) -> Recipe:
-        """The recipe with all its fields.
+        """Return the recipe with all its fields.
 
         Raises:
             RecipeError: an unknown preset or field, or a value outside its limits.

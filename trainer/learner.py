@@ -52,7 +52,7 @@ class Learner:
 
     @property
     def trained(self) -> VoxelNetwork:
-        """The network to evaluate: the averaged one if there is one."""
+        """Return the network to evaluate: the averaged one if there is one."""
         return self.network if self.average is None else self.average.network
 
     def step(self, work: Work, step: int, epoch: int) -> dict[str, Tensor]:

@@ -173,7 +173,7 @@ class Camera:
         return float(rates.sum(axis=0).reshape(len(self.voxels), -1)[list(grids)].sum())
 
     def _is_still(self, grids: Sequence[int]) -> bool:
-        """Whether no frame differs from the one of the voxel grid before it."""
+        """Return whether no frame differs from the one of the voxel grid before it."""
         for grid in grids:
             before, now = self.frames[max(0, grid - 1)].astype(np.int16), self.frames[grid]
             if np.quantile(np.abs(now - before), _STILL_QUANTILE) > _STILL_LEVELS:

@@ -190,12 +190,12 @@ class Recipe:
 
     @property
     def has_effects(self) -> bool:
-        """Whether a draw may switch on an effect beyond the paper's model."""
+        """Return whether a draw may switch on an effect beyond the paper's model."""
         return any(getattr(self, name)[1] > 0.0 for name in effect_settings())
 
     @property
     def timed_effects(self) -> bool:
-        """Whether a draw may switch on an effect that is stated in Hz or seconds."""
+        """Return whether a draw may switch on an effect that is stated in Hz or seconds."""
         return any(
             getattr(self, name)[1] > 0.0 for name, setting in effect_settings().items() if setting.unit in TIME_UNITS
         )

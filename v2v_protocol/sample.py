@@ -50,7 +50,7 @@ class FromSidecar:
 
     @property
     def endings(self) -> tuple[str, ...]:
-        """All endings that the array can be made from."""
+        """Return all endings that the array can be made from."""
         return self.ending, *self.or_else
 
 
@@ -219,6 +219,7 @@ class Provenance:
         unlabelled: reason by array, for each requested array that could not be made from the video's sidecars.
         boxes_dropped: boxes that ``max_boxes`` left out, in all frames of the sample.
         grid_seconds: actual duration of each voxel grid, where the recipe states ``voxel_seconds``.
+        left_out: effects of the draw that were not simulated (``tolerance`` of the spec).
     """
 
     id: SampleId
@@ -238,10 +239,11 @@ class Provenance:
     unlabelled: Mapping[str, str] = dataclasses.field(default_factory=dict)
     boxes_dropped: int = 0
     grid_seconds: tuple[float, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     @property
     def labelled(self) -> bool:
-        """Whether all requested labels could be made."""
+        """Return whether all requested labels could be made."""
         return not self.unlabelled
 
     def __repr__(self) -> str:
@@ -261,7 +263,7 @@ class Provenance:
             "refusals": tuple(refusal.to_dict() for refusal in self.refusals),
             "params": self.params.to_dict(),
         }
-        optional = ("scene", "saturated", "sidecars", "unlabelled", "boxes_dropped", "grid_seconds")
+        optional = ("scene", "saturated", "sidecars", "unlabelled", "boxes_dropped", "grid_seconds", "left_out")
         return {name: value for name, value in values.items() if value or name not in optional}
 
     @classmethod
@@ -278,6 +280,7 @@ class Provenance:
             params["noise_key"] = tuple(int(word) for word in params["noise_key"])
             params["grid_steps"] = tuple(map(int, params.get("grid_steps", ())))
             rest["grid_seconds"] = tuple(map(float, rest.get("grid_seconds", ())))
+            rest["left_out"] = tuple(map(str, rest.get("left_out", ())))
             known = effect_settings()
             params["effects"] = {
                 name: known[name].single.check(name, value) for name, value in params.get("effects", {}).items()
@@ -308,6 +311,11 @@ def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> L
     """
     if not arrays or len(set(arrays)) != len(arrays):
         raise UsageError(f"arrays = {list(arrays)}: ask for one or more of {', '.join(ARRAYS)}, each once")
+    if recipe.is_timed and "frames_all" in arrays:
+        raise UsageError(
+            "arrays: frames_all has one shape for all samples, but with voxel_seconds each has another number of "
+            "frames: ask for frames, or set voxel_seconds to 0"
+        )
     for name in arrays:
         if name not in ARRAYS:
             raise UsageError(f"arrays: unknown array {name!r}; known: {', '.join(ARRAYS)}")

@@ -43,7 +43,7 @@ DEFECTS = ("bars", "black", "combed", "cuts", "duplicates", "fades", "white")
 MOST_SAMPLES_PER_DECODE = 32
 MOST_SUBSTEPS = 16
 """Largest number of sub-steps of a step between video frames."""
-LATER_FIELDS = ("substep_px", "keep_defects", "still_share", "moving_share")
+LATER_FIELDS = ("substep_px", "keep_defects", "still_share", "moving_share", "tolerance")
 """Fields that the plain form leaves out at their defaults, so that older digests hold."""
 
 
@@ -121,6 +121,12 @@ class StreamSpec:
         unit="px",
         group="Motion",
     )  # fmt: skip
+    tolerance: float = number(
+        0.0, 0.0, 0.5,
+        "share of a clip's events that effects may change which are left out of it because they change little; 0: all "
+        "effects of the recipe are simulated",
+        group="Effects",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check_settings(self, "spec {}".format)
@@ -151,7 +157,7 @@ class StreamSpec:
 
     @property
     def kept_defects(self) -> frozenset[str]:
-        """The defects that are served as they are: all with scene "off"."""
+        """Return the defects that are served as they are: all with scene "off"."""
         return frozenset(DEFECTS if self.scene == "off" else filter(None, self.keep_defects.split(",")))
 
     def spaced(self, stride: int) -> StreamSpec:
@@ -229,6 +235,7 @@ class SpecOptions(TypedDict, total=False):
     still_share: float | None
     moving_share: float | None
     substep_px: float | None
+    tolerance: float | None
 
 
 SPEC_KEYS = ("preset", "recipe", *settings_of(StreamSpec))

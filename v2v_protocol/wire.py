@@ -254,7 +254,8 @@ def decode_sample(
     """
     if len(header.names) != len(payload):
         raise ProtocolError(
-            f"sample: {len(header.names)} names, {len(header.dtypes)} dtypes, {len(payload)} raw frames"
+            f"sample: {len(header.names)} names, {len(header.dtypes)} dtypes and {len(payload)} raw frames: "
+            "the numbers must be equal"
         )
     if header.packed and unpack is None:
         raise ProtocolError("sample: its arrays are compressed, but compression was not requested")

@@ -66,6 +66,7 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
     "flow_from": 20,
     "flow_margin_px": -1,
     "substep_px": 1.0,
+    "tolerance": 0.01,
     "scene": "auto",
     "keep_defects": "bars,cuts",
     "still_share": 0.5,

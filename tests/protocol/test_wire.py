@@ -339,7 +339,7 @@ def test_only_listed_dtypes_and_contiguous_arrays_are_sent() -> None:
         ([], ["int8"], [1, 3], [b"abc"]),
         ("a", ["int8"], [1, 3], [b"abc", b"abc"]),
         ("aa", ["int8"] * 2, [1, 1, 1, 1], [b"a", b"a"]),
-        ("abcdefghi", ["int8"] * 9, [1, 1] * 9, [b"a"] * 9),
+        ("abcdefghijklmnopq", ["int8"] * 17, [1, 1] * 17, [b"a"] * 17),
         ("a", ["int8"], [1, 3], [b"ab"]),
         ("a", ["int8"], [1, 3], [b"abcd"]),
         ("a", ["int16"], [1, 3], [b"abc"]),

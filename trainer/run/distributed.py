@@ -37,7 +37,7 @@ class Ranks:
 
     @property
     def first(self) -> bool:
-        """Whether this rank writes files and prints."""
+        """Return whether this rank writes files and prints."""
         return self.rank == 0
 
     def any(self, wish: bool) -> bool:

@@ -66,7 +66,7 @@ class StopRequest:
 
     @property
     def wanted(self) -> bool:
-        """Whether this rank wants to end."""
+        """Return whether this rank wants to end."""
         if self.signal or self.failure is not None:
             return True
         return self._deadline is not None and time.monotonic() >= self._deadline

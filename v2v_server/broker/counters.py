@@ -116,7 +116,7 @@ class Counters(WorkDone):
 
     @property
     def faults(self) -> int:
-        """Number of faults that the service survived."""
+        """Return the number of faults that the service survived."""
         return sum(getattr(self, name) for name, meaning in meanings(Counters).items() if meaning.is_fault)
 
 

@@ -122,12 +122,12 @@ class Dispatcher:
 
     @property
     def workers(self) -> int:
-        """Number of workers that said hello and are alive as far as is known."""
+        """Return the number of workers that said hello and are alive as far as is known."""
         return len(self.registry)
 
     @property
     def waiting(self) -> int:
-        """Number of requested samples that are not leased to a worker yet."""
+        """Return the number of requested samples that are not leased to a worker yet."""
         return len(self._grants.lone) + sum(len(session.waiting) for session in self.sessions)
 
     @property
@@ -138,7 +138,7 @@ class Dispatcher:
 
     @property
     def consumers(self) -> int:
-        """Number of consumers that are connected, as far as is known."""
+        """Return the number of consumers that are connected, as far as is known."""
         return sum(session.left_at is None for session in self.sessions)
 
     def identity_of(self, request: Request) -> SampleId | None:

@@ -189,7 +189,7 @@ class Grants:
         """Send a finished sample to its consumer, and to those that wait for an equal one.
 
         Args:
-            session, request: that it was made for.
+            session, request: the consumer and the request that it was made for.
             lease: number of the lease.
             header: of the sample.
             payload: the frames of its message, with the header's.

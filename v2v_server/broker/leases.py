@@ -131,7 +131,7 @@ class LeaseBook:
 
     @property
     def holders(self) -> int:
-        """Number of workers that hold any lease."""
+        """Return the number of workers that hold any lease."""
         return len(self._held)
 
     def take_changed(self) -> set[bytes]:

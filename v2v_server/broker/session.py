@@ -148,7 +148,7 @@ class Session:
 
     @property
     def display(self) -> tuple[object, ...]:
-        """What identifies a consumer in the status: a trainer has a new secret in each epoch."""
+        """Return what identifies the consumer in the status. Its secret does not: it changes with each epoch."""
         return self.user, self.name, self.host, self.spec.digest, self.seed
 
 

@@ -8,7 +8,8 @@ import math
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,11 @@ def _parser() -> Parser:
     videos.add_argument("--clips", type=int, default=4, metavar="N", help="different clips to take (default 4)")
     videos.add_argument("--places", type=int, default=8, metavar="N", help="sequences to sample (default 8)")
     videos.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field")
+    videos.add_argument(
+        "--vary", action="append", default=[], metavar="KEY=VALUE,VALUE",
+        help="also time samples with other values of one recipe field or of tolerance, for example "
+        "voxel_seconds=0.02,0.1",
+    )  # fmt: skip
     work = parser.group("Work")
     work.add_argument(
         "--forms", default=",".join(DEFAULT_FORMS), metavar="FORM,FORM",
@@ -102,6 +108,7 @@ def _run(asked: argparse.Namespace) -> int:
     budget = 60.0 * asked.budget_minutes
     rows = Rows.parse(asked.rows)
     spec = StreamSpec.from_dict({"recipe": recipe_setting("paper", asked.set)})
+    varied = dict(each for text in asked.vary for each in _varied(spec, text))
     cv2.setNumThreads(1)
     keep_freed_memory()
     warm_up()
@@ -109,7 +116,7 @@ def _run(asked: argparse.Namespace) -> int:
         asked.videos, rows, spec, asked.forms, most_clips=asked.clips, folder=Path(folder),
         until=begun + _FORMS_SHARE * budget, tell=_tell,
     ) as corpus:  # fmt: skip
-        records = _measured(corpus, spec, asked.places, begun, budget)
+        records = _measured(corpus, spec, varied, asked.places, begun, budget)
     print(tables(records))
     print(f"{(time.monotonic() - begun) / 60:.1f} minutes; the budget was {asked.budget_minutes:g}")
     if asked.json is not None:
@@ -119,10 +126,30 @@ def _run(asked: argparse.Namespace) -> int:
     return 0 if asked.target_rate is asked.max_error is None else choose(records, asked)
 
 
+def _varied(spec: StreamSpec, text: str) -> Iterator[tuple[str, StreamSpec]]:
+    """Yield the streams of one ``--vary``, by name.
+
+    Raises:
+        UsageError: it is not KEY=VALUE,VALUE, or a value is wrong.
+    """
+    key, equals, values = text.partition("=")
+    if not equals:
+        raise UsageError(f"--vary {text}: write KEY=VALUE,VALUE, for instance --vary voxel_seconds=0.02,0.1")
+    for value in values.split(","):
+        if key == "tolerance":
+            yield f"{key} = {value}", StreamSpec.from_dict({key: value}, spec)
+        else:
+            changed = recipe_setting(None, [f"{key}={value}"], spec.recipe.to_dict())
+            yield f"{key} = {value}", dataclasses.replace(spec, recipe=changed)
+
+
 def _measured(
-    corpus: Mapping[str, CorpusForm], spec: StreamSpec, places: int, begun: float, budget: float
-) -> list[dict[str, Any]]:
-    """Return the records of all settings, of the two rows that give the scale, and of the diversity."""
+    corpus: Mapping[str, CorpusForm], spec: StreamSpec, varied: Mapping[str, StreamSpec], places: int, begun: float,
+    budget: float,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Return the records of all settings, of the varied streams, of the two rows that give the scale, and of the
+    diversity.
+    """
     chosen = settings([name for name in corpus if name != SOURCE])
     sources = {name: (form.clips.folder, leases_of(form.clips, spec, places)) for name, form in corpus.items()}
     _tell(f"comparing {len(sources)} forms of the corpus")
@@ -141,6 +168,12 @@ def _measured(
         works[_substeps_name(name, SUBSTEP_PX)] = making(
             form.clips.folder, leases_of(form.clips, with_substeps, places)
         )
+    count = len(sources[SOURCE][1])
+    for name, stream in varied.items():
+        leases = leases_of(corpus[SOURCE].clips, stream, places)  # longer grids may give fewer places
+        if not leases:
+            raise UsageError(f"--vary {name}: none of the clips is long enough for a sequence")
+        works[name] = making(corpus[SOURCE].clips.folder, list(islice(cycle(leases), count)))
     speeds = measure(works, until=begun + budget)
     records = [
         _record(setting, speeds[setting.name], speeds[EXACT.name], corpus)
@@ -151,7 +184,15 @@ def _measured(
     name_dominated(records)
     scale = [{"measure": "scale", "name": name, **error_fields(tallies[name])} for name in (NOISE_ROW, DRAW_ROW)]
     between = _substeps(corpus, speeds, predicted_loss(*sources[SOURCE]))
-    return records + between + scale + alike
+    others = [
+        {
+            "measure": "varied", "name": name, "samples_per_core_second": 1.0 / speeds[name].fastest,
+            "cpu_seconds_per_sample": speeds[name].fastest,
+            "speed_ratio": speeds[EXACT.name].fastest / speeds[name].fastest,
+        }
+        for name in varied
+    ]  # fmt: skip
+    return records + others + between + scale + alike
 
 
 def _substeps_name(form: str, substep_px: float) -> str:

@@ -92,7 +92,7 @@ class Catalogue:
 
     @property
     def folder(self) -> Path:
-        """The folder that ids are relative to, see :attr:`VideoSource.folder`."""
+        """Return the folder that ids are relative to, see :attr:`VideoSource.folder`."""
         return self.source.folder
 
     def path(self, id: str) -> Path:

@@ -64,7 +64,7 @@ class Header:
         return Encoding(self.codec, self.size, self.quality, self.gop)
 
     def same_settings(self, other: Header) -> bool:
-        """Whether videos of both may lie in one folder."""
+        """Return whether one folder may hold videos of both."""
         return (self.rows, self.encoding) == (other.rows, other.encoding)
 
     def settings(self) -> str:
@@ -170,7 +170,7 @@ class Manifest:
         return tuple(id for id in wanted if id not in refused)
 
     def describes(self, record: IndexRow) -> bool:
-        """Whether the file that was probed is the one that was prepared.
+        """Return whether the probed file is the prepared one.
 
         A lossless one may be damaged since: it says itself what it was made of, and each of its blocks is checked when
         it is read. The source itself will do in its place.
@@ -243,7 +243,7 @@ def _header(line: bytes) -> Header:
 
 
 def _video(line: bytes) -> tuple[PreparedVideo, bool]:
-    """Return the record, and whether it is set aside."""
+    """Read the line of a video: return its record, and whether the video is set aside."""
     data = _object(line)
     aside = data.pop("aside", False) is True
     video = _record(PreparedVideo, data)

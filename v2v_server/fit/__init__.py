@@ -3,7 +3,8 @@
 recording   what is read of a recording: events and frames of some pixels
 increments  changes of brightness beside events, still stretches, intervals
 interval    estimates with intervals by a bootstrap over blocks
-estimators  each parameter from these measurements
+regression  thresholds, low-pass and dark floor from the changes
+estimators  noise, mismatch, refractory period and defects
 simulated   the recording's frames through the product's kernel
 statistics  statistics of recording and simulation, and their distance
 fit         the whole fit, fit(); which effects stay

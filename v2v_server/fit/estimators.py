@@ -1,244 +1,27 @@
-"""Estimate the parameters of a camera from what :mod:`v2v_server.fit.increments` measures.
+"""Estimate noise, mismatch and defects of a camera from what :mod:`v2v_server.fit.increments` measures.
 
-thresholds, corner, log_eps   least squares over increments: the pixel's level P obeys tau dP/dt = L - P, so
-                              change of L = c+ on - c- off + tau (change of dP/dt), tau = 1 / (2 pi f (i + 0.1) / 1.1)
-mismatch                      products of residuals of different increments of one pixel
-shot noise, leak              events of pixels that see no change
-refractory period             end of the distribution of the shortest intervals, by profile likelihood
-hot and dead pixels           pixels of a far higher rate than others; silent pixels among active ones
+mismatch               products of residuals of different increments of one pixel
+shot noise, leak       events of pixels that see no change
+refractory period      end of the distribution of the shortest intervals, by profile likelihood
+hot and dead pixels    pixels of a far higher rate than others; silent pixels among active ones
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.fit.increments import Increments, Still, increments_of
+from v2v_server.fit.increments import Increments, Still
 from v2v_server.fit.interval import Doubles, Estimate, bootstrap, sums_by_block, unknown
 from v2v_server.fit.recording import Recorded
+from v2v_server.fit.regression import LEAST_INCREMENTS, SYSTEMATIC, Regression
 
-GAMMA = 2.2
-SYSTEMATIC = {
-    "threshold_pos": 0.04,
-    "threshold_neg": 0.04,
-    "photoreceptor_hz": 0.08,
-    "log_eps": 0.3,
-    "threshold_mismatch_sigma": 0.2,
-    "shot_noise_hz": 0.02,
-    "leak_hz": 0.05,
-    "refractory_seconds": 0.1,
-}
-"""Errors, as shares, that a bootstrap does not see: seen on simulated cameras (``python -m bench fit``)."""
-_SOLVED = ("threshold_pos", "threshold_neg", "photoreceptor_hz")
-_CLOCK_SECONDS = 2e-5
-_GLITCHES = 3e-5
-_MANY_SHORT = 100
-DARKEST = 0.1
-"""Light that the corner frequency keeps in the dark (``effects/photoreceptor.py``)."""
-LEAST_INCREMENTS = 1000
 LEAST_SECONDS = 200.0
 """Pixel-seconds without a change that rates of noise need."""
-_LEAST_EVENTS = 2.0
-_MOST_FOR_LOG_EPS = 40_000
-
-
-def light_of(grey: Doubles) -> Doubles:
-    """Return light, 0 (black) to 1 (white), of grey levels."""
-    return np.asarray((grey / 255.0) ** GAMMA)
-
-
-def is_large(increments: Increments) -> npt.NDArray[np.bool_]:
-    """Return which increments have enough events that single noise events change little: [M]."""
-    return np.asarray(np.abs(increments.on) + np.abs(increments.off) >= _LEAST_EVENTS)
-
-
-class Regression:
-    """Fit thresholds, corner frequency and log_eps to increments.
-
-    Attributes:
-        positive, negative, corner, log_eps: estimates; ``corner`` is 1 / Hz.
-        residual: [M] residuals, log units.
-        kept: [M] mask of the increments used.
-    """
-
-    def __init__(self, increments: Increments, blocks: npt.NDArray[np.int64], log_eps: float | None = None) -> None:
-        """Fit.
-
-        Args:
-            blocks: [P] block of each pixel.
-            log_eps: epsilon inside the logarithm; None fits it.
-        """
-        self.kept = is_large(increments)
-        self.residual = np.zeros(len(self.kept))
-        if self.kept.sum() < LEAST_INCREMENTS:
-            note = f"{self.kept.sum()} changes of {_LEAST_EVENTS:.0f} events between frames; needs {LEAST_INCREMENTS}"
-            self.positive = self.negative = self.corner = self.log_eps = unknown(note)
-            return
-        given = increments.take(self.kept)
-        block = np.unique(blocks[given.pixel] * 4 + given.block, return_inverse=True)[1]
-        note = f"{self.kept.sum()} changes between frames"
-        if log_eps is None:
-            self.log_eps = _fit_log_eps(given, blocks)
-        else:
-            self.log_eps = Estimate(log_eps, log_eps, log_eps)
-        fit = _least_squares(given, self.log_eps.value)
-        self.residual[self.kept] = fit.residual
-        with_change = np.concatenate([fit.columns, fit.change[:, None]], axis=1)
-        rows = fit.weight[:, None, None] * fit.columns[:, :, None] * with_change[:, None, :]
-        sums = sums_by_block(block, rows.reshape(len(rows), -1), block.max() + 1).reshape(-1, 4, 5)
-        value, low, high = bootstrap(sums, lambda s: _solve(s[:, :4], s[:, 4]))
-        others = [_least_squares(given, max(end, 1e-5)).solved for end in (self.log_eps.low, self.log_eps.high)]
-        doubt = np.abs(others[1] - others[0]) / 2
-        doubt = np.hypot(doubt[:3], np.abs(value[:3]) * [SYSTEMATIC[name] for name in _SOLVED])
-        low, high = value[:3] - np.hypot(value[:3] - low[:3], doubt), value[:3] + np.hypot(high[:3] - value[:3], doubt)
-        self.positive, self.negative = (Estimate(value[k], low[k], high[k], 0.0, note) for k in range(2))
-        ends = [max(float(end), 0.0) for end in (value[2], low[2], high[2])]
-        self.corner = Estimate(ends[0], ends[1], ends[2], 1.0 / 500.0, note)
-
-
-class _Fit(NamedTuple):
-    """One solution: [M, 4] columns, [M] change, variance, weight and residual, [4] solved."""
-
-    columns: Doubles
-    change: Doubles
-    variance: Doubles
-    weight: Doubles
-    residual: Doubles
-    solved: Doubles
-
-
-def _rows(given: Increments, log_eps: float, solved: Doubles) -> tuple[Doubles, Doubles, Doubles]:
-    """Return columns [M, 4], change [M] and variance [M] of increments, for thresholds known from a turn before."""
-    light = light_of(given.grey)
-    change = np.log(log_eps + light[1]) - np.log(log_eps + light[0])
-    sensitivity = GAMMA * light / (light + log_eps) / given.grey
-    positive, negative = np.maximum(solved[:2], 1e-4)
-    lag = given.speed * (1.0 + DARKEST) / (2.0 * math.pi * (light + DARKEST))
-    lag = lag * np.where(given.speed > 0, positive, negative)
-    counted = np.abs(given.on) + np.abs(given.off)
-    columns = np.stack([given.on, -given.off, lag[1] - lag[0], given.seconds], axis=1)
-    variance = (sensitivity**2).sum(axis=0) / 12.0 + max(positive, negative) ** 2 * (0.02 + 0.02 * counted)
-    return columns, change, variance
-
-
-def _least_squares(given: Increments, log_eps: float, turns: int = 7, *, has_corner: bool = True) -> _Fit:
-    """Solve for c+, c-, 1 / corner and a drift, with Huber's weights."""
-    solved, robust = np.array([0.2, 0.2, 0.0, 0.0]), np.ones(len(given.on))
-    for _ in range(turns):
-        columns, change, variance = _rows(given, log_eps, solved)
-        if not has_corner:
-            columns[:, 2] = 0.0
-        weight = robust / variance
-        scaled = columns * weight[:, None]
-        solved = _solve(scaled.T @ columns, scaled.T @ change)
-        residual = change - columns @ solved
-        deviation = np.abs(residual) / np.sqrt(variance)
-        robust = np.minimum(1.0, 2.5 * 1.4826 * float(np.median(deviation)) / np.maximum(deviation, 1e-9))
-    return _Fit(columns, change, variance, weight, residual, solved)
-
-
-def _log_likelihood(given: Increments, log_eps: float, residual: Doubles, variance: Doubles, scale: float) -> Doubles:
-    """Return the log likelihood of each increment's grey levels, [M]; their errors have long tails.
-
-    A larger epsilon makes all changes smaller, residuals included. So the likelihood is that of grey levels, not of log
-    intensity: it has the derivative dL / dF as a factor.
-    """
-    light = light_of(given.grey)
-    derivative = np.log(light / (light + log_eps)).mean(axis=0)
-    tails = np.log1p(residual**2 / variance / scale**2 / 4)
-    return np.asarray(derivative - 0.5 * np.log(variance) - math.log(scale) - 2.5 * tails)
-
-
-def _likelihood(given: Increments, log_eps: float) -> Doubles:
-    """Return the log likelihood of each increment at the best thresholds, [M]."""
-    fit = _least_squares(given, log_eps, turns=5)
-    return _log_likelihood(given, log_eps, fit.residual, fit.variance, _scale(fit.residual, fit.variance))
-
-
-def _scale(residual: Doubles, variance: Doubles) -> float:
-    return 1.4826 * float(np.median(np.abs(residual) / np.sqrt(variance)))
-
-
-def held_out_likelihood(
-    seen: Increments, other: Increments, log_eps: float, mismatch_sigma: float = 0.0, *, has_corner: bool = True
-) -> Doubles:
-    """Fit some increments, and return the log likelihood of others: [M].
-
-    Args:
-        mismatch_sigma: spread of the thresholds over pixels, as a share.
-        has_corner: whether the pixel has a low-pass.
-    """
-    solved = _least_squares(seen, log_eps, has_corner=has_corner).solved
-    scale, made = 1.0, []
-    for given in (seen, other):
-        columns, change, variance = _rows(given, log_eps, solved)
-        residual = change - columns @ solved
-        variance = variance + mismatch_sigma**2 * ((solved[0] * given.on) ** 2 + (solved[1] * given.off) ** 2)
-        made.append((given, residual, variance))
-        scale = scale if len(made) == 2 else _scale(residual, variance)
-    return _log_likelihood(made[1][0], log_eps, made[1][1], made[1][2], scale)
-
-
-def _solve(normal: Doubles, right: Doubles) -> Doubles:
-    return np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], np.float64)
-
-
-def _sample(given: Increments, count: int) -> Increments:
-    if len(given.on) <= count:
-        return given
-    chosen = np.sort(np.random.default_rng(0).choice(len(given.on), count, replace=False))
-    return given.take(chosen)
-
-
-def _summit(grid: Doubles, total: Doubles) -> float:
-    """Return the place of the maximum of a function on a grid of even steps, between its points by a parabola."""
-    k = int(np.clip(np.argmax(total), 1, len(grid) - 2))
-    left, middle, right = total[k - 1 : k + 2]
-    bend = left - 2 * middle + right
-    shift = np.clip(0.5 * (left - right) / bend, -1, 1) if bend < 0 else np.sign(right - left)
-    return float(grid[k] + shift * (grid[1] - grid[0]))
-
-
-def _fit_log_eps(given: Increments, blocks: npt.NDArray[np.int64]) -> Estimate:
-    given = _sample(given, _MOST_FOR_LOG_EPS)
-    block = blocks[given.pixel] * 4 + given.block
-    coarse = np.log(np.geomspace(1e-4, 0.3, 14))
-    best = coarse[int(np.argmax([_likelihood(given, math.exp(x)).sum() for x in coarse]))]
-    grid = best + np.linspace(-1.25, 1.25, 11) * (coarse[1] - coarse[0])
-    values = np.stack([_likelihood(given, math.exp(x)) for x in grid], axis=1)
-    sums = sums_by_block(block, values, int(block.max()) + 1)
-    value, low, high = bootstrap(sums, lambda total: np.exp([_summit(grid, total)]))
-    made = Estimate(float(value[0]), float(low[0]), float(high[0]), 1e-3, f"{len(given.on)} changes between frames")
-    return made.moved(made.value, SYSTEMATIC["log_eps"] * made.value)
-
-
-def refractory_by_change(
-    recording: Recorded, blocks: npt.NDArray[np.int64], bound: Estimate, longest_us: float
-) -> Estimate:
-    """Estimate the refractory period, s, by the change that is lost in it: the likelihood of the frames.
-
-    Args:
-        bound: estimate whose upper end is the shortest interval between events.
-    """
-    grid = np.linspace(0.0, bound.high, 11)
-    columns, counts = [], []
-    for period in grid:
-        increments = increments_of(recording, period, longest_us)
-        kept = is_large(increments)
-        if kept.sum() < LEAST_INCREMENTS:
-            return bound
-        given = _sample(increments.take(kept), _MOST_FOR_LOG_EPS // 4)
-        best = max((_likelihood(given, eps) for eps in np.geomspace(1e-4, 0.3, 12)), key=np.sum)
-        size = int(blocks.max()) + 1
-        columns.append(np.bincount(blocks[given.pixel], best, size))
-        counts.append(np.bincount(blocks[given.pixel], minlength=size))
-    sums = np.stack([np.stack(columns, axis=1), np.stack(counts, axis=1)], axis=1)
-    value, low, high = bootstrap(sums, lambda s: np.clip([_summit(grid, s[0] / np.maximum(s[1], 1))], 0.0, bound.high))
-    made = Estimate(float(value[0]), float(low[0]), float(high[0]), 1e-4, f"change lost between events; {bound.note}")
-    return made.moved(made.value, SYSTEMATIC["refractory_seconds"] * made.value + _CLOCK_SECONDS)
+_GLITCHES = 3e-5
+_MANY_SHORT, _EDGE = 100, 0.01
 
 
 def mismatch(fitted: Regression, given: Increments, blocks: npt.NDArray[np.int64]) -> Estimate:
@@ -345,7 +128,7 @@ def refractory(gaps_us: Doubles) -> Estimate:
     best = int(np.argmax(likelihood))
     inside = np.flatnonzero(likelihood >= likelihood[best] - 1.353)
     # Few intervals near the end: the shape of their distribution is only a guess.
-    doubt = SYSTEMATIC["refractory_seconds"] * ends[best] if count < _MANY_SHORT else 0.0
+    doubt = (SYSTEMATIC["refractory_seconds"] if count < _MANY_SHORT else _EDGE) * ends[best]
     low = max(ends[inside[0]] - 1 - doubt, 0.0)
     return Estimate(float(ends[best]) * 1e-6, float(low) * 1e-6, float(smallest[0] + 1) * 1e-6, 1e-4, note)
 

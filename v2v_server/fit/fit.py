@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from v2v_protocol.recipe import effect_settings
 from v2v_recordings.items import ConvertOptions, Progress
-from v2v_server.fit import estimators
+from v2v_server.fit import estimators, regression
 from v2v_server.fit.increments import Still, increments_of, intervals_us, still_time
 from v2v_server.fit.interval import Doubles, Estimate, bootstrap, sums_by_block, unknown
 from v2v_server.fit.recording import Recorded, read_recording
@@ -82,7 +82,7 @@ def fit(
     if static and not has_frames:
         given = _with_constant_frames(given)
     estimates = _estimates(given, static and not has_frames)
-    light = estimators.light_of(np.arange(256.0))
+    light = regression.light_of(np.arange(256.0))
     begin, end = _span(given)
     measured = panels_of(given, light, begin, end)
     left_out = {name: made.note for name, made in estimates.items() if not made.told}
@@ -106,12 +106,12 @@ def fit(
 
 def _estimates(given: Recorded, is_blank: bool) -> dict[str, Estimate]:
     """Estimate all parameters. ``is_blank``: the frames are made up, of one grey level."""
-    blocks, light = given.blocks(_BLOCKS_SIDE), estimators.light_of(np.arange(256.0))
+    blocks, light = given.blocks(_BLOCKS_SIDE), regression.light_of(np.arange(256.0))
     period = estimators.refractory(intervals_us(given))
     has_frames = len(given.frames) >= LEAST_FRAMES
     longest_us = 1e6 * _frame_seconds(given) if has_frames else 0.0
     if has_frames and not period.told and math.isfinite(period.high) and not is_blank:
-        period = estimators.refractory_by_change(given, blocks, period, longest_us)
+        period = regression.refractory_by_change(given, blocks, period, longest_us)
     made = {"refractory_seconds": period}
     if not has_frames:
         note = f"needs at least {LEAST_FRAMES} frames"
@@ -126,11 +126,11 @@ def _estimates(given: Recorded, is_blank: bool) -> dict[str, Estimate]:
     increments = increments_of(given, refractory_seconds, longest_us)
     usual = ~is_hot[increments.pixel]
     increments = increments.take(usual)
-    regression = estimators.Regression(increments, blocks)
-    made["threshold_pos"], made["threshold_neg"] = regression.positive, regression.negative
-    made["log_eps"] = regression.log_eps
-    made["threshold_mismatch_sigma"] = estimators.mismatch(regression, increments, blocks)
-    made["photoreceptor_hz"] = regression.corner if made["threshold_pos"].told else unknown("needs the thresholds")
+    fitted = regression.Regression(increments, blocks)
+    made["threshold_pos"], made["threshold_neg"] = fitted.positive, fitted.negative
+    made["log_eps"] = fitted.log_eps
+    made["threshold_mismatch_sigma"] = estimators.mismatch(fitted, increments, blocks)
+    made["photoreceptor_hz"] = fitted.corner if made["threshold_pos"].told else unknown("needs the thresholds")
     shot, surplus = estimators.noise_rates(still, blocks, is_hot)
     if is_blank and shot.told:
         shot = dataclasses.replace(
@@ -178,7 +178,7 @@ def _matched_leak(
     if wanted[2] > rising[-1]:
         high = math.inf
     made = Estimate(value, low, high, 0.05, f"simulated with leaks up to 4 Hz; {surplus.note}")
-    return made.moved(value, estimators.SYSTEMATIC["leak_hz"] * value) if value > 0.0 else made
+    return made.moved(value, regression.SYSTEMATIC["leak_hz"] * value) if value > 0.0 else made
 
 
 def _without_evidence(
@@ -228,9 +228,9 @@ def _likelihood_gain(one: Recorded, other: Recorded, fitted: Mapping[str, float]
         pair = []
         for part in (one, other):
             made = increments_of(part, period, 1e6 * _frame_seconds(part))
-            large = estimators.is_large(made)
+            large = regression.is_large(made)
             pair.append(made.take(large))
-        values = estimators.held_out_likelihood(
+        values = regression.held_out_likelihood(
             pair[0], pair[1], fitted["log_eps"],
             fitted.get("threshold_mismatch_sigma", 0.0) if is_on or name != "threshold_mismatch_sigma" else 0.0,
             has_corner=fitted.get("photoreceptor_hz", 0.0) > 0.0 and (is_on or name != "photoreceptor_hz"),

@@ -39,7 +39,7 @@ class Estimate:
         """Whether the recording can tell the value: the interval is narrow, or lies below ``negligible``."""
         if not (math.isfinite(self.low) and math.isfinite(self.high)):
             return False
-        return self.high <= self.negligible or self.high - self.low <= 2 * WIDEST * max(self.value, 1e-12)
+        return bool(self.high <= self.negligible or self.high - self.low <= 2 * WIDEST * max(self.value, 1e-12))
 
     @property
     def is_absent(self) -> bool:

@@ -25,7 +25,8 @@ have the same motion as in the whole video, whose motion a store holds.
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
-from functools import cached_property
+from collections.abc import Callable
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numba
@@ -33,6 +34,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.motion.lanes import BLOCK_PX, CELL_PX, block_difference
+from v2v_server.video.orientation import Window
 
 Picture = npt.NDArray[np.uint8]
 Vectors = npt.NDArray[np.int16]
@@ -63,25 +65,57 @@ class Cells(NamedTuple):
 
 
 class Pyramid:
-    """A picture and its padded levels, which are made when they are first needed.
+    """A picture, and its padded levels, of which only what is needed is read or made.
 
     Args:
-        picture: [h, w] uint8, C-contiguous, at least CELL_PX on each side.
+        height, width: of the picture, pixels; at least CELL_PX each.
+        read: returns a part (top, left, rows, columns) of it, [rows, columns] uint8, C-contiguous.
+        raw: returns the values that a part is made from, which are quicker to get; equal ones make equal parts.
     """
 
-    def __init__(self, picture: Picture) -> None:
-        self.picture = picture
+    def __init__(
+        self,
+        height: int,
+        width: int,
+        read: Callable[[Window], Picture],
+        raw: Callable[[Window], npt.NDArray[Any]] | None = None,
+    ) -> None:
+        self.height, self.width, self._read, self._raw = height, width, read, raw
+        self._part: tuple[Window, Picture] | None = None
+
+    @classmethod
+    def of(cls, picture: Picture) -> Pyramid:
+        """Return the pyramid of a [h, w] uint8 picture. It is not copied, so it may not change."""
+
+        def part(window: Window) -> Picture:
+            top, left, rows, columns = window
+            return np.ascontiguousarray(picture[top : top + rows, left : left + columns])
+
+        height, width = picture.shape
+        return cls(height, width, part)
+
+    def is_like(self, other: Pyramid, window: Window) -> bool:
+        """Return whether a part is known to equal that of another picture, without reading it."""
+        if self._raw is None or other._raw is None:
+            return False
+        return np.array_equal(self._raw(window), other._raw(window))
+
+    def part(self, window: Window) -> Picture:
+        """Return a part of the picture; the last one is kept."""
+        if self._part is None or self._part[0] != window:
+            self._part = window, self._read(window)
+        return self._part[1]
 
     @property
     def cells(self) -> Cells:
-        """All cells of the picture."""
-        height, width = self.picture.shape
-        return Cells(0, 0, -(-height // CELL_PX), -(-width // CELL_PX))
+        """Return all cells of the picture."""
+        return Cells(0, 0, -(-self.height // CELL_PX), -(-self.width // CELL_PX))
 
     @cached_property
     def levels(self) -> list[Picture]:
-        """The picture and its rounded means of four, each with PAD_PX more on each side."""
-        picture, levels = self.picture, [padded(self.picture)]
+        """Return the picture and its rounded means of four, each with PAD_PX more on each side."""
+        picture = self.part((0, 0, self.height, self.width))
+        levels = [padded(picture)]
         while len(levels) < _LEVELS and min(picture.shape) >= 2 * _SMALLEST_SIDE_PX:
             picture = _halved(picture)
             levels.append(padded(picture))
@@ -100,9 +134,15 @@ def motion(first: Pyramid, second: Pyramid, cells: Cells | None = None) -> Vecto
         [2, rows, columns] of these cells.
     """
     cells = first.cells if cells is None else cells
+    found = motion_if_any(first, second, cells)
+    return np.zeros((2, cells.rows, cells.columns), np.int16) if found is None else found
+
+
+def motion_if_any(first: Pyramid, second: Pyramid, cells: Cells) -> Vectors | None:
+    """Return the motion of some cells; None if they all rest."""
     moves = np.ones(cells[2:], np.bool_)
-    if min(first.picture.shape) >= BLOCK_PX and not _mark_moving(first.picture, second.picture, *cells[:2], moves):
-        return np.zeros((2, *moves.shape), np.int16)
+    if min(first.height, first.width) >= BLOCK_PX and not _moves(first, second, cells, moves):
+        return None
     one, other = first.levels, _scaled(first.levels, second.levels)
     needed = [cells]
     for level in one[1:]:
@@ -116,6 +156,25 @@ def motion(first: Pyramid, second: Pyramid, cells: Cells | None = None) -> Vecto
     found = np.ascontiguousarray(found[:, top : top + rows, left : left + columns])
     _refine(one[0], other[0], found, moves, top, left)
     return found
+
+
+def _moves(first: Pyramid, second: Pyramid, cells: Cells, moves: npt.NDArray[np.bool_]) -> bool:
+    """Mark the cells whose blocks differ by more than a coder's noise, and return whether any does."""
+    window, place = _blocks_of(cells, first.height, first.width)
+    if second.is_like(first, window):
+        return False
+    return bool(_mark_moving(first.part(window), second.part(window), *place, moves))
+
+
+@lru_cache(maxsize=16)
+def _blocks_of(cells: Cells, height: int, width: int) -> tuple[Window, tuple[int, ...]]:
+    """Return the part of a picture with the blocks of some cells, and the numbers that ``_mark_moving`` wants."""
+    (top, bottom), (left, right) = (
+        tuple(min(max(CELL_PX * cell - _AROUND_PX, 0), side - BLOCK_PX) for cell in (at, at + count - 1))
+        for at, count, side in zip(cells[:2], cells[2:], (height, width), strict=True)
+    )
+    window = top, left, bottom + BLOCK_PX - top, right + BLOCK_PX - left
+    return window, (*cells[:2], top, left, height - BLOCK_PX, width - BLOCK_PX)
 
 
 def without_slow(vectors: Vectors, shortest: int) -> Vectors:
@@ -146,17 +205,25 @@ def _scaled(first: list[Picture], second: list[Picture]) -> list[Picture]:
 
 
 @compiled
-def _mark_moving(first, second, top, left, moves):
-    """Mark the cells whose blocks differ by more than a coder's noise, and return whether any does."""
-    height, width = first.shape
+def _mark_moving(first, second, top, left, first_y, first_x, last_y, last_x, moves):
+    """Mark moving cells in parts of pictures.
+
+    Args:
+        first, second: the parts that hold all blocks.
+        top, left: the first cell.
+        first_y, first_x: place of the parts.
+        last_y, last_x: of the last block of the pictures.
+        moves: written.
+    """
+    pitch = first.shape[1]
     a, b = first.ravel(), second.ravel()
     any_moves = False
     for row in range(moves.shape[0]):
-        y = min(max(CELL_PX * (top + row) - _AROUND_PX, 0), height - BLOCK_PX)
+        y = min(max(CELL_PX * (top + row) - _AROUND_PX, 0), last_y) - first_y
         for column in range(moves.shape[1]):
-            x = min(max(CELL_PX * (left + column) - _AROUND_PX, 0), width - BLOCK_PX)
-            at = y * width + x
-            differs = block_difference(a, at, b, at, width) > _REST
+            x = min(max(CELL_PX * (left + column) - _AROUND_PX, 0), last_x) - first_x
+            at = y * pitch + x
+            differs = block_difference(a, at, b, at, pitch) > _REST
             moves[row, column] = differs
             any_moves |= differs
     return any_moves

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from v2v_server.motion.matching import Cells, Picture, Pyramid, Vectors, motion
+from v2v_server.motion.matching import Cells, Pyramid, Vectors, motion, motion_if_any
 from v2v_server.simulation.view import Frames
 from v2v_server.video.collect import Cut
 
@@ -17,18 +17,18 @@ class MotionOfPictures:
     def __init__(self) -> None:
         self._last: Pyramid | None = None
 
-    def add(self, picture: Picture, cells: Cells | None = None) -> Vectors:
+    def add(self, picture: Pyramid, cells: Cells | None = None) -> Vectors:
         """Return the motion to the next picture; zero to the first.
 
         Args:
-            picture: [h, w] uint8. It is not copied, so it may not change before the next one.
+            picture: read until the next one comes.
             cells: those whose motion is wanted; None: all.
 
         Returns:
             [2, rows, columns] of these cells.
         """
-        before, self._last = self._last, Pyramid(np.ascontiguousarray(picture))
-        return motion(before or self._last, self._last, cells)
+        before, self._last = self._last, picture
+        return motion(before or picture, picture, cells)
 
 
 class MotionOfCuts:
@@ -44,23 +44,35 @@ class MotionOfCuts:
     def __init__(self, cuts: Sequence[Cut]) -> None:
         self._cuts = [(cut.count, Cells(*cut.cells)) for cut in cuts if cut.cells is not None]
         self.vectors = [np.zeros((count, 2, *cells[2:]), np.int16) for count, cells in self._cuts]
-        self._motion, self._seen = MotionOfPictures(), 0
+        self._last: Pyramid | None = None
+        self._seen = self._box_until = 0
+        self._box = Cells(0, 0, 0, 0)
 
-    def add(self, picture: Picture) -> None:
-        """Look at the next picture, [h, w] uint8."""
+    def add(self, picture: Pyramid) -> None:
+        """Look at the next picture."""
         number, self._seen = self._seen, self._seen + 1
-        current = [
-            (cells, vectors) for (count, cells), vectors in zip(self._cuts, self.vectors, strict=True) if number < count
-        ]
-        top, left = (min(cells[axis] for cells, _ in current) for axis in (0, 1))
-        bottom, right = (max(cells[axis] + cells[axis + 2] for cells, _ in current) for axis in (0, 1))
-        found = self._motion.add(picture, Cells(top, left, bottom - top, right - left))
-        for cells, vectors in current:
-            down, across = cells.top - top, cells.left - left
-            vectors[number] = found[:, down : down + cells.rows, across : across + cells.columns]
+        before, self._last = self._last, picture
+        if before is None:
+            return
+        if number >= self._box_until:
+            self._bound(number)
+        found = motion_if_any(before, picture, self._box)
+        if found is None:
+            return
+        for (count, cells), vectors in zip(self._cuts, self.vectors, strict=True):
+            if number < count:
+                down, across = cells.top - self._box.top, cells.left - self._box.left
+                vectors[number] = found[:, down : down + cells.rows, across : across + cells.columns]
+
+    def _bound(self, number: int) -> None:
+        """Bound the cells of the cuts that have a picture of this number, until one of them has no more."""
+        current = [(count, cells) for count, cells in self._cuts if number < count]
+        top, left = (min(cells[axis] for _, cells in current) for axis in (0, 1))
+        bottom, right = (max(cells[axis] + cells[axis + 2] for _, cells in current) for axis in (0, 1))
+        self._box, self._box_until = Cells(top, left, bottom - top, right - left), min(count for count, _ in current)
 
 
 def motions(pictures: Frames) -> Vectors:
     """Return the motion of pictures [n, h, w]: [n, 2, rows, columns], zero for the first."""
     following = MotionOfPictures()
-    return np.stack([following.add(picture) for picture in pictures])
+    return np.stack([following.add(Pyramid.of(picture)) for picture in pictures])

@@ -188,6 +188,6 @@ def _guess(three: Frames) -> tuple[float, float]:
     if np.array_equal(first, middle) or np.array_equal(middle, last):  # a repeated frame is not halfway
         return 0.0, 0.0
     guess = np.empty((1, *middle.shape), np.uint16)
-    before, after = (Pyramid(np.ascontiguousarray(picture)) for picture in (three[0], three[2]))
+    before, after = (Pyramid.of(picture) for picture in (three[0], three[2]))
     between(before.levels[0], after.levels[0], motion(before, after), _SHORTEST, 0, 0, guess)
     return float(np.abs(guess[0] / FINE_STEPS - middle).sum()), float(np.abs((first + last) / 2 - middle).sum())

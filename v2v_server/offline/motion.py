@@ -114,11 +114,11 @@ class CropEstimate:
 
     @property
     def moves(self) -> bool:
-        """Whether motion makes more events than noise."""
+        """Return whether motion makes more events than noise."""
         return self.motion > self.noise
 
     def overlaps(self, other: CropEstimate) -> bool:
-        """Whether a camera of the same clip sees the same place."""
+        """Return whether a camera of the same clip sees the same place."""
         (left, top, width, height), (x, y, *_) = self.box, other.box
         return self.clip == other.clip and abs(left - x) < width and abs(top - y) < height
 

@@ -36,12 +36,12 @@ class Report:
 
     @property
     def prepared(self) -> tuple[PreparedVideo, ...]:
-        """The videos that have a prepared file."""
+        """Return the videos that have a prepared file."""
         return tuple(video for video in self.videos if video.problem is None)
 
     @property
     def failed(self) -> tuple[PreparedVideo, ...]:
-        """The videos that have no prepared file."""
+        """Return the videos that have no prepared file."""
         return tuple(video for video in self.videos if video.problem is not None)
 
     @property
@@ -68,7 +68,7 @@ class Report:
 
     @property
     def complete(self) -> bool:
-        """Whether every video file was prepared, with everything requested, and above the floors."""
+        """Return whether every video file was prepared, with everything requested, and above the floors."""
         return not (self.failed or self.below_floor or self.unusable or self.not_looked_at)
 
 

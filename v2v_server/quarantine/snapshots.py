@@ -95,12 +95,12 @@ class Quarantine:
 
     @property
     def latest(self) -> int:
-        """Number of the newest snapshot."""
+        """Return the number of the newest snapshot."""
         return len(self._entries)
 
     @property
     def lines(self) -> tuple[QuarantineEntry, ...]:
-        """All entries and clearings, oldest first."""
+        """Return all entries and clearings, oldest first."""
         return tuple(self._entries)
 
     def entries(self, snapshot: int) -> list[QuarantineEntry]:

@@ -74,7 +74,7 @@ class Schedule:
 
     @property
     def count(self) -> int:
-        """Number of indices of an epoch."""
+        """Return the number of indices of an epoch."""
         return self._table.count // self._spacing * self._spacing * self._views
 
     def place(self, index: int) -> int:

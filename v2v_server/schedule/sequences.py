@@ -130,19 +130,19 @@ class SequenceTable:
 
     @property
     def refusals(self) -> Refusals:
-        """The videos that give no sequence; each refusal is built when it is read."""
+        """Return the videos that give no sequence; each refusal is built when it is read."""
         counts, _ = self._count(0, len(self._all))
         return Refusals(np.flatnonzero(counts == 0), self._all, self._rows, self._spec)
 
     @property
     def spoilt(self) -> int:
-        """Number of sequences at 0, L, 2L ... that are left out or moved because of what they show."""
+        """Return the number of sequences at 0, L, 2L ... that are left out or moved because of what they show."""
         _, cut = self._count(0, len(self._all))
         return 0 if cut is None else cut.spoilt()
 
     @property
     def longest_clips(self) -> tuple[int, ...]:
-        """The ``voxels_per_clip`` that each of the videos that are too short is long enough for."""
+        """Return the ``voxels_per_clip`` that each of the videos that are too short is long enough for."""
         columns, recipe = self._columns, self._spec.recipe
         _, cut = self._count(0, len(self._all))
         steps = recipe.steps_at(columns.rates)

@@ -101,7 +101,7 @@ class SampleRing:
         return None if memory is None else memory.slot
 
     def release(self, leases: Container[int]) -> None:
-        """Free the memory that was lent for other leases than these."""
+        """Free memory whose lease is not among these."""
         for lease in [lease for lease in self._lent if lease not in leases]:
             del self._lent[lease]
 

@@ -18,6 +18,7 @@ from v2v_protocol.recipe import TIME_UNITS, Recipe, effect_settings
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.settings import nearest, require_known
 from v2v_server.simulation.draw import noise_key_of_seed
+from v2v_server.simulation.effects.tolerance import changed_shares, left_out
 from v2v_server.simulation.grey import grey_levels
 from v2v_server.simulation.intensity import Intensity, log_table_float64
 from v2v_server.simulation.kernels import KernelInput
@@ -151,6 +152,7 @@ def simulate_clip(
     out: Mapping[str, npt.NDArray[Any]] | None = None,
     levels: Levels | None = None,
     signal: Signal = SDR,
+    tolerance: float = 0.0,
 ) -> Voxels:
     """Simulate one drawn sample.
 
@@ -163,9 +165,11 @@ def simulate_clip(
         out: C-contiguous arrays to fill, by name (``kernels.ARRAYS``); None makes the voxels.
         levels: grey levels between frames, only with 8 bits; None: log intensity is linear in time there.
         signal: what the levels mean.
+        tolerance: share of the events that effects may change which are left out (``effects/tolerance.py``).
 
     Returns:
-        voxels [recipe.voxel_grids, bins, H, W], and the number of saturated bins.
+        voxels [recipe.voxel_grids, bins, H, W], and the number of saturated bins; ``given.params`` has the effects that
+        were simulated.
 
     Raises:
         UsageError: too few frames, ``step_seconds`` missing, unwanted or of the wrong length, or a draw beyond what
@@ -204,6 +208,10 @@ def simulate_clip(
         step_seconds if recipe.noise_unit == "second" else np.ones(steps), step_seconds, recipe.bins, edges,
         voxel_dtype, levels=levels, grids_have_durations=recipe.is_timed,
     )  # fmt: skip
+    if tolerance > 0.0 and params.effects:
+        gone = left_out(changed_shares(given), tolerance)
+        kept = {name: value for name, value in params.effects.items() if name not in gone}
+        given = dataclasses.replace(given, params=dataclasses.replace(params, effects=kept))
     return Voxels.of(given, choose(AUTO, _most_events(given, _log_ends(intensity))), out)
 
 

@@ -76,7 +76,7 @@ class KernelInput:
 
     @property
     def needs_general(self) -> bool:
-        """Whether the voxels alone need the general kernel."""
+        """Return whether the voxels alone need the general kernel."""
         is_divided = self.grids_have_durations or bool(self.edges.share.any())
         return bool(self.params.effects) or self.levels is not None or is_divided
 

@@ -68,7 +68,7 @@ class StatusClient:
         raise ServerLost(f"{self._address}: no answer for {timeout_seconds:g} s; is v2v-serve running there?")
 
     def _latest(self, frames: Frames) -> dict[str, Any] | None:
-        """Return the newest answer that has arrived: one that came too late for its request is old."""
+        """Return the newest answer that has arrived; skip late answers to earlier requests."""
         newest = None
         more: Frames | None = frames
         while more is not None:

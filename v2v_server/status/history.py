@@ -45,7 +45,7 @@ class TimeWindow:
 
     @property
     def seconds(self) -> float:
-        """Its length."""
+        """Return the length of the window, seconds."""
         return self.last.now - self.before.now
 
     def change(self, name: str) -> float:

@@ -60,7 +60,7 @@ class Encoding:
 
     @property
     def is_lossless(self) -> bool:
-        """Whether the files reproduce the exact pixels of their sources."""
+        """Return whether the files reproduce the exact pixels of their sources."""
         return self.codec == LOSSLESS
 
     def __str__(self) -> str:

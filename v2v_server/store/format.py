@@ -115,17 +115,17 @@ class Head:
 
     @property
     def groups(self) -> int:
-        """Number of groups of frames."""
+        """Return the number of groups of frames."""
         return -(-self.count // self.group)
 
     @property
     def down(self) -> int:
-        """Number of rows of blocks in a picture."""
+        """Return the number of rows of blocks in a picture."""
         return -(-self.rows // BLOCK_ROWS)
 
     @property
     def across(self) -> int:
-        """Number of blocks in a row of blocks."""
+        """Return the number of blocks in a row of blocks."""
         return -(-self.width_px // BLOCK_COLUMNS)
 
     @property

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,19 +12,24 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import VideoError
-from v2v_server.motion import Cells, MotionOfCuts, MotionOfPictures, Vectors
+from v2v_server.motion import Cells, MotionOfCuts, MotionOfPictures, Pyramid, Vectors
 from v2v_server.store.chroma import CHROMA, chroma_of
 from v2v_server.store.depth import DETAIL, detail_of, grey_of
 from v2v_server.store.reader import StoreFile
-from v2v_server.video.collect import Cut, LastFrame, Watch
+from v2v_server.video.collect import Cut, DecodedFrame, LastFrame
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.orientation import Window
 
 MOTION = "motion"
 """Name of the plane."""
-MADE_PLANES: dict[str, Callable[[], Callable[[npt.NDArray[np.uint8]], npt.NDArray[Any]]]] = {
-    MOTION: lambda: MotionOfPictures().add
-}
+
+
+def _motion_maker() -> Callable[[npt.NDArray[np.uint8]], Vectors]:
+    following = MotionOfPictures()
+    return lambda picture: following.add(Pyramid.of(picture))
+
+
+MADE_PLANES: dict[str, Callable[[], Callable[[npt.NDArray[np.uint8]], npt.NDArray[Any]]]] = {MOTION: _motion_maker}
 """By name of the plane: makes a function that gets one usable picture after the other, and returns its array."""
 _PICTURES = 16
 """Whole pictures that are read at a time."""
@@ -40,12 +44,21 @@ class MotionWatch:
     """
 
     def __init__(self, cuts: Sequence[Cut], picture: Window) -> None:
-        self._cuts = cuts
-        self.watch = Watch(picture, self._begin) if wants_motion(cuts) else None
+        self._cuts, self._picture = cuts, picture
+        self.watch = self._begin if wants_motion(cuts) else None
 
-    def _begin(self) -> partial[None]:
-        self._found = MotionOfCuts(self._cuts)
-        return partial(self._found.add)
+    def _begin(self) -> Callable[[DecodedFrame], None]:
+        self._found = found = MotionOfCuts(self._cuts)
+        first_row, first_column, height, width = self._picture
+
+        def place(window: Window) -> Window:
+            top, left, rows, columns = window
+            return first_row + top, first_column + left, rows, columns
+
+        def see(frame: DecodedFrame) -> None:
+            found.add(Pyramid(height, width, lambda part: frame.part(place(part)), lambda part: frame.raw(place(part))))
+
+        return see
 
     def added_to(self, clips: Sequence[DecodedClip]) -> tuple[DecodedClip, ...]:
         """Return the decoded clips with their motion."""
@@ -109,7 +122,7 @@ def read_motion(
         found = MotionOfCuts(cuts)
         for stored, frames in files:
             for each in pictures_in(stored, frames, start, stride, picture):
-                found.add(each)
+                found.add(Pyramid.of(each))
         return found.vectors
     vectors = []
     for cut in cuts:
@@ -159,5 +172,5 @@ def _motion_across(before: StoreFile, after: StoreFile, at: int, cells: Cells, p
     following = MotionOfPictures()
     for stored, number in ((before, at - 1), (after, at)):
         for each in pictures_in(stored, range(1), number, 1, picture):
-            found = following.add(each, cells)
+            found = following.add(Pyramid.of(each), cells)
     return found

@@ -1,5 +1,4 @@
-"""Compress blocks of differences: densely (zstd), or for reading in half the time (LZ4HC). Blocks of a raw file are
-the pixels themselves.
+"""Compress blocks of differences: densely (zstd), for reading in half the time (LZ4HC), or not at all.
 
 Blocks are checked before they are unpacked, and unpacked into a known number of bytes.
 """
@@ -21,7 +20,7 @@ class Packing:
     """How blocks are compressed; reading them needs only the method.
 
     Attributes:
-        method: "zstd", "lz4", or "raw", which stores pixels instead of differences.
+        method: "zstd", "lz4", or "raw", which compresses nothing.
         search: zstd: match search settings, as ``ZstdCompressionParameters`` takes them.
         level: level of LZ4HC.
     """

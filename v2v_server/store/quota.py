@@ -79,7 +79,7 @@ class QuotaFolder:
 
     @property
     def used_bytes(self) -> int:
-        """Number of bytes in the folder; 0 if it is unknown."""
+        """Return the number of bytes in the folder; 0 if it is unknown."""
         return used_bytes(self.folder)
 
     @property

@@ -109,15 +109,11 @@ class BlockReader:
                 wide = min(BLOCK_COLUMNS, head.width_px - x)
                 here, there = max(left, x), min(left + width, x + wide)
                 part = out[:, upper - top : lower - top, here - left : there - left]
-                has_blocks |= bool(len(block))
-                if not len(block):
-                    part[...] = 0
-                elif head.packing == "raw":
-                    last = first + (len(out) - 1) * stride
-                    pixels = block.reshape(frames, tall, wide)[first : last + 1 : stride]
-                    part[...] = pixels[:, upper - y : lower - y, here - x : there - x]
-                else:
+                if len(block):
                     from_differences(block, tall, wide, upper - y, here - x, first, stride, part)
+                    has_blocks = True
+                else:
+                    part[...] = 0
         return has_blocks
 
     def _record(self, group: int) -> BlockRecord:
@@ -212,7 +208,7 @@ class StoreFile(BlockReader):
 
     @cached_property
     def planes(self) -> frozenset[str]:
-        """Names of the planes of this version that the file has.
+        """Return the names of the planes of this version that the file has.
 
         Raises:
             VideoUnreadable, VideoError: see :meth:`plane`.

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_server.store.format import BLOCK_COLUMNS, BLOCK_ROWS, Head, block_check, pack_record
-from v2v_server.store.packing import Bytes, Packing
+from v2v_server.store.packing import Packing
 from v2v_server.store.planes import PLANES, PlanePlace, pack_footer
 
 
@@ -64,14 +64,11 @@ class _BlockWriter:
         for top in range(0, head.rows, BLOCK_ROWS):
             band = frames[:, top : top + BLOCK_ROWS]
             packed = self._differences[: band.size]
-            if head.packing != "raw":
-                to_differences(band, BLOCK_COLUMNS, packed)
+            to_differences(band, BLOCK_COLUMNS, packed)
             view = packed.data
             column = band.size // head.width_px  # bytes of one column of pixels
             for left in range(0, head.width_px, BLOCK_COLUMNS):
-                block: Bytes = view[left * column : (left + BLOCK_COLUMNS) * column]
-                if head.packing == "raw":
-                    block = band[:, :, left : left + BLOCK_COLUMNS].tobytes()
+                block = view[left * column : (left + BLOCK_COLUMNS) * column]
                 is_empty = self._is_sparse and not np.frombuffer(block, np.uint8).any()
                 blocks.append(b"" if is_empty else self._pack(block))
         checks = [block_check(block, group, number) for number, block in enumerate(blocks)]

@@ -55,7 +55,7 @@ class WorkerPlace(Protocol):
 
     @property
     def is_running(self) -> bool:
-        """Whether its process runs, as far as is known."""
+        """Return whether its process runs, as far as is known."""
 
     def start(self, name: str, address: str) -> None:
         """Start a worker that connects to ``address``. A failure is reported by :meth:`take_exit`."""

@@ -97,7 +97,7 @@ class LocalPlace:
 
     @property
     def is_running(self) -> bool:
-        """Whether its process runs."""
+        """Return whether its process runs."""
         return self.process is not None and self.process.poll() is None
 
     def start(self, name: str, address: str) -> None:

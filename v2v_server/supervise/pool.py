@@ -88,7 +88,7 @@ class Pool:
 
     @property
     def is_local(self) -> bool:
-        """Whether all workers run on this host."""
+        """Return whether all workers run on this host."""
         return self._host.is_local
 
     @property
@@ -98,12 +98,12 @@ class Pool:
 
     @property
     def running(self) -> int:
-        """Number of workers whose process runs."""
+        """Return the number of workers whose process runs."""
         return sum(slot.place.is_running for slot in self._slots)
 
     @property
     def restarts(self) -> dict[bytes, int]:
-        """Number of earlier workers in the slot of each worker."""
+        """Return the number of earlier workers in the slot of each worker."""
         return {slot.name.encode(): slot.generation - 1 for slot in self._slots if slot.is_started}
 
     def start(self, address: str) -> None:

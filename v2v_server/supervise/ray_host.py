@@ -181,12 +181,12 @@ class RayPlace:
 
     @property
     def calls(self) -> list[Any]:
-        """The calls that have not returned."""
+        """Return the calls that have not returned."""
         return [call for call in (self.run, self._asked) if call is not None]
 
     @property
     def is_running(self) -> bool:
-        """Whether the worker's process was observed and has not ended."""
+        """Return whether the worker's process was observed and has not ended."""
         return self.run is not None and self.seen is not None and self.seen.name == self._name
 
     def start(self, name: str, address: str) -> None:

@@ -61,7 +61,7 @@ class Died:
 
     @property
     def is_crash(self) -> bool:
-        """Whether the job is to blame: a signal that the process caused itself struck it at work.
+        """Return whether the job is to blame: a signal that the process caused itself struck it at work.
 
         Otherwise it was killed from outside, the kernel was short of memory, it was overdue, or it exited with a
         status: an exception of this program, or a broken installation.

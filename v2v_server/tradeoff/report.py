@@ -43,6 +43,12 @@ _SETTINGS: _Columns = (
     (ERROR_KEY, f"voxels {ERROR_THRESHOLD:g}", "{:.2f}", 100),
     ("dominated_by", "dominated by", "{}", 1),
 )
+_VARIED: _Columns = (
+    ("name", "source, K = 1, with", "{}", 1),
+    ("samples_per_core_second", "samples/core s", "{:.2f}", 1),
+    ("speed_ratio", "x exact", "{:.2f}", 1),
+    ("cpu_seconds_per_sample", "CPU ms", "{:.1f}", 1e3),
+)
 _SUBSTEPS: _Columns = (
     ("name", "between frames", "{}", 1),
     ("samples_per_core_second", "samples/core s", "{:.2f}", 1),
@@ -88,13 +94,16 @@ def name_dominated(records: Sequence[dict[str, Any]]) -> None:
 
 def tables(records: Sequence[Record]) -> str:
     """Return the settings, the errors of each form, what sub-steps cost and restore, and the diversity as text."""
-    of = {kind: [r for r in records if r["measure"] == kind] for kind in ("setting", "substeps", "scale", "diversity")}
+    kinds = ("setting", "varied", "substeps", "scale", "diversity")
+    of = {kind: [r for r in records if r["measure"] == kind] for kind in kinds}
     forms = [record for record in of["setting"] if record["samples_per_decode"] == 1]
     scale = [{**record, "form": record["name"]} for record in of["scale"]]
     parts = [
         _table(of["setting"], _SETTINGS) + "x disk: of the source; MB/s: of video\n",
         _table([*forms, *scale], _FORMS) + "still: events a pixel in 1000 frames of a still scene, without noise\n",
     ]
+    if of["varied"]:
+        parts.append(_table(of["varied"], _VARIED))
     if of["substeps"]:
         about = (
             "errors in per cent against a camera that sees all of the motion, predicted at c = 0.2; -: unpredictable\n"

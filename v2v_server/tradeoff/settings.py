@@ -46,7 +46,7 @@ EXACT = ServeSetting()
 
 
 def settings(forms: Sequence[str]) -> list[ServeSetting]:
-    """Return the source and its prepared forms, each with every number of samples a decode."""
+    """Return the settings to compare: source and prepared forms, each with every number of samples per decode."""
     return [ServeSetting(form, count) for form in (SOURCE, *forms) for count in SAMPLES_PER_DECODE]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from v2v_protocol.errors import VideoError
 from v2v_server.video.colour.chroma import Chroma, ChromaCut, ChromaStack
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import MIXED, SDR, TRANSFERS, LumaFormat, Signal, copy_luma, luma_plane, stretch
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import Orientation, Window
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,18 +35,37 @@ class Cut:
     cells: Window | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Watch:
-    """What else looks at the frames as they are decoded.
+class DecodedFrame(NamedTuple):
+    """A frame in the decoder's memory, which it holds.
 
     Attributes:
-        window: the part of each picture, as in :class:`Cut`.
-        begin: called when decoding begins, again if it begins again; returns a function that gets the part of each
-            frame, [h, w] uint8: upright, in full range.
+        samples, luma: see :func:`v2v_server.video.luma.luma_plane`.
+        orientation, height_px, width_px: of the upright picture.
     """
 
-    window: Window
-    begin: Callable[[], Callable[[npt.NDArray[np.uint8]], object]]
+    samples: npt.NDArray[np.unsignedinteger]
+    luma: LumaFormat
+    orientation: Orientation
+    height_px: int
+    width_px: int
+
+    def raw(self, window: Window) -> npt.NDArray[np.unsignedinteger]:
+        """Return a window of the upright picture as the decoder stores it, without a copy."""
+        top, left, height, width = self.orientation.stored_window(window, self.height_px, self.width_px)
+        return self.samples[top : top + height, left : left + width]
+
+    def part(self, window: Window) -> npt.NDArray[np.uint8]:
+        """Return a window of the upright picture, [h, w] uint8 in full range."""
+        stored = self.orientation.stored_window(window, self.height_px, self.width_px)
+        part = np.empty((1, *stored[2:]), np.uint8)
+        copy_luma(self.samples, self.luma, stored, part[0])
+        stretch(part, self.luma)
+        upright: npt.NDArray[np.uint8] = self.orientation.upright(part)[0]
+        return upright
+
+
+Watch = Callable[[], Callable[[DecodedFrame], object]]
+"""What else looks at the frames: called whenever decoding begins; returns what gets each frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +84,7 @@ class FrameRange:
 
 
 def window_of(cut: Cut) -> Window:
-    """Of a cut that was checked."""
+    """Return the window of a cut that was checked."""
     assert cut.window is not None
     return cut.window
 
@@ -75,7 +94,7 @@ class Stack:
 
     def __init__(self, wanted: FrameRange, cuts: Sequence[Cut], watch: Watch | None = None) -> None:
         self.wanted = wanted
-        self._watch, self._show = watch, None if watch is None else watch.begin()
+        self._show = None if watch is None else watch()
         self.index = index = wanted.index
         self._orientation = index.orientation
         self.codec = ""  # FFmpeg's name, once decoding has begun
@@ -114,7 +133,7 @@ class Stack:
         return self.taken == len(self._expected)
 
     def _after_a_gap(self, frame: VideoFrame) -> bool:
-        """Whether the decoder skipped a frame that the index lists before this one."""
+        """Return whether the decoder skipped a frame that the index lists before this one."""
         pts, at = self._pts, self._cursor
         if not self.index.seekable or frame.pts is None or frame.pts < pts[0]:
             return False
@@ -139,7 +158,7 @@ class Stack:
         return False
 
     def _is_passed_over(self, pts: int) -> bool:
-        """Whether a frame before the next one to take is one that the stride skips."""
+        """Return whether a frame before the next one to take is one that the stride skips."""
         return self._stride > 1 and pts in self._pts
 
     def _copy(self, frame: VideoFrame) -> None:
@@ -160,12 +179,9 @@ class Stack:
             self.signal = self.signal._replace(transfer=MIXED)
         samples = luma_plane(frame, self._luma)
         self._keep(samples)
-        if self._watch is not None and self._show is not None:
-            stored = self._orientation.stored_window(self._watch.window, self.index.height_px, self.index.width_px)
-            seen = np.empty((1, *stored[2:]), np.uint8)
-            copy_luma(samples, self._luma, stored, seen[0])
-            stretch(seen, self._luma)
-            self._show(self._orientation.upright(seen)[0])
+        if self._show is not None:
+            height, width = self.index.height_px, self.index.width_px
+            self._show(DecodedFrame(samples, self._luma, self._orientation, height, width))
 
     def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
         for stored, raw in self._parts:

@@ -78,7 +78,7 @@ class _SeekFailed(Exception):
 def decode_luma(
     path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: Window | None = None
 ) -> DecodedClip:
-    """Frames start .. start + count - 1 of a video, or a window of them: :func:`decode_cuts` for a single cut."""
+    """Decode frames start .. start + count - 1 of a video, or a window of them: :func:`decode_cuts` of one cut."""
     return decode_cuts(path, index, start, [Cut(count, window)])[0]
 
 

@@ -48,7 +48,7 @@ def unreadable(video: str, error: OSError) -> VideoUnreadable:
 
 
 def is_same_file(one: str, other: str) -> bool:
-    """Whether two fingerprints can be of one file, as far as both of them say."""
+    """Return whether two fingerprints can be of one file; a part that one of them lacks is not compared."""
     parts = list(zip(one.split("-"), other.split("-"), strict=False))
     return len(parts) > 1 and all(a == b for a, b in parts)
 

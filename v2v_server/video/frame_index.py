@@ -68,7 +68,7 @@ class FrameIndex:
         return self.first + len(self.pts)
 
     def position(self, start: int, count: int) -> int:
-        """Where frame ``start`` stands in ``pts``, after checking that the range lies in this index.
+        """Return the place of frame ``start`` in ``pts``, after a check that the range lies in this index.
 
         Raises:
             UsageError: an empty range, or one not inside first .. end.
@@ -113,7 +113,7 @@ class FrameIndex:
         )
 
     def seconds(self, start: int, count: int) -> npt.NDArray[np.float64]:
-        """Presentation times of frames start .. start + count - 1.
+        """Return the presentation times of frames start .. start + count - 1.
 
         Returns:
             [count] float64, seconds on the container's clock; NaN where unknown.

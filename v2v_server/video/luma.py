@@ -59,7 +59,7 @@ class Signal(NamedTuple):
 
     @property
     def white(self) -> int:
-        """The highest level."""
+        """Return the highest level."""
         return (1 << self.bits) - 1
 
     @property
@@ -122,7 +122,7 @@ class LumaFormat:
 
 
 def _is_full_range(pixel_format: str, color_range: int) -> bool:
-    """Whether samples span 0 .. 2**b - 1: as stated, or by the rule above where nothing is stated."""
+    """Return whether samples span 0 .. 2**b - 1: as stated, or by the rule above where nothing is stated."""
     if color_range == ColorRange.UNSPECIFIED:
         return pixel_format.startswith(("yuvj", "gray"))
     return color_range == ColorRange.JPEG

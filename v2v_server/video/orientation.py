@@ -44,11 +44,11 @@ class Orientation:
         return cls(True, flip_y=b < 0, flip_x=c < 0)
 
     def size(self, height: int, width: int) -> tuple[int, int]:
-        """(height, width) of the upright picture, or of the stored one: the rule is its own inverse."""
+        """Return (height, width) of the upright picture from the stored one's, or the reverse."""
         return (width, height) if self.transpose else (height, width)
 
     def stored_window(self, window: Window, height: int, width: int) -> Window:
-        """Where a window of the upright picture of that height and width lies in the stored one."""
+        """Return the window of the stored picture that shows a window of the upright one of that height and width."""
         top, left, rows, columns = window
         if self.flip_y:
             top = height - top - rows

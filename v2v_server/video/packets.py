@@ -23,7 +23,7 @@ _Picture = tuple[int, int]
 
 
 def is_hidden(codec: str, packet: memoryview) -> bool:
-    """Whether a packet of VP8 or VP9 decodes to nothing; False of other codecs."""
+    """Return whether a packet of VP8 or VP9 decodes to nothing; False of other codecs."""
     if codec == "vp8":
         return not packet[0] & 0x10  # show_frame is bit 4 of the frame tag
     if codec == "vp9":
@@ -48,8 +48,8 @@ def length_bytes(extradata: bytes | None) -> int:
 
 
 def is_unreferenced(packet: memoryview, length_bytes: int) -> bool:
-    """Whether the packet is well formed, in AVC form, and holds slices of non-reference pictures only (nal_ref_idc 0,
-    7.4.1), so that it need not be decoded on the way to a later frame.
+    """Return whether the packet is well formed, in AVC form, and holds slices of non-reference pictures only
+    (nal_ref_idc 0, 7.4.1), so that it need not be decoded on the way to a later frame.
 
     The decoder's own option for this (``skip_frame``) also turns damaged packets into skipped ones without a word.
     """
@@ -89,7 +89,7 @@ class Fields:
                 self._learn(nal)
 
     def begins_frame(self, packet: memoryview) -> bool:
-        """Whether the packet's first picture is not the second field of a frame that an earlier packet began."""
+        """Return whether the packet's first picture is not the second field of a frame that an earlier packet began."""
         pictures = self._pictures(packet)
         first = next(pictures, None)
         if first is None or not first[1]:
@@ -120,7 +120,7 @@ class Fields:
                     return
 
     def _picture(self, bits: _Bits) -> _Picture:
-        """7.3.3, up to bottom_field_flag."""
+        """Read a slice header (7.3.3) up to bottom_field_flag."""
         bits.ue()
         bits.ue()
         frame_num_bits, planes_apart, fields = self._sps[self._pps[bits.ue()]]

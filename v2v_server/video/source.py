@@ -151,7 +151,7 @@ def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[V
 
 
 def pictures(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
-    """All frames from the current position, in the decoder's order of output."""
+    """Return all frames from the current position, in the decoder's order of output."""
     for packet in packets(container, stream):
         yield from stream.decode(packet)
     yield from stream.decode(None)

@@ -77,6 +77,7 @@ class SampleContext:
         into: the arrays to fill, by name.
         saturated: number of bins that were clipped, by array; None until the clip is simulated.
         boxes_dropped: boxes left out because of ``max_boxes``.
+        left_out: effects of the draw that were not simulated.
     """
 
     video: str
@@ -92,6 +93,7 @@ class SampleContext:
     into: Mapping[str, npt.NDArray[Any]]
     saturated: Mapping[str, int] | None = None
     boxes_dropped: int = 0
+    left_out: tuple[str, ...] = ()
 
     @property
     def target_steps(self) -> npt.NDArray[np.int64]:
@@ -100,7 +102,7 @@ class SampleContext:
 
     @property
     def recipe(self) -> Recipe:
-        """The spec's recipe."""
+        """Return the spec's recipe."""
         return self.spec.recipe
 
     @property
@@ -144,6 +146,7 @@ def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Vox
             out,
             context.levels,
             context.signal,
+            context.spec.tolerance,
         )
     except UsageError as error:
         # The recipe was checked before, so the values come from the corpus.
@@ -157,7 +160,9 @@ def simulated(context: SampleContext, out: npt.NDArray[Any]) -> None:
     """Fill in all arrays of the kernel together, the first time."""
     if context.saturated is None:
         asked = {name: context.into[name] for name in ARRAYS if name in context.into}
-        context.saturated = simulate(context, asked).saturated
+        made = simulate(context, asked)
+        context.saturated = made.saturated
+        context.left_out = tuple(name for name in context.params.effects if name not in made.given.params.effects)
 
 
 @makes("frames")

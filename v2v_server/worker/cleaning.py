@@ -46,7 +46,7 @@ class CleanFrames:
 
     @property
     def span(self) -> int:
-        """Number of the video's frames from the first to the last of these."""
+        """Return the number of the video's frames from the first to the last of these."""
         return int(self.numbers[-1] - self.numbers[0]) + 1
 
     @property

@@ -277,6 +277,7 @@ def make_sample(
             boxes_dropped=context.boxes_dropped,
             saturated={name: count for name, count in saturated.items() if count},
             grid_seconds=_grid_seconds(context),
+            left_out=context.left_out,
         ),
     )
 
@@ -382,7 +383,10 @@ def _variants(
     spec = _spec(canonical)
     step_seconds = spec.recipe.frame_stride / frames_per_second
     levels_per_step = MOST_SUBSTEPS - 1 if spec.substep_px else 0
-    return variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds), arrays, levels_per_step)
+    found = variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds), arrays, levels_per_step)
+    if not spec.tolerance:
+        return found
+    return found | {variant._replace(is_general=False, is_divided=False) for variant in found}
 
 
 @lru_cache(maxsize=16)

@@ -71,7 +71,7 @@ class FlowPlan:
 
     @property
     def still(self) -> bool:
-        """Whether no flow has to be estimated."""
+        """Return whether no flow has to be estimated."""
         return bool(self.methods) and all(name == STILL for name in self.methods)
 
 

@@ -24,6 +24,7 @@ from v2v_server.fit.increments import increments_of
 from v2v_server.fit.interval import Estimate
 from v2v_server.fit.picture import draw_fit
 from v2v_server.fit.recording import Recorded, chosen_pixels, read_recording, recorded
+from v2v_server.fit.regression import Regression
 from v2v_server.fit.report import recipe_fields, report_lines, write_recipe
 
 FAST = TrueCamera(0.2, 0.26, shot_noise_hz=3.0, leak_hz=0.0, refractory_seconds=5e-4, log_eps=0.01)
@@ -50,9 +51,9 @@ def fitted(camera: TrueCamera) -> FittedCamera:
 @pytest.mark.parametrize("camera", [FAST, SLOW], ids=["refractory", "low-pass"])
 def test_thresholds_come_back_from_events_and_frames(camera: TrueCamera) -> None:
     made = recording_of(camera, rendered_film("camera", 48, 64, 70.0, moving=0.8, still=0.0))
-    regression = estimators.Regression(increments_of(made, camera.refractory_seconds, 33_333.0), made.blocks())
+    found = Regression(increments_of(made, camera.refractory_seconds, 33_333.0), made.blocks())
     names = ("threshold_pos", "threshold_neg", "log_eps")
-    check(dict(zip(names, (regression.positive, regression.negative, regression.log_eps), strict=True)), camera, names)
+    check(dict(zip(names, (found.positive, found.negative, found.log_eps), strict=True)), camera, names)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ HALF_PX = UNITS_PER_PX // 2
 @pytest.mark.parametrize("px", [1.3, 4.0, 12.0])
 def test_a_pan_is_found(px: float) -> None:
     first, second = rendered_scene("gravel", 128, 128, 30 * px).frames(30, 2)
-    found = without_slow(motion(Pyramid(first), Pyramid(second)), HALF_PX)[:, 6:-6, 6:-6] / UNITS_PER_PX
+    found = without_slow(motion(Pyramid.of(first), Pyramid.of(second)), HALF_PX)[:, 6:-6, 6:-6] / UNITS_PER_PX
     lengths = np.hypot(*found)
     assert abs(np.median(lengths) - px) < 0.25
     assert np.quantile(np.hypot(*(found - np.median(found, axis=(1, 2), keepdims=True))), 0.9) < 0.5
@@ -25,15 +25,15 @@ def test_a_pan_is_found(px: float) -> None:
 def test_what_rests_has_no_motion() -> None:
     """Neither in a still picture, nor under a lamp that flickers, nor where an edge moves by a third of a pixel."""
     still = rendered_scene("coffee", 128, 128, 0.0).frames(30, 2)
-    assert not without_slow(motion(Pyramid(still[0]), Pyramid(still[1])), HALF_PX).any()
+    assert not without_slow(motion(Pyramid.of(still[0]), Pyramid.of(still[1])), HALF_PX).any()
     noisy = still[1] + np.random.default_rng(0).integers(-1, 2, still[1].shape).astype(np.uint8)
     assert not without_slow(
-        motion(Pyramid(still[0]), Pyramid(np.where(still[1] % 255, noisy, still[1]))), HALF_PX
+        motion(Pyramid.of(still[0]), Pyramid.of(np.where(still[1] % 255, noisy, still[1]))), HALF_PX
     ).any()
     lit = rendered_scene("flicker", 128, 128, 0.0).frames(30, 2)
-    assert (without_slow(motion(Pyramid(lit[0]), Pyramid(lit[1])), HALF_PX) == 0).all(axis=0).mean() > 0.99
+    assert (without_slow(motion(Pyramid.of(lit[0]), Pyramid.of(lit[1])), HALF_PX) == 0).all(axis=0).mean() > 0.99
     slow = rendered_scene("coffee", 128, 128, 9.0).frames(30, 2)
-    assert (without_slow(motion(Pyramid(slow[0]), Pyramid(slow[1])), HALF_PX) == 0).all(axis=0).mean() > 0.98
+    assert (without_slow(motion(Pyramid.of(slow[0]), Pyramid.of(slow[1])), HALF_PX) == 0).all(axis=0).mean() > 0.98
 
 
 @settings(deadline=None, max_examples=40)
@@ -52,7 +52,7 @@ def test_any_pictures_have_bounded_motion(height: int, width: int, kind: str, se
         "cut": np.roll(first, 40, 1),
     }[kind]
     for one, other in ((first, second), (second, first)):
-        found = without_slow(motion(Pyramid(one), Pyramid(other)), HALF_PX)
+        found = without_slow(motion(Pyramid.of(one), Pyramid.of(other)), HALF_PX)
         assert found.shape == (2, -(-height // 4), -(-width // 4))
         assert np.abs(found.astype(int)).max() <= 2 * (max(height, width) + 32) * UNITS_PER_PX
         squares = (found.astype(int) ** 2).sum(axis=0)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.oracles.rendered import rendered_scene
-from v2v_server.motion import Cells, MotionOfCuts, motions
+from v2v_server.motion import Cells, MotionOfCuts, Pyramid, motions
 from v2v_server.video.collect import Cut
 
 
@@ -29,7 +29,7 @@ def test_the_motion_of_cuts_is_that_of_the_whole_pictures(
         cuts.append(Cut(data.draw(st.integers(1, 3)), cells=Cells(top, left, *size)))
     found = MotionOfCuts([Cut(3), *cuts])
     for picture in pictures[: max(cut.count for cut in cuts)]:
-        found.add(picture)
+        found.add(Pyramid.of(picture))
     for cut, vectors in zip(cuts, found.vectors, strict=True):
         assert cut.cells is not None
         top, left, down, across = cut.cells

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import MOST_STEPS_PER_GRID, Recipe
-from v2v_protocol.sample import SampleParams
+from v2v_protocol.sample import SampleParams, array_layout
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import FrameTimes, draw, grid_steps
 from v2v_server.simulation.voxel import step_seconds, timed_edges
@@ -168,6 +168,8 @@ def test_a_draw_without_time_stamps_is_refused() -> None:
         drawn(RECIPE, np.arange(3) / 30, 30.0)
     with pytest.raises(RecipeError, match="frames lie at other steps in each sample"):
         _ = RECIPE.target_steps
+    with pytest.raises(UsageError, match="frames_all has one shape for all samples"):
+        array_layout(RECIPE, "int8", ("voxels", "frames_all"))
 
 
 def test_steps_by_rate() -> None:

@@ -231,12 +231,12 @@ def test_arrays_and_events_agree(effects: dict[str, float], grids: int) -> None:
     np.testing.assert_allclose(bilinear[grid, :, 11, 20], expected, atol=0.01)
 
 
-def real_frames(name: str) -> np.ndarray:
-    """Return 21 frames of the middle of a real video, [21, 30, 40]."""
+def real_frames(name: str, count: int = 21, size: tuple[int, int] = (30, 40)) -> np.ndarray:
+    """Return frames of a part of a real video, [count, *size]."""
     if not (REAL_VIDEOS / name).is_file():
         pytest.skip(f"no {name} in {REAL_VIDEOS}; set V2V_TEST_VIDEOS")
     index = probe(REAL_VIDEOS / name).index
-    return decode_luma(REAL_VIDEOS / name, index.slice(30, 21), 30, 21, (100, 100, 30, 40)).frames
+    return decode_luma(REAL_VIDEOS / name, index.slice(0, count), 0, count, (100, 100, *size)).frames
 
 
 @pytest.mark.parametrize("grids", [0, 2])

@@ -248,7 +248,8 @@ def test_events_on_scenes_are_counted_per_pixel_and_frame(tmp_path: Path) -> Non
     [
         ["--budget-minutes", "0"], ["--budget-minutes", "nan"], ["--places", "0"], ["--clips", "0"],
         ["--target-rate", "-1"], ["--max-error", "nan"], ["--forms", "h265 1"], ["--preset-out", "x.yaml"],
-        ["--set", "gama=1"], ["--rows", "upper"],
+        ["--set", "gama=1"], ["--rows", "upper"], ["--vary", "tolerance"], ["--vary", "tolerance=2"],
+        ["--vary", "voxel_seconds=0.1,101"],
     ],
 )  # fmt: skip
 def test_wrong_usage_is_status_2(tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -286,6 +287,10 @@ def test_a_short_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         "lossless fast,h264 23",
         "--budget-minutes",
         "0.5",
+        "--vary",
+        "voxel_seconds=0.1,0.2",
+        "--vary",
+        "tolerance=0.01",
         "--max-error",
         "0",
         "--preset-out",
@@ -307,6 +312,8 @@ def test_a_short_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     scale = {item["name"]: item["voxel_error_at_0.2"] for item in found if item["measure"] == "scale"}
     assert set(scale) == {NOISE_ROW, DRAW_ROW}
     assert min(scale.values()) > 0
+    varied = [item["name"] for item in found if item["measure"] == "varied" and item["cpu_seconds_per_sample"] > 0]
+    assert varied == ["voxel_seconds = 0.1", "voxel_seconds = 0.2", "tolerance = 0.01"]
     between = {(item["form"], item["substep_px"]): item for item in found if item["measure"] == "substeps"}
     assert set(between) == {(form, px) for form in (SOURCE, "lossless fast", "h264 23") for px in (0.0, 1.0)}
     assert between[SOURCE, 0.0]["cpu_seconds_per_sample"] == exact["cpu_seconds_per_sample"]

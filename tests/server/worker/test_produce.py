@@ -16,6 +16,7 @@ from tests.clips import panned_luma, write_clip
 from tests.server.named_corpus import SMALL_SPEC
 from v2v_protocol.errors import ProtocolError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import Lease
+from v2v_protocol.sample import Provenance
 from v2v_server.broker.leases import Request
 from v2v_server.commands.simulate import main as simulate
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
@@ -85,6 +86,20 @@ def test_sub_steps_do_not_depend_on_the_arrays_that_are_asked_for(catalogue: Cat
     on_and_off = beside_flow["event_counts"].astype(int)
     np.testing.assert_array_equal(on_and_off[:, 1] - on_and_off[:, 0], alone["voxels"])
     assert not np.array_equal(alone["voxels"], plain["voxels"])
+
+
+def test_the_provenance_names_the_effects_that_were_left_out(catalogue: Catalogue, lease: Lease) -> None:
+    camera = SMALL_SPEC.recipe.replace(threshold=0.1, refractory_seconds=1e-9, dead_pixel_share=1e-3)
+    made = []
+    for tolerance in (0.0, 0.5):
+        spec = dataclasses.replace(SMALL_SPEC, recipe=camera, tolerance=tolerance)
+        each = dataclasses.replace(lease, spec=spec.canonical(), spec_digest=spec.digest)
+        made.append(make_sample(each, decode_for(each, each.indices, catalogue.source)[0]))
+    full, part = made
+    assert (full.provenance.left_out, part.provenance.left_out) == ((), ("refractory_seconds",))
+    assert part.provenance.params == full.provenance.params
+    assert Provenance.from_dict(part.provenance.to_dict()) == part.provenance
+    np.testing.assert_array_equal(part.arrays["voxels"], full.arrays["voxels"])  # a nanosecond changes nothing here
 
 
 def test_events_need_no_flow(catalogue: Catalogue, lease: Lease, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -71,7 +71,7 @@ class Figures:
 
     Attributes:
         id, fingerprint: of the video.
-        summary: what a start reads of every video.
+        summary: the figures that a start of the server reads of all videos, encoded.
         data: all figures, encoded.
     """
 

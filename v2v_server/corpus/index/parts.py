@@ -48,11 +48,11 @@ class Shard:
 
     @property
     def file_name(self) -> str:
-        """Of its index among the parts."""
+        """Return the name of the file of its index in the folder of the parts."""
         return f"part-{self.number:0{len(str(self.count))}d}-of-{self.count}.sqlite3"
 
     def holds(self, id: str) -> bool:
-        """Whether that file is one of it."""
+        """Return whether the shard contains this file."""
         return xxhash.xxh3_64_intdigest(id.encode()) % self.count == self.number - 1
 
 

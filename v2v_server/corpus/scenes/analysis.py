@@ -236,7 +236,7 @@ def _is_combed(picture: Picture, change: npt.NDArray[np.int64]) -> bool:
 
 
 def _difference(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> float:
-    """Return the mean absolute difference of block means in grey levels, each picture's own mean taken off."""
+    """Return the mean absolute difference of block means in grey levels, after each picture's mean is subtracted."""
     change = second - first
     count = change.size
     return float(np.abs(count * change - change.sum()).sum()) / (64 * count**2)

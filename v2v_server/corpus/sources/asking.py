@@ -26,7 +26,7 @@ _IN_TURN = 256
 
 
 def is_said(done: int) -> bool:
-    """Whether progress is reported after this number of files: a million reports take seconds."""
+    """Return whether progress is reported after this number of files: a million reports take seconds."""
     return done <= _TOGETHER or done % _TOGETHER == 0
 
 

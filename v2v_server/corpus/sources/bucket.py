@@ -60,7 +60,7 @@ class Bucket:
 
     @cached_property
     def _store(self) -> Any:
-        """The file system of fsspec.
+        """Return the file system of fsspec.
 
         Raises:
             UsageError: a package is missing, or fsspec has no such kind of address.

@@ -80,7 +80,7 @@ class Copies(VideoSource):
 
     @cached_property
     def _objects(self) -> dict[str, State]:
-        """The objects, as first listed.
+        """Return the objects, as first listed.
 
         Raises:
             CorpusError: they cannot be listed.

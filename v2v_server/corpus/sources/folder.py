@@ -46,7 +46,7 @@ class Folder(VideoSource):
 
     @property
     def folder(self) -> Path:
-        """The folder that ids are relative to."""
+        """Return the folder that ids are relative to."""
         return Path(self.name)
 
     def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:

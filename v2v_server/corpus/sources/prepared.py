@@ -18,7 +18,7 @@ class Prepared(Folder):
 
     @cached_property
     def manifest(self) -> Manifest:
-        """The manifest; only the process that lists the videos reads it.
+        """Return the manifest; only the process that lists the videos reads it.
 
         Raises:
             CorpusError: it cannot be read, or makes no sense.

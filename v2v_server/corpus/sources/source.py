@@ -91,7 +91,7 @@ class VideoSource(ABC):
 
     @cached_property
     def listed(self) -> tuple[ListEntry, ...] | None:
-        """The entries of the list that restricts it; None without one.
+        """Return the entries of the list file that restricts the source; None without a list file.
 
         Raises:
             CorpusError: the list cannot be read, or makes no sense.
@@ -103,7 +103,7 @@ class VideoSource(ABC):
 
     @property
     def folder(self) -> Path:
-        """The folder that ids are relative to.
+        """Return the folder that ids are relative to.
 
         Raises:
             CorpusError: there is no such folder on this host.
@@ -178,8 +178,8 @@ class VideoSource(ABC):
         return [""] * len(ids)
 
     def has(self, files: Mapping[str, str]) -> bool:
-        """Return whether :meth:`open_local` needs no network for these files. If so, they stay until others are asked
-        for.
+        """Return whether :meth:`open_local` finds these files on this host. If so, they stay until the next call with
+        other files.
 
         Args:
             files: their fingerprints, by id.
@@ -227,4 +227,4 @@ def open_source(name: str | os.PathLike[str], options: SourceOptions = SourceOpt
                 return source
     except OSError as error:  # a folder that this user may not enter, a share that has gone
         raise CorpusError(f"{name}: cannot be read: {error.strerror or error}") from error
-    raise CorpusError(f"{name}: no kind of source takes this name")
+    raise CorpusError(f"{name}: neither a folder, a video, a list file nor an address of a known form")

@@ -6,6 +6,7 @@
     refractory.py     a pixel fires no events for a time after an event
     shot_noise.py     events of either sign, most in the dark
     dead_pixels.py    pixels that never fire
+    tolerance.py      which effects a clip does without
     state.py          inputs of an effect
     kernel.py         the general kernel: all effects, and events with times
 

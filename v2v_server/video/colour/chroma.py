@@ -58,7 +58,7 @@ class ChromaCut:
 
     @property
     def cells(self) -> Window:
-        """The cells that hold the window: (top, left, rows, columns)."""
+        """Return the cells that hold the window: (top, left, rows, columns)."""
         top, left, height, width = self.window
         top -= self.top_px
         first_row, first_column = top // CELL_PX, left // CELL_PX
