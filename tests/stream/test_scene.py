@@ -124,14 +124,11 @@ def boxed(luma: Luma) -> Luma:
 MOVING_LUMA = panned_luma(64, 96, 128, (1, 2))
 DEFECTS = {
     "24 in 30": lambda luma: luma[np.arange(79) * 4 // 5],
-    "twos": lambda luma: luma[np.arange(126) // 2],
-    "bars": boxed,
     "twos with bars": lambda luma: boxed(luma[np.arange(126) // 2]),
 }
 
 
-@pytest.mark.parametrize("name", DEFECTS)
-@pytest.mark.parametrize("stride", [1, 2])
+@pytest.mark.parametrize(("name", "stride"), [("24 in 30", 1), ("twos with bars", 2)])
 def test_a_cleaned_clip_has_the_voxels_of_the_clean_one(name: str, stride: int, tmp_path: Path) -> None:
     spec = dataclasses.replace(AUTO, recipe=STEADY.replace(frame_stride=stride), max_sequences_per_video=1)
     samples = []
