@@ -32,7 +32,7 @@ OnBadVideo = Literal["substitute", "raise"]
 FlowMethod = Literal["auto", "zero", "dis-ultrafast", "dis-fast", "dis-fast-lean", "dis-fast-1"]
 FlowDirection = Literal["forward", "backward"]
 SceneChoice = Literal["off", "auto"]
-SpeedPreset = Literal["exact", "balanced", "fast"]
+SpeedPreset = Literal["exact", "balanced", "fast", "natural"]
 VOXEL_DTYPES: tuple[VoxelDtype, ...] = get_args(VoxelDtype)
 FLOW_METHODS: tuple[FlowMethod, ...] = get_args(FlowMethod)
 ON_BAD_VIDEO: tuple[OnBadVideo, ...] = get_args(OnBadVideo)
@@ -43,7 +43,7 @@ DEFECTS = ("bars", "black", "combed", "cuts", "duplicates", "fades", "white")
 MOST_SAMPLES_PER_DECODE = 32
 MOST_SUBSTEPS = 16
 """Largest number of sub-steps of a step between video frames."""
-LATER_FIELDS = ("substep_px", "keep_defects", "still_share", "tolerance")
+LATER_FIELDS = ("substep_px", "keep_defects", "still_share", "moving_share", "tolerance")
 """Fields that the plain form leaves out at their defaults, so that older digests hold."""
 
 
@@ -111,6 +111,9 @@ class StreamSpec:
     )  # fmt: skip
     keep_defects: str = text("", f"what scene auto serves as it is, with commas between; of {', '.join(DEFECTS)}")
     still_share: float = number(0.1, 0.0, 1.0, "share of the still sequences that scene auto serves")
+    moving_share: float = number(
+        0.0, 0.0, 1.0, "share of the samples whose crop is drawn with weight by how much changes there (scene auto)"
+    )
     substep_px: float = number(
         0.0, 0.0, 64.0,
         "longest motion that a pixel model sees as one step: a step in which the picture moves further is divided, at "
@@ -130,6 +133,11 @@ class StreamSpec:
         kinds = sorted({kind.strip() for kind in self.keep_defects.split(",")} - {""})
         require_known(kinds, DEFECTS, "kind in spec keep_defects")
         object.__setattr__(self, "keep_defects", ",".join(kinds))
+        if self.moving_share and self.scene == "off":
+            raise UsageError(
+                f'spec moving_share = {self.moving_share:g} applies only to scene = "auto", which is "off": set '
+                "moving_share = 0, or scene = auto"
+            )
         if self.flow_from > self.recipe.voxels_per_clip:
             raise UsageError(
                 f"spec flow_from = {self.flow_from}: give a whole number from 0 to the recipe's voxels_per_clip "
@@ -192,6 +200,8 @@ class StreamSpec:
             changes["recipe"] = _recipe(changes["recipe"], base.recipe)
         if changes.get("samples_per_decode") == 1:
             changes.setdefault("sibling_spacing", 0)
+        if changes.get("scene") == "off":
+            changes.setdefault("moving_share", 0.0)
         return dataclasses.replace(base, **changes)
 
     def canonical(self) -> bytes:
@@ -223,6 +233,7 @@ class SpecOptions(TypedDict, total=False):
     scene: SceneChoice | None
     keep_defects: str | None
     still_share: float | None
+    moving_share: float | None
     substep_px: float | None
     tolerance: float | None
 
@@ -246,8 +257,11 @@ SPEED_PRESETS: dict[str, dict[str, Any]] = {
     "exact": {"samples_per_decode": 1},
     "balanced": {"samples_per_decode": 2},
     "fast": {"samples_per_decode": 4},
+    "natural": {"samples_per_decode": 1, "scene": "auto", "moving_share": 0.75},
 }
-"""Spec fields that each speed preset sets, trading accuracy for speed. `docs/accuracy.md` gives the reasons."""
+"""Spec fields that each preset sets. The first three trade accuracy for speed (`docs/accuracy.md`); "natural" is for
+videos as they are: what spoils events is left out, and most crops show something that moves (`docs/scene.md`).
+"""
 
 
 def speed_preset(name: object, base: StreamSpec) -> StreamSpec:

@@ -109,11 +109,11 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
     return catalogue
 
 
-def serve(config: ServeConfig, times: StartTimes | None = None) -> None:
+def serve(config: ServeConfig, times: StartTimes) -> None:
     """Run a server until SIGINT or SIGTERM.
 
     Args:
-        times: completed and perhaps logged once the first sample is sent.
+        times: logged once the first sample is sent, if they are to be.
 
     Raises:
         CorpusError: the corpus gives no sequence.
@@ -123,14 +123,12 @@ def serve(config: ServeConfig, times: StartTimes | None = None) -> None:
     keep_freed_memory()
     open_many_files()
     log = Log(is_json=config.log_format == "json")
-    times = times or StartTimes()
     times.mark("imports")
     catalogue = load_catalogue(config)
     times.mark("catalogue")
-    for note in catalogue.notes:
-        log.say(note)
     table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
-    for line in corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused):
+    summary = corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused)
+    for line in (*catalogue.notes, *summary):
         log.say(line)
     catalogue.fail_fast()
     if not table.count:
@@ -151,14 +149,13 @@ def serve(config: ServeConfig, times: StartTimes | None = None) -> None:
         share_bytes=int(config.share_gib * GIB),
     )
     # Workers of this host use an address that requires no key.
-    worker_flags = ["--keys", ""] if config.engine == "local" else []
-    worker_flags += ["--log-format", config.log_format]
+    worker_flags = [*(["--keys", ""] if config.engine == "local" else []), "--log-format", config.log_format]
     if config.cache:
         folder = Path(config.cache).absolute()
         make_cache(folder)
         worker_flags += ["--cache", str(folder), "--cache-gib", str(config.cache_gib)]
+    worker_flags += ["--cache-raw"] * config.cache_raw + ["--debug"] * times.is_logged
     worker_flags += catalogue.source.worker_flags()
-    worker_flags += ["--debug"] if times.is_logged else []
     label = f"w{secrets.token_hex(4)}"
     keys = KeyFolder(Path(config.keys)) if config.keys else None
     stop = threading.Event()
@@ -182,8 +179,7 @@ def serve(config: ServeConfig, times: StartTimes | None = None) -> None:
             pool.start(sockets.local_address if pool.is_local else sockets.worker_address)
             pool.scale(config.least_workers)
             times.mark("schedule and sockets")
-            if config.spec.scene == "off":
-                check_in_background(catalogue, config.spec.recipe.frames_needed, stop, log.say)
+            check_in_background(catalogue, config.spec, stop, log.say)
             if page is not None:
                 page.start(sockets.local_address)
                 log.say(f"page: {page.url}")

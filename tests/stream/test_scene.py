@@ -95,13 +95,15 @@ def test_voxels_and_frames_are_those_of_scene_off(catalogue: Catalogue) -> None:
 
 
 def test_the_stream_is_what_is_remade_and_a_server_with_scenes_serves_both(scenes: Path, catalogue: Catalogue) -> None:
-    flags = (*SMALL_FLAGS, "--set", "pause_probability=0", "--scene", "auto", "--no-shuffle", "--still-share", "1")
+    flags = (*SMALL_FLAGS, "--set", "pause_probability=0", "--scene", "auto", "--no-shuffle")
+    flags = (*flags, "--still-share", "1", "--moving-share", "0.5")
+    spec = dataclasses.replace(AUTO, moving_share=0.5)
     with LocalServer(scenes, workers=2, flags=flags) as server:
         stream = V2VStreamDataset(server.address, batch_size=4, arrays=ARRAYS, seed=3)
         count = 0
         for batch in stream:
             for row, index in enumerate(batch.indices):
-                sample = remake(catalogue, AUTO, seed=3, epoch=0, index=index, arrays=ARRAYS)
+                sample = remake(catalogue, spec, seed=3, epoch=0, index=index, arrays=ARRAYS)
                 assert batch.provenance[row] == sample.provenance
                 for name in ARRAYS:
                     np.testing.assert_array_equal(getattr(batch, name)[row].numpy(), sample.arrays[name])

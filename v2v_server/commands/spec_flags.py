@@ -14,7 +14,11 @@ from v2v_protocol.spec import SPEED_PRESETS, StreamSpec
 def add_spec(parser: Parser) -> None:
     """Add ``--preset``, ``--recipe``, ``--set``, and a flag for each field of a StreamSpec."""
     stream = parser.group("Stream")
-    stream.add_argument("--preset", choices=tuple(SPEED_PRESETS), help="trade accuracy for speed (default exact)")
+    stream.add_argument(
+        "--preset",
+        choices=tuple(SPEED_PRESETS),
+        help="trade accuracy for speed (default exact), or natural: clean videos as they are",
+    )
     stream.add_argument(
         "--recipe", metavar="NAME", help=f"virtual cameras: a preset ({', '.join(PRESETS)}) or a YAML file of fields"
     )

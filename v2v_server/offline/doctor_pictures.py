@@ -10,7 +10,10 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
+
 from v2v_protocol.errors import V2VError
+from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES
 from v2v_server.corpus.scenes.findings import (
@@ -116,6 +119,10 @@ def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple
             more = f"; and {len(having) - _SHOWN} more" if len(having) > _SHOWN else ""
             text = f"{count} of {len(sequences)} sequences ({100 * count // len(sequences)}%) have {effect} ({named}"
             yield "note", "pictures", f"{text}{more})", _CHANGES[kind]
+    if varying := [excerpt.id for excerpt, _, _, _ in found if _has_variable_rate(excerpt)]:
+        text = f"{len(varying)} of {len(found)} videos have a variable rate ({', '.join(varying[:_SHOWN])})"
+        change = "recipes that state times use the time stamps; a bin of frames then lasts differently long"
+        yield "note", "pictures", text, change
     if stated := [(excerpt.id, signal) for excerpt, _, _, signal in found if signal != SDR]:
         named = "; ".join(f"{id}: {signal}" for id, signal in stated[:_SHOWN])
         more = f"; and {len(stated) - _SHOWN} more" if len(stated) > _SHOWN else ""
@@ -124,20 +131,20 @@ def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple
 
 
 def check_in_background(
-    catalogue: Catalogue, frames_needed: int, stop: threading.Event, say: Callable[[str], object], processes: int = 1
+    catalogue: Catalogue, spec: StreamSpec, stop: threading.Event, say: Callable[[str], object], processes: int = 1
 ) -> threading.Thread | None:
     """Look for defects in a few videos of a local corpus while a server serves it, and say once what is found.
 
     Args:
-        frames_needed: frames of a sequence.
+        spec: of the server; nothing is looked at with scene "auto".
         stop: set when the server ends.
         say: called in the thread with a line of text; not called if nothing is found.
         processes: of :func:`v2v_server.system.isolate.run_isolated`.
 
     Returns:
-        the thread; None for a corpus on another host.
+        the thread; None where nothing is looked at, as for a corpus on another host.
     """
-    if not catalogue.source.is_local:
+    if spec.scene != "off" or not catalogue.source.is_local:
         return None
     excerpts = list(_excerpts(catalogue, _SERVED_VIDEOS))  # here: the index is open in this thread only
 
@@ -153,7 +160,7 @@ def check_in_background(
         except (OSError, V2VError) as error:
             say(f"pictures: not looked at: {error}")
             return
-        sequences = _sequences_of(results, frames_needed)
+        sequences = _sequences_of(results, spec.recipe.frames_needed)
         shares = [
             f"{100 * count // len(sequences)}% have {effect}"
             for kind, effect in _EFFECTS.items()
@@ -214,6 +221,14 @@ def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal]:
     except V2VError:
         return 0, (), SDR
     return scene.end, defects_of(scene), signal
+
+
+def _has_variable_rate(excerpt: _Excerpt) -> bool:
+    """Return whether a twentieth of the steps lasts a tenth longer or shorter than the median."""
+    steps = np.diff(excerpt.index.seconds(excerpt.start, excerpt.count))
+    if not len(steps) or np.isnan(steps).any():
+        return False
+    return bool(20 * np.count_nonzero(np.abs(steps / np.median(steps) - 1) > 0.1) > len(steps))
 
 
 def _sequences_of(results: Iterable[_Found], needed: int) -> list[tuple[_Found, tuple[int, int]]]:

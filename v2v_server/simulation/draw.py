@@ -15,11 +15,14 @@ numbers, does not change the others.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from itertools import accumulate
 
 import numpy as np
 import numpy.typing as npt
@@ -48,9 +51,12 @@ class Purpose(IntEnum):
     NOISE_KEY = 9
     LOG_EPS = 16
     VOXEL_SECONDS = 17
+    CROP_CHOICE = 18
 
 
 _LOG_EPS_STEPS = 32
+_CROP_PLACES = 8
+"""Places of which a crop is chosen."""
 _FIRST_EFFECTS = {
     name: number
     for number, name in enumerate(
@@ -193,6 +199,37 @@ def _timed(params: SampleParams, recipe: Recipe, stream: _Stream, times: FrameTi
 def _until(pauses: Sequence[tuple[int, int]], steps: int) -> tuple[tuple[int, int], ...]:
     """Return the pauses of a clip that ends earlier."""
     return tuple((first, min(length, steps + 1 - first)) for first, length in pauses if first <= steps)
+
+
+def choose_crop(
+    params: SampleParams,
+    recipe: Recipe,
+    *,
+    seed: int,
+    epoch: int,
+    index: int,
+    share: float,
+    picture_height_px: int,
+    picture_width_px: int,
+    weigh: Callable[[int, int], int],
+) -> SampleParams:
+    """Return a draw whose crop lies, with a probability of ``share``, at one of eight places drawn with weights.
+
+    Args:
+        params, recipe: the draw and its recipe.
+        seed, epoch, index, picture_height_px, picture_width_px: see :func:`draw`.
+        weigh: return the weight of a crop from its row and column in the resized picture; all 0: as drawn.
+    """
+    words = _raw((seed, _SAMPLE_KEY), (0, Purpose.CROP_CHOICE, index, epoch), 2 + 2 * _CROP_PLACES)
+    height, width = resized_size(picture_height_px, picture_width_px, params.scale)
+    places = [
+        (_below(height - recipe.crop_height_px + 1, top), _below(width - recipe.crop_width_px + 1, left))
+        for top, left in zip(words[2::2], words[3::2], strict=True)
+    ]
+    if _unit(words[0]) >= share or not (total := sum(weights := [weigh(*place) for place in places])):
+        return params
+    top, left = places[bisect_right(list(accumulate(weights)), _below(total, words[1]))]
+    return dataclasses.replace(params, crop_top_px=top, crop_left_px=left)
 
 
 def smallest_scale(recipe: Recipe, picture_height_px: int, picture_width_px: int) -> float:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
 from itertools import pairwise
+from pathlib import Path
 from types import TracebackType
 from typing import Any, NoReturn
 
@@ -248,3 +249,14 @@ class StoreFile(BlockReader):
         except OSError as error:
             raise VideoUnreadable(self._path, None, f"cannot be read: {error.strerror or error}") from error
         return {name: place for name, place in places.items() if name in PLANES}
+
+
+def has_planes(path: Path, planes: Collection[str]) -> bool:
+    """Return whether a store file has planes; True if it cannot be read, since whatever reads it says why."""
+    if not planes:
+        return True
+    try:
+        with StoreFile(path) as stored:
+            return stored.planes.issuperset(planes)
+    except VideoError:
+        return True

@@ -39,7 +39,7 @@ from v2v_server.corpus.scenes.scene import Scene, Sides
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.motion import MARGIN_PX, cells_of, levels_of
-from v2v_server.simulation.draw import FrameTimes, draw
+from v2v_server.simulation.draw import FrameTimes, choose_crop, draw
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.kernels import ARRAYS, list_events
 from v2v_server.simulation.variants import Variant, variants
@@ -56,7 +56,7 @@ from v2v_server.video.luma import MIXED, MOST_BITS, SDR
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, simulate
 from v2v_server.worker.cleaning import CleanFrames
-from v2v_server.worker.scene_choice import FlowPlan, plan_flow
+from v2v_server.worker.scene_choice import FlowPlan, crop_weight, plan_flow
 from v2v_server.worker.sidecars import errors_of_sidecar, sidecar_files
 
 
@@ -116,6 +116,18 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
         video_thresholds=_pair(lease.thresholds),
         times=_frame_times(lease, spec, frames) if recipe.is_timed else None,
     )
+    if scene is not None and spec.moving_share:
+        params = choose_crop(
+            params,
+            recipe,
+            seed=lease.seed,
+            epoch=lease.epoch,
+            index=index,
+            share=spec.moving_share,
+            picture_height_px=picture.height_px,
+            picture_width_px=picture.width_px,
+            weigh=crop_weight(scene, frames, params.scale, recipe, picture),
+        )
     source = params.source_index(int(params.ends(recipe)[-1]))
     flow: FlowSettings | None = None
     margin_px: int | None = MARGIN_PX if spec.substep_px else 0

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -36,11 +37,14 @@ from v2v_server.corpus.scenes.scene import (
     LAG_FRAMES,
     MOTION,
     NOISE,
+    SEGMENT_FRAMES,
     TILES,
+    UNKNOWN,
     Scene,
     Sides,
 )
 from v2v_server.flow.methods import AUTO, SLOW, SLOW_PX, STILL, STILL_GREY_LEVELS
+from v2v_server.simulation.draw import resized_size
 from v2v_server.simulation.view import Window
 from v2v_server.worker.cleaning import CleanFrames
 
@@ -91,6 +95,38 @@ def plan_flow(scene: Scene, frames: CleanFrames, params: SampleParams, spec: Str
     if spec.flow_method != AUTO:
         return FlowPlan((), f"{kind}; flow {spec.flow_method} as asked; {figures}")
     return FlowPlan(methods, f"{kind}; flow {_counted(methods)}; {figures}")
+
+
+def crop_weight(
+    scene: Scene, frames: CleanFrames, scale: float, recipe: Recipe, picture: Window
+) -> Callable[[int, int], int]:
+    """Return a function of a crop's row and column: the change of the tiles that it shows, by their area in it.
+
+    Args:
+        scene, frames, recipe, picture: see :func:`plan_flow`.
+        scale: of the picture before the crop.
+    """
+    first, end = (int(frames.numbers[place]) - scene.first for place in (0, -1))
+    changes = scene.segments[max(0, first // SEGMENT_FRAMES) : max(0, end // SEGMENT_FRAMES + 1), CHANGE]
+    tiles = np.where(changes == UNKNOWN, 0, changes).sum(axis=0, dtype=np.int64).reshape(TILES, TILES).tolist()
+    sides = frames.sides
+    height, width = resized_size(
+        picture.height_px + sides.top + sides.bottom, picture.width_px + sides.left + sides.right, scale
+    )
+    above, before = resized_size(sides.top, sides.left, scale)
+
+    def weigh(top: int, left: int) -> int:
+        rows = _overlaps(top + above, recipe.crop_height_px, height)
+        columns = _overlaps(left + before, recipe.crop_width_px, width)
+        return sum(row * column * tiles[y][x] for y, row in enumerate(rows) for x, column in enumerate(columns))
+
+    return weigh
+
+
+def _overlaps(start_px: int, extent_px: int, side_px: int) -> list[int]:
+    """Return how much of each of the four parts of a side an extent covers, 1/4 px."""
+    end = TILES * (start_px + extent_px)
+    return [max(0, min(end, (part + 1) * side_px) - max(TILES * start_px, part * side_px)) for part in range(TILES)]
 
 
 def _method(scene: Scene, earlier: int, later: int, tiles: npt.NDArray[np.bool_], scale: float) -> str:

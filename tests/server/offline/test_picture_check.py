@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from tests.clips import panned_luma, write_clip
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.offline import doctor_pictures
 from v2v_server.offline.doctor_pictures import check_in_background
@@ -23,11 +25,12 @@ def test_a_server_says_once_which_share_of_its_sequences_has_defects(
     moving = panned_luma(60, 96, 128)
     for name, luma in {"clean": moving, "twos": moving[np.arange(60) // 2]}.items():
         write_clip(tmp_path / f"{name}.mkv", luma, codec="ffv1", pixel_format="gray", full_range=True)
+    spec = StreamSpec(recipe=Recipe(voxels_per_clip=1, bins=29, crop_height_px=32, crop_width_px=32))
     said, stop = list[str](), threading.Event()
     with closing(open_catalogue(tmp_path, cache_dir=tmp_path / "index", processes=0)) as catalogue:
         if ends_first:
             stop.set()
-        thread = check_in_background(catalogue, 30, stop, said.append, processes=0)
+        thread = check_in_background(catalogue, spec, stop, said.append, processes=0)
         assert thread is not None
         thread.join(60)
         assert not thread.is_alive()

@@ -12,9 +12,10 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.scenes.scene import CHANGE, COLUMNS, CONTRAST, DARK, MOTION, NOISE, TILES, Scene
+from v2v_server.simulation.draw import choose_crop
 from v2v_server.simulation.view import Window
 from v2v_server.worker.cleaning import CleanFrames
-from v2v_server.worker.scene_choice import MOVING, FlowPlan, plan_flow
+from v2v_server.worker.scene_choice import MOVING, FlowPlan, crop_weight, plan_flow
 
 RECIPE = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=32)
 AUTO = StreamSpec(recipe=RECIPE, scene="auto")
@@ -138,3 +139,36 @@ def test_a_method_that_was_asked_for_is_obeyed() -> None:
     assert made.methods == ()
     assert not made.still
     assert made.reason.startswith("still; flow dis-fast-1 as asked; ")
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_crops_lie_where_the_picture_changes(share: float) -> None:
+    """Of 8 places drawn, those are likely whose tiles change; with a share of 0 each crop stays as drawn."""
+    values = np.zeros((4, COLUMNS))
+    values[:, CHANGE] = 0.0
+    values[2, CHANGE.start + 5] = 30.0  # the second tile of the second row: rows and columns 32 .. 63
+    what, picture = Scene.of(shots(64), values), Window(0, 0, SIZE_PX, SIZE_PX)
+    weigh = crop_weight(what, CleanFrames.of(what, 30, AUTO, 21), 1.0, RECIPE, picture)
+    assert weigh(32, 32) == 30 * 64 * 128 * 128
+    assert weigh(48, 16) == weigh(32, 32) // 4
+    assert weigh(64, 0) == 0
+    drawn = params(crop_top_px=96, crop_left_px=96)
+    chosen = [
+        choose_crop(
+            drawn, RECIPE, seed=1, epoch=0, index=index, share=share, picture_height_px=SIZE_PX,
+            picture_width_px=SIZE_PX, weigh=weigh,
+        )
+        for index in range(50)
+    ]  # fmt: skip
+    if share:
+        assert np.mean([weigh(each.crop_top_px, each.crop_left_px) > 0 for each in chosen]) > 0.8
+    else:
+        assert all(each == drawn for each in chosen)
+
+
+def test_crops_stay_as_drawn_where_nothing_changes() -> None:
+    drawn = params(crop_top_px=7)
+    assert drawn == choose_crop(
+        drawn, RECIPE, seed=1, epoch=0, index=0, share=1.0, picture_height_px=SIZE_PX, picture_width_px=SIZE_PX,
+        weigh=lambda top, left: 0,
+    )  # fmt: skip
