@@ -134,6 +134,19 @@ class Videos(Sequence[VideoEntry]):
 
 
 COLOUR_REMEDY = "prepare them again with v2v-prepare --planes chroma, or serve the videos that they were prepared from"
+_ASKED = 16
+"""Prepared files that are checked for their colour."""
+
+
+def has_chroma(source: VideoSource, ids: Sequence[str]) -> bool:
+    """Return whether some prepared files of this host, evenly spaced, all have their colour."""
+    if not source.is_local:
+        return False
+    for id in ids[:: max(1, len(ids) // _ASKED)]:
+        with source.open_local(id, "") as path:
+            if not is_store_file(path) or not has_planes(path, (CHROMA,)):
+                return False
+    return True
 
 
 @dataclass(frozen=True, slots=True)
