@@ -37,6 +37,7 @@ BENCHES = {
     "substeps": "accuracy.substeps",
     "fit": "accuracy.fit",
     "extremes": "accuracy.extremes",
+    "light": "accuracy.light",
     "sensor": "accuracy.sensor",
     "scene": "accuracy.scene",
     "defects": "accuracy.defects",

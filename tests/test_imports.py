@@ -181,6 +181,7 @@ def test_imports_are_absolute() -> None:
         ("v2v_protocol.wire", ("torch", "zmq", "av", "numba", "cv2", "yaml")),
         ("v2v_server.simulation.draw", ("torch", "zmq", "av", "numba", "cv2")),
         ("v2v_server.broker.dispatcher", ("torch", "zmq", "numba", "cv2")),
+        ("v2v_server.serve", ("torch", "numba", "cv2")),
     ],
 )
 def test_what_a_fresh_interpreter_loads(module: str, without: tuple[str, ...]) -> None:

@@ -151,6 +151,33 @@ class Batch:
         return self._array("frames")
 
     @property
+    def frames_rgb(self) -> torch.Tensor:
+        """Return the frames in colour: [B, T + lead_frames, 3, H, W] uint8, red, green and blue.
+
+        Raises:
+            UsageError: the dataset did not request this array.
+        """
+        return self._array("frames_rgb")
+
+    @property
+    def frames_u16(self) -> torch.Tensor:
+        """Return the frames with the levels that the video stores: [B, T + lead_frames, 1, H, W] uint16.
+
+        Raises:
+            UsageError: the dataset did not request this array.
+        """
+        return self._array("frames_u16")
+
+    @property
+    def frames_all(self) -> torch.Tensor:
+        """Return all frames that were simulated, the first included: [B, steps + 1, 1, H, W] uint8.
+
+        Raises:
+            UsageError: the dataset did not request this array.
+        """
+        return self._array("frames_all")
+
+    @property
     def frame_grids(self) -> torch.Tensor:
         """Return the number of the voxel grid that ends at each frame: int64 [T + lead_frames].
 

@@ -14,6 +14,9 @@ The pixel model (section 3 of the paper), per pixel, with F in 0..255:
     residual(t) = dL(t) - threshold_pos N+ + threshold_neg N-
     V(bin)     += N+ - N-
 
+With ``light`` = declared, F has the bits of the video, and the transfer that it states may replace (F / 255) ** gamma
+(``v2v_server/simulation/intensity.py``).
+
 Effects beyond it (mismatch, shot noise, leak, refractory period, low-pass, dead pixels) are off in ``paper``; their
 equations and sources are in ``docs/effects.md``.
 """

@@ -109,11 +109,11 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
     return catalogue
 
 
-def serve(config: ServeConfig, times: StartTimes | None = None) -> None:
+def serve(config: ServeConfig, times: StartTimes) -> None:
     """Run a server until SIGINT or SIGTERM.
 
     Args:
-        times: completed and perhaps logged once the first sample is sent.
+        times: logged once the first sample is sent, if they are to be.
 
     Raises:
         CorpusError: the corpus gives no sequence.
@@ -123,7 +123,6 @@ def serve(config: ServeConfig, times: StartTimes | None = None) -> None:
     keep_freed_memory()
     open_many_files()
     log = Log(is_json=config.log_format == "json")
-    times = times or StartTimes()
     times.mark("imports")
     catalogue = load_catalogue(config)
     times.mark("catalogue")
@@ -155,8 +154,8 @@ def serve(config: ServeConfig, times: StartTimes | None = None) -> None:
         folder = Path(config.cache).absolute()
         make_cache(folder)
         worker_flags += ["--cache", str(folder), "--cache-gib", str(config.cache_gib)]
+    worker_flags += ["--cache-raw"] * config.cache_raw + ["--debug"] * times.is_logged
     worker_flags += catalogue.source.worker_flags()
-    worker_flags += ["--debug"] if times.is_logged else []
     label = f"w{secrets.token_hex(4)}"
     keys = KeyFolder(Path(config.keys)) if config.keys else None
     stop = threading.Event()
@@ -179,8 +178,8 @@ def serve(config: ServeConfig, times: StartTimes | None = None) -> None:
                 log.say(question, "warning")
             pool.start(sockets.local_address if pool.is_local else sockets.worker_address)
             pool.scale(config.least_workers)
-            check_in_background(catalogue, config.spec, stop, log.say)
             times.mark("schedule and sockets")
+            check_in_background(catalogue, config.spec, stop, log.say)
             if page is not None:
                 page.start(sockets.local_address)
                 log.say(f"page: {page.url}")

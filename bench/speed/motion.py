@@ -16,9 +16,9 @@ import os
 import statistics
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from bench.frame import Column, Report, add_positive, add_whole, progress
 from tests.clips import write_clip
 from tests.oracles.leases import open_leases
 from v2v_protocol.command import Parser
+from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.folder import Folder
@@ -69,26 +70,26 @@ def forms_of(video: Path, folder: Path) -> Iterator[tuple[str, str, Path]]:
             yield clip, form, target
 
 
-def sample_seconds(videos: Path, spec: StreamSpec, count: int) -> float:
-    """Return the processor time of a sample, the mean of the first ones."""
-    with open_leases(videos, "full", spec) as (root, leases):
-        chosen = list(islice(leases, count))
-        begin = time.process_time()
-        for lease in chosen:
-            (decoded,) = decode_for(lease, lease.indices, Folder(root))
-            make_sample(lease, decoded)
-        return (time.process_time() - begin) / count
+def sample_seconds(root: Path, leases: Sequence[Lease]) -> float:
+    """Return the processor time of a sample, the mean of some."""
+    begin = time.process_time()
+    for lease in leases:
+        (decoded,) = decode_for(lease, lease.indices, Folder(root))
+        make_sample(lease, decoded)
+    return (time.process_time() - begin) / len(leases)
 
 
 def compared(asked: argparse.Namespace, folder: Path) -> Iterator[dict[str, Any]]:
     """Yield the record of each clip and form."""
-    plain = StreamSpec()
-    divided = replace(plain, substep_px=asked.substep_px)
     for clip, form, videos in forms_of(asked.video, folder):
         progress(f"{clip}, {form}")
-        for spec in (plain, divided):
-            sample_seconds(videos, spec, 1)  # loads or compiles the kernels
-        turns = [[sample_seconds(videos, spec, asked.samples) for spec in (plain, divided)] for _ in range(asked.turns)]
+        works = []
+        for substep_px in (0.0, asked.substep_px):
+            with open_leases(videos, "full", StreamSpec(substep_px=substep_px)) as (root, leases):
+                works.append(partial(sample_seconds, root, list(islice(leases, asked.samples))))
+        for work in works:
+            work()  # loads or compiles the kernels
+        turns = [[work() for work in works] for _ in range(asked.turns)]
         yield {
             "measure": "sub-steps", "clip": clip, "form": form, "substep_px": asked.substep_px,
             "plain_seconds": min(turn[0] for turn in turns), "divided_seconds": min(turn[1] for turn in turns),
@@ -100,8 +101,8 @@ def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     parser.add_argument("--video", type=Path, required=True, metavar="FILE", help="film of someone who walks")
     add_positive(parser, "--substep-px", 1.0, "substep_px of the spec")
-    add_whole(parser, "--samples", 2, "samples of a turn")
-    add_whole(parser, "--turns", 5, "turns")
+    add_whole(parser, "--samples", 3, "samples of a turn")
+    add_whole(parser, "--turns", 7, "turns")
 
 
 def measure(asked: argparse.Namespace) -> Report:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import abc
 from typing import Any
 
 import pytest
 import torch
 
+from tests.protocol.test_sample import PROVENANCE
 from v2v_client import Batch
-from v2v_protocol.errors import UsageError
-from v2v_protocol.sample import ARRAYS
+from v2v_client.options import require_labels
+from v2v_protocol.errors import SampleUnavailable, UsageError
+from v2v_protocol.sample import ARRAYS, Provenance
 
 
 class Somewhere:
@@ -69,4 +72,27 @@ def test_every_array_is_an_attribute_and_says_how_to_get_it(name: str) -> None:
     with pytest.raises(UsageError, match=rf"batch.{name}: .*arrays=\('depth', '{name}'\)"):
         getattr(with_arrays(depth=torch.ones(1)), name)
     tensor = torch.ones(1, 2)
-    assert getattr(with_arrays(**{name: tensor}), name) is tensor
+    if name != "boxes":  # a list for each clip
+        assert getattr(with_arrays(**{name: tensor}), name) is tensor
+
+
+def test_boxes_are_those_of_each_frame() -> None:
+    boxes = torch.full((2, 3, 4, 7), -1.0)
+    boxes[0, 1, :2, 4] = torch.tensor([5.0, 0.0])
+    boxes[1, 2, :4, 4] = 1.0
+    batch = with_arrays(boxes=boxes)
+    assert [[len(frame) for frame in clip] for clip in batch.boxes] == [[0, 2, 0], [0, 0, 4]]
+    assert torch.equal(batch.boxes[0][1], boxes[0, 1, :2])
+    assert batch.boxes[0][1].untyped_storage().data_ptr() == boxes.untyped_storage().data_ptr(), "no copy"
+
+
+def test_a_sample_without_its_labels_says_so() -> None:
+    why = "tree/clip.mp4: its sidecar .boxes.txt: line 3 has 2 values"
+    bare = dataclasses.replace(PROVENANCE, unlabelled={"boxes": why})
+    batch = dataclasses.replace(of(torch.ones(2)), provenance=(PROVENANCE, bare))
+    assert batch.labelled == (True, False)
+    assert Provenance.from_dict(bare.to_dict()) == bare
+    assert "unlabelled" not in PROVENANCE.to_dict()
+    require_labels([PROVENANCE])
+    with pytest.raises(SampleUnavailable, match=r'has no boxes: tree/clip\.mp4: .* line 3 .* labels="optional"'):
+        require_labels(batch.provenance)

@@ -104,8 +104,9 @@ def any_time_stamps() -> int:
         "apart": np.where(np.arange(count) < 20, MICROSECOND, HOUR) * np.arange(count),
     }  # fmt: skip
     plain = Recipe(
-        voxels_per_clip=40, bins=1, crop_height_px=8, crop_width_px=8, noise_sigma=0.0, hot_pixel_share=0.0,
-        pause_probability=0.0, threshold=0.1, threshold_ratio=1.0, flip_probability=0.0,
+        voxels_per_clip=40, bins=1, crop_height_px=8, crop_width_px=8, noise_sigma=(0.0, 0.0),
+        hot_pixel_share=(0.0, 0.0), pause_probability=0.0, threshold=(0.1, 0.1), threshold_ratio=(1.0, 1.0),
+        flip_probability=0.0,
     )  # fmt: skip
     for stamps in hostile.values():
         for duration in (MICROSECOND, 0.1, 100.0):

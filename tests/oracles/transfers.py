@@ -24,7 +24,7 @@ def encode(light: Reals, transfer: str, gamma: float) -> Reals:
     if transfer == "hlg":
         scene = light * WHITE_HLG_SCENE
         high = 0.17883277 * np.log(np.maximum(12.0 * scene - 0.28466892, 1e-9)) + 0.55991073
-        return np.where(scene <= 1 / 12, np.sqrt(3.0 * scene), high)
+        return np.asarray(np.where(scene <= 1 / 12, np.sqrt(3.0 * scene), high))
     if transfer.startswith("log"):
         decades = 2.0 if transfer == "log100" else 2.5
         return np.asarray(1.0 + np.log10(np.maximum(light, 10.0**-decades)) / decades)

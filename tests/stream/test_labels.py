@@ -15,7 +15,7 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import SampleUnavailable, StateMismatch, UsageError
 
 PLAIN = ("voxels", "frames")
-LABELS = ("boxes",)
+LABELS = ("boxes", "frames_rgb", "frames_all")
 ARRAYS = (*PLAIN, *LABELS)
 FLAGS = [
     "--set=voxels_per_clip=3", "--set=bins=2", "--set=crop_height_px=16", "--set=crop_width_px=24",

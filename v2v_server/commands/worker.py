@@ -11,6 +11,7 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_source
 from v2v_server.store.cache import Cache, make_cache
+from v2v_server.store.packing import QUICK, RAW
 from v2v_server.system.log import LOG_FORMATS, Log, report_errors
 from v2v_server.system.start_times import StartTimes
 from v2v_server.system.status_fields import GIB
@@ -33,6 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     work.add_argument(
         "--cache-gib", type=float, default=100.0, metavar="N", help="size limit of --cache, GiB (default 100)"
     )
+    work.add_argument("--cache-raw", action="store_true", help="store frames in --cache without compression")
     work.add_argument(
         "--copies",
         metavar="DIR",
@@ -72,7 +74,8 @@ def _work(arguments: argparse.Namespace) -> None:
         folder = Path(arguments.cache)
         if arguments.logbook_fd is None:  # a server has already made the name of its own workers unique
             make_cache(folder)
-        cache = Cache(folder, int(arguments.cache_gib * GIB))
+        packing = RAW if arguments.cache_raw else QUICK
+        cache = Cache(folder, int(arguments.cache_gib * GIB), packing=packing)
     log = Log(is_json=arguments.log_format == "json")
     run_worker(
         arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log,

@@ -20,7 +20,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.corpus import Corpus, format_problems, list_corpus
 from v2v_server.corpus.index.columns import VideoTable
 from v2v_server.corpus.index.file import Store
-from v2v_server.corpus.manifest import Header, PreparedVideo
+from v2v_server.corpus.manifest import Header, PreparedVideo, has_chroma
 from v2v_server.corpus.probe import Progress
 from v2v_server.corpus.refresh import index_path, refresh_index
 from v2v_server.corpus.scenes.collect import SceneCollection
@@ -30,7 +30,7 @@ from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.listfile import ListEntry
 from v2v_server.corpus.sources.sidecar import sidecar_id
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
-from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos, has_chroma
+from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.system.process import without_collections

@@ -13,24 +13,29 @@ from __future__ import annotations
 
 import math
 from base64 import b64decode
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
-from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
+from v2v_protocol.errors import CorpusError, ProtocolError, UsageError, VideoError, VideoUnreadable
 from v2v_protocol.safe_json import parse_json
 from v2v_server.corpus.index.file import IndexRow
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.names import UNPRINTABLE, printable
+from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.store.chroma import CHROMA
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.encoding import Encoding
+from v2v_server.store.reader import StoreFile
 from v2v_server.video.fingerprint import is_same_file
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 from v2v_server.video.rows import Rows
 
 MANIFEST_NAME = "v2v-prepared.jsonl"
 MANIFEST_VERSION = 2
+_ASKED = 16
+"""Prepared files that are checked for their colour."""
 _Record = TypeVar("_Record", "Header", "PreparedVideo")
 
 
@@ -310,3 +315,17 @@ _FIELD_CHECKS: dict[str, Callable[[object], bool]] = {
     "str | None": lambda value: value is None or _is_text(value),
     "float | None": lambda value: value is None or _is_rate(value),
 }
+
+
+def has_chroma(source: VideoSource, ids: Sequence[str]) -> bool:
+    """Return whether some prepared files of this host, evenly spaced, all have their colour."""
+    for id in ids[:: max(1, len(ids) // _ASKED)] if source.is_local else ():
+        try:
+            with source.open_local(id, "") as path, StoreFile(path) as stored:
+                if CHROMA not in stored.planes:
+                    return False
+        except VideoUnreadable:
+            continue  # reading a sample of it reports the reason
+        except VideoError:  # not a store file
+            return False
+    return source.is_local

@@ -13,10 +13,6 @@ from v2v_protocol.sample import sidecar_endings
 from v2v_server.corpus.index.columns import CHUNK, NO_STRINGS, VideoTable
 from v2v_server.corpus.scenes.pieces import SplitVideos
 from v2v_server.corpus.sidecars import Sidecars
-from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.chroma import CHROMA
-from v2v_server.store.format import is_store_file
-from v2v_server.store.motion import has_planes
 from v2v_server.video.rows import Rows
 
 Thresholds = tuple[float | None, float | None]
@@ -138,19 +134,6 @@ class Videos(Sequence[VideoEntry]):
 
 
 COLOUR_REMEDY = "prepare them again with v2v-prepare --planes chroma, or serve the videos that they were prepared from"
-_ASKED = 16
-"""Prepared files that are checked for their colour."""
-
-
-def has_chroma(source: VideoSource, ids: Sequence[str]) -> bool:
-    """Return whether some prepared files of this host, evenly spaced, all have their colour."""
-    if not source.is_local:
-        return False
-    for id in ids[:: max(1, len(ids) // _ASKED)]:
-        with source.open_local(id, "") as path:
-            if not is_store_file(path) or not has_planes(path, (CHROMA,)):
-                return False
-    return True
 
 
 @dataclass(frozen=True, slots=True)

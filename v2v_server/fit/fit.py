@@ -203,7 +203,7 @@ def _without_evidence(
         if name in left_out or not estimates[name].told:
             continue
         if not fitted.get(name):
-            reasons[name] = "half of the sensor shows nothing of it"
+            reasons[name] = "half of the sensor tells nothing of it"
             continue
         if name in _NOISE_PANELS:
             without = panels_of(simulate_recording(other, fitted | {name: 0.0}, 3), light, begin, end)

@@ -79,7 +79,7 @@ def table(columns: Mapping[str, Mapping[str, float]]) -> str:
 def _events(camera: Mapping[str, float], greys: Doubles, frames_per_second: float) -> EventList:
     frames = np.rint(greys).astype(np.uint8)[:, None, None] * np.ones((1, SIDE_PX, SIDE_PX), np.uint8)
     arguments: dict[str, Any] = dict(camera)
-    made = simulate(frames, bins=1, frames_per_second=frames_per_second, dtype="float32", **arguments)
+    made = simulate(frames, bins=1, frames_per_second=frames_per_second, **arguments)
     return made.to_events(1e6 / frames_per_second)
 
 

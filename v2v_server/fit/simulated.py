@@ -37,7 +37,7 @@ def simulate_recording(recording: Recorded, camera: Mapping[str, float], seed: i
     )  # fmt: skip
     step_us = np.diff(recording.frame_us).astype(np.float64)
     frames = np.ascontiguousarray(recording.frames[:, None, :])
-    voxels = simulate_clip(frames, params, recipe, "int16", step_us * 1e-6, out={})
+    voxels = simulate_clip(frames, params, recipe, "int8", step_us * 1e-6, out={})
     events = list_events(voxels.given, voxels.real, step_us)
     order = np.argsort(events.x, kind="stable") if pixels <= 1 << 16 else np.lexsort((events.t, events.x))
     first = np.searchsorted(events.x[order], np.arange(pixels + 1))

@@ -17,6 +17,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.config import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.offline.aperture import clean_aperture
+from v2v_server.offline.doctor_motion import look_at_motion
 from v2v_server.offline.doctor_pictures import look_at_pictures
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable
@@ -71,6 +72,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
         yield "note", "corpus", note, ""
     yield from _how_videos_are_stored(catalogue)
     yield from look_at_pictures(catalogue, int(np.median(spec.recipe.sequence_at(found.frames_per_second))) + 1)
+    yield from look_at_motion(catalogue)
     table = SequenceTable(found, catalogue.rows, spec)
     useless = len(found) - table.videos
     if useless:

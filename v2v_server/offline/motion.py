@@ -170,7 +170,7 @@ class WholePictures:
         with catalogue.source.open_local(video.id, video.fingerprint) as path:
             signal = SDR if recipe.light == "sdr" else signal_of(path, index)._replace(bits=8)
             window = (top, 0, bottom - top, video.width_px)
-            taken = _pictures(path, index, sequence.start_frame, count, window)
+            taken = pictures_from(path, index, sequence.start_frame, count, window)
             for frame, picture in zip(frames, islice(taken, 0, None, stride), strict=True):
                 cv2.resize(picture, (width, height), frame, interpolation=cv2.INTER_AREA)
         seconds = index.seconds(sequence.start_frame, count)[::stride]
@@ -213,7 +213,9 @@ class WholePictures:
         )
 
 
-def _pictures(path: Path, index: FrameIndex, start: int, count: int, window: Window) -> Iterator[npt.NDArray[np.uint8]]:
+def pictures_from(
+    path: Path, index: FrameIndex, start: int, count: int, window: Window
+) -> Iterator[npt.NDArray[np.uint8]]:
     """Yield the luma of frame after frame, in the memory of a few."""
     if not is_store_file(path):
         yield from stream_luma(path, index, start, count, window)

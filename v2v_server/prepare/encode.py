@@ -26,8 +26,10 @@ from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError
 from v2v_server.store.encoding import Encoding
+from v2v_server.video.luma import SDR, TRANSFERS
 from v2v_server.video.source import reason
 
+_CODE_POINTS = {name: code for code, name in TRANSFERS.items()}
 _NOMINAL_RATE = 25
 _OPTIONS = {"preset": "medium", "tune": "fastdecode", "x264-params": "no-psy=1:scenecut=0"}
 
@@ -36,6 +38,7 @@ def encode_luma(
     path: str | os.PathLike[str],
     frames: Iterable[npt.NDArray[np.uint8]],
     encoding: Encoding,
+    transfer: str = SDR.transfer,
     *,
     height: int,
     width: int,
@@ -48,6 +51,7 @@ def encode_luma(
         path: the file; its suffix does not matter.
         frames: ``len(pts)`` pictures [height, width] uint8, full range.
         encoding: settings of h264.
+        transfer: of the pictures, see :class:`v2v_server.video.luma.Signal`; SDR is not stated.
         height, width: size of the pictures, pixels; odd sizes are allowed.
         pts: strictly increasing time stamps in units of ``time_base``.
         time_base: seconds.
@@ -64,6 +68,8 @@ def encode_luma(
             stream.width, stream.height, stream.pix_fmt = width, height, "gray"
             stream.gop_size, stream.max_b_frames, stream.thread_count = encoding.gop, 0, 1
             stream.color_range = ColorRange.JPEG
+            if transfer in _CODE_POINTS:
+                stream.codec_context.color_trc = _CODE_POINTS[transfer]
             stream.time_base = time_base
             due = iter(pts)
 

@@ -32,7 +32,7 @@ from v2v_server.prepare.report import Report
 from v2v_server.prepare.resume import has_failed, known_records, locked, refuse_overlap, standing_files
 from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode
 from v2v_server.store.encoding import Encoding
-from v2v_server.store.motion import has_planes
+from v2v_server.store.reader import has_planes
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.orientation import Window

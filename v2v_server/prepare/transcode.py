@@ -39,7 +39,7 @@ from v2v_server.video.collect import LastFrame
 from v2v_server.video.decode import BIT_EXACT_CODECS, decode_luma, stream_decoded, stream_luma
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import MOST_BITS
+from v2v_server.video.luma import MOST_BITS, SDR
 from v2v_server.video.orientation import Window
 from v2v_server.video.probe import probe
 
@@ -120,7 +120,7 @@ def transcode(job: Transcoding) -> Made:
     hidden = job.target.with_name(f".{name}{PARTIAL_SUFFIX}")
     with write_aside_and_rename(job.target, partial=hidden) as partial:
         analysis = SceneAnalysis()
-        frames = _decoded(job, index, MOST_BITS if job.encoding.is_lossless else None)
+        frames = _decoded(job, index, MOST_BITS if job.encoding.is_lossless else SDR.bits)
         if job.scene:
             frames = _watched(frames, analysis)
         made = (
@@ -196,9 +196,11 @@ def _encoded(job: Transcoding, index: FrameIndex, made: Path, frames: Iterator[_
     """Encode a video, and compare it with its source."""
     pts, time_base = _times(job, index)
     height, width = job.window[2:]
+    first = next(frames)
+    pictures, transfer = (picture for _, picture in chain((first,), frames)), first[0].signal.transfer
     encode_luma(
-        made, (picture for _, picture in frames), job.encoding, height=height, width=width, pts=pts, time_base=time_base
-    )
+        made, pictures, job.encoding, transfer, height=height, width=width, pts=pts, time_base=time_base
+    )  # fmt: skip
     verified = _verified(job, index, made, pts, time_base)
     with made.open("rb") as file:
         os.fsync(file.fileno())

@@ -31,10 +31,10 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnread
 from v2v_server.store.chroma import CHROMA, chroma_planes, matrix_of, whole_chroma, with_chroma
 from v2v_server.store.depth import detail_planes, read_levels, same_transfer
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
-from v2v_server.store.motion import MOTION, has_planes, read_motion, wants_motion, with_motion, with_planes
-from v2v_server.store.packing import QUICK
+from v2v_server.store.motion import MOTION, read_motion, wants_motion, with_motion, with_planes
+from v2v_server.store.packing import QUICK, RAW, Packing
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.reader import StoreFile, has_planes
 from v2v_server.store.writer import StoreWriter
 from v2v_server.system.private import make_private
 from v2v_server.system.status_fields import GIB
@@ -48,7 +48,7 @@ from v2v_server.video.orientation import Window
 _LOCK_SECONDS = 0.06
 """Longest wait for the lock of the folder; a sample does without the cache rather than wait."""
 _LARGE_PICTURE_PX = 1 << 20
-_EXPECTED_BITS = 4
+_EXPECTED_BITS = {QUICK: 4, RAW: 8}
 """Largest size of a packed pixel; the real size is known only after writing."""
 _REST_SECONDS = 60.0
 """Time without writing to a cache after a write failed."""
@@ -71,14 +71,18 @@ class Cache:
         folder: created by :func:`make_cache`.
         most_bytes: largest size of the folder, bytes.
         least_free_bytes: disk space to keep free, bytes.
+        packing: of the pieces that it stores, QUICK or RAW; it reads all.
 
     Attributes:
         on_wait: called with True before this waits for other processes, and with False when it goes on.
         trouble: the last problem, for people: why nothing more is stored, or a damaged piece; empty if there is none.
     """
 
-    def __init__(self, folder: Path, most_bytes: int, least_free_bytes: int = LEAST_FREE_BYTES) -> None:
+    def __init__(
+        self, folder: Path, most_bytes: int, least_free_bytes: int = LEAST_FREE_BYTES, packing: Packing = QUICK
+    ) -> None:
         self.folder = folder
+        self._packing = packing
         self._quota = QuotaFolder(folder, most_bytes, _LOCK_SECONDS, least_free_bytes)
         self._rest_until, self._rest_reason = 0.0, ""
         self.trouble = ""
@@ -128,7 +132,7 @@ class Cache:
         picture = rows[0], 0, rows[1] - rows[0], index.width_px
         planes = [*([MOTION] if stride == 1 and wants_motion(cuts) else []), *chroma_planes(cuts)]
         lacking = [piece for piece in pieces if not has_planes(piece.path, planes)]
-        # Keep what other streams stored; otherwise two streams would replace each other's pieces for ever.
+        # Keep what other streams stored; otherwise two streams would replace each other's pieces.
         kept = [name for name in (MOTION, CHROMA) if any(has_planes(piece.path, (name,)) for piece in lacking)]
         planes = [*dict.fromkeys([*planes, *kept])]
         made = self._read(pieces, fingerprint, index, start, cuts, stride, picture)
@@ -224,7 +228,7 @@ class Cache:
         except OSError as error:
             self._rest(f"is gone: {error.strerror or error}")
             return False
-        expected = pixels * _EXPECTED_BITS // 8
+        expected = pixels * _EXPECTED_BITS[self._packing] // 8
         if self.used_bytes + expected > self._quota.most_bytes:
             self.trouble = f"full: {self.used_bytes / GIB:.2f} of {self._quota.most_bytes / GIB:g} GiB"
             return False
@@ -266,7 +270,7 @@ class Cache:
                     video=video, fingerprint=fingerprint, height_px=index.height_px, width_px=width, top=top,
                     rows=height, first=piece.first, count=piece.end - piece.first, frames=piece.end,
                     frames_per_second=0.0, codec=stream.codec, bit_exact=stream.codec in BIT_EXACT_CODECS,
-                    group=group_frames_for(height, width), packing=QUICK.method, bits=signal.bits,
+                    group=group_frames_for(height, width), packing=self._packing.method, bits=signal.bits,
                     transfer=signal.transfer, matrix=matrix_of(stream),
                 )  # fmt: skip
                 more = chain(((stream, picture),), islice(frames, head.count - 1))
@@ -280,7 +284,7 @@ class Cache:
         try:
             partial.parent.mkdir(exist_ok=True)
             make_private(partial)
-            with StoreWriter(partial, head, QUICK, planes) as writer:
+            with StoreWriter(partial, head, self._packing, planes) as writer:
                 fcntl.flock(
                     writer.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB
                 )  # held for the life of this process: see _remove_abandoned

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import VideoError
 from v2v_server.store.reader import StoreFile
 from v2v_server.video.collect import Cut, LastFrame
-from v2v_server.video.colour.chroma import DEFAULT_MATRIX, Chroma, ChromaCut
+from v2v_server.video.colour.chroma import CELL_PX, DEFAULT_MATRIX, Chroma, ChromaCut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.orientation import Window
 
@@ -26,7 +26,7 @@ def chroma_planes(cuts: Sequence[Cut]) -> list[str]:
 
 def whole_chroma(planes: Collection[str], picture: Window) -> ChromaCut | None:
     """Return what to decode for the plane of a usable picture; None without the plane."""
-    return ChromaCut((), picture, picture[0]) if CHROMA in planes else None
+    return ChromaCut((), picture, (picture[0], picture[2])) if CHROMA in planes else None
 
 
 def matrix_of(stream: LastFrame) -> str:
@@ -67,5 +67,11 @@ def _read(cut: ChromaCut, files: Sequence[tuple[StoreFile, range]], start: int, 
         if len(frames):
             first = start + int(frames[0]) * stride
             count = int(frames[-1] - frames[0]) * stride + 1
-            parts.append(stored.plane(CHROMA, first, count, cut.cells)[(frames - frames[0]) * stride])
+            parts.append(stored.plane(CHROMA, first, count, _cells_in(stored, cut))[(frames - frames[0]) * stride])
     return Chroma(np.concatenate(parts), files[0][0].head.matrix)
+
+
+def _cells_in(stored: StoreFile, cut: ChromaCut) -> Window:
+    """Return the cells of a cut in the plane of a file, whose cells begin at its own first row."""
+    top, left, rows, columns = cut.cells
+    return top - stored.head.top // CELL_PX, left, rows, columns

@@ -1,18 +1,18 @@
-"""The motion of a clip, read beside its pixels or found from them."""
+"""The motion of a clip, read beside its pixels or found from them.
+
+:mod:`v2v_server.motion` is imported lazily: listing files must not load numba.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import VideoError
-from v2v_server.motion import Cells, MotionOfCuts, MotionOfPictures, Pyramid, Vectors
 from v2v_server.store.chroma import CHROMA, chroma_of
 from v2v_server.store.depth import DETAIL, detail_of, grey_of
 from v2v_server.store.reader import StoreFile
@@ -20,11 +20,16 @@ from v2v_server.video.collect import Cut, DecodedFrame, LastFrame
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.orientation import Window
 
+if TYPE_CHECKING:
+    from v2v_server.motion import Cells, Vectors
+
 MOTION = "motion"
 """Name of the plane."""
 
 
 def _motion_maker() -> Callable[[npt.NDArray[np.uint8]], Vectors]:
+    from v2v_server.motion import MotionOfPictures, Pyramid
+
     following = MotionOfPictures()
     return lambda picture: following.add(Pyramid.of(picture))
 
@@ -48,6 +53,8 @@ class MotionWatch:
         self.watch = self._begin if wants_motion(cuts) else None
 
     def _begin(self) -> Callable[[DecodedFrame], None]:
+        from v2v_server.motion import MotionOfCuts, Pyramid
+
         self._found = found = MotionOfCuts(self._cuts)
         first_row, first_column, height, width = self._picture
 
@@ -68,17 +75,6 @@ class MotionWatch:
 def wants_motion(cuts: Sequence[Cut]) -> bool:
     """Return whether a cut asks for motion."""
     return any(cut.cells is not None for cut in cuts)
-
-
-def has_planes(path: Path, planes: Collection[str]) -> bool:
-    """Return whether a store file has planes; True if it cannot be read, since whatever reads it says why."""
-    if not planes:
-        return True
-    try:
-        with StoreFile(path) as stored:
-            return stored.planes.issuperset(planes)
-    except VideoError:
-        return True
 
 
 def with_motion(
@@ -118,6 +114,8 @@ def read_motion(
     cuts = [cut for cut in cuts if cut.cells is not None]
     if not cuts:
         return []
+    from v2v_server.motion import Cells, MotionOfCuts, Pyramid
+
     if not all(has_motion(stored, stride, picture) for stored, _ in files):
         found = MotionOfCuts(cuts)
         for stored, frames in files:
@@ -128,10 +126,11 @@ def read_motion(
     for cut in cuts:
         assert cut.cells is not None
         cells = Cells(*cut.cells)
-        of_cut = np.empty((cut.count, 2, *cells[2:]), np.int16)
+        parts = []
         for stored, held in files:
             if frames := range(held.start, min(held.stop, cut.count)):
-                of_cut[frames.start : frames.stop] = stored.plane(MOTION, start + frames.start, len(frames), cells)
+                parts.append(stored.plane(MOTION, start + frames.start, len(frames), cells))
+        of_cut = parts[0] if len(parts) == 1 else np.concatenate(parts)
         of_cut[0] = 0
         for (before, _), (after, frames) in pairwise(files):
             if frames.start < cut.count:  # the first frame of a file has no motion in it
@@ -169,6 +168,8 @@ def with_planes(
 
 def _motion_across(before: StoreFile, after: StoreFile, at: int, cells: Cells, picture: Window) -> Vectors:
     """Return the motion to the first frame of a file, ``at``, from the last frame of the one before."""
+    from v2v_server.motion import MotionOfPictures, Pyramid
+
     following = MotionOfPictures()
     for stored, number in ((before, at - 1), (after, at)):
         for each in pictures_in(stored, range(1), number, 1, picture):

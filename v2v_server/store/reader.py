@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
 from itertools import pairwise
+from pathlib import Path
 from types import TracebackType
 from typing import Any, NoReturn
 
@@ -36,7 +37,7 @@ class BlockReader:
     Args:
         path, file: name and descriptor of the file; the descriptor stays open.
         offset: where the store file begins in it, bytes.
-        is_sparse: whether an empty block means zeros.
+        is_sparse: whether an empty block means zeros; :meth:`read` then leaves its part of ``out`` as it is.
 
     Attributes:
         head: head of the store file.
@@ -63,7 +64,7 @@ class BlockReader:
             out: [n, height, width] uint8, receives them.
 
         Returns:
-            whether blocks were read; otherwise everything is zero.
+            whether blocks were read; otherwise all of them are empty.
 
         Raises:
             UsageError: the file does not hold a requested frame or row.
@@ -95,7 +96,6 @@ class BlockReader:
         head, (top, left, height, width) = self.head, window
         record = self._record(group)
         if self._is_sparse and record.starts[0] == record.starts[-1]:
-            out[...] = 0
             return False
         frames = head.group_frames(group)
         columns, has_blocks = range(left // BLOCK_COLUMNS, (left + width - 1) // BLOCK_COLUMNS + 1), False
@@ -236,7 +236,7 @@ class StoreFile(BlockReader):
         if stored.head != kind.head(self.head):
             raise VideoError(self._path, None, f"the store file is corrupt (its plane {name}): {_REMEDY}")
         window = kind.window(cells)
-        pictures = np.empty((count, *window[2:]), np.uint8)
+        pictures = np.zeros((count, *window[2:]), np.uint8)
         if not stored.read(start, 1, window, pictures):
             return np.zeros((count, kind.values, *cells[2:]), kind.dtype)
         return kind.from_pictures(pictures, cells)
@@ -248,3 +248,14 @@ class StoreFile(BlockReader):
         except OSError as error:
             raise VideoUnreadable(self._path, None, f"cannot be read: {error.strerror or error}") from error
         return {name: place for name, place in places.items() if name in PLANES}
+
+
+def has_planes(path: Path, planes: Collection[str]) -> bool:
+    """Return whether a store file has planes; True if it cannot be read, since whatever reads it says why."""
+    if not planes:
+        return True
+    try:
+        with StoreFile(path) as stored:
+            return stored.planes.issuperset(planes)
+    except VideoError:
+        return True

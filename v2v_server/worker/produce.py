@@ -165,9 +165,9 @@ def _chroma_cut(
     delivered = np.unique(source[params.ends(spec.recipe)[spec.recipe.first_frame :]])
     if not frames.stride:
         delivered = frames.numbers[delivered] - frames.numbers[0]
-    top, _ = Rows.parse(lease.rows).bounds(lease.height_px)
+    top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
     window = source_window(params, spec.recipe, usable_window(lease, frames.sides))
-    return ChromaCut(tuple(delivered.tolist()), window, top)
+    return ChromaCut(tuple(delivered.tolist()), window, (top, bottom - top))
 
 
 def decode_for(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import struct
 import subprocess
@@ -14,14 +15,15 @@ import pytest
 
 from tests.clips import damaged, panned_luma, write_clip
 from v2v_server.commands import doctor as command
-from v2v_server.offline import doctor, doctor_corpus, doctor_pictures
+from v2v_server.offline import doctor, doctor_corpus, doctor_motion, doctor_pictures
 from v2v_server.offline.doctor import BAD, NOTE, OK, Finding, control_group_memory
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a process that loads torch, or processes that decode, and whatever this machine's memory is."""
-    monkeypatch.setattr(doctor_pictures, "usable_cores", lambda: 0)
+    for module in (doctor_pictures, doctor_motion):
+        monkeypatch.setattr(module, "usable_cores", lambda: 0)
     monkeypatch.setattr(doctor, "_torch", lambda: Finding(OK, "torch", "here"))
     monkeypatch.setattr(doctor, "_memory", lambda: Finding(OK, "memory", "enough"))
 
@@ -214,6 +216,17 @@ def test_defects_of_pictures_are_said_with_what_can_be_done(tmp_path: Path, caps
     assert "no problems found" not in said
     status, said = told(capsys, *flags, "--rows", "0.1:0.8")
     assert "have bars at the sides of the picture (boxed.mp4: 100% of the frames have bars: left 10 px" in said
+
+
+def test_the_loss_of_fast_motion_is_predicted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_clip(tmp_path / "slow.mp4", panned_luma(21, 140, 160, step=(0, 0)))
+    flags = ["--videos", str(tmp_path), "--cache-dir", str(tmp_path)]
+    _, said = told(capsys, *flags)
+    assert re.search(r"\nok    motion        0 px .*substep_px would change little; .* middle of 1 videos\n", said)
+    write_clip(tmp_path / "fast.mp4", panned_luma(21, 140, 160, step=(3, 4)))
+    _, said = told(capsys, *flags)
+    assert re.search(r"\nnote  motion        fast motion: 5.* px a frame .* lost within steps, .* of 2 videos\n", said)
+    assert "so does substep_px: 1 in the spec" in said
 
 
 @pytest.mark.slow

@@ -27,7 +27,9 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.store.cache import Cache, make_cache, piece_frames
+from v2v_server.store.packing import RAW
 from v2v_server.store.quota import used_bytes
+from v2v_server.store.reader import StoreFile
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.produce import make_sample
 
@@ -98,6 +100,17 @@ def test_first_a_miss_then_hits(source: Path, folder: Path, changes: dict[str, A
     assert epoch(source, Cache(folder, 1 << 30, 0), 8, spec) == ["hit"] * 8
     assert used_bytes(folder) == sum(path.stat().st_size for path in pieces(folder))
     assert not list((folder / "partial").iterdir())
+
+
+def test_raw_pieces_are_added_to_compressed_ones_and_all_are_read(source: Path, folder: Path) -> None:
+    epoch(source, Cache(folder, 1 << 30, 0), 2)
+    epoch(source, Cache(folder, 1 << 30, 0, RAW), 8)
+    assert epoch(source, Cache(folder, 1 << 30, 0), 8) == ["hit"] * 8
+    found = set()
+    for path in pieces(folder):
+        with StoreFile(path) as stored:
+            found.add(stored.head.packing)
+    assert found == {"zstd", "raw"}
 
 
 def test_waits_for_other_processes_are_told_and_its_files_are_private(source: Path, folder: Path) -> None:

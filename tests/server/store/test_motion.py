@@ -17,8 +17,8 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
+from v2v_server import motion
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.store import motion
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.encoding import Encoding
 from v2v_server.store.reader import StoreFile

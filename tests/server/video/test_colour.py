@@ -59,7 +59,8 @@ def test_each_pixel_has_the_colour_of_its_cell(
     frame = random_frame(name, *orientation.size(height, width), seed)
     y, x = data.draw(st.integers(top, height - 2)), data.draw(st.integers(0, width - 2))
     window = (y, x, data.draw(st.integers(1, height - y)), data.draw(st.integers(1, width - x)))
-    cut = ChromaCut((1, 3), window, top)
+    rows = height - top
+    cut = ChromaCut((1, 3), window, (top, rows))
     stack = ChromaStack(cut, orientation, height, width)
     for ordinal in range(4):
         stack.add(random_frame(name, *orientation.size(height, width), 7) if ordinal == 3 else frame, ordinal)
@@ -72,7 +73,8 @@ def test_each_pixel_has_the_colour_of_its_cell(
     upright = orientation.upright(values)
     expected = upright[
         :,
-        (top + (window[0] - top + np.arange(window[2])) // 2 * 2)[:, None],
+        # Half as many rows of cells as usable rows, rounded up.
+        np.minimum((window[0] + np.arange(window[2])) // 2, top // 2 + (rows + 1) // 2 - 1)[:, None] * 2,
         (window[1] + np.arange(window[3])) // 2 * 2,
     ]
     np.testing.assert_array_equal(cut.pixels(chroma.cells[0]), expected + 128)
@@ -80,7 +82,7 @@ def test_each_pixel_has_the_colour_of_its_cell(
 
 def rgb_of(frame: VideoFrame) -> npt.NDArray[np.uint8]:
     height, width = frame.height, frame.width
-    cut = ChromaCut((0,), (0, 0, height, width), 0)
+    cut = ChromaCut((0,), (0, 0, height, width), (0, height))
     stack = ChromaStack(cut, Orientation(), height, width)
     stack.add(frame, 0)
     cells, matrix = stack.chroma()

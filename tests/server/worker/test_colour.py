@@ -121,13 +121,17 @@ def samples_of(folder: Path, recipe: Recipe = RECIPE) -> list[bytes]:
 
 @pytest.mark.parametrize("recipe", [RECIPE, RECIPE.replace(frame_stride=2, resize_scale=(0.7, 1.6))])
 def test_a_prepared_folder_with_chroma_gives_the_same_colour(tmp_path: Path, recipe: Recipe) -> None:
-    source, prepared, grey = (tmp_path / name for name in ("source", "prepared", "grey"))
+    source, prepared, whole, grey = (tmp_path / name for name in ("source", "prepared", "whole", "grey"))
     source.mkdir()
     write_coloured(source / "a.mp4", coloured(40))
     with closing(open_catalogue(source, processes=0, rows=Rows.parse("0.1:0.9"))) as catalogue:
         prepare(catalogue, prepared, Encoding(size="fast"), processes=0, planes=("chroma",))
         prepare(catalogue, grey, Encoding(size="fast"), processes=0)
-    assert samples_of(prepared, recipe) == samples_of(source, recipe)
+    with closing(open_catalogue(source, processes=0)) as catalogue:
+        prepare(catalogue, whole, Encoding(size="dense"), processes=0, planes=("chroma",))
+    expected = samples_of(source, recipe)
+    assert samples_of(prepared, recipe) == expected
+    assert samples_of(whole, recipe) == expected
     with pytest.raises(UsageError, match=r"frames_rgb needs colour, .*: prepare them again with v2v-prepare --planes"):
         samples_of(grey, recipe)
 

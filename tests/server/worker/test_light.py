@@ -144,6 +144,13 @@ def test_store_and_cache_keep_transfer_and_bits(tmp_path: Path, is_deep: bool) -
     require_equal(make_sample(lease, decoded), exact, "cache")
 
 
+def test_a_lossy_corpus_keeps_the_transfer(tmp_path: Path) -> None:
+    (tmp_path / "clips").mkdir()
+    write_clip(tmp_path / "clips" / "a.mp4", LUMA, transfer=ColorTrc.ARIB_STD_B67)
+    assert run(tmp_path / "clips", tmp_path / "small", Encoding.of("h264")).complete
+    assert sample_of(tmp_path / "small", DECLARED).provenance.decoder == "h264, 8 bits, HLG"
+
+
 def test_preview_and_doctor_name_what_a_video_has(tmp_path: Path) -> None:
     ten_bits(tmp_path / "clips", ColorTrc.SMPTE2084)
     provenance = sample_of(tmp_path / "clips", SDR).provenance

@@ -1,7 +1,7 @@
 """The colour differences of decoded frames.
 
 One sample of Cb and Cr for each cell of 2 x 2 pixels, the sampling of most videos: that of the cell's upper left pixel.
-Cells are counted from the first usable row. Values are the stored ones, shifted and stretched like full-range luma
+Values are the stored ones, shifted and stretched like full-range luma
 (:mod:`v2v_server.video.luma`), at 8 bits:
 
     Cb = round((stored - 128 s) 255 / (224 s)), limited range, s = 2**(bits - 8);
@@ -49,30 +49,41 @@ class ChromaCut:
     Attributes:
         frames: which frames of the cut, ascending.
         window: (top, left, height, width) in the upright picture, px.
-        top_px: first usable row.
+        usable_px: first row in use (:mod:`v2v_server.video.rows`), and number of rows in use.
     """
 
     frames: tuple[int, ...]
     window: Window
-    top_px: int
+    usable_px: tuple[int, int]
 
     @property
     def cells(self) -> Window:
         """Return the cells that hold the window: (top, left, rows, columns)."""
-        top, left, height, width = self.window
-        top -= self.top_px
-        first_row, first_column = top // CELL_PX, left // CELL_PX
-        rows, columns = (top + height - 1) // CELL_PX + 1, (left + width - 1) // CELL_PX + 1
-        return first_row, first_column, rows - first_row, columns - first_column
+        _, left, _, width = self.window
+        rows, first_column = self._rows, left // CELL_PX
+        first_row = int(rows[0])
+        return first_row, first_column, int(rows[-1]) + 1 - first_row, (left + width - 1) // CELL_PX + 1 - first_column
+
+    @property
+    def _rows(self) -> npt.NDArray[np.int64]:
+        """Return the row of cells of each row of the window.
+
+        As many rows of cells are stored as the rows in use fill. If an even number of rows begins at an odd one, the
+        last has the colour of the row before.
+        """
+        top, _, height, _ = self.window
+        first, count = self.usable_px
+        last = first // CELL_PX + -(-count // CELL_PX) - 1
+        rows: npt.NDArray[np.int64] = np.minimum((top + np.arange(height, dtype=np.int64)) // CELL_PX, last)
+        return rows
 
     def pixels(self, cells: npt.NDArray[np.int8]) -> npt.NDArray[np.uint8]:
         """Return Cb and Cr of one frame for each pixel of the window: [2, height, width] uint8, 128 for no colour."""
-        top, left, height, width = self.window
-        first_row, first_column, *_ = self.cells
-        rows = (top - self.top_px + np.arange(height)) // CELL_PX - first_row
-        columns = (left + np.arange(width)) // CELL_PX - first_column
-        shifted = (cells.view(np.uint8) ^ 128)[:, :, columns]  # the bits of int8 plus 128
-        return np.ascontiguousarray(shifted[:, rows])
+        _, left, _, width = self.window
+        column, rows = left % CELL_PX, self._rows
+        shifted = cells.view(np.uint8) ^ 128  # the bits of int8 plus 128
+        wide = shifted.repeat(CELL_PX, axis=2)[:, :, column : column + width]
+        return np.ascontiguousarray(wide[:, rows - rows[0]])
 
 
 class ChromaStack:
@@ -87,7 +98,7 @@ class ChromaStack:
     def __init__(self, cut: ChromaCut, orientation: Orientation, height_px: int, width_px: int) -> None:
         first_row, first_column, rows, columns = cut.cells
         # The upper left pixel of each cell, in the stored picture.
-        y = cut.top_px + CELL_PX * np.arange(first_row, first_row + rows)
+        y = CELL_PX * np.arange(first_row, first_row + rows)
         x = CELL_PX * np.arange(first_column, first_column + columns)
         y = height_px - 1 - y if orientation.flip_y else y
         x = width_px - 1 - x if orientation.flip_x else x

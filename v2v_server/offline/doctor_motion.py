@@ -1,0 +1,96 @@
+"""The motion check of `v2v-doctor`: the events that a corpus loses between its frames, predicted from a few of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import Any
+
+from v2v_protocol.errors import V2VError
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES
+from v2v_server.system.compile_cache import compile_cache
+from v2v_server.system.isolate import Died, run_isolated
+from v2v_server.system.process import usable_cores
+from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.orientation import Window
+
+MOST_VIDEOS = 6
+_SIDE_PX = 256
+"""Largest side of the part in the middle of the picture that is looked at."""
+_FRAMES = 33
+_LONGEST_SECONDS = 30.0
+"""After this time no other video is begun."""
+_LONGEST_VIDEO_SECONDS = 90.0
+"""The first one may compile the kernels."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Middle:
+    """Frames in the middle of a video, and the part of the picture that is looked at."""
+
+    path: Path
+    index: FrameIndex
+    start: int
+    count: int
+    window: Window
+
+
+def look_at_motion(catalogue: Catalogue) -> Iterator[tuple[str, str, str, str]]:
+    """Predict the loss in some videos of a local corpus, in bounded time, and yield the line of the report."""
+    if not catalogue.source.is_local:
+        return
+    results = run_isolated(
+        _predicted, _middles(catalogue), usable_cores(), lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES,
+        compile_cache(),
+    )  # fmt: skip
+    found = [result for _, result in results if not isinstance(result, Died) and result]
+    if not found:
+        return
+    # Import lazily: these load OpenCV, which worked in the processes that found something.
+    from v2v_server.motion.prediction import Prediction
+    from v2v_server.offline.motion import describe_loss
+
+    total = sum((Prediction(*each) for each in found), Prediction())
+    change = ""
+    if not total.is_slow:
+        change = "more frames a second lose less"
+        if total.can_be_followed:
+            change += "; so does substep_px: 1 in the spec, for processor time"
+    text = f"{describe_loss(total)}; {_FRAMES} frames in the middle of {len(found)} videos"
+    yield "ok" if total.is_slow else "note", "motion", text.removeprefix("motion: "), change
+
+
+def _middles(catalogue: Catalogue) -> Iterator[_Middle]:
+    begun, videos = time.monotonic(), catalogue.videos
+    many = min(MOST_VIDEOS, len(videos))
+    for video in (videos[at * len(videos) // many] for at in range(many)):
+        if time.monotonic() - begun > _LONGEST_SECONDS:
+            return
+        try:
+            index = catalogue.frame_index(video.id)
+            top, bottom = catalogue.rows.bounds(index.height_px)
+        except V2VError:
+            continue  # reported with the other checks of this corpus
+        count = min(len(index), _FRAMES)
+        start = (len(index) - count) // 2 if index.seekable else 0
+        height, width = min(bottom - top, _SIDE_PX), min(index.width_px, _SIDE_PX)
+        window = top + (bottom - top - height) // 2, (index.width_px - width) // 2, height, width
+        if count > 1:
+            yield _Middle(catalogue.path(video.id), index, start, count, window)
+
+
+def _predicted(middle: _Middle) -> tuple[Any, ...]:
+    """Return the fields of the prediction; none where the frames do not decode."""
+    import numpy as np
+
+    from v2v_server.motion.prediction import predict
+    from v2v_server.offline.motion import pictures_from
+
+    try:
+        frames = list(pictures_from(middle.path, middle.index, middle.start, middle.count, middle.window))
+    except V2VError:
+        return ()
+    return astuple(predict(np.stack(frames)))
