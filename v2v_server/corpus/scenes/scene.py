@@ -128,7 +128,7 @@ class Scene:
             DARK      share of the pixels below grey level 16; 1/1000
             CLIPPED   share of the pixels from grey level 250 on; 1/1000
             FLICKER   mean distance of a frame's mean from that of its two neighbours; 1/64 grey level
-            NOISE     deviation of one pixel from frame to frame in the stillest tenth of the blocks; 1/64 grey level
+            NOISE     deviation of one pixel from frame to frame in the stillest middle blocks; 1/64 grey level
     """
 
     first: int
