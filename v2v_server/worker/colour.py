@@ -1,4 +1,4 @@
-"""Fill the delivered frames in colour."""
+"""The delivered frames in colour: what to decode, and how to fill them."""
 
 from __future__ import annotations
 
@@ -9,9 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import VideoError
-from v2v_server.simulation.view import apply_view
+from v2v_protocol.messages import Lease
+from v2v_protocol.sample import SampleParams
+from v2v_protocol.spec import StreamSpec
+from v2v_server.simulation.view import apply_view, source_window
+from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.colour.rgb import add_colour
+from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, makes
+from v2v_server.worker.cleaning import CleanFrames, usable_window
 
 
 @makes("frames_rgb")
@@ -31,3 +37,15 @@ def frames_rgb(context: SampleContext, out: npt.NDArray[Any]) -> None:
         if place != before:  # a paused camera repeats its frame
             before, chroma = place, apply_view(cut.pixels(cells[place]), view, context.recipe)
         add_colour(picture[0], chroma, matrix, context.params.contrast or 1.0, target)
+
+
+def chroma_cut(
+    lease: Lease, params: SampleParams, spec: StreamSpec, frames: CleanFrames, source: npt.NDArray[np.int64]
+) -> ChromaCut:
+    """Return which colour to decode: that of the delivered frames, in the crop."""
+    delivered = np.unique(source[params.ends(spec.recipe)[spec.recipe.first_frame :]])
+    if not frames.stride:
+        delivered = frames.numbers[delivered] - frames.numbers[0]
+    top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
+    window = source_window(params, spec.recipe, usable_window(lease, frames.sides))
+    return ChromaCut(tuple(delivered.tolist()), window, (top, bottom - top))

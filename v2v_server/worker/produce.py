@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-import v2v_server.worker.colour  # registers its arrays
 import v2v_server.worker.labels  # noqa: F401  # registers its arrays
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
@@ -35,27 +34,33 @@ from v2v_protocol.sample import (
     new_arrays,
 )
 from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
-from v2v_server.corpus.scenes.scene import Scene, Sides
+from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.motion import MARGIN_PX, cells_of, levels_of
-from v2v_server.simulation.draw import FrameTimes, choose_crop, draw
+from v2v_server.simulation.draw import choose_crop, draw
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.kernels import ARRAYS, list_events
 from v2v_server.simulation.variants import Variant, variants
-from v2v_server.simulation.view import Window, apply_view, source_window, without_margin
+from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache
 from v2v_server.store.clips import clips_of
 from v2v_server.store.format import is_store_file
 from v2v_server.video.collect import Cut
-from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import DecodedClip
-from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, simulate
-from v2v_server.worker.cleaning import CleanFrames
+from v2v_server.worker.cleaning import (
+    CleanFrames,
+    frame_index,
+    frame_times,
+    most_frames,
+    usable_window,
+    within_rows,
+)
+from v2v_server.worker.colour import chroma_cut
 from v2v_server.worker.scene_choice import FlowPlan, crop_weight, plan_flow
 from v2v_server.worker.sidecars import errors_of_sidecar, sidecar_files
 
@@ -103,7 +108,7 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
     spec = _spec(lease.spec)
     recipe = spec.recipe
     scene = None if spec.scene == "off" else Scene.from_bytes(lease.scene)
-    frames = CleanFrames.of(scene, lease.start_frame, spec, _most_frames(lease, spec))
+    frames = CleanFrames.of(scene, lease.start_frame, spec, most_frames(lease, spec))
     picture = usable_window(lease, frames.sides)
     params = draw(
         recipe,
@@ -114,7 +119,7 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
         picture_width_px=picture.width_px,
         video_id=lease.video,
         video_thresholds=_pair(lease.thresholds),
-        times=_frame_times(lease, spec, frames) if recipe.is_timed else None,
+        times=frame_times(lease, spec, frames) if recipe.is_timed else None,
     )
     if scene is not None and spec.moving_share:
         params = choose_crop(
@@ -138,36 +143,10 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
             flow = replace(flow, margin_px=0)
         margin_px = None if flow.margin_px is None else max(flow.margin_px, margin_px or 0)
     window = source_window(params, recipe, picture, margin_px)
-    chroma = _chroma_cut(lease, params, spec, frames, source) if "frames_rgb" in lease.arrays else None
-    cells = cells_of(params, recipe, _within_rows(lease, frames.sides)) if spec.substep_px else None
+    chroma = chroma_cut(lease, params, spec, frames, source) if "frames_rgb" in lease.arrays else None
+    cells = cells_of(params, recipe, within_rows(lease, frames.sides)) if spec.substep_px else None
     cut = Cut(frames.count(int(source[-1]) + 1), window, chroma, cells)
     return SamplePlan(spec, params, source, frames, cut, margin_px, flow, flow_plan)
-
-
-def usable_window(lease: Lease, sides: Sides) -> Window:
-    """Return the part of a lease's upright picture that may be used: its rows without these bars."""
-    top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
-    height, width = bottom - top - sides.top - sides.bottom, lease.width_px - sides.left - sides.right
-    return Window(top + sides.top, sides.left, height, width)
-
-
-def _within_rows(lease: Lease, sides: Sides) -> Window:
-    """Return the window of :func:`usable_window`, counted from the first usable row."""
-    top, _ = Rows.parse(lease.rows).bounds(lease.height_px)
-    usable = usable_window(lease, sides)
-    return usable._replace(top_px=usable.top_px - top)
-
-
-def _chroma_cut(
-    lease: Lease, params: SampleParams, spec: StreamSpec, frames: CleanFrames, source: npt.NDArray[np.int64]
-) -> ChromaCut:
-    """Return which colour to decode: that of the delivered frames, in the crop."""
-    delivered = np.unique(source[params.ends(spec.recipe)[spec.recipe.first_frame :]])
-    if not frames.stride:
-        delivered = frames.numbers[delivered] - frames.numbers[0]
-    top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
-    window = source_window(params, spec.recipe, usable_window(lease, frames.sides))
-    return ChromaCut(tuple(delivered.tolist()), window, (top, bottom - top))
 
 
 def decode_for(
@@ -189,7 +168,7 @@ def decode_for(
     frames = plans[0].frames
     _refuse_outside(lease.video)
     try:
-        index, cuts = _frame_index(lease, frames.span), [plan.cut for plan in plans]
+        index, cuts = frame_index(lease, frames.span), [plan.cut for plan in plans]
         what = index, lease.start_frame, cuts, frames.stride or 1
         most_bits = _most_bits(plans[0].spec)
         clips = None
@@ -311,7 +290,7 @@ def _context(
         )
     if plan.spec.substep_px and not (into and into.keys().isdisjoint(ARRAYS)):
         part = without_margin(frames, params, recipe, plan.margin_px, MARGIN_PX)
-        motion, picture = decoded.clip.motion, _within_rows(lease, plan.frames.sides)
+        motion, picture = decoded.clip.motion, within_rows(lease, plan.frames.sides)
         assert motion is not None
         levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px, motion, picture)
     seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
@@ -405,42 +384,6 @@ def _layout(canonical: bytes, arrays: tuple[str, ...]) -> Layout:
 
 def _pair(thresholds: tuple[float, ...]) -> tuple[float, float] | None:
     return (thresholds[0], thresholds[1]) if thresholds else None
-
-
-def _most_frames(lease: Lease, spec: StreamSpec) -> int:
-    """Return how many frames a sample may use, those in between included: the same for every server, whose index of a
-    lease may hold more.
-    """
-    recipe, rate = spec.recipe, lease.frames_per_second
-    if not recipe.is_timed:
-        return recipe.frames_needed
-    if not rate:
-        raise VideoError(lease.video, None, "its frame rate is unknown, and voxel_seconds needs it")
-    needed = int(recipe.sequence_at(rate)) + 1
-    if spec.scene != "off":
-        return needed
-    return min(int(recipe.reach_at(rate)) + 1, _frame_index(lease, needed).end - lease.start_frame)
-
-
-def _frame_times(lease: Lease, spec: StreamSpec, frames: CleanFrames) -> FrameTimes:
-    """Return the time stamps of the frames that a sample may use."""
-    seconds = _frame_index(lease, frames.span).seconds(lease.start_frame, frames.span)
-    rate = lease.frames_per_second / spec.recipe.frame_stride
-    return FrameTimes(seconds[frames.numbers - frames.numbers[0]], rate)
-
-
-def _frame_index(lease: Lease, count: int) -> FrameIndex:
-    """Decode the frame index of a lease, for this number of frames. Its server may not have checked it.
-
-    Raises:
-        VideoError: the index is damaged.
-    """
-    try:
-        frame_index = FrameIndex.from_bytes(lease.frame_index)
-        frame_index.position(lease.start_frame, count)
-    except (ProtocolError, UsageError) as error:
-        raise VideoError(lease.video, None, f"its index from the server is damaged: {error}") from error
-    return frame_index
 
 
 def _refusals(lease: Lease) -> tuple[Refusal, ...]:
