@@ -19,6 +19,7 @@ from tests.leftovers import abandoned_memory, shared_memory
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_protocol.errors import UsageError
+from v2v_protocol.spec import SpecOptions
 from v2v_server.keys.folder import KeyFolder
 
 RECIPE = {"preset": "noise-free", "voxels_per_clip": 2, "crop_height_px": 32, "crop_width_px": 32}
@@ -159,3 +160,25 @@ def test_no_process_is_left_when_the_program_ends(clips: Path, tmp_path: Path, e
     assert program.returncode == status
     until(lambda: not [each for each in started if each.is_running() and each.status() != psutil.STATUS_ZOMBIE])
     until(lambda: not abandoned_memory(memory))
+
+
+@pytest.mark.parametrize(
+    ("options", "scene"), [({}, "off"), ({"preset": "natural"}, "auto"), ({"scene": "auto"}, "auto")]
+)
+def test_its_server_has_the_statistics_that_the_options_need(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, options: SpecOptions, scene: str
+) -> None:
+    asked: list[list[str]] = []
+
+    class Started(Exception):
+        pass
+
+    def start(videos: Path, *, workers: int, flags: list[str]) -> None:
+        asked.append(flags)
+        raise Started
+
+    monkeypatch.setattr("v2v_client.dataset.LocalServer", start)
+    with pytest.raises(Started):
+        V2VStreamDataset.local(tmp_path, **options)
+    (flags,) = asked
+    assert flags[flags.index("--scene") + 1] == scene
