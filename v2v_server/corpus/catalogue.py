@@ -365,11 +365,9 @@ def _snapshot(
         videos = Videos(table, thresholds, split)
         if died := sorted(unknown - absent.keys()):
             notes = [*notes, f"{len(died)} videos crash the decoder that analyses their scenes: {died[0]}"]
-    sidecars = dict[str, Sidecars]()
-    for ending in sidecar_endings(tuple(ARRAYS)):
-        marks = {id: files.get(id, mark) for id, mark in zip(videos.ids, videos.fingerprints, strict=True)}
-        sidecars[ending], said = collect_sidecars(source, store, marks, ending, notice)
-        notes = [*notes, *said]
+    marks = {id: files.get(id, mark) for id, mark in zip(videos.ids, videos.fingerprints, strict=True)}
+    sidecars, said = collect_sidecars(source, store, marks, sidecar_endings(tuple(ARRAYS)), notice)
+    notes = [*notes, *said]
     return Catalogue(
         source=source,
         rows=corpus.rows,

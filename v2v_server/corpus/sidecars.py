@@ -29,18 +29,38 @@ class Sidecars:
 
 
 def collect_sidecars(
-    source: VideoSource, store: Store, videos: Mapping[str, str], ending: str, notice: Notice | None
-) -> tuple[Sidecars, list[str]]:
-    """Return the sidecars of one ending, and notes for the user. Only new and changed ones are read.
+    source: VideoSource, store: Store, videos: Mapping[str, str], endings: Sequence[str], notice: Notice | None
+) -> tuple[dict[str, Sidecars], list[str]]:
+    """Return the sidecars of each ending, and notes for the user. Only new and changed ones are read.
 
     Args:
         source: where the videos come from.
         store: the index.
         videos: fingerprint of each video's file, by id.
-        ending: see :mod:`v2v_server.corpus.sources.sidecar`.
+        endings: see :mod:`v2v_server.corpus.sources.sidecar`.
         notice: progress callback.
     """
-    kind, ids = FigureKind(f"sidecar {ending}", "1"), sorted(videos)
+    sidecars, notes = dict[str, Sidecars](), list[str]()
+    for ending, ids in source.with_sidecars(sorted(videos), endings).items():
+        fingerprints, unreadable = _fingerprints(source, store, videos, ids, ending, notice) if ids else ({}, [])
+        if fingerprints:
+            notes.append(f"{len(fingerprints)} of {len(videos)} videos have a sidecar {ending}")
+        if unreadable:
+            notes.append(f"{len(unreadable)} sidecars cannot be read and count as missing ({unreadable[0]})")
+        sidecars[ending] = Sidecars(fingerprints, _digest(ending, fingerprints))
+    return sidecars, notes
+
+
+def _fingerprints(
+    source: VideoSource,
+    store: Store,
+    videos: Mapping[str, str],
+    ids: Sequence[str],
+    ending: str,
+    notice: Notice | None,
+) -> tuple[dict[str, str], list[str]]:
+    """Return the fingerprint of each of these videos' sidecars, and why others cannot be read."""
+    kind = FigureKind(f"sidecar {ending}", "1")
     known = dict[str, str]()  # state and fingerprint
     with suppress(sqlite3.Error):  # an index that cannot be read or written costs time only
         store.make_figures()
@@ -71,10 +91,7 @@ def collect_sidecars(
                 fresh = []
             if notice is not None:
                 notice(f"looking for sidecars {ending} in {source}: {done} of {len(ids)} videos")
-    notes = [f"{len(fingerprints)} of {len(ids)} videos have a sidecar {ending}"] if fingerprints else []
-    if unreadable:
-        notes.append(f"{len(unreadable)} sidecars cannot be read and count as missing ({unreadable[0]})")
-    return Sidecars(fingerprints, _digest(ending, fingerprints)), notes
+    return fingerprints, unreadable
 
 
 def _digest(ending: str, fingerprints: Mapping[str, str]) -> str:

@@ -188,3 +188,10 @@ def test_a_changed_and_a_missing_one_are_told_apart(corpus: Path, kind: str) -> 
         pass
     with pytest.raises(VideoError), open_sidecar(fresh, "deep/b.x.masks/", masks):
         pass
+
+
+def test_only_videos_with_such_a_name_beside_them_are_asked_about(corpus: Path) -> None:
+    source, ids = open_source(str(corpus), SourceOptions()), ["a.mp4", "deep/b.x.mp4"]
+    assert source.with_sidecars(ids, (JSON, MASKS)) == {JSON: ["a.mp4"], MASKS: ids}
+    shutil.rmtree(corpus / "deep")  # a folder that cannot be listed
+    assert source.with_sidecars(ids, (JSON, MASKS)) == {JSON: ids, MASKS: ids}

@@ -171,6 +171,10 @@ class VideoSource(ABC):
             VideoError: it is gone, another one by now, or (on a disk) cannot be read.
         """
 
+    def with_sidecars(self, ids: Sequence[str], endings: Sequence[str]) -> Mapping[str, Sequence[str]]:
+        """Return, by ending, those of these videos that may have such a sidecar, in their order."""
+        return dict.fromkeys(endings, ids)
+
     def sidecar_states(self, ids: Sequence[str]) -> list[str]:
         """Return texts that change with the content of these sidecars; "" for one that is not there. Called in threads.
         A source without sidecars need not implement this.
