@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 
@@ -29,6 +28,7 @@ from v2v_server.corpus.scenes.findings import (
     Defect,
     defects_of,
 )  # fmt: skip
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.clips import pictures_of, signal_of
 from v2v_server.store.format import is_store_file
 from v2v_server.system.compile_cache import compile_cache
@@ -84,7 +84,7 @@ class _Excerpt:
     """The part of a video that is looked at, in the rows that are used."""
 
     id: str
-    path: Path
+    source: VideoSource
     index: FrameIndex
     start: int
     count: int
@@ -194,7 +194,7 @@ def _excerpts(catalogue: Catalogue, most: int) -> Iterator[_Excerpt]:
         count = max(1, min(len(index), _MOST_FRAMES, round(SECONDS_OF_EACH * rate)))
         start = (len(index) - count) // 2 if index.seekable else 0
         window = top, 0, bottom - top, index.width_px
-        yield _Excerpt(video.id, catalogue.path(video.id), index, start, count, window)
+        yield _Excerpt(video.id, catalogue.source, index, start, count, window)
 
 
 def _found(excerpts: Iterable[_Excerpt], processes: int) -> Iterator[_Found]:
@@ -211,13 +211,14 @@ def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal]:
     # Import lazily: the process that draws up the report needs no OpenCV.
     from v2v_server.corpus.scenes.analysis import analyse
 
-    path, index, window = excerpt.path, excerpt.index, excerpt.window
+    index, window = excerpt.index, excerpt.window
     try:
-        if is_store_file(path):
-            scene = analyse(islice(pictures_of(path, index, window), excerpt.count))
-        else:
-            scene = analyse(stream_luma(path, index, excerpt.start, excerpt.count, window))
-        signal = signal_of(path, index)
+        with excerpt.source.open_local(excerpt.id, "") as path:
+            if is_store_file(path):
+                scene = analyse(islice(pictures_of(path, index, window), excerpt.count))
+            else:
+                scene = analyse(stream_luma(path, index, excerpt.start, excerpt.count, window))
+            signal = signal_of(path, index)
     except V2VError:
         return 0, (), SDR
     return scene.end, defects_of(scene), signal
