@@ -62,7 +62,7 @@ _COMB_LEVELS = 5
 _COMB_CHANGE = 64
 """Least change of its mean from one frame to the next, 1/64 grey level."""
 _COMB_BLOCKS = 1000
-"""One of that number of blocks, and two at least, are combed in a combed picture."""
+"""One of that number of blocks are combed in a combed picture, and four at least: fine texture has two or three."""
 
 _EVEN_BYTES = np.uint64(0x00FF00FF00FF00FF)
 _EACH_WORD = np.uint64(0x0001000100010001)
@@ -232,7 +232,7 @@ def _is_combed(picture: Picture, change: npt.NDArray[np.int64]) -> bool:
     size = columns, rows - 1
     near, far = (cv2.resize(each, size, interpolation=cv2.INTER_AREA).astype(np.int32) for each in (line, field))
     combed = (near >= _COMB_LEVELS) & (near > 2 * far) & (change[:-1] >= _COMB_CHANGE)
-    return int(np.count_nonzero(combed)) >= max(2, change.size // _COMB_BLOCKS)
+    return int(np.count_nonzero(combed)) >= max(4, change.size // _COMB_BLOCKS)
 
 
 def _difference(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> float:
