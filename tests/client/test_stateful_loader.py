@@ -176,5 +176,4 @@ def test_short_passes_that_are_left_early_warn_at_the_third(server):
     stream = dataset(server)
     errors = [[outcome.error for outcome in run(stream, 100 * turn, most=(1, 1))] for turn in range(3)]
     assert errors[:2] == [["", ""], ["", ""]]
-    assert "set_epoch" in errors[2][0]
-    assert errors[2][1] == ""
+    assert sorted("set_epoch" in error for error in errors[2]) == [False, True]  # the worker that is first says so
