@@ -102,7 +102,7 @@ def one(camera: TrueCamera, film: Film, seed: int, scene: str) -> Iterator[dict[
         if name == "photoreceptor_hz":  # estimated as 1 / Hz
             true = 1.0 / true if true else 0.0
         if name == "hot_pixel_sigma" and not camera.hot_pixel_share:
-            continue  # there is none to tell
+            continue  # this camera has no such effect
         yield {
             "seed": seed, "scene": scene, "parameter": name, "true": true, "value": float(estimate.value),
             "low": float(estimate.low), "high": float(estimate.high), "told": estimate.told,

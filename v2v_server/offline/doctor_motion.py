@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import astuple, dataclass
-from pathlib import Path
 from typing import Any
 
 from v2v_protocol.errors import V2VError
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES
+from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.offline.doctor_pictures import spread_videos
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.system.process import usable_cores
@@ -31,7 +31,8 @@ _LONGEST_VIDEO_SECONDS = 90.0
 class _Middle:
     """Frames in the middle of a video, and the part of the picture that is looked at."""
 
-    path: Path
+    id: str
+    source: VideoSource
     index: FrameIndex
     start: int
     count: int
@@ -64,22 +65,13 @@ def look_at_motion(catalogue: Catalogue) -> Iterator[tuple[str, str, str, str]]:
 
 
 def _middles(catalogue: Catalogue) -> Iterator[_Middle]:
-    begun, videos = time.monotonic(), catalogue.videos
-    many = min(MOST_VIDEOS, len(videos))
-    for video in (videos[at * len(videos) // many] for at in range(many)):
-        if time.monotonic() - begun > _LONGEST_SECONDS:
-            return
-        try:
-            index = catalogue.frame_index(video.id)
-            top, bottom = catalogue.rows.bounds(index.height_px)
-        except V2VError:
-            continue  # reported with the other checks of this corpus
+    for video, index, (top, left, rows, columns) in spread_videos(catalogue, MOST_VIDEOS, _LONGEST_SECONDS):
         count = min(len(index), _FRAMES)
         start = (len(index) - count) // 2 if index.seekable else 0
-        height, width = min(bottom - top, _SIDE_PX), min(index.width_px, _SIDE_PX)
-        window = top + (bottom - top - height) // 2, (index.width_px - width) // 2, height, width
+        height, width = min(rows, _SIDE_PX), min(columns, _SIDE_PX)
+        window = top + (rows - height) // 2, left + (columns - width) // 2, height, width
         if count > 1:
-            yield _Middle(catalogue.path(video.id), index, start, count, window)
+            yield _Middle(video.id, catalogue.source, index, start, count, window)
 
 
 def _predicted(middle: _Middle) -> tuple[Any, ...]:
@@ -90,7 +82,8 @@ def _predicted(middle: _Middle) -> tuple[Any, ...]:
     from v2v_server.offline.motion import pictures_from
 
     try:
-        frames = list(pictures_from(middle.path, middle.index, middle.start, middle.count, middle.window))
+        with middle.source.open_local(middle.id, "") as path:
+            frames = list(pictures_from(path, middle.index, middle.start, middle.count, middle.window))
     except V2VError:
         return ()
     return astuple(predict(np.stack(frames)))

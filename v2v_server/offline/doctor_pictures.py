@@ -29,6 +29,7 @@ from v2v_server.corpus.scenes.findings import (
     defects_of,
 )  # fmt: skip
 from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.corpus.videos import VideoEntry
 from v2v_server.store.clips import pictures_of, signal_of
 from v2v_server.store.format import is_store_file
 from v2v_server.system.compile_cache import compile_cache
@@ -177,23 +178,28 @@ def check_in_background(
     return thread
 
 
-def _excerpts(catalogue: Catalogue, most: int) -> Iterator[_Excerpt]:
-    """Yield the middle of some videos, spread over the catalogue, for a limited time."""
+def spread_videos(catalogue: Catalogue, most: int, seconds: float) -> Iterator[tuple[VideoEntry, FrameIndex, Window]]:
+    """Yield some videos, spread over the catalogue, with their index and their usable rows, for a limited time."""
     begun, videos = time.monotonic(), catalogue.videos
     many = min(most, len(videos))
     for video in (videos[at * len(videos) // many] for at in range(many)):
-        if time.monotonic() - begun > _LONGEST_SECONDS:
+        if time.monotonic() - begun > seconds:
             return
         try:
             index = catalogue.frame_index(video.id)
             top, bottom = catalogue.rows.bounds(index.height_px)
         except V2VError:
             continue  # reported with the other checks of this corpus
+        yield video, index, (top, 0, bottom - top, index.width_px)
+
+
+def _excerpts(catalogue: Catalogue, most: int) -> Iterator[_Excerpt]:
+    """Yield the middle of some videos."""
+    for video, index, window in spread_videos(catalogue, most, _LONGEST_SECONDS):
         rate = video.frames_per_second
         rate = rate if rate and math.isfinite(rate) else _ASSUMED_RATE
         count = max(1, min(len(index), _MOST_FRAMES, round(SECONDS_OF_EACH * rate)))
         start = (len(index) - count) // 2 if index.seekable else 0
-        window = top, 0, bottom - top, index.width_px
         yield _Excerpt(video.id, catalogue.source, index, start, count, window)
 
 

@@ -1,4 +1,4 @@
-"""The ring: what it holds, what it drops, and that nobody can write to what it hands out."""
+"""The ring: what it holds, what it drops, and that what it hands out cannot be written to."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ class Folder(VideoSource):
         return nullcontext(self.folder / id)
 
     def with_sidecars(self, ids: Sequence[str], endings: Sequence[str]) -> Mapping[str, Sequence[str]]:
-        """List each folder once: asking for four sidecars of a million videos takes most of a minute."""
+        """Return the videos beside which such a name is listed. Each folder is listed once."""
         names = dict[str, frozenset[str] | None]()
         found: dict[str, list[str]] = {ending: [] for ending in endings}
         for id in ids:
