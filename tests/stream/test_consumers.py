@@ -112,7 +112,7 @@ def test_stalled_consumers_hold_bounded_memory_and_do_not_delay_others(tmp_path:
         assert [here.recv() for here in pipes] == [BATCH_SIZE * SAMPLE_BYTES] * 2
         stalled = [psutil.Process(client.pid) for client in clients]
         stalled[1].suspend()
-        # Nobody is held up, and by fair sharing the stalled ones were served all they had asked for long before this.
+        # No consumer is held up: by fair sharing the stalled ones were served all they had asked for long before this.
         fast = V2VStreamDataset(server.address, batch_size=BATCH_SIZE, recipe=LARGE, voxel_dtype="float32")
         epoch = [_samples(batch) for batch in fast]
         epoch_bytes = len(epoch) * BATCH_SIZE * SAMPLE_BYTES

@@ -81,7 +81,7 @@ def loader_worker(before: set[psutil.Process]) -> psutil.Process:
 
 
 def until_ended(child: psutil.Process) -> None:
-    """Returns once all threads of a child are gone; its pipes end earlier. Whoever started it can still ask for it."""
+    """Wait until all threads of a child are gone, and leave it to be reaped; its pipes end earlier."""
     os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
 
 

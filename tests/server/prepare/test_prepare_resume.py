@@ -343,7 +343,7 @@ def test_killed_at_a_random_moment(source: Path, tmp_path: Path, turn: int) -> N
     last = run(source, out)
     assert last.complete
     assert not list(out.rglob(f"*{PARTIAL_SUFFIX}"))
-    # Whole and right, whoever made them; x264's very bytes may differ from run to run.
+    # Whole and right, whichever process made them; x264's bytes may differ from run to run.
     for video in last.videos:
         assert fingerprint(out / video.id) == video.fingerprint
         assert psnr_db(whole(out / video.id), whole(source / video.id)) == pytest.approx(video.psnr_db)
