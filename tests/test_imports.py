@@ -112,22 +112,12 @@ def test_the_protocol_needs_only_light_packages(path: Path) -> None:
 
 def test_one_file_draws_progress() -> None:
     """Every command shows its progress in the same way."""
-    users = [
-        path
-        for package in PACKAGES
-        for path in modules(package)
-        if "rich.progress" in modules_of(path)
-    ]
+    users = [path for package in PACKAGES for path in modules(package) if "rich.progress" in modules_of(path)]
     assert users == [ROOT / "v2v_protocol" / "progress.py"]
 
 
 def test_at_most_four_files_import_the_transport() -> None:
-    users = {
-        path.relative_to(ROOT)
-        for name in PACKAGES
-        for path in modules(name)
-        if "zmq" in imported(path)
-    }
+    users = {path.relative_to(ROOT) for name in PACKAGES for path in modules(name) if "zmq" in imported(path)}
     assert {path.parent.as_posix() for path in users} == {"v2v_protocol/link"}
     assert len(users) <= 4
 

@@ -119,14 +119,6 @@ def test_stalled_consumers_hold_bounded_memory_and_do_not_delay_others(tmp_path:
         assert epoch_bytes > 2 * (CLIENT_BYTES + ALLOWANCE_BYTES), "the test could not tell bounded from unbounded"
         grown = [process.memory_info().rss - at_first for process, at_first in zip(stalled, before, strict=True)]
         broker_grown = broker.memory_info().rss - broker_before
-        print(
-            "GROWN",
-            [g >> 20 for g in grown],
-            broker_grown >> 20,
-            CLIENT_BYTES >> 20,
-            CREDIT * SAMPLE_BYTES >> 20,
-            epoch_bytes >> 20,
-        )
         assert max(grown) < CLIENT_BYTES + ALLOWANCE_BYTES
         assert broker_grown < (len(stalled) + 1) * CREDIT * SAMPLE_BYTES + ALLOWANCE_BYTES
         stalled[1].resume()

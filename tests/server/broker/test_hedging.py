@@ -1,4 +1,4 @@
-"""Second leases for slow samples: the consumer gets the sample once, whichever worker is first and whatever the other does."""
+"""Second leases for slow samples: the consumer gets the sample once, from whichever worker is first."""
 
 from __future__ import annotations
 

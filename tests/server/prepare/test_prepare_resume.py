@@ -118,7 +118,7 @@ def test_finished_files_are_looked_at_together_and_told_of(
         inside.append(path)
         if len(inside) > 1:
             several.set()
-        assert several.wait(1), "the files are read one after the other"
+        assert several.wait(60.0), "the files are read one after the other"
         return fingerprint(path)
 
     monkeypatch.setattr("v2v_server.prepare.resume.fingerprint", among_others)

@@ -109,7 +109,7 @@ def test_beside_a_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         try:
             until(lambda: seen(2))
             program.send_signal(signal.SIGINT)
-            assert program.wait(30) == 130
+            assert program.wait(60) == 130
         finally:
             program.kill()
             program.wait()
