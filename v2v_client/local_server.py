@@ -180,7 +180,7 @@ class LocalServer:
 
 
 def recipe_flags(recipe: Recipe) -> list[str]:
-    """Return flags that give ``v2v-serve`` this recipe, so that its start names the videos that are too small for it."""
+    """Return flags that give ``v2v-serve`` this recipe: its start then names the videos that are too small."""
     return [text for key, value in recipe.to_dict().items() for text in ("--set", f"{key}={json.dumps(value)}")]
 
 
