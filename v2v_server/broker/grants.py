@@ -205,7 +205,7 @@ class Grants:
         return actions
 
     def _share(self, session: Session, request: Request) -> list[Action] | None:
-        """Answer a request from the ring, or let it wait for the lease that makes the sample; return None if neither."""
+        """Answer a request from the ring, or let it wait for the lease that makes its sample; else return None."""
         if self._ring is None:
             return None
         key = sharing_key(session, request)
