@@ -33,7 +33,7 @@ def is_held(folder: Path) -> bool:
 
 
 def has_ended(process: psutil.Process) -> bool:
-    """Gone, or waiting for whoever has adopted it to notice."""
+    """Return whether the process is gone or a zombie that its new parent has not reaped."""
     try:
         return process.status() == psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
