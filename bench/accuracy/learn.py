@@ -82,11 +82,11 @@ def score(predict: Predict, voxels: Tensor, frames: Tensor, metrics: Mapping[str
     """Return the means of metrics over the later half of the clips, of predicted pictures clamped to 0 .. 1."""
     later = frames.shape[1] // 2
     prediction = torch.cat([predict(piece)[:, later:] for piece in torch.split(voxels, _BATCH)]).clamp(0, 1)
-    pairs = [
-        (*map(np.float64, pair),)
-        for pair in zip(prediction.flatten(0, 2), frames[:, later:].flatten(0, 2), strict=True)
-    ]
-    return {name: float(np.mean([metric(*pair) for pair in pairs])) for name, metric in metrics.items()}
+    made, true = (pictures.flatten(0, 2).double().numpy() for pictures in (prediction, frames[:, later:]))
+    return {
+        name: float(np.mean([metric(*pair) for pair in zip(made, true, strict=True)]))
+        for name, metric in metrics.items()
+    }
 
 
 def _grey(frames: Tensor) -> Predict:
