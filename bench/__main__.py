@@ -42,6 +42,7 @@ BENCHES = {
     "defects": "accuracy.defects",
     "flow": "accuracy.flow",
     "learn": "accuracy.learn",
+    "recordings": "accuracy.recordings",
     "chaos": "chaos.chaos",
     "chaos_across": "chaos.across",
     "siege": "chaos.siege",
