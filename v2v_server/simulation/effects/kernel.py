@@ -20,7 +20,6 @@ from v2v_server.simulation.pixel import (
     BLOCK_PX,
     PITCH,
     ROWS_AHEAD,
-    count_crossings,
     crossed,
     folds_of,
     look_up,
@@ -201,10 +200,16 @@ def _simulate(
             if is_plain:
                 for spot in range(hot, next_hot):
                     residual[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
-                count_crossings(
-                    levels, before, now, normal, odd, scale, residual, threshold_pos, threshold_neg, tolerance,
-                    is_first, on,
-                )  # fmt: skip
+                # The loops of ``simulate_pixels``: as a function of both they would count references there.
+                if is_first:
+                    for i in range(BLOCK_PX):
+                        more = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
+                        on[i], residual[i] = crossed(residual[i] + more, threshold_pos, threshold_neg, tolerance)
+                else:
+                    for i in range(BLOCK_PX):
+                        more = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
+                        events, residual[i] = crossed(residual[i] + more, threshold_pos, threshold_neg, tolerance)
+                        on[i] += events
             else:
                 shown = frames[segments.shown[each], first:last]
                 at = At(first, each, moved, before, now, shown)
