@@ -121,8 +121,9 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
         video_thresholds=_pair(lease.thresholds),
         times=frame_times(lease, spec, frames) if recipe.is_timed else None,
     )
+    place = ""
     if scene is not None and spec.moving_share:
-        params = choose_crop(
+        drawn = choose_crop(
             params,
             recipe,
             seed=lease.seed,
@@ -133,10 +134,13 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
             picture_width_px=picture.width_px,
             weigh=crop_weight(scene, frames, params.scale, recipe, picture),
         )
+        params, place = drawn, f"; crop drawn {'uniformly' if drawn is params else 'by motion'}"
     source = params.source_index(int(params.ends(recipe)[-1]))
     flow: FlowSettings | None = None
     margin_px: int | None = MARGIN_PX if spec.substep_px else 0
     flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture)
+    if flow_plan is not None:
+        flow_plan = replace(flow_plan, reason=flow_plan.reason + place)
     if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
         if flow_plan is not None and flow_plan.still:
