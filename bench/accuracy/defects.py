@@ -207,7 +207,7 @@ _CASES: tuple[Column, ...] = (
     ("made", "defect", "{}", 1),
     ("cases", "cases", "{:.0f}", 1),
     ("found", "found", "{:.0f}", 1),
-    ("others", "others found", "{}", 1),
+    ("others_found", "others found", "{}", 1),
     ("missed", "missed in", "{}", 1),
 )
 _EVENTS: tuple[Column, ...] = (
@@ -271,7 +271,7 @@ def measure(asked: argparse.Namespace) -> Report:
             cases = len(clips) * len(_BIT_RATES)
             records.append(
                 {"measure": "made", "made": name, "cases": cases, "found": cases - len(missed) if kind else None,
-                 "others": ", ".join(said), "missed": ", ".join(missed)}
+                 "others_found": len(said), "others": ", ".join(said), "missed": ", ".join(missed)}
             )  # fmt: skip
             progress(f"{name}: missed {len(missed)} of {cases}; others {said}; {missed}; {false[-2:]}")
     share = sum(each["found"] or 0 for each in records) / ((len(MADE) - 1) * len(clips) * len(_BIT_RATES))

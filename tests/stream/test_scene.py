@@ -69,6 +69,14 @@ def test_a_still_a_dark_and_a_fast_clip_get_different_decisions(catalogue: Catal
     np.testing.assert_array_equal(chosen.arrays["flow"], by_name.arrays["flow"])
 
 
+def test_the_provenance_says_how_a_crop_was_drawn(catalogue: Catalogue) -> None:
+    moving = dataclasses.replace(AUTO, moving_share=1.0)
+    still, fast = (remake(catalogue, moving, seed=3, epoch=0, index=index).provenance for index in (0, 4))
+    assert (still.video, fast.video) == ("a-still.mkv", "c-fast.mkv")
+    assert still.scene.endswith("; crop drawn uniformly")
+    assert fast.scene.endswith("; crop drawn by motion")
+
+
 def test_no_sequence_holds_the_cut_or_shows_nothing(catalogue: Catalogue) -> None:
     found = [(item.provenance.video, item.provenance.start_frame) for item in made(catalogue, AUTO, 6)]
     assert found == [("a-still.mkv", 0), ("a-still.mkv", 20), ("b-dark.mkv", 0), ("b-dark.mkv", 20),

@@ -125,7 +125,7 @@ class Scene:
         pieces: [p] of :data:`PIECE`, frames ``first`` .. ``end`` - 1.
         segments: [n, 37] uint16, one row a segment, :data:`UNKNOWN` where a number could not be measured. Of each tile:
 
-            MOTION    95th percentile of its motion, the largest of the segment's quarters; 1/64 px a frame
+            MOTION    95th percentile of its motion, the larger of the segment's halves; 1/64 px a frame
             CHANGE    largest change of the mean of a block of 8 x 8 pixels over four frames; the fourth is any frame
                       of the segment after its first, or the next segment's first; 1/64 grey level
 
