@@ -134,13 +134,11 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
             picture_width_px=picture.width_px,
             weigh=crop_weight(scene, frames, params.scale, recipe, picture),
         )
-        params, place = drawn, f"; crop drawn {'uniformly' if drawn is params else 'by motion'}"
+        params, place = drawn, f"crop drawn {'uniformly' if drawn is params else 'by motion'}"
     source = params.source_index(int(params.ends(recipe)[-1]))
     flow: FlowSettings | None = None
     margin_px: int | None = MARGIN_PX if spec.substep_px else 0
-    flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture)
-    if flow_plan is not None:
-        flow_plan = replace(flow_plan, reason=flow_plan.reason + place)
+    flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture, place)
     if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
         if flow_plan is not None and flow_plan.still:

@@ -114,7 +114,7 @@ class SceneCollection:
         kept, key = FigureKind("scene digest", self.kind.version), f"{digest} {state}"
         if (known := store.figures("", key, kept)) is not None:
             return known.decode()
-        sha = hashlib.sha256(f"v2v catalogue with scenes 2\n{digest}\n".encode())
+        sha = hashlib.sha256(f"v2v catalogue with scenes 1\n{digest}\n".encode())
         nothing = Scene.unknown().to_bytes()
         for id, _, data in joined(ids, store.all_figures(self.kind), [], (b"", nothing)):
             sha.update(nothing if id in unknown else data)

@@ -38,7 +38,7 @@ CONTRAST, DARK, CLIPPED, FLICKER, NOISE = range(2 * TILES**2, 2 * TILES**2 + 5)
 COLUMNS = NOISE + 1
 _UNITS = np.array([64.0] * TILES**2 + [64.0] * TILES**2 + [64.0, 1000.0, 1000.0, 64.0, 64.0])
 """How many of each column's units make one pixel, grey level or whole."""
-_MAGIC = b"VSC2"
+_MAGIC = b"VSC3"
 _HEADER = struct.Struct("<4sIIHI")  # magic, first, end, segments, pieces
 
 
