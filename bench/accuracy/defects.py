@@ -239,7 +239,7 @@ def measure(asked: argparse.Namespace) -> Report:
     """Run the bench.
 
     Raises:
-        UsageError: fewer than two videos are clean and long enough.
+        UsageError: fewer than four clips are clean and move.
     """
     parts_of, real = list[tuple[int, str, Film]](), list[dict[str, Any]]()
     for name, parts, defects in films(asked.videos):
@@ -253,10 +253,10 @@ def measure(asked: argparse.Namespace) -> Report:
     with tempfile.TemporaryDirectory() as folder:
         for name, (kind, change, _) in MADE.items():
             said, missed = list[str](), list[str]()
-            made = []
+            made = list[Film]()
             for seed, (_, film) in enumerate(clips):
                 other = cv2.resize(clips[seed - 3][1].transpose(1, 2, 0), film.shape[:0:-1]).transpose(2, 0, 1)
-                made.append(change(film, other, seed))
+                made.append(change(film, other.astype(np.uint8), seed))
             for rate in _BIT_RATES:
                 pictures = [coded(each, rate, Path(folder)) for each in made]
                 scenes = [analyse(each) for each in pictures]

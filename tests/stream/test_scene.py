@@ -20,6 +20,8 @@ from v2v_protocol.sample import Provenance, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.remake import remake
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule.summary import corpus_summary
 from v2v_server.worker.scene_choice import MOVING
 
 Luma = npt.NDArray[np.uint8]
@@ -75,6 +77,14 @@ def test_the_provenance_says_how_a_crop_was_drawn(catalogue: Catalogue) -> None:
     assert (still.video, fast.video) == ("a-still.mkv", "c-fast.mkv")
     assert still.scene.endswith("; crop drawn uniformly")
     assert fast.scene.endswith("; crop drawn by motion")
+
+
+def test_a_start_says_how_many_videos_are_longer_than_what_is_analysed(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("v2v_server.schedule.summary.MOST_FRAMES", 42)
+    said = corpus_summary(catalogue, AUTO, SequenceTable(catalogue.videos, catalogue.rows, AUTO))
+    assert any(line.startswith("1 videos are longer than the 42 frames that are analysed") for line in said)
 
 
 def test_no_sequence_holds_the_cut_or_shows_nothing(catalogue: Catalogue) -> None:
