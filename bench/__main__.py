@@ -38,7 +38,6 @@ BENCHES = {
     "fit": "accuracy.fit",
     "extremes": "accuracy.extremes",
     "light": "accuracy.light",
-    "sensor": "accuracy.sensor",
     "scene": "accuracy.scene",
     "defects": "accuracy.defects",
     "flow": "accuracy.flow",
