@@ -54,6 +54,7 @@ from v2v_server.store.cache import make_cache
 from v2v_server.supervise.engines import make_pool
 from v2v_server.supervise.pool import Pool
 from v2v_server.supervise.scaling import Scaling
+from v2v_server.supervise.standby import Standby
 from v2v_server.system.clock import Clock
 from v2v_server.system.log import Level, Log
 from v2v_server.system.process import keep_freed_memory, open_many_files, usable_cores
@@ -109,11 +110,12 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
     return catalogue
 
 
-def serve(config: ServeConfig, times: StartTimes) -> None:
+def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None = None) -> None:
     """Run a server until SIGINT or SIGTERM.
 
     Args:
         times: logged once the first sample is sent, if they are to be.
+        standbys: see :func:`v2v_server.supervise.engines.make_pool`.
 
     Raises:
         CorpusError: the corpus gives no sequence.
@@ -160,7 +162,7 @@ def serve(config: ServeConfig, times: StartTimes) -> None:
     keys = KeyFolder(Path(config.keys)) if config.keys else None
     stop = threading.Event()
     with stop_on_signals(stop):
-        pool = make_pool(config, catalogue.source, label, worker_flags, keys)
+        pool = make_pool(config, catalogue.source, label, worker_flags, keys, standbys)
         sockets = Sockets(
             config.bind,
             config.worker_bind or _private_address(label),
