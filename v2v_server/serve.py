@@ -53,7 +53,7 @@ from v2v_server.status.text import format_shutdown_summary
 from v2v_server.store.cache import make_cache
 from v2v_server.supervise.engines import make_pool
 from v2v_server.supervise.pool import Pool
-from v2v_server.supervise.scaling import Scaling
+from v2v_server.supervise.scaling import Scaling, question_workers
 from v2v_server.supervise.standby import Standby
 from v2v_server.system.clock import Clock
 from v2v_server.system.log import Level, Log
@@ -63,7 +63,6 @@ from v2v_server.system.start_times import StartTimes
 from v2v_server.system.status_fields import GIB
 from v2v_server.video.rows import Rows
 
-_MANY_WORKERS_A_CORE = 4
 _FILES_A_WORKER = 4
 _TURN_SECONDS = 0.1
 """Longest wait of the loop without a message; also the interval of checks of deadlines and workers."""
@@ -71,16 +70,6 @@ _SOON_SECONDS = 5.0
 """Time after which blocked leases are reported."""
 _GIVE_BACK_SECONDS = 12.0
 """Time from the end of a connection until its memory is returned to the kernel; its session is forgotten by then."""
-
-
-def question_workers(workers: int, cores: int) -> str:
-    """Return a warning if there are more workers than cores; empty otherwise."""
-    if workers <= _MANY_WORKERS_A_CORE * cores:
-        return ""
-    return (
-        f"warning: --workers {workers} on {cores} cores: each uses one core, and more than {cores} only "
-        f"cost memory; --workers {cores} makes as many samples"
-    )
 
 
 def load_catalogue(config: ServeConfig) -> Catalogue:
