@@ -71,6 +71,7 @@ def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, 
         address,
         batch_size=asked.batch_size,
         arrays=asked.arrays,
+        labels="optional",  # a corpus of --videos may have none
         seed=asked.seed,
         rank=0,
         world_size=1,
