@@ -111,8 +111,8 @@ def _run(asked: argparse.Namespace) -> int:
     keep_freed_memory()
     warm_up()
     with tempfile.TemporaryDirectory(prefix="v2v-tradeoff-") as folder, forms(
-        asked.videos, rows, spec, asked.forms, most_clips=asked.clips, folder=Path(folder),
-        until=begun + _FORMS_SHARE * budget, tell=_tell,
+        asked.videos, rows, spec, asked.forms, motion=any(setting.spec.substep_px for setting in compared),
+        most_clips=asked.clips, folder=Path(folder), until=begun + _FORMS_SHARE * budget, tell=_tell,
     ) as corpus:  # fmt: skip
         compared = [setting for setting in compared if setting.form in corpus]
         records = _measured(corpus, compared, asked.places, begun, budget)

@@ -18,6 +18,7 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.prepare.prepare import prepare
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.encoding import Encoding
+from v2v_server.store.motion import MADE_PLANES
 from v2v_server.video.rows import Rows
 
 SOURCE = "source"
@@ -45,8 +46,8 @@ class CorpusForm:
 
 @contextlib.contextmanager
 def forms(
-    videos: Path, rows: Rows, spec: StreamSpec, names: Sequence[str], *, most_clips: int, folder: Path, until: float,
-    tell: Callable[[str], None],
+    videos: Path, rows: Rows, spec: StreamSpec, names: Sequence[str], *, motion: bool, most_clips: int, folder: Path,
+    until: float, tell: Callable[[str], None],
 ) -> Iterator[dict[str, CorpusForm]]:  # fmt: skip
     """Make the forms.
 
@@ -55,6 +56,7 @@ def forms(
         rows: rows of the pictures to use.
         spec: decides which clips are long and large enough.
         names: keys of ENCODINGS, in order.
+        motion: whether lossless forms hold the motion between frames.
         most_clips: number of clips to take: the first different ones.
         folder: an empty folder for all files.
         until: reading of ``time.monotonic`` after which no further form is made.
@@ -83,8 +85,9 @@ def forms(
                 tell(f"left out for lack of time: {name}")
                 continue
             tell(f"preparing {len(source.videos)} clips as {name}")
-            into = folder / name.replace(" ", "-")
-            failed = prepare(source, into, ENCODINGS[name], processes=0, floor_db=0.0).failed
+            how, into = ENCODINGS[name], folder / name.replace(" ", "-")
+            planes = MADE_PLANES if motion and how.is_lossless else ()
+            failed = prepare(source, into, how, processes=0, floor_db=0.0, planes=planes).failed
             if failed:
                 raise CorpusError(f"{failed[0].id} could not be prepared as {name}: {failed[0].problem}")
             clips = opened(into)

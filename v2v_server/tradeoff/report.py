@@ -154,28 +154,24 @@ def plot(records: Sequence[Record], file: Path) -> None:
         raise UsageError("--plot needs matplotlib, which is not installed: pip install matplotlib") from error
     shown = [record for record in records if record["measure"] == "setting"]
     alike: Record = next((record for record in records if record.get("name") == "siblings"), {})
-    figure, axes = pyplot.subplots(figsize=(9.0, 5.5))
+    figure, axes = pyplot.subplots(figsize=(12.0, 5.5))
     try:
         for way in dict.fromkeys(record["way"] for record in shown):
             of = [record for record in shown if record["way"] == way]
             points = [(r["samples_per_core_second"], 100 * (r[ERROR_KEY] or 0.0)) for r in of]
-            (line,) = axes.plot(*zip(*points, strict=True), "-", lw=1)
+            label = f"{way}, {of[0]['bytes_ratio']:.1f}x disk"
+            (line,) = axes.plot(*zip(*points, strict=True), "-", lw=1, marker="s", markersize=3, label=label)
             for record, point in zip(of, points, strict=True):
                 axes.plot(*point, _MARKERS[record["samples_per_decode"]], color=line.get_color(), clip_on=False)
-            axes.annotate(
-                f"{way}, {of[0]['bytes_ratio']:.1f}x disk", points[0], xytext=(0, 9), textcoords="offset points",
-                rotation=30, fontsize=9, color=line.get_color(),
-            )  # fmt: skip
         for count, marker in _MARKERS.items():
             worth = alike.get(f"effective_samples_of_{count}")
             label = f"{count} sample{'s' * (count > 1)} a decode" + (f", worth {worth:.1f}" if worth else "")
             axes.plot([], [], marker, color="grey", label=label)
         axes.set_title("What speed costs: right is faster, down is more accurate")
         axes.set(xscale="log", xlabel="samples a second of processor time", ylabel="voxel error at c = 0.2, per cent")
-        axes.set_xlim(right=3 * max(record["samples_per_core_second"] for record in shown))  # for the labels
         axes.set_ylim(bottom=0, top=1.35 * max(1.0, axes.get_ylim()[1]))
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=9, title="worth: independent samples", loc="upper left")
+        axes.legend(fontsize=8, title="worth: independent samples", loc="upper left", bbox_to_anchor=(1.0, 1.0))
         figure.tight_layout()
         figure.savefig(file, dpi=110)
     except OSError as error:
