@@ -86,7 +86,7 @@ def forms(
                 continue
             tell(f"preparing {len(source.videos)} clips as {name}")
             how, into = ENCODINGS[name], folder / name.replace(" ", "-")
-            planes = MADE_PLANES if motion and how.is_lossless else ()
+            planes = tuple(MADE_PLANES) if motion and how.is_lossless else ()
             failed = prepare(source, into, how, processes=0, floor_db=0.0, planes=planes).failed
             if failed:
                 raise CorpusError(f"{failed[0].id} could not be prepared as {name}: {failed[0].problem}")
