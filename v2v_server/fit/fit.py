@@ -109,6 +109,8 @@ def _estimates(given: Recorded, is_blank: bool) -> dict[str, Estimate]:
     period = estimators.refractory(intervals_us(given))
     has_frames = len(given.frames) >= LEAST_FRAMES
     longest_us = 1e6 * _frame_seconds(given) if has_frames else 0.0
+    if has_frames and not period.told and math.isfinite(period.high) and not is_blank:
+        period = regression.refractory_by_change(given, blocks, period, longest_us)
     made = {"refractory_seconds": period}
     if not has_frames:
         note = f"needs at least {LEAST_FRAMES} frames"

@@ -14,8 +14,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.fit.increments import Increments
+from v2v_server.fit.increments import Increments, increments_of
 from v2v_server.fit.interval import Doubles, Estimate, bootstrap, sums_by_block, unknown
+from v2v_server.fit.recording import Recorded
 
 GAMMA = 2.2
 SYSTEMATIC = {
@@ -33,8 +34,8 @@ DARKEST = 0.1
 """Light that the corner frequency keeps in the dark (``effects/photoreceptor.py``)."""
 LEAST_INCREMENTS = 1000
 _SOLVED = ("threshold_pos", "threshold_neg", "photoreceptor_hz")
+_CLOCK_SECONDS = 2e-5
 _LEAST_EVENTS = 2.0
-"""Of an increment in use: single noise events change it little."""
 _MOST_FOR_LOG_EPS = 40_000
 _LEAST_LOG_EPS = 5e-4
 
@@ -42,6 +43,11 @@ _LEAST_LOG_EPS = 5e-4
 def light_of(grey: Doubles) -> Doubles:
     """Return light, 0 (black) to 1 (white), of grey levels."""
     return np.asarray((grey / 255.0) ** GAMMA)
+
+
+def is_large(increments: Increments) -> npt.NDArray[np.bool_]:
+    """Return which increments have enough events that single noise events change little: [M]."""
+    return np.asarray(np.abs(increments.on) + np.abs(increments.off) >= _LEAST_EVENTS)
 
 
 class Regression:
@@ -59,7 +65,7 @@ class Regression:
         Args:
             blocks: [P] block of each pixel.
         """
-        self.kept = np.asarray(np.abs(increments.on) + np.abs(increments.off) >= _LEAST_EVENTS)
+        self.kept = is_large(increments)
         self.residual = np.zeros(len(self.kept))
         if self.kept.sum() < LEAST_INCREMENTS:
             note = f"{self.kept.sum()} changes of {_LEAST_EVENTS:.0f} events between frames; needs {LEAST_INCREMENTS}"
@@ -151,6 +157,13 @@ def _solve(normal: Doubles, right: Doubles) -> Doubles:
     return np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], np.float64)
 
 
+def _sample(given: Increments, count: int) -> Increments:
+    if len(given.on) <= count:
+        return given
+    chosen = np.sort(np.random.default_rng(0).choice(len(given.on), count, replace=False))
+    return given.take(chosen)
+
+
 def _summit(grid: Doubles, total: Doubles) -> float:
     """Return the place of the maximum of a function on a grid of even steps, between its points by a parabola."""
     k = int(np.clip(np.argmax(total), 1, len(grid) - 2))
@@ -161,8 +174,7 @@ def _summit(grid: Doubles, total: Doubles) -> float:
 
 
 def _fit_log_eps(given: Increments, blocks: npt.NDArray[np.int64]) -> Estimate:
-    if len(given.on) > _MOST_FOR_LOG_EPS:
-        given = given.take(np.sort(np.random.default_rng(0).choice(len(given.on), _MOST_FOR_LOG_EPS, replace=False)))
+    given = _sample(given, _MOST_FOR_LOG_EPS)
     block = blocks[given.pixel] * 4 + given.block
     coarse = np.log(np.geomspace(1e-4, 0.3, 14))
     best = coarse[int(np.argmax([_likelihood(given, math.exp(x)).sum() for x in coarse]))]
@@ -175,3 +187,29 @@ def _fit_log_eps(given: Increments, blocks: npt.NDArray[np.int64]) -> Estimate:
         return Estimate(float(value[0]), 0.0, math.inf, 0.0, f"too little in the dark: {note}")
     made = Estimate(float(value[0]), float(low[0]), float(high[0]), 0.0, note)
     return made.moved(made.value, SYSTEMATIC["log_eps"] * made.value)
+
+
+def refractory_by_change(
+    recording: Recorded, blocks: npt.NDArray[np.int64], bound: Estimate, longest_us: float
+) -> Estimate:
+    """Estimate the refractory period, s, by the change that is lost in it: the likelihood of the frames.
+
+    Args:
+        bound: estimate whose upper end is the shortest interval between events.
+    """
+    grid = np.linspace(0.0, bound.high, 11)
+    columns, counts = [], []
+    for period in grid:
+        increments = increments_of(recording, period, longest_us)
+        large = increments.take(is_large(increments))
+        if len(large.on) < LEAST_INCREMENTS:
+            return bound
+        given = _sample(large, _MOST_FOR_LOG_EPS // 4)
+        best = max((_likelihood(given, eps) for eps in np.geomspace(1e-4, 0.3, 12)), key=np.sum)
+        size = int(blocks.max()) + 1
+        columns.append(np.bincount(blocks[given.pixel], best, size))
+        counts.append(np.bincount(blocks[given.pixel], minlength=size))
+    sums = np.stack([np.stack(columns, axis=1), np.stack(counts, axis=1)], axis=1)
+    value, low, high = bootstrap(sums, lambda s: np.clip([_summit(grid, s[0] / np.maximum(s[1], 1))], 0.0, bound.high))
+    made = Estimate(float(value[0]), float(low[0]), float(high[0]), 1e-4, f"change lost between events; {bound.note}")
+    return made.moved(made.value, SYSTEMATIC["refractory_seconds"] * made.value + _CLOCK_SECONDS)
