@@ -13,7 +13,6 @@ import fcntl
 import os
 import random
 import select
-import socket
 import struct
 import subprocess
 import sys
@@ -34,7 +33,6 @@ _NETWORK = 0x40000000  # CLONE_NEWNET
 _SET_DEVICE, _PACKETS_ONLY = 0x400454CA, 0x1001  # TUNSETIFF; IFF_TUN | IFF_NO_PI
 _LONGEST_QUEUE_SECONDS = 0.05
 _AT_ONCE = 64
-_PIECE_BYTES = 1 << 18
 
 
 def in_own_network(work: Callable[[argparse.Namespace], int], command: Sequence[str], asked: argparse.Namespace) -> int:
@@ -140,30 +138,6 @@ class Cable:
         """Return the bytes that the far host has received, headers included."""
         lines = Path(f"/proc/{self.pid}/net/dev").read_text(encoding="ascii").splitlines()
         return int(next(line for line in lines if line.strip().startswith("far:")).split()[1])
-
-    def measured_bytes_per_second(self, seconds: float = 1.0) -> float:
-        """Return the rate of a plain TCP connection from the near host to the far one, after a warm-up."""
-        with socket.create_server((NEAR, 0)) as listener:
-            with self.on_far_host():
-                receiver = socket.create_connection(listener.getsockname())
-            sender, _ = listener.accept()
-
-        def send() -> None:
-            with suppress(OSError):  # the receiver closed the connection
-                while True:
-                    sender.sendall(bytes(_PIECE_BYTES))
-
-        thread = threading.Thread(target=send, daemon=True)
-        thread.start()
-        with sender, receiver:
-            counts_from, nbytes = time.monotonic() + seconds / 4, 0
-            while (now := time.monotonic()) < counts_from + seconds:
-                got = len(receiver.recv(_PIECE_BYTES))
-                nbytes += got if now >= counts_from else 0
-            receiver.shutdown(socket.SHUT_RDWR)
-            receiver.close()
-            thread.join()
-        return nbytes / seconds
 
 
 def _system(name: str, *arguments: int) -> None:

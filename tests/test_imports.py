@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -67,9 +68,15 @@ def imported_modules(source: str) -> set[str]:
     return names
 
 
-def imported(source: str) -> set[str]:
-    """Return the top-level names of a module's imports."""
-    return {name.split(".")[0] for name in imported_modules(source)}
+@cache
+def modules_of(path: Path) -> frozenset[str]:
+    """Return the full names of a file's imports; each file is parsed once."""
+    return frozenset(imported_modules(path.read_text("utf-8")))
+
+
+def imported(path: Path) -> set[str]:
+    """Return the top-level names of a file's imports."""
+    return {name.split(".")[0] for name in modules_of(path)}
 
 
 def modules(package: str) -> list[Path]:
@@ -88,7 +95,7 @@ def h():
     __import__("n")
 from . import o
 """
-    assert imported(source) == {"a", "c", "e", "i", "j", "l", "n", ""}
+    assert imported_modules(source) == {"a.b", "c", "e.f", "i", "j", "l.m", "n", "."}
 
 
 @pytest.mark.parametrize("package", ["v2v_protocol", *FORBIDDEN])
@@ -100,41 +107,31 @@ def test_the_packages_have_modules_to_check(package: str) -> None:
 def test_the_protocol_needs_only_light_packages(path: Path) -> None:
     may = PROTOCOL_MAY | {"safe_yaml.py": {"yaml"}, "progress.py": {"rich"}}.get(path.name, set())
     may = may | {"zmq"} if path.parent.name == "link" else may
-    assert imported(path.read_text(encoding="utf-8")) - may == set()
+    assert imported(path) - may == set()
 
 
 def test_one_file_draws_progress() -> None:
     """Every command shows its progress in the same way."""
-    users = [
-        path
-        for package in PACKAGES
-        for path in modules(package)
-        if "rich.progress" in imported_modules(path.read_text("utf-8"))
-    ]
+    users = [path for package in PACKAGES for path in modules(package) if "rich.progress" in modules_of(path)]
     assert users == [ROOT / "v2v_protocol" / "progress.py"]
 
 
 def test_at_most_four_files_import_the_transport() -> None:
-    users = {
-        path.relative_to(ROOT)
-        for name in PACKAGES
-        for path in modules(name)
-        if "zmq" in imported(path.read_text("utf-8"))
-    }
+    users = {path.relative_to(ROOT) for name in PACKAGES for path in modules(name) if "zmq" in imported(path)}
     assert {path.parent.as_posix() for path in users} == {"v2v_protocol/link"}
     assert len(users) <= 4
 
 
 def test_yaml_is_read_in_one_place() -> None:
     """YAML's own loaders expand aliases without a bound."""
-    users = [path for package in PACKAGES for path in modules(package) if "yaml" in imported(path.read_text("utf-8"))]
+    users = [path for package in PACKAGES for path in modules(package) if "yaml" in imported(path)]
     assert users == [ROOT / "v2v_protocol" / "safe_yaml.py"]
 
 
 @pytest.mark.parametrize("package", FORBIDDEN)
 def test_packages_import_only_allowed_packages(package: str) -> None:
     for path in modules(package):
-        crossed = imported(path.read_text(encoding="utf-8")) & FORBIDDEN[package]
+        crossed = imported(path) & FORBIDDEN[package]
         if path.name == "in_process.py":
             crossed -= {"v2v_server"}  # the one door, opened when it is used
         assert not crossed, f"{path.relative_to(ROOT)} imports {', '.join(sorted(crossed))}"
@@ -146,7 +143,7 @@ def test_server_folders_import_only_lower_folders() -> None:
         room = path.relative_to(ROOT / "v2v_server").parts[0].removesuffix(".py")
         if room.startswith("__"):
             continue
-        for name in imported_modules(path.read_text(encoding="utf-8")):
+        for name in modules_of(path):
             package, _, rest = name.partition(".")
             other = rest.split(".")[0]
             if package == "v2v_server" and FLOORS.index(other) > FLOORS.index(room):
@@ -172,7 +169,7 @@ def test_every_folder_documents_its_files(room: str) -> None:
 def test_imports_are_absolute() -> None:
     for package in PACKAGES:
         for path in modules(package):
-            assert "" not in imported(path.read_text(encoding="utf-8")), path.relative_to(ROOT)
+            assert "" not in imported(path), path.relative_to(ROOT)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("v2v_protocol", "v2v_pictures", "v2v_recordings", "v2v_server", "v2v_client", "trainer")
@@ -14,57 +16,68 @@ MAY_UNPICKLE = {
 CALLS = {"eval", "exec", "os.system", "os.popen", "pickle.load", "pickle.loads", "marshal.loads", "yaml.unsafe_load"}
 
 
-def calls() -> list[tuple[str, ast.Call]]:
-    found = []
+class Call(NamedTuple):
+    """A call in a file: the function, its further arguments, and its keywords, as source."""
+
+    path: str
+    function: str
+    arguments: tuple[str, ...]
+    keywords: dict[str | None, str]
+
+
+@cache
+def nodes() -> tuple[list[Call], set[str]]:
+    """Return the calls of all packages, and the files that import pickle."""
+    found, pickles = [], set()
     for package in PACKAGES:
         for path in (ROOT / package).rglob("*.py"):
-            tree = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-            found += [(str(path.relative_to(ROOT)), node) for node in tree if isinstance(node, ast.Call)]
-    return found
+            name = str(path.relative_to(ROOT))
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call):
+                    keywords = {word.arg: ast.unparse(word.value) for word in node.keywords}
+                    found.append(Call(name, ast.unparse(node.func), tuple(map(ast.unparse, node.args[1:])), keywords))
+                elif isinstance(node, ast.Import) and any(alias.name == "pickle" for alias in node.names):
+                    pickles.add(name)
+    return found, pickles
+
+
+def calls() -> list[Call]:
+    return nodes()[0]
 
 
 def test_received_data_is_never_executed() -> None:
-    found = {path for path, call in calls() if ast.unparse(call.func) in CALLS}
-    assert found == {"v2v_client/position/shared.py"}
+    assert {call.path for call in calls() if call.function in CALLS} == {"v2v_client/position/shared.py"}
 
 
 def test_commands_never_use_a_shell() -> None:
-    assert [path for path, call in calls() if any(word.arg == "shell" for word in call.keywords)] == []
+    assert [call.path for call in calls() if "shell" in call.keywords] == []
 
 
 def test_yaml_is_loaded_safely() -> None:
-    loads = [(path, call) for path, call in calls() if ast.unparse(call.func) in ("yaml.load", "yaml.full_load")]
-    assert {(path, ast.unparse(call.args[1])) for path, call in loads} == {("v2v_protocol/safe_yaml.py", "_Loader")}
+    loads = {(call.path, call.arguments[0]) for call in calls() if call.function in ("yaml.load", "yaml.full_load")}
+    assert loads == {("v2v_protocol/safe_yaml.py", "_Loader")}
     assert "class _Loader(yaml.SafeLoader)" in (ROOT / "v2v_protocol/safe_yaml.py").read_text(encoding="utf-8")
 
 
 def test_weights_and_arrays_are_loaded_without_pickle() -> None:
     """``weights_only=False`` is there once, with an unpickler of a closed list instead of pickle."""
     unsafe = [
-        (path, word.arg)
-        for path, call in calls()
-        for word in call.keywords
-        if (word.arg == "allow_pickle" and ast.unparse(word.value) != "False")
-        or (word.arg == "weights_only" and ast.unparse(word.value) != "True")
+        (call.path, word)
+        for call in calls()
+        for word, safe in (("allow_pickle", "False"), ("weights_only", "True"))
+        if call.keywords.get(word, safe) != safe
     ]
     assert unsafe == [("trainer/unpickle.py", "weights_only")]
-    loads = [call for _, call in calls() if ast.unparse(call.func) == "torch.load"]
+    loads = [call.keywords for call in calls() if call.function == "torch.load"]
     assert loads
-    for call in loads:
-        assert {"weights_only"} <= {word.arg for word in call.keywords}
-        assert "False" not in ast.unparse(call) or "pickle_module=_TENSORS_ONLY" in ast.unparse(call)
+    for keywords in loads:
+        assert keywords["weights_only"] == "True" or keywords["pickle_module"] == "_TENSORS_ONLY"
 
 
 def test_opencv_opens_no_file() -> None:
     readers = ("VideoCapture", "imread", "imreadmulti", "FileStorage", "readNet")
-    assert [path for path, call in calls() if ast.unparse(call.func).endswith(readers)] == []
+    assert [call.path for call in calls() if call.function.endswith(readers)] == []
 
 
 def test_pickle_is_used_in_two_places() -> None:
-    found = set()
-    for package in PACKAGES:
-        for path in (ROOT / package).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Import) and any(alias.name == "pickle" for alias in node.names):
-                    found.add(str(path.relative_to(ROOT)))
-    assert found == MAY_UNPICKLE
+    assert nodes()[1] == MAY_UNPICKLE

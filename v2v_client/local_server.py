@@ -180,7 +180,7 @@ class LocalServer:
 
 
 def recipe_flags(recipe: Recipe) -> list[str]:
-    """Return flags that give ``v2v-serve`` this recipe. At its start it checks which videos are large enough for it."""
+    """Return flags that give ``v2v-serve`` this recipe: its start then names the videos that are too small."""
     return [text for key, value in recipe.to_dict().items() for text in ("--set", f"{key}={json.dumps(value)}")]
 
 

@@ -4,8 +4,7 @@
 
 Analytic scenes have events known from a formula. Photographs moved along a known path are rendered at 1200 frames a
 second, and every frame is simulated event by event; so is a film of true high rate (``--video``). V2V gets every n-th
-frame. Both sides start with the same residuals and are summed into the same bins. The sensor bench compares the
-events of a real camera.
+frame. Both sides start with the same residuals and are summed into the same bins.
 
     count error   (events of V2V - events) / events, whatever their sign
     voxel error   sum of |V2V - true| / sum of |true|, over the signed counts of common bins and pixels

@@ -31,7 +31,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.flow import FlowSettings, flow_for
+from v2v_server.flow import flow_for
 from v2v_server.flow.methods import one_thread
 from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.sequences import SequenceTable
@@ -104,7 +104,8 @@ def _timed(work: Callable[[], _T]) -> tuple[_T, float]:
 def _flow(decoded: Decoded, method: str | None = None) -> npt.NDArray[np.float16]:
     """Return flow [T, 2, H, W] as a worker makes it, or by one method."""
     plan = decoded.plan
-    settings = _settings(decoded) if method is None else replace(_settings(decoded), method=method)
+    assert plan.flow is not None  # the lease asks for flow
+    settings = plan.flow if method is None else replace(plan.flow, method=method)
     methods = plan.flow_plan.methods if plan.flow_plan is not None and method is None else ()
     return flow_for(decoded.clip.frames, plan.params, plan.spec.recipe, settings, plan=methods).flow
 
@@ -113,12 +114,6 @@ def _simulated(decoded: Decoded) -> object:
     params, spec = decoded.plan.params, decoded.plan.spec
     view = without_margin(decoded.clip.frames, params, spec.recipe, decoded.plan.margin_px)
     return simulate_clip(apply_view(view, params, spec.recipe), params, spec.recipe, spec.voxel_dtype, None)
-
-
-def _settings(decoded: Decoded) -> FlowSettings:
-    if decoded.plan.flow is None:
-        raise UsageError("the lease asks for no flow")
-    return decoded.plan.flow
 
 
 def totals(clips: Sequence[Record]) -> list[dict[str, Any]]:

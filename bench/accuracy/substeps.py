@@ -1,4 +1,4 @@
-"""Error of voxels between frames, with and without sub-steps, and what sub-steps cost.
+"""Error of voxels between frames, with and without sub-steps.
 
 Scenes that are rendered at any time (``tests/oracles/rendered.py``) are seen as 8-bit frames. Their events, one by one
 with exact times, are compared with those of the frames, linear in time, and with those of the frames and the levels
@@ -17,10 +17,8 @@ measured. Its constants (FITS) are least squares over the moving photographs; th
 from __future__ import annotations
 
 import argparse
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,11 +40,8 @@ from tests.oracles.rendered import (
 )
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe
 from v2v_server.motion import levels_between, motions
 from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, predict
-from v2v_server.simulation.clip import simulate_clip
-from v2v_server.simulation.draw import draw
 from v2v_server.simulation.voxel import FINE_STEPS, Levels
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
@@ -83,14 +78,6 @@ _PREDICTED: tuple[Column, ...] = (
     ("predicted_px_per_frame", "found", "{:.1f}", 1),
     ("explained", "explained", "{:.0%}", 1),
     *((f"{key}_{name}", f"{key}{title}", "{}", 1) for name, title in SETTINGS for key in PredictedErrors._fields),
-)
-_COSTS: tuple[Column, ...] = (
-    ("px_per_frame", "px a frame", "{:g}", 1),
-    ("substeps", "sub-steps", "{:.1f}", 1),
-    ("kernel_seconds", "paper's kernel, us a frame", "{:.0f}", 1e6),
-    ("motion_seconds", "motion of 160 x 160 px", "{:.0f}", 1e6),
-    ("levels_seconds", "warp", "{:.0f}", 1e6),
-    ("divided_seconds", "kernel with sub-steps", "{:.0f}", 1e6),
 )
 
 
@@ -197,36 +184,6 @@ def filmed(path: Path, substep_px: float) -> Iterator[dict[str, Any]]:
         }  # fmt: skip
 
 
-def costs(substep_px: float, repeats: int) -> Iterator[dict[str, Any]]:
-    """Yield the processor time of one frame of 128 x 128 px at several speeds, the shortest of some repeats."""
-    recipe = Recipe(voxels_per_clip=4, pause_probability=0.0)
-    params = draw(recipe, seed=1, epoch=0, index=0, picture_height_px=160, picture_width_px=160, video_id="")
-    steps, part = recipe.steps, (16, 16, 128, 128)
-
-    def shortest(work: Callable[[], object]) -> float:
-        work()
-        taken = []
-        for _ in range(repeats):
-            begin = time.thread_time()
-            work()
-            taken.append(time.thread_time() - begin)
-        return min(taken) / steps
-
-    for px in (2.0, 4.8, 12.0):
-        pictures = rendered_scene("camera", 160, 160, px * FRAMES_PER_SECOND).frames(FRAMES_PER_SECOND, steps + 1)
-        frames, source = np.ascontiguousarray(pictures[:, 16:-16, 16:-16]), np.arange(steps + 1)
-        vectors = motions(pictures)[:, :, 4:36, 4:36]
-        levels = levels_between(pictures, part, source, substep_px, vectors)
-        yield {
-            "measure": "cost", "px_per_frame": px, "substep_px": substep_px,
-            "substeps": 1 + (0 if levels is None else len(levels.grey) / steps),
-            "kernel_seconds": shortest(partial(simulate_clip, frames, params, recipe, "int8")),
-            "motion_seconds": shortest(partial(motions, pictures)),
-            "levels_seconds": shortest(partial(levels_between, pictures, part, source, substep_px, vectors)),
-            "divided_seconds": shortest(partial(simulate_clip, frames, params, recipe, "int8", levels=levels)),
-        }  # fmt: skip
-
-
 def missed(records: Records) -> list[str]:
     """Return the bars that the mean of the moving photographs misses."""
     texts = []
@@ -252,7 +209,6 @@ def add_flags(parser: Parser) -> None:
     add_positive(parser, "--substep-px", 1.0, "substep_px of the spec")
     add_whole(parser, "--side", 160, "side of the scenes, px", least=32)
     add_whole(parser, "--steps", 4, "steps between frames of each scene")
-    add_whole(parser, "--repeats", 5, "repeats of each cost")
     parser.add_argument("--video", action="append", default=[], type=Path, metavar="FILE", help="film of high rate")
 
 
@@ -260,12 +216,11 @@ def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
     scenes = list(rendered(asked.substep_px, asked.side, asked.steps))
     films = [each for path in asked.video for each in filmed(path, asked.substep_px)]
-    spent = list(costs(asked.substep_px, asked.repeats))
-    tables: list[tuple[Records, tuple[Column, ...]]] = [(scenes + films, _COLUMNS), (spent, _COSTS)]
+    tables: list[tuple[Records, tuple[Column, ...]]] = [(scenes + films, _COLUMNS)]
     if asked.substep_px != SUBSTEP_PX:
-        return Report([*scenes, *films, *spent], tables)
+        return Report(scenes + films, tables)
     held_out = [
         side_by_side(each) for each in scenes + films if "explained" in each and each["scene"] not in PHOTOGRAPHS
     ]
     tables.append((held_out, _PREDICTED))
-    return Report([*scenes, *films, *spent], tables, list(fits(scenes + films)), missed(scenes))
+    return Report(scenes + films, tables, list(fits(scenes + films)), missed(scenes))

@@ -13,8 +13,6 @@ with the schedule and with samples made here (:mod:`tests.oracles.stream`).
     condemned       quarantined videos without a planted SIGSEGV: good videos
     leftovers       processes, zombies, listening ports, temporary files, shared memory, and processes that ignored
                     SIGTERM
-    rss slope       growth of the server's main process: least squares over one point a second, one slope, an intercept
-                    for each life, without the first seconds of each
 
 Bars: each of lost, duplicated, mismatched, condemned, out_of_order, leftovers, broken_lives, stalled, failures and
 unrecovered is 0.
@@ -35,7 +33,6 @@ from bench.chaos.faults import WEIGHTS, Chaos, Fault
 from bench.chaos.fleet import Fleet
 from bench.corpus import add_source, run_folder
 from bench.frame import Column, Record, Report, add_positive, add_whole, key_values
-from bench.processes import fit, rss_mib
 from tests.leftovers import abandoned_memory, shared_memory
 from tests.oracles.stream import check
 from tests.oracles.stream_log import BatchLine, Kill, read_log, recovery_seconds
@@ -47,7 +44,6 @@ from v2v_server.corpus.sources.names import VIDEO_SUFFIXES
 from v2v_server.quarantine.file import quarantine_path, read_quarantine
 
 _POLL_SECONDS = 0.05
-_WARM_UP_SECONDS = 8.0
 _LAST_BATCH_SECONDS = 120.0
 FAILING = (
     *("lost", "duplicated", "mismatched", "condemned", "out_of_order"),
@@ -69,13 +65,11 @@ class Run:
 
     Attributes:
         faults: committed.
-        server_rss: (seconds, MiB) of each server process.
         stalled: consumers without a batch after the last fault.
         seconds: duration of the faults.
     """
 
     faults: list[Fault] = field(default_factory=list)
-    server_rss: dict[int, list[tuple[float, float]]] = field(default_factory=dict)
     stalled: int = 0
     seconds: float = 0.0
 
@@ -83,15 +77,10 @@ class Run:
 def torment(fleet: Fleet, chaos: Chaos, seconds: float) -> Run:
     """Run the fleet under faults, then wait until every consumer has another batch."""
     run = Run(faults=chaos.done)
-    began = next_point = time.monotonic()
+    began = time.monotonic()
     while (now := time.monotonic()) < began + seconds:
         fleet.restart(now)
         chaos.act(now)
-        pid = fleet.server.pid
-        if now >= next_point and pid is not None and not fleet.server.expected:
-            next_point = now + 1.0
-            if (resident := rss_mib(pid)) is not None:
-                run.server_rss.setdefault(pid, []).append((now, resident))
         time.sleep(_POLL_SECONDS)
     chaos.end()
     run.seconds = time.monotonic() - began
@@ -178,15 +167,6 @@ def run_fleet(fleet: Fleet, chaos: Chaos, asked: argparse.Namespace) -> Report:
         fleet.kill()
     left += [f"shared memory {name}" for name in abandoned_memory(shared)]
     record, faults = record_of(fleet, run, checked(fleet, asked.remakes, asked.seed), left)
-    try:
-        slope = fit(list(run.server_rss.values()), skip_seconds=_WARM_UP_SECONDS)
-        record = {
-            **record,
-            "rss_slope_mib_per_minute": slope.slope,
-            "rss_slope_standard_error_mib_per_minute": slope.standard_error,
-        }
-    except UsageError:  # no server lived long enough
-        record = {**record, "rss_slope_mib_per_minute": None}
     shown = {key: value for key, value in record.items() if not key.startswith("faults_")}
     missed = [f"{key} {record[key]}; the bar is 0" for key in FAILING if record[key]]
     missed += [f"left over: {text}" for text in left[:20]]

@@ -159,11 +159,6 @@ class Fleet:
         return self._address, self._worker_address
 
     @property
-    def ports(self) -> list[int]:
-        """Return the two ports of the server."""
-        return [int(address.rpartition(":")[2]) for address in self.addresses]
-
-    @property
     def everyone(self) -> list[Process]:
         """Return all places."""
         return [self.server, *self.further_workers, *self.crowd]
@@ -182,7 +177,7 @@ class Fleet:
             *(() if self.keys is None else ("--keys", str(self.keys.server))),
         ]
 
-    def start(self, start_seconds: float = 180.0) -> None:
+    def start(self, start_seconds: float = 400.0) -> None:
         """Start the server, then the consumers; wait until each consumer has saved a state.
 
         Raises:
@@ -345,7 +340,7 @@ class Fleet:
         for child in psutil.Process().children():
             if child.status() == psutil.STATUS_ZOMBIE:
                 left.append(f"zombie {child.pid}")
-        for port in self.ports:
+        for port in (int(address.rpartition(":")[2]) for address in self.addresses):
             with socket.socket() as probe:
                 if probe.connect_ex((self.host, port)) == 0:
                     left.append(f"port {port} still listens")

@@ -72,17 +72,7 @@ def parts(address: str, number: int) -> None:
             _push(peer, _PART * 256)
 
 
-def unfinished(address: str, number: int) -> None:
-    """See the module."""
-    _hold(address, b"\x01\x00" * 1000)
-
-
-def segments(address: str, number: int) -> None:
-    """See the module."""
-    _hold(address, b"\x01\x22" + bytes(34))
-
-
-def _hold(address: str, piece: bytes) -> None:
+def _hold(piece: bytes, address: str, number: int) -> None:
     """Send pieces of a message without end over several connections, and hold these until one is ended."""
     with ExitStack() as stack:
         peers = [stack.enter_context(_raw(address)) for _ in range(_UNFINISHED_EACH)]
@@ -252,8 +242,10 @@ class Handshakes:
 
 
 KINDS: dict[str, Callable[[str, int], None]] = {
-    each.__name__: each
-    for each in (parts, unfinished, segments, headers, hello, leave, thief, look, idle, flood, trickle, slow)
+    "parts": parts,
+    "unfinished": functools.partial(_hold, b"\x01\x00" * 1000),
+    "segments": functools.partial(_hold, b"\x01\x22" + bytes(34)),
+    **{each.__name__: each for each in (headers, hello, leave, thief, look, idle, flood, trickle, slow)},
 }
 REFUSED, HANDSHAKES = "refused", "handshakes"
 KEYED_KINDS = (REFUSED, HANDSHAKES)

@@ -22,12 +22,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import numpy.typing as npt
-from av.video.frame import VideoFrame
 
 from bench.processes import Roles
+from tests.clips import write_clip
 from v2v_client.local_server import LocalServer
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import RemoteError, ServerLost
@@ -55,7 +54,6 @@ Ready = Mapping[str, npt.NDArray[Any]]  # Samples made ahead: [samples, ...] of 
 
 CREDIT = 2  # Leases that each holds at a time, as a real worker does
 _PING_SECONDS = 5.0
-_FRAMES_PER_SECOND = 30
 _SEQUENCES_PER_VIDEO = 2
 
 CAMERA = SampleParams(
@@ -232,7 +230,8 @@ def null_service(
         # As long as usual clips, because a lease carries part of the index of all frames.
         frames = (_SEQUENCES_PER_VIDEO - 1) * recipe.frames_per_sequence + recipe.frames_needed
         first = corpus / "0.mp4"
-        still_video(first, frames, recipe.crop_height_px, recipe.crop_width_px)
+        height, width = (side + side % 2 for side in (recipe.crop_height_px, recipe.crop_width_px))
+        write_clip(first, np.full((frames, height, width), 128, np.uint8), codec="mpeg4", gop=600)
         for number in range(1, -(-sequences // _SEQUENCES_PER_VIDEO)):
             (corpus / f"{number}.mp4").hardlink_to(first)
         own = ["--worker-bind", address, "--cache-dir", folder]
@@ -256,20 +255,6 @@ def null_service(
             finally:
                 process.terminate()
                 process.communicate()
-
-
-def still_video(path: Path, frames: int, height_px: int, width_px: int) -> None:
-    """Write a video of a constant grey picture; odd sides are rounded up."""
-    height, width = height_px + height_px % 2, width_px + width_px % 2
-    picture = VideoFrame.from_ndarray(np.full((height * 3 // 2, width), 128, np.uint8), format="yuv420p")
-    with av.open(str(path), "w") as output:
-        stream = output.add_stream("mpeg4", rate=_FRAMES_PER_SECOND)
-        stream.width, stream.height, stream.pix_fmt, stream.gop_size = width, height, "yuv420p", 600
-        stream.thread_count = 1
-        for number in range(frames):
-            picture.pts = number
-            output.mux(stream.encode(picture))
-        output.mux(stream.encode(None))
 
 
 def main() -> None:

@@ -8,7 +8,6 @@ state, and returns float32 voxels; torch's default collate stacks a batch. It is
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -24,18 +23,6 @@ from v2v_server.video.rows import Rows
 _SUFFIXES = {".avi", ".mkv", ".mov", ".mp4", ".webm"}
 
 Sample = dict[str, torch.Tensor]
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """Where one sample comes from: path, first frame, crop, flip, and the source frame of each position."""
-
-    path: Path
-    start_frame: int
-    top_px: int
-    left_px: int
-    flip: bool
-    source_index: npt.NDArray[np.int64]
 
 
 class ReleasedStyleDataset(Dataset[Sample]):
@@ -65,11 +52,13 @@ class ReleasedStyleDataset(Dataset[Sample]):
         return 1_000_000
 
     def __getitem__(self, index: int) -> Sample:
-        view = self.draw_view()
-        return self.simulate(self.read(view))
+        return self.simulate(self.read(*self.draw_view()))
 
-    def draw_view(self) -> View:
-        """Draw clip, sequence, crop, flip and pauses. Open the file a first time: its size is not remembered."""
+    def draw_view(self) -> tuple[Path, int, int, int, bool, npt.NDArray[np.int64]]:
+        """Draw clip, first frame, top, left, flip, and the source frame of each position.
+
+        It opens the file a first time: its size is not remembered.
+        """
         recipe = self.recipe
         path = self.clips[np.random.randint(len(self.clips))]
         capture = cv2.VideoCapture(str(path))
@@ -84,7 +73,7 @@ class ReleasedStyleDataset(Dataset[Sample]):
         for position in range(1, recipe.frames_needed):
             paused = np.random.rand() < (recipe.pause_stay_probability if paused else recipe.pause_probability)
             advance[position] = not paused
-        return View(
+        return (
             path,
             np.random.randint((count - recipe.frames_needed) // recipe.frames_per_sequence + 1)
             * recipe.frames_per_sequence,
@@ -94,25 +83,27 @@ class ReleasedStyleDataset(Dataset[Sample]):
             np.cumsum(advance),
         )
 
-    def read(self, view: View) -> npt.NDArray[np.uint8]:
+    def read(
+        self, path: Path, start: int, top: int, left: int, flip: bool, source_index: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.uint8]:
         """Return the frames of a sample, [steps + 1, H, W].
 
         Raises:
             VideoError: the file ends early.
         """
         height, width = self.recipe.crop_height_px, self.recipe.crop_width_px
-        capture = cv2.VideoCapture(str(view.path))
-        capture.set(cv2.CAP_PROP_POS_FRAMES, view.start_frame)
+        capture = cv2.VideoCapture(str(path))
+        capture.set(cv2.CAP_PROP_POS_FRAMES, start)
         decoded = []
-        for number in range(int(view.source_index[-1]) + 1):
+        for number in range(int(source_index[-1]) + 1):
             read, picture = capture.read()
             if not read:
-                raise VideoError(str(view.path), view.start_frame + number, "OpenCV gives no frame")
+                raise VideoError(str(path), start + number, "OpenCV gives no frame")
             grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-            decoded.append(grey[view.top_px : view.top_px + height, view.left_px : view.left_px + width])
+            decoded.append(grey[top : top + height, left : left + width])
         capture.release()
-        frames = np.stack([decoded[source] for source in view.source_index])
-        return frames[:, :, ::-1] if view.flip else frames
+        frames = np.stack([decoded[source] for source in source_index])
+        return frames[:, :, ::-1] if flip else frames
 
     def simulate(self, frames: npt.NDArray[np.uint8]) -> Sample:
         """Draw a camera; return voxels and target frames."""

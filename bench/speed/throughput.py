@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import psutil
 from torch.utils.data import DataLoader
@@ -83,28 +83,12 @@ class Corpus:
     rows: str
 
 
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """One contender in one turn.
+class Measured(NamedTuple):
+    """One contender in one turn: the rates after the warm-up, with the processor time of all processes."""
 
-    Attributes:
-        batches, seconds, cpu_seconds: after the warm-up; the processor time is that of all processes.
-    """
-
-    batches: int
-    seconds: float
-    cpu_seconds: float
+    batches_per_second: float
+    cpu_seconds_per_batch: float
     samples_per_decode: float = 1.0
-
-    @property
-    def batches_per_second(self) -> float:
-        """Return the rate by the clock."""
-        return self.batches / self.seconds
-
-    @property
-    def cpu_seconds_per_batch(self) -> float:
-        """Return the processor time of all processes together."""
-        return self.cpu_seconds / self.batches
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,8 +139,7 @@ def _preset(name: str, corpus: Corpus, asked: argparse.Namespace) -> Measured:
 
         views = int(SPEED_PRESETS[name]["samples_per_decode"])
         measured = _measure(asked, batches(), used, burst=views)
-    achieved = made["samples"] / made["decodes"]
-    return Measured(measured.batches, measured.seconds, measured.cpu_seconds, achieved)
+    return measured._replace(samples_per_decode=made["samples"] / made["decodes"])
 
 
 def _decode(corpus: Corpus, asked: argparse.Namespace) -> Measured:
@@ -210,7 +193,7 @@ def _measure(
     while time.perf_counter() - started < asked.seconds or taken % burst:
         next(stream)
         taken += 1
-    return Measured(taken, time.perf_counter() - started, used() - cpu)
+    return Measured(taken / (time.perf_counter() - started), (used() - cpu) / taken)
 
 
 def _own_cpu_seconds() -> float:

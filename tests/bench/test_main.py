@@ -82,8 +82,8 @@ def test_every_bench_has_a_parser_and_a_line_in_the_list() -> None:
         ("siege --footage film --kinds refused", "--kinds refused: choose of parts, "),
         ("fuzz --live 5", "--live needs a corpus: give --videos DIR"),
         ("flow --methods dis", "flow_method"),
-        ("flow --videos none", "No such file or directory: 'none'"),
         ("extremes --rows zzz", "--rows zzz: no row has that in its name"),
+        ("flow --videos none", "No such file or directory: 'none'"),
     ],
 )
 def test_wrong_usage_is_one_line(command: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:

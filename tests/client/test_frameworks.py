@@ -27,7 +27,7 @@ def server() -> Iterator[FakeServer]:
 
 
 def dataset(server: FakeServer) -> V2VStreamDataset:
-    return V2VStreamDataset(server.address, batch_size=4, timeout_seconds=20.0)
+    return V2VStreamDataset(server.address, batch_size=4, timeout_seconds=60.0)
 
 
 @pytest.mark.parametrize("batch_size", [1, 4])
@@ -169,7 +169,7 @@ def test_a_forked_child_cannot_continue_an_iterator(server: FakeServer) -> None:
     child = FORK.Process(target=_read_on, args=(batches, there))
     child.start()
     there.close()
-    assert here.poll(20.0)
+    assert here.poll(60.0)
     said = here.recv()
     child.join()
     child.close()

@@ -40,7 +40,7 @@ def test_a_spawned_process_sends_its_queued_batches_before_it_exits() -> None:
     queue = spawn.Queue()
     process = spawn.Process(target=hand_over_and_leave, args=(queue,))
     process.start()
-    assert queue.get(timeout=30) == "arrived"
+    assert queue.get(timeout=60) == "arrived"
     process.join()
     assert process.exitcode == 0
     queue.close()

@@ -23,7 +23,7 @@ FULL_SHM = "mount -t tmpfs -o size=4k tmpfs /dev/shm && head -c 4096 /dev/zero >
 
 
 def mounted(setup: str, command: Sequence[str]) -> list[str]:
-    """``command`` as it runs after the shell lines ``setup``, which may mount what they like: nobody else sees it.
+    """``command`` as it runs after the shell lines ``setup``, whose mounts no other process sees.
 
     Skips the test where the system does not permit that.
     """

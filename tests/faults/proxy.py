@@ -153,7 +153,7 @@ class Proxy:
                 continue
             try:
                 server = socket.create_connection(self._target)
-            except OSError:  # nobody there: neither are we
+            except OSError:  # the server is gone: so is the proxy
                 client.close()
                 continue
             connection = _Connection(client, server)

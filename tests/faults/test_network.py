@@ -16,7 +16,7 @@ pytestmark = pytest.mark.timeout(60)
 
 QUICK = Patience(ping_seconds=0.2, rewant_seconds=0.6)
 NEVER_BY_THE_CLOCK = Patience(ping_seconds=1000.0, rewant_seconds=1000.0)
-"""Whoever recovers with this patience noticed the cut itself."""
+"""A client that recovers with this patience noticed the cut itself."""
 
 
 @pytest.fixture(scope="module")

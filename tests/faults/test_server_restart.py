@@ -68,7 +68,7 @@ def test_the_client_goes_on_with_a_restarted_server(clips: Path) -> None:
         expected = [digest(batch) for batch in epoch_of(address)]
         with iterating(address) as (client, go_on):
             kill(first)
-            go_on.set()  # it waits for samples while nobody is there
+            go_on.set()  # it waits for samples while there is no server
             with LocalServer(clips, workers=2, flags=same_address(address)):
                 assert client.result() == expected
     assert len(expected) > 2 * BATCHES_BEFORE

@@ -74,7 +74,7 @@ def test_where_no_sample_can_come_the_consumer_says_why_and_ends(clips: Path, tm
             first(3.0)
         with subprocess.Popen(worker_command(address, tmp_path)) as lacking:
             try:
-                # Until it is there, and has failed, nobody can say more than that none is connected.
+                # Until it has started and failed, the message can only say that none is connected.
                 text = ""
                 while "can read its videos" not in text:
                     with pytest.raises(NoWorkers) as caught:
@@ -175,7 +175,7 @@ def test_a_poison_video_is_quarantined_and_stays_so(monkeypatch: pytest.MonkeyPa
     assert poison not in videos
     verdicts = [json.loads(text) for text in next(cache.glob("quarantine-*.jsonl")).read_text().splitlines()]
     assert {line["path"] for line in verdicts} == {poison}
-    # Both workers may have been at it when the second verdict fell; after that nobody touches it.
+    # Both workers may have been at it when the second verdict fell; after that it is not leased.
     assert 2 <= len(verdicts) <= 4
 
     with _faulty(monkeypatch, clips, "--cache-dir", str(cache), **fault) as server:

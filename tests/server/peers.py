@@ -302,7 +302,7 @@ def peers(
     expected_workers: int = 0,
     share_bytes: int = 0,
 ) -> Peers:
-    """A dispatcher over a small corpus (or the one given), with nobody connected yet."""
+    """Return a dispatcher over a small corpus, or over the given one, without connected peers."""
     videos = catalogue or corpus(*(video(f"v{number}.mp4") for number in range(5)))
     held = Quarantine() if quarantine is None else quarantine
     dispatcher = Dispatcher(

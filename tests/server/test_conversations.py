@@ -213,7 +213,7 @@ class World:
             self.end(name)  # its supervisor gave it up
 
     def settle(self) -> None:
-        """Everybody goes on until nobody waits for anything."""
+        """Run all peers until none waits for anything."""
         for _ in range(20_000):
             self.turn()
             for worker in list(self.workers.values()):
@@ -254,7 +254,7 @@ def test_workers_come_and_go_as_the_supervisor_is_told(tmp_path: Path) -> None:
 
 
 class AnyOrder(RuleBasedStateMachine):
-    """Messages are taken and steps are made in any order; workers die, hang and leave; the server is started anew."""
+    """Messages are taken and steps are made in any order; workers die, hang and leave; the server restarts."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -311,7 +311,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     @precondition(lambda self: self.world.dispatcher.counters.samples)
     @rule()
-    def server_is_started_anew(self) -> None:
+    def server_restarts(self) -> None:
         assert self.world.dispatcher.counters.malformed == 0
         self.world.start()
 
@@ -349,14 +349,14 @@ def walk(seed: int) -> Counter[str]:
         "hang": (0.5, lambda: model.worker_hangs(draw.randrange(4))),
         "leave": (1, lambda: model.worker_is_told_to_leave(draw.randrange(4))),
         "time": (2, lambda: model.time_passes(draw.choice((1.0, 10.0, DEADLINE + 1)))),
-        "anew": (2, model.server_is_started_anew),
+        "restart": (2, model.server_restarts),
     }
     weights = [weight for weight, _ in moves.values()]
     seen: Counter[str] = Counter()
     for name in draw.choices(list(moves), weights, k=300):
-        if name == "anew":
+        if name == "restart":
             at_work = any(isinstance(worker.step, Make) for worker in model.world.workers.values())
-            seen["started anew while samples are made"] += at_work
+            seen["restarted while samples are made"] += at_work
             counters = model.world.dispatcher.counters
             seen["refused"] += counters.refused_candidates
             seen["lost"] += counters.workers_lost
@@ -368,7 +368,7 @@ def walk(seed: int) -> Counter[str]:
 
 def test_long_walks_keep_the_promise_and_reach_what_is_rare() -> None:
     seen = sum(map(walk, range(40)), Counter())
-    least = {"started anew while samples are made": 15, "refused": 100, "lost": 100, "samples": 800}
+    least = {"restarted while samples are made": 15, "refused": 100, "lost": 100, "samples": 800}
     assert {name: seen[name] for name in least if seen[name] < least[name]} == {}
 
 

@@ -224,7 +224,7 @@ def test_a_server_stops_even_if_a_worker_is_not_connected(tmp_path: Path) -> Non
 def test_a_time_in_which_the_server_was_stopped_is_no_silence_of_others(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Its workers were stopped along with it, or have answered to nobody: no deadline may run out."""
+    """No deadline may run out: its workers were stopped too, or their answers were not read."""
     dispatcher = Scripted()
     monkeypatch.setattr(clock_module, "time", SimpleNamespace(monotonic=lambda: 50.0 + 100.0 * len(dispatcher.times)))
     server = served(dispatcher, tmp_path)

@@ -1,4 +1,4 @@
-"""The promise: the same (spec, seed, epoch, index) gives the same bytes, whoever makes the sample."""
+"""The promise: the same (spec, seed, epoch, index) gives the same bytes, whichever process makes the sample."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_a_killed_worker_changes_nothing(clips: Path, reference: list[str]) -> N
 def test_a_stopped_worker_is_replaced(clips: Path, reference: list[str]) -> None:
     """SIGSTOP: the worker answers no more but does not die; its leases run out and it is killed."""
     with LocalServer(clips, workers=2, flags=[*SMALL_FLAGS, "--lease-deadline-seconds", "2"]) as server:
-        # Before its hello nobody would miss a worker.
+        # Before its hello the server does not miss a worker.
         with StatusClient(server.address) as client:
             until(lambda: len(client.get_status()["workers"]) == 2)
         stopped = server_workers(server.pid)[0]

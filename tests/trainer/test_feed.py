@@ -81,7 +81,7 @@ def loader_worker(before: set[psutil.Process]) -> psutil.Process:
 
 
 def until_ended(child: psutil.Process) -> None:
-    """Returns once all threads of a child are gone; its pipes end earlier. Whoever started it can still ask for it."""
+    """Wait until all threads of a child are gone, and leave it to be reaped; its pipes end earlier."""
     os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
 
 
@@ -106,7 +106,7 @@ def test_a_signal_to_the_whole_group_lets_the_step_finish() -> None:
     """The loader worker dies of it in the middle of the step; the run ends after the step."""
     before, finished = set(psutil.Process().children()), []
     with FakeServer() as server, StopRequest() as stop:
-        feed = Feed(V2VStreamDataset(server.address, batch_size=2, timeout_seconds=20.0), CPU, loader_workers=1)
+        feed = Feed(V2VStreamDataset(server.address, batch_size=2, timeout_seconds=60.0), CPU, loader_workers=1)
         for batch in stop.until(feed.epochs(0, 2)):
             worker = loader_worker(before)
             # By somebody else: of its parent, a loader worker takes SIGTERM for an ordinary end.
@@ -122,7 +122,7 @@ def test_a_signal_to_the_whole_group_lets_the_step_finish() -> None:
 def test_a_loader_worker_that_dies_by_itself_is_noticed() -> None:
     before = set(psutil.Process().children())
     with FakeServer() as server:
-        feed = Feed(V2VStreamDataset(server.address, batch_size=2, timeout_seconds=20.0), CPU, loader_workers=1)
+        feed = Feed(V2VStreamDataset(server.address, batch_size=2, timeout_seconds=60.0), CPU, loader_workers=1)
         batches = feed.epochs(0, 2)
         assert next(batches).indices == (0, 1)
         worker = loader_worker(before)

@@ -91,11 +91,11 @@ class Admission:
         quarantine = newest if hello.quarantine is None else hello.quarantine
         if quarantine > newest:
             raise CorpusError(
-                f"quarantine snapshot {quarantine} was asked for, this server has 0 .. {newest}: the stream goes by "
-                "verdicts that this server has not read. Put the quarantine file of the server that it came from "
-                "in the place of this one's (v2v-quarantine --videos DIR says where each lies), and start this server "
-                'again; if both have the same file, only start it again. Or set "quarantine" of the saved state to '
-                "None, to go on under what this server has: sequences that the other had condemned then come again"
+                f"quarantine snapshot {quarantine} was asked for, this server has 0 .. {newest}: the stream follows "
+                "entries that this server has not read. Replace this server's quarantine file by that of the stream's "
+                "earlier server (v2v-quarantine --videos DIR prints its path), and restart this server; if they are "
+                'the same file, just restart. To continue without these entries, set "quarantine" of the saved state '
+                "to None: the sequences that they refused then return"
             )
         table = self._table(spec)
         schedule = Schedule.of(table, spec)

@@ -205,7 +205,7 @@ class Grants:
         return actions
 
     def _share(self, session: Session, request: Request) -> list[Action] | None:
-        """Answer a request from the ring, or let it follow its maker; return None if it must be made."""
+        """Answer a request from the ring, or let it wait for the lease that makes its sample; else return None."""
         if self._ring is None:
             return None
         key = sharing_key(session, request)

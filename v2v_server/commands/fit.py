@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     out.add_argument("--picture", metavar="FILE.png", help="also draw measured against simulated statistics")
     check = parser.group("Check")
     check.add_argument("--check", metavar="RECIPE", help="measure this recipe: a preset's name or a YAML file")
-    check.add_argument("--sheet", metavar="FILE.yaml", help="figures to show beside it, by the names of the table")
+    check.add_argument("--sheet", metavar="FILE.yaml", help="figures to show in the table, by its row names")
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="interrupted; no recipe was written")
 
 

@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--connect",
         default="tcp://127.0.0.1:5555",
         metavar="ADDRESS",
-        help="where consumers connect (default %(default)s)",
+        help="address of the server for consumers (default %(default)s)",
     )
     what.add_argument("--keys", metavar="FILE", help="a consumer's key (default: what V2V_KEYS names)")
     what.add_argument(

@@ -36,7 +36,7 @@ def cells_of(params: SampleParams, recipe: Recipe, picture: Window) -> Cells:
 
     Args:
         params, recipe: the draw and its recipe.
-        picture: the part of the usable picture that the draw is about, less its bars.
+        picture: the usable picture without bars, which the draw refers to.
     """
     (top, rows), (left, columns) = (
         (int(cells[0]), int(cells[-1] - cells[0]) + 1) for cells in _shown_cells(params, recipe, picture)

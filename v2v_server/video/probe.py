@@ -66,8 +66,8 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
     """Open, decode the first frame, and walk over all packets.
 
     Frames that the decoder does not deliver are not counted: hidden reference frames, frames outside the edit list,
-    those in front of the first one that can be decoded in a file cut in mid-GOP, and those behind a change of size or
-    luma format. Two fields are one frame. A file whose packets may not name its frames is decoded once.
+    frames before the first keyframe of a file that starts in mid-GOP, and frames after a change of size or luma format.
+    Two fields are one frame. A file whose packets may not name its frames is decoded once.
 
     Raises:
         VideoError: the file does not open, has no video track, or not one frame of it decodes.

@@ -29,7 +29,6 @@ DEMANDED = (
     "leftovers",
     "recovery_p50_seconds",
     "recovery_p99_seconds",
-    "rss_slope_mib_per_minute",
 )
 
 

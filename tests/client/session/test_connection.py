@@ -25,7 +25,7 @@ from v2v_protocol.messages import Hello
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.wire import Frames
 
-NEVER_BY_THE_CLOCK = Patience(timeout_seconds=20.0, ping_seconds=1000.0, rewant_seconds=1000.0)
+NEVER_BY_THE_CLOCK = Patience(timeout_seconds=60.0, ping_seconds=1000.0, rewant_seconds=1000.0)
 
 
 @pytest.fixture

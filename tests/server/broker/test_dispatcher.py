@@ -1,4 +1,4 @@
-"""The dispatcher with fake peers: who gets what, what happens when somebody dies, and that nobody can stop it."""
+"""The dispatcher with fake peers: which peer gets what, what a death changes, and that no peer can stop it."""
 
 from __future__ import annotations
 
@@ -242,7 +242,7 @@ def test_credit_follows_batch_size_workers_and_bytes() -> None:
 
 
 def test_credit_counts_workers_that_are_still_starting() -> None:
-    """A server is ready with its first worker, and the credit of whoever connects then holds for an epoch."""
+    """A server is ready with its first worker, and the credit of a consumer that connects then holds for an epoch."""
     at = peers(expected_workers=20)
     assert at.hello(batch_size=12).credit == 40
     for number in range(3):
@@ -269,7 +269,7 @@ def test_a_full_server_is_busy_to_newcomers_only(monkeypatch: pytest.MonkeyPatch
     hello = Hello({}, ("voxels",), 4, 0)
     assert "3 consumers" in refused(at.consumer_says(b"c4", hello), ErrorCode.BUSY)
     refused(at.want(0, identity=b"c4"), ErrorCode.UNKNOWN_SESSION)
-    # Those that are in may connect again, and whoever leaves makes room.
+    # Admitted consumers may connect again, and one that leaves makes room.
     at.hello(b"c2", seed=1)
     at.consumer_says(b"c3", Goodbye())
     at.hello(b"c4")
@@ -303,7 +303,7 @@ def test_work_of_a_dead_worker_is_done_by_another_once(cause: Cause) -> None:
     at.worker_says(b"w1", Result(held[0].lease), *sample_frames(0, 0))
     at.work_off(b"w2")
     assert sorted(at.samples()) == [(0, 0), (0, 1), (0, 2)]
-    # What the dead one still had in the post is told that nobody knows it.
+    # A late message of the dead worker is answered: unknown worker.
     assert [type(message) for message in at.told[b"w1"]] == [Denied]
     assert at.dispatcher.counters.workers_lost == 1
     assert at.dispatcher.counters.returned_leases == 2
@@ -600,7 +600,7 @@ def test_a_worker_that_fell_silent_is_given_up_once_without_blame() -> None:
     at.tick(0.5)
     assert (at.given_up, at.dispatcher.workers) == ([b"w2"], 1)
     assert (at.recorded, at.dispatcher.counters.workers_lost) == ([], 1)
-    # Whoever holds a lease may be silent for as long as that lasts; a word counts, whatever it is.
+    # A worker with a lease may be silent until its deadline; any message counts as a sign of life.
     at.finish(b"w1")
     at.worker_says(b"w1", Ping())
     at.tick(SILENCE_SECONDS - 0.1)
@@ -778,11 +778,11 @@ def test_geometries_requested_once_are_evicted() -> None:
     assert at.samples(b"other") == [(0, 0)]
 
 
-# --- nobody can stop it -----------------------------------------------------------------------------------------------
+# --- no peer can stop it ----------------------------------------------------------------------------------------------
 
 
 def still_serves(at: Peers) -> None:
-    """A consumer and a worker that behave are served as if nobody else were there."""
+    """Check that a healthy consumer and worker are served as if they were alone."""
     at.join(b"good worker")
     at.hello(b"good consumer", seed=3)
     at.want(0, 1, identity=b"good consumer")
@@ -1005,7 +1005,7 @@ def test_a_worker_that_answers_nonsense_is_dropped_at_once_and_its_work_keeps_it
     (reply,) = at.told[b"w"]
     assert isinstance(reply, Denied)
     assert reply.code == ErrorCode.MALFORMED
-    # Whatever else it says, nobody knows it any more.
+    # Whatever else it says, the server does not know it any more.
     at.worker_says(b"w", Result(lease.lease + 1), *sample_frames(0, 1))
     assert at.samples() == []
     at.join(b"w2", credit=3)

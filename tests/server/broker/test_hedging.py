@@ -1,4 +1,4 @@
-"""Second leases for slow samples: the consumer gets the sample once, whoever is first and whatever the other does."""
+"""Second leases for slow samples: the consumer gets the sample once, from whichever worker is first."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_the_first_answer_is_delivered_and_the_second_dropped(order: tuple[bytes
 def test_a_failure_answers_for_both() -> None:
     at, first, _ = slowed()
     at.fail(b"fast")
-    # The next candidate is tried by whoever has room, and the slow one's sample of the one before comes too late.
+    # A free worker tries the next candidate, and the slow worker's sample of the one before comes too late.
     assert [lease.candidate for lease in at.leases[b"fast"]] == [1]
     before = at.samples()
     at.finish(b"slow")
@@ -161,7 +161,7 @@ def test_a_lone_task_has_no_twin() -> None:
 
 
 def test_a_twin_is_of_the_snapshot_of_the_first_though_a_verdict_fell_meanwhile() -> None:
-    """Both are the same candidate, chosen under the same snapshot; whoever makes it again asks for that one."""
+    """Both are the same candidate under the same snapshot, so a remake of either asks for that snapshot."""
     at, hanging = practised()
     at.want(21)
     at.join(b"dies", credit=1)

@@ -33,7 +33,7 @@ _HALF_WRITTEN = (-1, -1, -1)
 
 class Interleaving(RuleBasedStateMachine):
     """Whatever happens in whatever order, once healthy workers are left to finish, every index that a consumer waits
-    for has been answered exactly once, and nothing that was said to nobody is left."""
+    for has been answered exactly once, and no message without a recipient is left."""
 
     spec: Mapping[str, int] = {}
     share_bytes = 0
@@ -74,7 +74,7 @@ class Interleaving(RuleBasedStateMachine):
         self.join(b"w2", CREDIT)
 
     def _listen(self) -> None:
-        """Each consumer takes what it was sent; workers that nobody knows clear their table and say hello again."""
+        """Deliver to each consumer; workers that the server does not know clear their leases and say hello again."""
         for identity, heard in self.at.heard.items():
             for number, message in enumerate(heard[self.read.get(identity, 0) :], self.read.get(identity, 0)):
                 if isinstance(message, SampleHeader):

@@ -358,7 +358,7 @@ class LeaseModel(RuleBasedStateMachine):
         if place is None or place.retired:
             return multiple()
         if worker in {other.worker for other in self.out.values() if other.request == place.request}:
-            return multiple()  # nobody is given a request that it has
+            return multiple()  # no worker is given a request that it has
         return self._granted(place.request, worker)
 
     @rule(number=numbers, worker=workers)

@@ -47,7 +47,7 @@ def opened(*sessions: Session) -> Sessions:
 def take(sessions: Sessions) -> Request:
     request = sessions.next_request()
     if request is None:
-        raise AssertionError("nobody waits")
+        raise AssertionError("no request waits")
     return request
 
 
@@ -246,7 +246,7 @@ def test_the_largest_debt_that_is_accepted_does_not_stall() -> None:
 
 @pytest.mark.parametrize("credit", [1, 2])
 def test_asking_for_one_sample_at_a_time_is_not_free_of_charge(credit: int) -> None:
-    """Whose queue runs empty with every answer still pays for it, and starves nobody."""
+    """A consumer whose queue runs empty with every answer still pays for it, and starves no other."""
     got = serve({b"cheap": 0.1, b"dear": 1.0}, 2200, credits={b"dear": credit})
     assert got[b"cheap"] / got[b"dear"] == pytest.approx(10.0, rel=0.1)
 

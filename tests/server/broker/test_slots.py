@@ -1,4 +1,4 @@
-"""Slots on the server's side: who is told of one, and that nobody is told of one that somebody may still write to."""
+"""Slots on the server's side: which consumer is told of one, and never of one that a worker may still write to."""
 
 from __future__ import annotations
 

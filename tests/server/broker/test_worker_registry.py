@@ -163,7 +163,7 @@ def test_a_worker_at_a_lone_task_gets_nothing_else() -> None:
 
 
 def test_while_a_lone_task_waits_one_worker_works_itself_empty_and_the_others_go_on() -> None:
-    """Busy as they may be kept, whoever holds least is not refilled: it is empty in the end."""
+    """The worker with the fewest tasks is not refilled, so it ends empty."""
     table = Table(a=2, b=2)
     held: dict[str, list[int]] = {name: [table.load(name), table.load(name)] for name in "ab"}
     served = 0

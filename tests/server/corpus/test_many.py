@@ -22,7 +22,7 @@ MOST_THAT_STAY = 200
 
 @pytest.fixture
 def corpus(tmp_path: Path) -> Path:
-    """A folder of files that nobody opens, because the index knows them."""
+    """Make a folder of files that are never opened, because the index knows them."""
     folder = tmp_path / "videos"
     folder.mkdir()
     rows = []

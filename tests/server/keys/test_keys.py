@@ -168,10 +168,15 @@ def test_a_revoked_worker_is_cut_off_and_local_ones_need_no_key(
         remote = peers[0].get_monitor_socket(zmq.EVENT_DISCONNECTED)
         assert len({next_from(sockets, FromWorker).identity for _ in peers}) == 2  # type: ignore[union-attr]
         folder.revoke("cpu1")
-        arrivals(sockets, 2.0)
-        assert remote.poll(3000)
+
+        def is_cut_off() -> bool:
+            sockets.receive(0.05)
+            return bool(remote.poll(0))
+
+        until(is_cut_off)
         peers[1].send_multipart(encode(Ping()))
-        assert len(arrivals(sockets, 1.0)) == 1  # the local one's
+        next_from(sockets, FromWorker)  # the local one's
+        assert arrivals(sockets, 0.1) == []
     finally:
         context.destroy(linger=0)
 
@@ -238,7 +243,7 @@ def test_who_says_nothing_until_its_key_is_revoked_is_not_heard(
         secure(peer, read_key(tmp_path / "gpu1.key"))
         monitor = peer.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED)
         peer.connect(sockets.address)
-        assert monitor.poll(5000)
+        assert monitor.poll(60_000)
         monitor.recv_multipart()
         folder.revoke("gpu1")
         gate = sockets._routers.gate

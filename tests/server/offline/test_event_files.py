@@ -1,4 +1,4 @@
-"""Files of events say what was written, to whoever reads such files; `v2v-simulate --events` writes the sample's."""
+"""Other programs read from files of events what was written; `v2v-simulate --events` writes the sample's."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def got(port: int, path: str, host: str | None = None) -> tuple[int, str]:
     if host is not None:
         request.add_header("Host", host)
     try:
-        with urllib.request.urlopen(request, timeout=30) as answer:
+        with urllib.request.urlopen(request, timeout=60) as answer:
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as error:
         return error.code, error.read().decode()
@@ -181,7 +181,7 @@ def test_the_page_ends_with_its_server_even_when_that_is_killed(clips: Path) -> 
         assert page is not None
         until(lambda: got(port, "/healthz")[0] == 200)
         os.kill(server.pid, signal.SIGKILL)
-        server.wait(30)
+        server.wait(60)
         assert psutil.wait_procs([page], timeout=60)[1] == []
         PageProcess("127.0.0.1", port).stop()  # the port is free
     finally:

@@ -38,13 +38,13 @@ def test_silent_connections_are_bounded_and_requests_are_answered(port: int) -> 
     more = 16
     with contextlib.ExitStack() as stack:
         silent = [
-            stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=30))
+            stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=60))
             for _ in range(MOST_SILENT + more)
         ]
         for oldest in silent[:more]:
             with contextlib.suppress(ConnectionResetError):
                 assert oldest.recv(1) == b""
-        asking = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+        asking = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
         with contextlib.closing(asking):
             asking.request("GET", "/healthz")
             assert asking.getresponse().status == 200

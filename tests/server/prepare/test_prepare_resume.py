@@ -118,7 +118,7 @@ def test_finished_files_are_looked_at_together_and_told_of(
         inside.append(path)
         if len(inside) > 1:
             several.set()
-        assert several.wait(1), "the files are read one after the other"
+        assert several.wait(60.0), "the files are read one after the other"
         return fingerprint(path)
 
     monkeypatch.setattr("v2v_server.prepare.resume.fingerprint", among_others)
@@ -343,7 +343,7 @@ def test_killed_at_a_random_moment(source: Path, tmp_path: Path, turn: int) -> N
     last = run(source, out)
     assert last.complete
     assert not list(out.rglob(f"*{PARTIAL_SUFFIX}"))
-    # Whole and right, whoever made them; x264's very bytes may differ from run to run.
+    # Whole and right, whichever process made them; x264's bytes may differ from run to run.
     for video in last.videos:
         assert fingerprint(out / video.id) == video.fingerprint
         assert psnr_db(whole(out / video.id), whole(source / video.id)) == pytest.approx(video.psnr_db)

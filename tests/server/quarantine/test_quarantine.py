@@ -247,7 +247,7 @@ def test_two_servers_and_a_clearing_share_one_numbering(tmp_path: Path) -> None:
     here.extend(write_entry(file, verdict("a.mp4"), here))
     write(file, clearing(TIME))
     written = write_entry(file, verdict("b.mp4"), there)
-    # Whoever writes learns of everything that was written since it last looked, its own line last.
+    # A writer learns of everything written since its last reading, its own line last.
     assert written == numbered(verdict("a.mp4"), clearing(TIME), verdict("b.mp4"))
     there.extend(written)
     here.extend(write_entry(file, verdict("c.mp4"), here))

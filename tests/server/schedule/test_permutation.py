@@ -47,7 +47,7 @@ def test_large_domains_stay_inside_and_do_not_collide(n: int, seed: int, epoch: 
 
 
 def test_golden_order() -> None:
-    """Saved positions rest on this order: whoever changes it raises NUMERICS_VERSION."""
+    """Saved positions rest on this order: a change of it raises NUMERICS_VERSION."""
     assert order(12, 0, 0) == [1, 4, 0, 10, 11, 6, 5, 2, 8, 3, 9, 7]
     assert order(12, 0, 1) == [0, 2, 4, 7, 6, 8, 3, 11, 5, 1, 9, 10]
     large = Permutation(22_725, 2**64 - 1, 7)

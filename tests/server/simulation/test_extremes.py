@@ -1,8 +1,7 @@
-"""The edges of what a recipe may ask for: every row of the extremes bench, and cameras drawn at random."""
+"""The edges of what a recipe may ask for: every row of the oracle, and cameras drawn at random."""
 
 from __future__ import annotations
 
-import argparse
 import math
 from typing import Any
 
@@ -11,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.accuracy import extremes
 from tests.oracles.balance import Camera, arithmetic, balance, imbalance, trace_of
 from tests.oracles.extremes import Finding, Row, record_of, refused, rows, texture
 from tests.server.simulation import oracle, reference
@@ -180,7 +178,6 @@ def test_float32_asked_for_by_name_is_kept_to_its_limit() -> None:
         simulate(frames, threshold_pos=1e-4, bins=60, precision="float32")
 
 
-def test_a_row_beyond_its_bound_is_a_missed_bar(monkeypatch: pytest.MonkeyPatch) -> None:
-    bad = Row("bad", "counted", "things", lambda: Finding(2.0, 1.0, note="too many"))
-    monkeypatch.setattr(extremes, "rows", lambda: [bad])
-    assert extremes.measure(argparse.Namespace(rows="")).missed == ["bad: too many"]
+@pytest.mark.parametrize(("measured", "passed"), [(2.0, False), (1.0, True), (float("nan"), False)])
+def test_a_row_beyond_its_bound_does_not_pass(measured: float, passed: bool) -> None:
+    assert record_of(Row("row", "counted", "things", lambda: Finding(measured, 1.0)))["passed"] is passed

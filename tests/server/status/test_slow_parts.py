@@ -81,7 +81,7 @@ def verdicts(
             said += [client.get_status()["waiting"] for _ in range(3)]
     finally:
         stop.set()
-        consumer.join(30)
+        consumer.join(60)
     assert not trouble
     return said
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 
 import pytest
 from hypothesis import given
@@ -324,7 +323,7 @@ def test_the_state_is_plain_json() -> None:
     assert service.plain()["workers"][0]["name"] == "w"
 
 
-def test_thousands_of_peers_fit_into_one_message_and_take_milliseconds() -> None:
+def test_thousands_of_peers_fit_into_one_message_after_a_few_encodings(monkeypatch: pytest.MonkeyPatch) -> None:
     at = peers()
     service = published(at)
     for number in range(MOST_SHOWN + 50):
@@ -335,15 +334,15 @@ def test_thousands_of_peers_fit_into_one_message_and_take_milliseconds() -> None
     for worker in range(0, MOST_SHOWN, 2):
         at.begin(b"w%04d" % worker)
     service.pass_seconds(1.0)
-    began = time.process_time()
+    encodings, dumps = [], json.dumps
+    monkeypatch.setattr(json, "dumps", lambda *values, **form: encodings.append(0) or dumps(*values, **form))
     encoded = to_json(service.status())
-    took = time.process_time() - began
     state = service.view()
     assert (state.worker_count, state.consumer_count) == (MOST_SHOWN + 50, MOST_SHOWN + 50)
     assert len(encoded) < 1 << 20
     values = json.loads(encoded)
     assert 0 < len(values["workers"]) <= MOST_SHOWN
-    assert took < 1.0  # 0.1 s on an idle core, twice that for lists that do not fit
+    assert 1 < len(encodings) <= 3  # lists that do not fit are halved, not shortened one by one
 
 
 def test_names_that_are_no_text_and_very_long_ones_do_no_harm() -> None:

@@ -232,7 +232,7 @@ def test_damage_beyond_a_sample_does_not_spoil_it(tmp_path: Path, folder: Path) 
 
 
 def test_what_a_killed_worker_leaves_is_not_used_and_removed(source: Path, folder: Path) -> None:
-    """Killed in the middle of a piece: the file is there, under a name that nobody reads."""
+    """Killed in the middle of a piece: the file is there, under a name that is never read."""
     program = (
         "import os, signal, sys\nfrom pathlib import Path\nimport v2v_server.store.cache as cache\n"
         "from tests.server.store.test_cache import leases_of, Clips, Folder\n"

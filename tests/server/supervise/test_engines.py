@@ -46,7 +46,7 @@ def test_a_server_whose_workers_are_here_loads_no_ray() -> None:
 
 def test_where_no_cluster_is_it_says_what_to_start() -> None:
     pytest.importorskip("ray", reason="the extra 'ray' is not installed")
-    # In a process of its own: Ray changes warnings, signal handlers and more of whoever imports it.
+    # In a process of its own: importing Ray changes warnings, signal handlers and more.
     program = "from v2v_server.supervise.ray_host import RayHost\nRayHost('videos', 'w', address='127.0.0.1:1')"
     done = subprocess.run([sys.executable, "-c", program], check=False, timeout=120, capture_output=True, text=True)
     assert "UsageError: --ray-address 127.0.0.1:1: " in done.stderr

@@ -19,7 +19,7 @@ NAME = f"numba-{sources_digest()}"
 
 
 def run(code: str, folder: Path = ROOT) -> str:
-    """What the program prints in a fresh interpreter for which nobody has chosen a folder yet."""
+    """Return what the program prints in a fresh interpreter without a chosen folder."""
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, timeout=120, check=True)

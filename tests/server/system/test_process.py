@@ -146,7 +146,7 @@ def test_long_turns_leave_niceness_and_policy_alone() -> None:
     said = _in_a_process(
         "import os\n"
         "from v2v_server.system.process import take_long_turns\n"
-        "before = os.nice(5)\n"  # added to that of whoever runs the tests
+        "before = os.nice(5)\n"  # added to that of the test process
         "print(take_long_turns(), 0 < os.nice(0) == before, os.sched_getscheduler(0) == os.SCHED_OTHER)\n"
     )
     assert said[1:] == ["True", "True"]

@@ -169,6 +169,6 @@ def test_a_lost_server_costs_no_steps(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_an_unreachable_server_leaves_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    message = refused(tmp_path, f"ipc://{tmp_path}/nobody", capsys, stream__timeout_seconds=0.1)
+    message = refused(tmp_path, f"ipc://{tmp_path}/unbound", capsys, stream__timeout_seconds=0.1)
     assert "nothing received" in message
     assert not (tmp_path / "run" / LAST).exists()
