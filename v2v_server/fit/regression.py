@@ -89,8 +89,8 @@ class Regression:
         doubt = np.hypot(doubt[:3], np.abs(value[:3]) * usual)
         low, high = value[:3] - np.hypot(value[:3] - low[:3], doubt), value[:3] + np.hypot(high[:3] - value[:3], doubt)
         self.positive, self.negative = (Estimate(value[k], low[k], high[k], 0.0, note) for k in range(2))
-        ends = [max(float(end[2]), 0.0) for end in (value, low, high)]
-        self.corner = Estimate(ends[0], ends[1], ends[2], 1.0 / 500.0, note)
+        corner, least, most = (max(float(end[2]), 0.0) for end in (value, low, high))
+        self.corner = Estimate(corner, least, most, 1.0 / 500.0, note)
 
 
 class _Fit(NamedTuple):
