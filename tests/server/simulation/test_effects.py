@@ -402,7 +402,7 @@ def test_tables_against_their_equations() -> None:
             below = sum(math.exp(-means[d, level]) * means[d, level] ** j / math.factorial(j) for j in range(k + 1))
             expected = 1 - below if k < table.shape[1] else 0.0
             assert table[d, min(k, table.shape[1] - 1), level] == pytest.approx(expected, abs=3e-10)
-    slow, fast = photoreceptor.low_pass_table(30.0, light, 0.02)
+    slow, fast = photoreceptor.low_pass_tables(30.0, light, np.array([0.02]))[0]
     x = 2 * math.pi * 30.0 * 0.02
     assert slow[255] == pytest.approx(1 - math.exp(-x))
     assert fast[255] == pytest.approx(1 - (1 - math.exp(-x)) / x)
