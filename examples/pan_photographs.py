@@ -4,7 +4,10 @@
 
 A few dozen photographs give a network more scenes than a handful of films do. Motion is smooth and random, like that of
 a hand-held camera. A patch is an ellipse of another photograph with its own motion, so that edges occlude each other.
-PNG files with transparent parts are objects without background: they become patches of their own shape.
+PNG files with transparent parts are objects without background: they become patches of their own shape. Networks for
+real windows, which are short, need many frames a second and large plain areas:
+
+    python examples/pan_photographs.py PHOTOGRAPHS OUT --frames 401 --rate 240 --plain 0.4
 """
 
 import argparse
@@ -15,24 +18,24 @@ import av
 import cv2
 import numpy as np
 
-WIDTH, HEIGHT, FRAMES, RATE = 320, 240, 130, 30
+WIDTH, HEIGHT = 320, 240
 
 
-def smooth(random: np.random.Generator, step: float) -> np.ndarray:
-    """Return a path (FRAMES,) float64 from 0, whose change per frame is about `step` and varies slowly."""
+def smooth(random: np.random.Generator, step: float, count: int) -> np.ndarray:
+    """Return a path (count,) float64 from 0, whose change per frame is about `step` and varies slowly."""
     knots = random.normal(0, step, 8)
-    speed = np.interp(np.linspace(0, 7, FRAMES), np.arange(8), knots)
+    speed = np.interp(np.linspace(0, 7, count), np.arange(8), knots)
     return np.asarray(np.cumsum(speed) - speed[0])
 
 
-def motion(random: np.random.Generator, speed: float) -> np.ndarray:
-    """Return homographies (FRAMES, 3, 3) float64 in px: pan by about `speed` px per frame, turns, zoom, tilt."""
-    x, y = smooth(random, speed), smooth(random, speed)
-    angle, zoom = smooth(random, 0.004 * speed), np.exp(smooth(random, 0.002 * speed))
-    tilt = smooth(random, 4e-6 * speed), smooth(random, 4e-6 * speed)
+def motion(random: np.random.Generator, speed: float, count: int) -> np.ndarray:
+    """Return homographies (count, 3, 3) float64 in px: pan by about `speed` px per frame, turns, zoom, tilt."""
+    x, y = smooth(random, speed, count), smooth(random, speed, count)
+    angle, zoom = smooth(random, 0.004 * speed, count), np.exp(smooth(random, 0.002 * speed, count))
+    tilt = smooth(random, 4e-6 * speed, count), smooth(random, 4e-6 * speed, count)
     centre = np.array([[1, 0, WIDTH / 2], [0, 1, HEIGHT / 2], [0, 0, 1]])
-    steps = np.zeros((FRAMES, 3, 3))
-    for t in range(FRAMES):
+    steps = np.zeros((count, 3, 3))
+    for t in range(count):
         c, s = zoom[t] * np.cos(angle[t]), zoom[t] * np.sin(angle[t])
         steps[t] = centre @ [[c, -s, x[t]], [s, c, y[t]], [tilt[0][t], tilt[1][t], 1]] @ np.linalg.inv(centre)
     return steps
@@ -44,6 +47,11 @@ def downscale(photograph: np.ndarray, random: np.random.Generator) -> np.ndarray
     scale = min(fill * random.uniform(1, 2.5), 1.0)
     smaller = cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return np.asarray(smaller[:, :: random.choice((-1, 1))])
+
+
+def flat(picture: np.ndarray) -> np.ndarray:
+    """Return the colours of a picture as one smooth gradient."""
+    return cv2.resize(cv2.resize(picture, (2, 2), interpolation=cv2.INTER_AREA), picture.shape[1::-1])
 
 
 def ellipse(photographs: list[np.ndarray], random: np.random.Generator) -> np.ndarray:
@@ -67,17 +75,21 @@ def cut_out(objects: list[np.ndarray], random: np.random.Generator) -> np.ndarra
     return np.asarray(cv2.warpAffine(thing, place, (WIDTH, HEIGHT)))
 
 
-def clip(photographs: list[np.ndarray], objects: list[np.ndarray], random: np.random.Generator) -> np.ndarray:
-    """Return frames (FRAMES, HEIGHT, WIDTH, 3) uint8 of a background and up to three patches."""
-    frames = np.zeros((FRAMES, HEIGHT, WIDTH, 3), np.uint8)
+def clip(
+    photographs: list[np.ndarray], objects: list[np.ndarray], random: np.random.Generator, count: int, plain: float
+) -> np.ndarray:
+    """Return frames (count, HEIGHT, WIDTH, 3) uint8 of a background and up to three patches."""
+    frames = np.zeros((count, HEIGHT, WIDTH, 3), np.uint8)
+    is_plain = plain > 0 and random.random() < plain
     background = downscale(photographs[random.integers(len(photographs))], random)
+    background = flat(background) if is_plain else background
     start = np.eye(3)
     start[:2, 2] = -random.integers(0, np.maximum(np.array(background.shape[1::-1]) - (WIDTH, HEIGHT), 1))
-    for t, step in enumerate(motion(random, pace(random))):
+    for t, step in enumerate(motion(random, pace(random), count)):
         frames[t] = cv2.warpPerspective(background, step @ start, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT_101)
-    for _ in range(random.integers(0, 4)):
+    for _ in range(random.integers(3, 7) if is_plain else random.integers(0, 4)):
         patch = cut_out(objects, random) if objects and random.random() < 0.5 else ellipse(photographs, random)
-        for t, step in enumerate(motion(random, pace(random))):
+        for t, step in enumerate(motion(random, pace(random), count)):
             moved = cv2.warpPerspective(patch, step, (WIDTH, HEIGHT))
             inside = moved[..., 3:] / np.float32(255)
             frames[t] = np.rint(inside * moved[..., :3] + (1 - inside) * frames[t])
@@ -95,10 +107,10 @@ def tone(random: np.random.Generator) -> np.ndarray:
     return np.rint(low + (high - low) * (np.arange(256) / 255) ** random.uniform(0.6, 1.6)).astype(np.uint8)
 
 
-def write(path: Path, frames: np.ndarray) -> None:
+def write(path: Path, frames: np.ndarray, rate: int) -> None:
     """Encode frames (T, H, W, 3) uint8, BGR, as nearly lossless H.264."""
     with av.open(str(path), "w") as file:
-        stream = file.add_stream("libx264", rate=Fraction(RATE), options={"crf": "10", "preset": "veryfast"})
+        stream = file.add_stream("libx264", rate=Fraction(rate), options={"crf": "10", "preset": "veryfast"})
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         for frame in frames:
             file.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "bgr24")))
@@ -111,6 +123,9 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--clips", type=int, default=120)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--frames", type=int, default=130, help="frames of a clip")
+    parser.add_argument("--rate", type=int, default=30, help="frames a second; motion is given per frame")
+    parser.add_argument("--plain", type=float, default=0.0, help="share of clips before a smooth gradient")
     args = parser.parse_args()
     files = sorted(p for p in args.photographs.rglob("*") if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
     pictures = [picture for p in files if (picture := cv2.imread(str(p), cv2.IMREAD_UNCHANGED)) is not None]
@@ -122,7 +137,8 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     for index in range(args.clips):
         random = np.random.default_rng((args.seed, index))
-        write(args.out / f"pan_{index:04d}.mp4", clip(photographs, objects, random))
+        frames = clip(photographs, objects, random, args.frames, args.plain)
+        write(args.out / f"pan_{index:04d}.mp4", frames, args.rate)
         print(f"\r{index + 1}/{args.clips}", end="", flush=True)
     print()
 

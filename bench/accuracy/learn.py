@@ -18,12 +18,14 @@ import itertools
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from bench.frame import Column, Record, Report, add_whole
 from bench.processes import endless
-from trainer.losses.lpips import LPIPS
+from trainer.evaluation.metrics import Metric, make_metrics
+from trainer.losses.backbones import BACKBONES
 from trainer.models import VoxelNetwork
 from trainer.weights import load_network
 from v2v_client import V2VStreamDataset
@@ -40,16 +42,15 @@ CAMERAS: Mapping[str, Mapping[str, Any]] = {
 }
 _SEED = 2**32
 _BATCH = 4
-_LEAST_SCALE = 1e-12
 _GREY = "constant grey"
 
 _COLUMNS: tuple[Column, ...] = (
     ("network", "network", "{}", 1.0),
     ("cameras", "cameras", "{}", 1.0),
     ("samples", "samples", "{:.0f}", 1.0),
-    ("lpips", "LPIPS", "{:.4f}", 1.0),
+    *((f"lpips_{net}", f"LPIPS {net}", "{:.4f}", 1.0) for net in BACKBONES),
     ("correlation", "correlation", "{:.4f}", 1.0),
-    ("mean_absolute_error", "mean absolute error", "{:.4f}", 1.0),
+    ("mse", "MSE", "{:.4f}", 1.0),
 )
 
 Predict = Callable[[Tensor], Tensor]
@@ -77,24 +78,15 @@ def _samples(address: str, recipe: Recipe, samples: int) -> tuple[Tensor, Tensor
 
 
 @torch.no_grad()
-def score(predict: Predict, voxels: Tensor, frames: Tensor, lpips: LPIPS | None) -> dict[str, float]:
-    """Return how far predicted pictures, clamped to 0 .. 1, are from the true ones, over the later half of the clips.
-
-    The correlation is Pearson's, of prediction and truth within a frame, averaged over frames; 0 for constant pictures.
-    """
-    prediction = torch.cat([predict(piece) for piece in torch.split(voxels, _BATCH)]).clamp(0, 1)
+def score(predict: Predict, voxels: Tensor, frames: Tensor, metrics: Mapping[str, Metric]) -> dict[str, float]:
+    """Return the means of metrics over the later half of the clips, of predicted pictures clamped to 0 .. 1."""
     later = frames.shape[1] // 2
-    made, true = prediction[:, later:], frames[:, later:]
-    ours, truth = ((each - each.mean(-1, keepdim=True)) for each in (made.flatten(2), true.flatten(2)))
-    scale = (ours.norm(dim=-1) * truth.norm(dim=-1)).clamp_min(_LEAST_SCALE)
-    found = {
-        "correlation": float(((ours * truth).sum(-1) / scale).mean()),
-        "mean_absolute_error": float((made - true).abs().mean()),
+    prediction = torch.cat([predict(piece)[:, later:] for piece in torch.split(voxels, _BATCH)]).clamp(0, 1)
+    made, true = (pictures.flatten(0, 2).double().numpy() for pictures in (prediction, frames[:, later:]))
+    return {
+        name: float(np.mean([metric(*pair) for pair in zip(made, true, strict=True)]))
+        for name, metric in metrics.items()
     }
-    if lpips is not None:
-        pairs = zip(torch.split(made, _BATCH), torch.split(true, _BATCH), strict=True)
-        found["lpips"] = float(torch.cat([lpips(*pair) for pair in pairs]).mean())
-    return found
 
 
 def _grey(frames: Tensor) -> Predict:
@@ -145,12 +137,13 @@ def measure(asked: argparse.Namespace) -> Report:
     """Judge the networks; return one record for each network and set of cameras."""
     torch.set_num_threads(1)
     judged = networks(asked)
-    lpips = None if asked.lpips is None else LPIPS.from_files(*asked.lpips)
+    names = ["mse", "correlation", *([] if asked.lpips is None else [f"lpips_{asked.lpips[0]}"])]
+    metrics = make_metrics(names, {} if asked.lpips is None else {asked.lpips[0]: tuple(asked.lpips[1:])})
     records: list[Record] = []
     for cameras, (voxels, frames) in held_out(asked.held_out, asked.samples).items():
         predictors: dict[str, Predict] = {_GREY: _grey(frames)}
         predictors |= {name: network.forward_sequence for name, network in judged.items()}
         for name, predict in predictors.items():
-            scores = score(predict, voxels, frames, lpips)
+            scores = score(predict, voxels, frames, metrics)
             records.append({"network": name, "cameras": cameras, "samples": len(frames), **scores})
     return Report(records, [(records, _COLUMNS)])

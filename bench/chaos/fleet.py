@@ -177,7 +177,7 @@ class Fleet:
             *(() if self.keys is None else ("--keys", str(self.keys.server))),
         ]
 
-    def start(self, start_seconds: float = 180.0) -> None:
+    def start(self, start_seconds: float = 400.0) -> None:
         """Start the server, then the consumers; wait until each consumer has saved a state.
 
         Raises:

@@ -16,19 +16,15 @@ from __future__ import annotations
 import argparse
 import math
 import random
-import signal
 import tempfile
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import psutil
-
 from bench.chaos.chaos import checked
 from bench.chaos.fleet import Fleet
+from bench.chaos.trimming_server import MODULE, trimmed_mib
 from bench.frame import Report, add_whole, key_values
-from bench.processes import rss_mib
 from tests.oracles.hostile_frames import MOST_GROWTH_MIB, failed, fuzz_decoder
 from tests.oracles.hostile_peers import Attack
 from v2v_protocol.command import Parser
@@ -36,7 +32,6 @@ from v2v_protocol.errors import UsageError
 
 _UNDER_ATTACK_SECONDS = 60.0  # Longest extension of the attack until the healthy consumer has a batch
 _LAST_BATCHES_SECONDS = 120.0
-_TRIM_SECONDS = 0.5
 _SETTLE_SECONDS = 30.0
 _SETTLED_POLLS = 4
 
@@ -57,8 +52,7 @@ def fuzz_live(
     Raises:
         UsageError: the server does not start.
     """
-    server = "bench.chaos.trimming_server"
-    fleet = Fleet(folder, videos, 1, 1, lease_deadline_seconds=10.0, server_module=server, keyed=keyed)
+    fleet = Fleet(folder, videos, 1, 1, lease_deadline_seconds=10.0, server_module=MODULE, keyed=keyed)
     try:
         fleet.start()
         pid = fleet.server.pid or 0
@@ -111,10 +105,7 @@ def _settled_mib(pid: int, limit_mib: float = math.inf) -> float:
     deadline = time.monotonic() + _SETTLE_SECONDS
     lowest, unchanged = math.inf, 0
     while True:
-        with suppress(psutil.NoSuchProcess):
-            psutil.Process(pid).send_signal(signal.SIGUSR2)
-            time.sleep(_TRIM_SECONDS)
-        held = rss_mib(pid) or 0.0
+        held = trimmed_mib(pid)
         unchanged = 0 if held < lowest - 1.0 else unchanged + 1
         lowest = min(lowest, held)
         if time.monotonic() > deadline or (held <= limit_mib and unchanged >= _SETTLED_POLLS):

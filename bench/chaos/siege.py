@@ -9,7 +9,7 @@ attacks in turn, eight peers at a time, between two calm stretches.
     came/s      raw connections and refused handshakes of the attackers a second, median of the turns
     server CPU  cores that the server uses above the calm stretch before, median of the turns
     peak MiB    most memory of the server's main process above its start, under attack
-    after MiB   the same at most 30 s after the attack
+    after MiB   the same at most 30 s after the attack, once the allocator has returned what is free
 
 The attackers have the lowest priority: on the same cores they would otherwise take time from the honest consumer, which
 peers on other hosts cannot do. ``--urgent`` gives them normal priority; then the server CPU counts, not the rate.
@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 
 from bench.chaos.fleet import Fleet
 from bench.chaos.hostile import KEYED_KINDS, KINDS, PEERS
+from bench.chaos.trimming_server import MODULE, trimmed_mib
 from bench.corpus import add_source, run_folder
 from bench.frame import Column, Record, Report, add_positive, add_whole, progress
 from bench.processes import cpu_seconds, rss_mib
@@ -99,9 +100,8 @@ def attacked(fleet: Fleet, kind: str, *, urgent: bool = False) -> Iterator[None]
 def _after_mib(fleet: Fleet, start_mib: float) -> float:
     """Return the memory above the start as soon as it is within the bar, else after 30 s."""
     deadline = time.monotonic() + AFTER_SECONDS
-    while (above := _held_mib(fleet) - start_mib) > AFTER_BAR_MIB and time.monotonic() < deadline:
+    while (above := trimmed_mib(fleet.server.pid or 0) - start_mib) > AFTER_BAR_MIB and time.monotonic() < deadline:
         fleet.restart(time.monotonic())
-        time.sleep(0.1)
     return above
 
 
@@ -110,7 +110,8 @@ def besiege(
 ) -> list[dict[str, Any]]:
     """Attack with all kinds in turns; return one record for each kind."""
     found: dict[str, list[dict[str, float]]] = {kind: [] for kind in kinds}
-    start = max(stretch(fleet, seconds).peak_mib for _ in range(2))
+    stretch(fleet, 2 * seconds)
+    start = trimmed_mib(fleet.server.pid or 0)
     for turn in range(turns):
         for kind in kinds:
             before = stretch(fleet, seconds / 2)
@@ -170,7 +171,9 @@ def measure(asked: argparse.Namespace) -> Report:
     if unknown := set(kinds) - set(possible):
         raise UsageError(f"--kinds {','.join(sorted(unknown))}: choose of {', '.join(possible)}")
     with run_folder(asked) as (folder, videos):
-        fleet = Fleet(folder / "run", videos, 1, 2, 60.0, server_flags=CREDIT_FLAGS, keyed=asked.keys)
+        fleet = Fleet(
+            folder / "run", videos, 1, 2, 60.0, server_module=MODULE, server_flags=CREDIT_FLAGS, keyed=asked.keys
+        )
         del fleet.crowd[0]  # the consumer of small samples; that of the paper's samples stays
         try:
             fleet.start()

@@ -8,9 +8,26 @@ from __future__ import annotations
 
 import signal
 import sys
+import time
+from contextlib import suppress
 
+import psutil
+
+from bench.processes import rss_mib
 from v2v_protocol.allocator import give_back_freed_memory
 from v2v_server.commands.serve import main
+
+MODULE = "bench.chaos.trimming_server"
+_TRIM_SECONDS = 0.5
+
+
+def trimmed_mib(pid: int) -> float:
+    """Return the memory that such a server holds after it has returned what is free; 0 when it has ended."""
+    with suppress(psutil.NoSuchProcess):
+        psutil.Process(pid).send_signal(signal.SIGUSR2)
+        time.sleep(_TRIM_SECONDS)
+    return rss_mib(pid) or 0.0
+
 
 if __name__ == "__main__":
     signal.signal(signal.SIGUSR2, lambda _number, _frame: give_back_freed_memory())

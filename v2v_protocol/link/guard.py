@@ -56,6 +56,9 @@ _LONGEST_TURN_SECONDS = 1.0
 _HANDSHAKE_BYTES, _CURVE_HANDSHAKE_BYTES = 128, 640
 _CURVE_FRAME_BYTES = 33
 _SLACK_BYTES = 64 << 20
+_LATE_SECONDS = CHECK_SECONDS
+"""A message of an ended connection is read at most this long after its end, while the loop reads; a peer that connects
+again does so later (``dealer``)."""
 _EVENTS = int(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_CLOSED)
 _TCP_INFO_BYTES, _ACKED, _RECEIVED = 136, 120, 128  # of struct tcp_info, Linux
 
@@ -108,6 +111,7 @@ class ConnectionGuard:
         self._handshake_bytes = _CURVE_HANDSHAKE_BYTES if is_encrypted else _HANDSHAKE_BYTES
         self._frame_bytes = _CURVE_FRAME_BYTES if is_encrypted else 0
         self._connections: dict[int, _Connection] = {}  # by descriptor, the least recently heard first
+        self._left: dict[int, tuple[bytes | None, float]] = {}  # who had a descriptor until just now, and when it ended
         self._silent: dict[int, None] = {}  # those that have sent no message, the oldest first
         self._descriptors: dict[bytes, int] = {}
         self._to_check: set[int] = set()
@@ -138,7 +142,8 @@ class ConnectionGuard:
                 return
             self._take_events()
             connection = self._connections.get(descriptor)
-            if connection is None:  # it has ended
+            previous, _ = self._left.get(descriptor, (None, 0.0))
+            if connection is None or identity == previous:  # it has ended; another may have its descriptor already
                 if identity not in self._descriptors:
                     self._ended.append(identity)
                 return
@@ -170,7 +175,8 @@ class ConnectionGuard:
         with self._lock:
             self._take_events()
             descriptor = self._descriptors.get(identity, -1)
-            if descriptor in self._connections:
+            # Shortly after an end, a late first message may have given this identity to the descriptor's next owner.
+            if descriptor in self._connections and descriptor not in self._left:
                 self._cut(descriptor)
 
     def take_ended(self) -> list[bytes]:
@@ -251,6 +257,7 @@ class ConnectionGuard:
         connection = self._connections.pop(descriptor, None)
         if connection is None:
             return
+        self._left[descriptor] = connection.identity, self._now
         self._silent.pop(descriptor, None)
         self._to_check.discard(descriptor)
         self._unfinished.pop(descriptor, None)
@@ -273,6 +280,7 @@ class ConnectionGuard:
         self._elapsed_seconds = min(now - self._checked_at, 2 * CHECK_SECONDS) if is_reading else 0.0
         self._checked_at = now
         self._now += self._elapsed_seconds
+        self._left = {key: left for key, left in self._left.items() if self._now - left[1] < _LATE_SECONDS}
         while (
             self._silent and self._now - self._connections[oldest := next(iter(self._silent))].heard_at > IDLE_SECONDS
         ):

@@ -9,8 +9,11 @@ import pytest
 import torch
 
 from bench.accuracy import learn
+from trainer.evaluation.metrics import make_metrics
 from trainer.models import NETWORKS
 from v2v_protocol.errors import UsageError
+
+METRICS = make_metrics(["mse", "correlation"], {})
 
 
 def clip() -> tuple[torch.Tensor, torch.Tensor]:
@@ -20,28 +23,28 @@ def clip() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_a_network_that_sees_is_without_fault() -> None:
-    found = learn.score(lambda voxels: voxels[:, :, :1], *clip(), None)
-    assert found == pytest.approx({"correlation": 1.0, "mean_absolute_error": 0.0}, abs=1e-5)
+    found = learn.score(lambda voxels: voxels[:, :, :1], *clip(), METRICS)
+    assert found == pytest.approx({"correlation": 1.0, "mse": 0.0}, abs=1e-5)
 
 
 def test_only_the_later_half_counts() -> None:
     voxels, frames = clip()
     voxels[:, :2] = 1 - voxels[:, :2]
-    found = learn.score(lambda voxels: voxels[:, :, :1], voxels, frames, None)
-    assert found == pytest.approx({"correlation": 1.0, "mean_absolute_error": 0.0}, abs=1e-5)
+    found = learn.score(lambda voxels: voxels[:, :, :1], voxels, frames, METRICS)
+    assert found == pytest.approx({"correlation": 1.0, "mse": 0.0}, abs=1e-5)
 
 
 def test_pictures_are_clamped_first() -> None:
     voxels, _ = clip()
-    found = learn.score(lambda voxels: voxels[:, :, :1] + 7, voxels, torch.ones(5, 4, 1, 8, 8), None)
-    assert found["mean_absolute_error"] == 0.0
+    found = learn.score(lambda voxels: voxels[:, :, :1] + 7, voxels, torch.ones(5, 4, 1, 8, 8), METRICS)
+    assert found["mse"] == 0.0
 
 
 def test_constant_grey_is_the_mean_of_what_is_judged() -> None:
     voxels, frames = clip()
     frames[:, 2:, :, :4], frames[:, 2:, :, 4:] = 0.25, 0.75
-    found = learn.score(learn._grey(frames), voxels, frames, None)
-    assert found == pytest.approx({"correlation": 0.0, "mean_absolute_error": 0.25}, abs=1e-3)
+    found = learn.score(learn._grey(frames), voxels, frames, METRICS)
+    assert found == pytest.approx({"correlation": 0.0, "mse": 0.0625}, abs=1e-3)
 
 
 @pytest.fixture

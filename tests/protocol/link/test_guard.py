@@ -454,6 +454,46 @@ def test_the_end_of_a_connection_is_reported_after_its_late_message(
     until(all_gone)
 
 
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_late_message_does_not_end_the_next_connection_with_its_descriptor(
+    monkeypatch: pytest.MonkeyPatch,
+    serve: Callable[..., Sockets],
+    consumer: Callable[..., zmq.Socket[bytes]],
+    is_known: bool,
+) -> None:
+    monkeypatch.setattr(guard, "_LATE_SECONDS", 1e9)
+    sockets = serve()
+    connections = sockets._consumers.guard._connections  # type: ignore[union-attr]
+    early = consumer(sockets, b"early")
+    if is_known:
+        early.send_multipart(encode(Ping()))
+        assert next_from(sockets, FromConsumer).identity == b"early"  # type: ignore[union-attr]
+    until(lambda: connections)
+    descriptors = list(connections)
+    for _ in range(2):
+        early.send_multipart(encode(Ping()))
+    early.close(linger=-1)
+    until(lambda: not connections)
+    honest = consumer(sockets, b"honest")
+    until(lambda: list(connections) == descriptors)
+    honest.send_multipart(encode(Ping()))
+    came: list[Arrival] = []
+
+    def is_served() -> bool:
+        for one in sockets.receive(0.05):
+            came.append(one)
+            if isinstance(one, FromConsumer):
+                if one.identity == b"early":
+                    sockets.cut(one.identity)
+                else:
+                    sockets.send(ToConsumer(one.identity, encode(Pong())))
+        return bool(honest.poll(0))
+
+    until(is_served)
+    assert b"early" in [one.identity for one in came if isinstance(one, FromConsumer)]
+    assert not is_known or ConsumerGone(b"honest") not in came
+
+
 def test_a_connection_that_has_just_ended_is_no_error() -> None:
     """Its descriptor is closed before its event comes."""
     ours, theirs = socket.socketpair()

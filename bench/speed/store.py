@@ -1,0 +1,166 @@
+"""Measure the lossless clip store: its size, and the time to read a crop, beside the source.
+
+    python -m bench store --videos DIR --rows top:0.54 --json store.json
+
+Each form keeps the same frames. Crops of 149 frames of 128 x 128 pixels, which is what a sample of the paper's recipe
+decodes on average, are read at random places and compared with the frames. Times are processor times of one thread:
+the fastest reading of each place, the median over the places, the median over the clips.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, progress
+from v2v_protocol.command import Parser
+from v2v_protocol.errors import CorpusError
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.store.format import Head, group_frames_for
+from v2v_server.store.packing import DENSE, FAST, QUICK, RAW, Packing
+from v2v_server.store.reader import StoreFile
+from v2v_server.store.writer import StoreWriter
+from v2v_server.video.decode import decode_luma, stream_luma
+from v2v_server.video.rows import Rows
+
+Luma = npt.NDArray[np.uint8]
+CROP = (149, 128, 128)  # Frames, rows and columns
+FORMS = {"store dense": DENSE, "store fast": FAST, "store raw": RAW, "cache": QUICK}
+_MOST_FRAMES = 450
+_COLUMNS: tuple[Column, ...] = (
+    ("form", "", "{}", 1.0),
+    ("ratio_to_source_bytes", "x source", "{:.2f}", 1.0),
+    ("bits_per_pixel", "bits/px", "{:.2f}", 1.0),
+    ("bytes_per_video_second", "MB/s of video", "{:.2f}", 1e-6),
+    ("read_cpu_seconds", "read ms", "{:.2f}", 1e3),
+    ("write_bytes_per_cpu_second", "write MB/s", "{:.0f}", 1e-6),
+)
+
+
+def write_store(path: Path, luma: Luma, packing: Packing) -> None:
+    """Write [n, rows, columns] luma as a store."""
+    count, rows, width = luma.shape
+    group = group_frames_for(rows, width)
+    head = Head("", "", rows, width, 0, rows, 0, count, count, 0.0, "", True, group, packing.method)
+    with StoreWriter(path, head, packing) as writer:
+        for picture in luma:
+            writer.add(picture)
+        writer.close()
+
+
+def read_crop(path: Path, place: Sequence[int]) -> Luma:
+    """Read one crop of a store from its first frame, row and column."""
+    out = np.empty(CROP, np.uint8)
+    with StoreFile(path) as stored:
+        stored.read(place[0], 1, (place[1], place[2], *CROP[1:]), out)
+    return out
+
+
+def fastest_seconds(calls: Sequence[Callable[[], object]], seconds: float) -> float:
+    """Time calls in turns for that long; return the fastest of each, the median over them."""
+    fastest = [float("inf")] * len(calls)
+    end = time.perf_counter() + seconds
+    while fastest[-1] == float("inf") or time.perf_counter() < end:
+        for number, call in enumerate(calls):
+            started = time.process_time()
+            call()
+            fastest[number] = min(fastest[number], time.process_time() - started)
+    return statistics.median(fastest)
+
+
+def clips(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Yield one record for each form of the first clips that are long and large enough."""
+    with (
+        closing(open_catalogue(asked.videos, rows=Rows.parse(asked.rows), processes=0)) as catalogue,
+        tempfile.TemporaryDirectory(prefix="v2v-store-") as folder,
+    ):
+        used = 0
+        for video in catalogue.videos:
+            top, bottom = catalogue.rows.bounds(video.height_px)
+            if used == asked.clips or np.less((video.frames, bottom - top, video.width_px), CROP).any():
+                continue
+            used += 1
+            path, index = catalogue.path(video.id), catalogue.frame_index(video.id)
+            count = min(video.frames, _MOST_FRAMES)
+            luma = np.stack(list(stream_luma(path, index, 0, count, (top, 0, bottom - top, video.width_px))))
+            source_bytes = path.stat().st_size * count / video.frames
+            limits = np.subtract(luma.shape, CROP) + 1
+            places = np.random.default_rng(0).integers(0, limits, (asked.places, 3)).tolist()
+            reads = [
+                partial(decode_luma, path, index, at[0], CROP[0], (top + at[1], at[2], *CROP[1:])) for at in places
+            ]
+            common = {
+                "video": video.id, "pixels": luma.size, "source_bytes": source_bytes,
+                "seconds": count / video.frames_per_second,
+            }  # fmt: skip
+            yield common | {
+                "form": "source",
+                "bytes": source_bytes,
+                "read_cpu_seconds": fastest_seconds(reads, asked.seconds),
+            }
+            for form, packing in FORMS.items():
+                progress(f"{video.id}: {form}")
+                file = Path(folder, f"{used}-{form}")
+                started = time.process_time()
+                write_store(file, luma, packing)
+                writing = time.process_time() - started
+                for at in places:
+                    wanted = luma[tuple(slice(first, first + size) for first, size in zip(at, CROP, strict=True))]
+                    np.testing.assert_array_equal(read_crop(file, at), wanted)
+                yield common | {
+                    "form": form,
+                    "bytes": file.stat().st_size,
+                    "read_cpu_seconds": fastest_seconds([partial(read_crop, file, at) for at in places], asked.seconds),
+                    "write_bytes_per_cpu_second": luma.size / writing,
+                }
+
+
+def medians(records: Sequence[Record]) -> list[dict[str, Any]]:
+    """Return one record for each form: medians over the clips."""
+    found = []
+    for form in dict.fromkeys(record["form"] for record in records):
+        of = [record for record in records if record["form"] == form]
+        found.append(
+            {
+                "form": form,
+                "ratio_to_source_bytes": statistics.median(each["bytes"] / each["source_bytes"] for each in of),
+                "bits_per_pixel": statistics.median(8 * each["bytes"] / each["pixels"] for each in of),
+                "bytes_per_video_second": statistics.median(each["bytes"] / each["seconds"] for each in of),
+                "read_cpu_seconds": statistics.median(each["read_cpu_seconds"] for each in of),
+                "write_bytes_per_cpu_second": None
+                if form == "source"
+                else statistics.median(each["write_bytes_per_cpu_second"] for each in of),
+            }
+        )
+    return found
+
+
+def add_flags(parser: Parser) -> None:
+    """Add the bench's flags."""
+    add_videos(parser, "clips (python -m bench corpus)", rows="top:0.54")
+    add_whole(parser, "--clips", 6, "most clips to take")
+    add_whole(parser, "--places", 8, "crops to read of each clip")
+    add_positive(parser, "--seconds", 2.0, "of reading each form of each clip")
+
+
+def measure(asked: argparse.Namespace) -> Report:
+    """Run the bench.
+
+    Raises:
+        CorpusError: no clip is long and large enough.
+    """
+    records = list(clips(asked))
+    if not records:
+        raise CorpusError(f"--videos {asked.videos}: no clip has {CROP[0]} frames of {CROP[1]} x {CROP[2]} px")
+    found = medians(records)
+    return Report([*records, *found], [(found, _COLUMNS)])
