@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.oracles.in_time import bilinear_of, counts_of, stacked_histogram, watch
-from tests.server.simulation.generic_processor import printed_on_a_generic_processor
+from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from tests.server.simulation.test_pixel import moving_frames
 from tests.server.video.test_real_videos import FOLDER as REAL_VIDEOS
 from v2v_protocol.errors import UsageError
@@ -364,6 +364,7 @@ print(digest.hexdigest()[:32])
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(COMPILE_SECONDS)
 def test_bytes_do_not_depend_on_the_processor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     exec(DIGEST)
     assert printed_on_a_generic_processor(DIGEST, tmp_path) == capsys.readouterr().out.split()
