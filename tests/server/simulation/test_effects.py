@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from tests.server.simulation import effect_oracle, reference
 from tests.server.simulation.effect_oracle import Camera, Chance
-from tests.server.simulation.generic_processor import printed_on_a_generic_processor
+from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from tests.server.simulation.test_pixel import moving_frames
 from v2v_protocol.bounds import LARGEST_NORMAL
 from v2v_protocol.errors import UsageError
@@ -472,6 +472,7 @@ def test_golden_voxels(dtype: Any) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(COMPILE_SECONDS)
 def test_a_generic_processor_gives_the_same_bytes(tmp_path: Path) -> None:
     code = "from tests.server.simulation.test_effects import digest; print(digest('float32'))"
     assert printed_on_a_generic_processor(code, tmp_path) == [GOLDEN["float32"]]
