@@ -24,6 +24,7 @@ from tests.oracles.dense import trace
 from v2v_protocol.bounds import most_events
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import Recipe, preset
+from v2v_protocol.spec import StreamSpec
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.draw import draw, noise_key_of_seed
 from v2v_server.simulation.intensity import log_table, log_table_float64
@@ -237,6 +238,12 @@ def not_numbers_in_a_recipe() -> Finding:
     return refused(RecipeError, *calls)
 
 
+def not_numbers_of_motion() -> Finding:
+    """Check substep_px: NaN, infinite, negative. Motion itself is whole numbers."""
+    values = (math.nan, math.inf, -1.0)
+    return refused(UsageError, *((partial(StreamSpec, substep_px=value), ("substep_px",)) for value in values))
+
+
 def denormals() -> Finding:
     """Check log intensities that differ by denormal numbers, under noise of denormal strength."""
     tiny = np.arange(STEPS + 1)[:, None, None] * np.array([[5e-324, 1e-45, 1e-39, 2e-38]])
@@ -338,7 +345,11 @@ def divided_rows() -> list[Row]:
         return Finding(*in_time.excess_of_divided_steps(*setting))
 
     quantity = "more than a threshold left, log units"
-    return [Row(name, "counted", quantity, partial(check, setting)) for name, setting in asked.items()]
+    made = [Row(name, "counted", quantity, partial(check, setting)) for name, setting in asked.items()]
+    for px in (0.0, 500.0, -2048.0):  # the last is the largest that is stored
+        name = f"motion of {px:g} px a frame"
+        made.append(Row(name, "counted", quantity, lambda px=px: Finding(*in_time.excess_along_motion(px))))
+    return made
 
 
 def rows() -> list[Row]:
@@ -394,6 +405,9 @@ def rows() -> list[Row]:
         Row("recipes beyond float64", "refused", "calls not refused", recipe_beyond_float64),
         *divided_rows(),
         Row("steps of 1 us and 1 h", "counted", "violations", lambda: Finding(in_time.steps_of_any_duration(), 0.0)),
+        Row("refractory time longer than a step, sub-steps", "counted", "pixels with a wrong count",
+            lambda: Finding(in_time.blind_sub_steps(), 0.0)),
+        Row("motion or sub-steps of no number", "refused", "calls not refused", not_numbers_of_motion),
         Row("time stamps of any kind", "counted", "violations", lambda: Finding(in_time.any_time_stamps(), 0.0)),
         Row("float16 above 2,048 events", "counted", wrong, lambda: Finding(in_time.large_float16(), 0.0)),
         Row("table of gamma 4, eps 0.1", "counted", "falls of log intensity", table_never_falls),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,9 @@ import numpy.typing as npt
 
 from v2v_protocol.bounds import most_events
 from v2v_protocol.recipe import Recipe
+from v2v_protocol.spec import MOST_SUBSTEPS
+from v2v_server.motion import levels_between
+from v2v_server.motion.matching import UNITS_PER_PX
 from v2v_server.simulation import simulate
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import FrameTimes, draw
@@ -23,31 +27,59 @@ HOUR, MICROSECOND = 3600.0, 1e-6
 
 
 def excess_of_divided_steps(threshold: float, ratio: float, grids: int, bins: int, levels_per_step: int = 0) -> Any:
-    """Return by how much the events of any stretch of a clip differ from its change of log intensity by more than a
-    threshold, and the bound of that: (excess, bound, arithmetic).
-
-    Every end of a bin is checked, with every pixel between black and white at every step.
-    """
+    """Return the excess of steps in which every pixel jumps between black and white, see :func:`_excess`."""
     steps = 12
     frames = np.random.default_rng(2).integers(0, 256, (steps + 1, 4, 5), np.uint8)
-    made = simulate(
-        frames, threshold_pos=threshold, threshold_neg=threshold * ratio, start_residual=0.0, bins=bins,
-        grids_per_frame=grids, dtype="float32",
-    )  # fmt: skip
-    given, parts = made.given, grids * bins
-    table = log_table_float64(2.2, 1e-3)
-    ends = table[frames.reshape(steps + 1, -1)]
-    times = np.arange(steps + 1.0)
+    levels = None
     if levels_per_step:
         step = np.repeat(np.arange(steps), levels_per_step)
         share = np.tile(np.arange(1, levels_per_step + 1) / (levels_per_step + 1), steps)
         between = np.random.default_rng(3).integers(0, 255 * FINE_STEPS + 1, (len(step), 4, 5), np.uint16)
-        given = dataclasses.replace(given, levels=Levels(Moments(step, share), between))
-        order = np.argsort(np.r_[times, step + share], kind="stable")
-        ends = np.concatenate([ends, np.interp(between.reshape(len(step), -1) / FINE_STEPS, np.arange(256), table)])[
-            order
-        ]
-        times = np.r_[times, step + share][order]
+        levels = Levels(Moments(step, share), between)
+    return _excess(frames, levels, threshold, ratio, grids, bins)
+
+
+def excess_along_motion(px: float) -> Any:
+    """Return the excess of steps whose levels are made along a motion that the pictures do not have.
+
+    Without motion there are no levels; the excess is infinite if there are, or fewer than sub-steps of a pixel make.
+    """
+    frames, levels = _along(px)
+    expected = 12 * (min(math.ceil(abs(px)), MOST_SUBSTEPS - 1) if px else 0)
+    if expected != (0 if levels is None else len(levels.grey)):
+        return math.inf, 0.0, ""
+    return _excess(frames, levels, 0.2, 1.3, 3, 5)
+
+
+def _along(px: float) -> tuple[npt.NDArray[np.uint8], Levels | None]:
+    pictures = np.random.default_rng(4).integers(0, 256, (13, 24, 28), np.uint8)
+    vectors = np.full((13, 2, 2, 3), round(px * UNITS_PER_PX), np.int16)
+    vectors[:, 1] = 0
+    levels = levels_between(pictures, (8, 8, 8, 12), np.arange(13), 1.0, vectors)
+    return np.ascontiguousarray(pictures[:, 8:16, 8:20]), levels
+
+
+def _excess(
+    frames: npt.NDArray[np.uint8], levels: Levels | None, threshold: float, ratio: float, grids: int, bins: int
+) -> tuple[float, float, str]:
+    """Return by how much the events of any stretch of a clip differ from its change of log intensity by more than a
+    threshold, and the bound of that: (excess, bound, arithmetic). Every end of a bin is checked.
+    """
+    steps = len(frames) - 1
+    made = simulate(
+        frames, threshold_pos=threshold, threshold_neg=threshold * ratio, start_residual=0.0, bins=bins,
+        grids_per_frame=grids, dtype="float32",
+    )  # fmt: skip
+    given, parts = dataclasses.replace(made.given, levels=levels), grids * bins
+    table = log_table_float64(2.2, 1e-3)
+    ends = table[frames.reshape(steps + 1, -1)]
+    times = np.arange(steps + 1.0)
+    if levels is not None:
+        between = levels.grey.reshape(len(levels.grey), -1) / FINE_STEPS
+        times = np.r_[times, levels.at.step + levels.at.share]
+        order = np.argsort(times, kind="stable")
+        ends = np.concatenate([ends, np.interp(between, np.arange(256), table)])[order]
+        times = times[order]
     low, high = float(ends.min()), float(ends.max())
     events = most_events(given.segments, (low, high), (threshold, threshold * ratio), 0.0)
     real = choose(AUTO, events)
@@ -60,6 +92,20 @@ def excess_of_divided_steps(threshold: float, ratio: float, grids: int, bins: in
     left = lines - fired
     excess = max(float((left - positive).max()), float((-left - negative).max()), 0.0)
     return excess, error_bound(real, events, min(threshold, threshold * ratio)), real.__name__
+
+
+def blind_sub_steps() -> int:
+    """Count the pixels with more than 1 + T/t events in T, of a refractory time t longer than a step with sub-steps."""
+    frames, levels = _along(9.0)
+    wrong = 0
+    for period in (1.5, 1000.0):
+        made = simulate(
+            frames, threshold_pos=0.2, bins=12, dtype="float32", frames_per_second=1.0, refractory_seconds=period
+        )
+        counts = fill(dataclasses.replace(made.given, levels=levels), made.real, {"event_counts": None})[0]
+        fired = counts["event_counts"].sum(axis=(0, 1, 2), dtype=np.float64)
+        wrong += int((fired > 1 + 12 / period).sum()) + int((fired < 1).sum())
+    return wrong
 
 
 def steps_of_any_duration() -> int:

@@ -15,7 +15,7 @@ All of it but the prediction is integer arithmetic, so that every host makes the
 """
 
 from v2v_server.motion.clip import MARGIN_PX, cells_of, levels_between, levels_of, load, substeps
-from v2v_server.motion.matching import Cells, Pyramid, Vectors
+from v2v_server.motion.matching import Cells, Pyramid, Vectors, motion
 from v2v_server.motion.plane import MotionOfCuts, MotionOfPictures, motions
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "levels_between",
     "levels_of",
     "load",
+    "motion",
     "motions",
     "substeps",
 ]

@@ -17,7 +17,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import MOST_SUBSTEPS
 from v2v_server.motion.lanes import CELL_PX
-from v2v_server.motion.matching import UNITS_PER_PX, Cells, Vectors, padded
+from v2v_server.motion.matching import UNITS_PER_PX, Cells, Vectors, compiled, padded
 from v2v_server.motion.plane import motions
 from v2v_server.motion.warping import between
 from v2v_server.simulation.draw import resized_size
@@ -85,8 +85,6 @@ def levels_of(
     Returns:
         the levels, for ``simulate_clip``; None if no step is divided.
     """
-    if not vectors.any():
-        return None
     down, across = _shown_cells(params, recipe, picture)
     vectors = vectors[:, :, down - down[0]][..., across - across[0]]
     top, left = crop_place(params, MARGIN_PX)
@@ -98,13 +96,10 @@ def levels_of(
             [resized(frame, size, params.scale)[row : row + height, column : column + width] for frame in frames]
         )
     part = top, left, recipe.crop_height_px, recipe.crop_width_px
-    levels = levels_between(frames, part, source_index, substep_px, vectors)
-    if levels is None:
-        return None
-    grey = levels.grey[:, :, ::-1] if params.flip else levels.grey
-    if params.contrast != 0.0:
-        grey = contrast_table(params.contrast, 255 * FINE_STEPS)[grey]
-    return Levels(levels.at, np.ascontiguousarray(grey))
+    levels = levels_between(frames, part, source_index, substep_px, vectors, mirrored=params.flip)
+    if levels is None or params.contrast == 0.0:
+        return levels
+    return levels._replace(grey=contrast_table(params.contrast, 255 * FINE_STEPS)[levels.grey])
 
 
 def levels_between(
@@ -113,6 +108,8 @@ def levels_between(
     source_index: npt.NDArray[np.int64],
     substep_px: float,
     vectors: Vectors,
+    *,
+    mirrored: bool = False,
 ) -> Levels | None:
     """Return the levels between pictures.
 
@@ -122,6 +119,7 @@ def levels_between(
         source_index: [steps + 1], which picture each position of the clip shows: the one before or the next.
         substep_px: longest motion of a sub-step, above 0.
         vectors: [n, 2, rows, columns], the motion to each picture from the one before, in cells of the part.
+        mirrored: whether the levels show right and left exchanged.
 
     Returns:
         the levels; None if no step is divided.
@@ -130,6 +128,7 @@ def levels_between(
     if min(height, width) < CELL_PX:
         return None
     shortest = math.ceil(substep_px * UNITS_PER_PX / 2)
+    vectors = np.ascontiguousarray(vectors)
     steps, counts = [], []
     for step, (before, after) in enumerate(pairwise(source_index.tolist())):
         if before != after and (count := substeps(vectors[after], substep_px)) > 1:
@@ -142,8 +141,7 @@ def levels_between(
     for (_, after), count in zip(steps, counts, strict=True):
         earlier = later if shown == after - 1 else padded(np.ascontiguousarray(pictures[after - 1]))
         shown, later = after, padded(np.ascontiguousarray(pictures[after]))
-        field = np.ascontiguousarray(vectors[after])
-        between(earlier, later, field, shortest, top, left, grey[first : first + count])
+        between(earlier, later, vectors[after], shortest, top, left, grey[first : first + count], mirrored=mirrored)
         first += count
     at = np.repeat([step for step, _ in steps], counts)
     share = np.concatenate([np.arange(1, count + 1) / (count + 1) for count in counts])
@@ -152,15 +150,27 @@ def levels_between(
 
 def substeps(vectors: Vectors, substep_px: float) -> int:
     """Return the number of sub-steps of a step with this motion: 1 .. MOST_SUBSTEPS."""
-    x, y = vectors.astype(np.int32)
-    squares = x * x + y * y
     shortest = math.ceil(substep_px * UNITS_PER_PX / 2)
-    moving = squares[squares >= max(shortest * shortest, 1)]
-    if len(moving) < _LEAST_SHARE * squares.size or not len(moving):
+    moving = _moving_squares(vectors, max(shortest * shortest, 1))
+    if len(moving) < _LEAST_SHARE * vectors[0].size or not len(moving):
         return 1
     which = int(len(moving) * (1 - _FASTEST_SHARE))
-    longest = math.sqrt(int(np.partition(moving, which)[which])) / UNITS_PER_PX
+    longest = math.sqrt(np.partition(moving, which)[which]) / UNITS_PER_PX
     return 1 + int(min(longest / substep_px, MOST_SUBSTEPS - 1))  # the quotient may be infinite
+
+
+@compiled
+def _moving_squares(vectors, least):  # type: ignore[no-untyped-def]
+    """Return the squared lengths of at least ``least``."""
+    rows, columns = vectors.shape[1:]
+    squares, moving = np.empty(rows * columns, np.int64), 0
+    for row in range(rows):
+        for column in range(columns):
+            x, y = np.int64(vectors[0, row, column]), np.int64(vectors[1, row, column])
+            square = x * x + y * y
+            squares[moving] = square
+            moving += square >= least
+    return squares[:moving]
 
 
 def load() -> None:

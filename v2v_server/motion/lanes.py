@@ -58,7 +58,7 @@ def block_difference(typing_context: Any, first: Any, at: Any, second: Any, to: 
 @_untyped
 def warp_cell(
     typing_context: Any, first: Any, at: Any, first_x: Any, first_y: Any, second: Any, to: Any, second_x: Any,
-    second_y: Any, weights: Any, pitch: Any, share: Any, out: Any, place: Any, out_pitch: Any,
+    second_y: Any, weights: Any, pitch: Any, share: Any, out: Any, place: Any, out_pitch: Any, mirrored: Any,
 ) -> Any:  # fmt: skip
     """Write the weighted mean of two cells, each read between pixels by a separable cubic.
 
@@ -70,12 +70,13 @@ def warp_cell(
         share: int64, weight of the second cell, in 2**-8.
         out: 1-D uint16 array with rows ``out_pitch`` apart, written at ``place``: grey levels in 2**-FINE_BITS. Nothing
             is checked.
+        mirrored: boolean, whether each row is written from right to left.
     """
 
     def generate(context, builder, signature, args):
         data = [
             context.make_array(signature.args[i])(context, builder, args[i]).data if i in (0, 4, 8, 11) else args[i]
-            for i in range(14)
+            for i in range(15)
         ]
         pixels = ir.VectorType(_INT32, CELL_PX * CELL_PX)
 
@@ -142,6 +143,9 @@ def warp_cell(
             outside = builder.icmp_signed(sign, mean, constant(limit))
             mean = builder.select(outside, constant(limit), mean)
         grey = builder.trunc(mean, ir.VectorType(_INT16, 16))
+        backwards = [row + CELL_PX - 1 - column for row in range(0, 16, CELL_PX) for column in range(CELL_PX)]
+        turned = builder.shuffle_vector(grey, grey, ir.Constant(pixels, backwards))
+        grey = builder.select(data[14], turned, grey)
         four = ir.VectorType(_INT16, CELL_PX)
         for row in range(CELL_PX):
             lanes = [row * CELL_PX + column for column in range(CELL_PX)]
@@ -151,7 +155,21 @@ def warp_cell(
         return context.get_dummy_value()
 
     return types.none(
-        first, at, first_x, first_y, second, to, second_x, second_y, weights, pitch, share, out, place, out_pitch
+        first,
+        at,
+        first_x,
+        first_y,
+        second,
+        to,
+        second_x,
+        second_y,
+        weights,
+        pitch,
+        share,
+        out,
+        place,
+        out_pitch,
+        mirrored,
     ), generate
 
 

@@ -17,18 +17,10 @@ class MotionOfPictures:
     def __init__(self) -> None:
         self._last: Pyramid | None = None
 
-    def add(self, picture: Pyramid, cells: Cells | None = None) -> Vectors:
-        """Return the motion to the next picture; zero to the first.
-
-        Args:
-            picture: read until the next one comes.
-            cells: those whose motion is wanted; None: all.
-
-        Returns:
-            [2, rows, columns] of these cells.
-        """
+    def add(self, picture: Pyramid) -> Vectors:
+        """Return the motion to the next picture, which is read until another comes; zero to the first."""
         before, self._last = self._last, picture
-        return motion(before or picture, picture, cells)
+        return motion(before or picture, picture)
 
 
 class MotionOfCuts:

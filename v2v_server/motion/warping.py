@@ -41,7 +41,15 @@ _WEIGHTS = _cubic_weights()
 
 
 def between(
-    first: Picture, second: Picture, vectors: Vectors, shortest: int, top: int, left: int, out: FineGrey
+    first: Picture,
+    second: Picture,
+    vectors: Vectors,
+    shortest: int,
+    top: int,
+    left: int,
+    out: FineGrey,
+    *,
+    mirrored: bool = False,
 ) -> None:
     """Write the pictures at the shares 1/(n + 1) .. n/(n + 1) of the time between two pictures.
 
@@ -51,12 +59,13 @@ def between(
         shortest: length, in 1/UNITS_PER_PX px, below which a cell counts as still.
         top, left: place of the part that is written.
         out: [n, h, w] uint16, C-contiguous, at least CELL_PX on each side: grey levels in 1/16.
+        mirrored: whether rows are written from right to left.
     """
-    _between(first, second, vectors, max(shortest * shortest, 1), top, left, _WEIGHTS, out)
+    _between(first, second, vectors, max(shortest * shortest, 1), top, left, _WEIGHTS, out, mirrored)
 
 
 @compiled
-def _between(first, second, vectors, shortest_squared, top, left, weights, out):
+def _between(first, second, vectors, shortest_squared, top, left, weights, out, mirrored):
     pitch = first.shape[1]
     height, width = first.shape[0] - 2 * PAD_PX, first.shape[1] - 2 * PAD_PX
     count, rows, columns = out.shape
@@ -70,7 +79,7 @@ def _between(first, second, vectors, shortest_squared, top, left, weights, out):
         share = ((number + 1) * 2 * _SHARES + count + 1) // (2 * (count + 1))
         if has_still:
             start = (PAD_PX + top) * pitch + PAD_PX + left
-            _mean(a, b, start, pitch, share, flat[number * rows * columns :], rows, columns)
+            _mean(a, b, start, pitch, share, flat[number * rows * columns :], rows, columns, mirrored)
         for line in range(0, rows, CELL_PX):
             row = min(line, rows - CELL_PX)
             cell_row = min((row + CELL_PX // 2) // CELL_PX, vectors.shape[1] - 1)
@@ -90,21 +99,27 @@ def _between(first, second, vectors, shortest_squared, top, left, weights, out):
                     weight = 0 if is_first else _SHARES
                 warp_cell(
                     a, at, at_x, at_y, b, to, to_x, to_y, table, pitch, weight, flat,
-                    (number * rows + row) * columns + column, columns,
+                    (number * rows + row) * columns + (columns - CELL_PX - column if mirrored else column), columns,
+                    mirrored,
                 )  # fmt: skip
 
 
 @compiled
-def _mean(first, second, at, pitch, share, out, rows, columns):
+def _mean(first, second, at, pitch, share, out, rows, columns, mirrored):
     """Write the weighted mean of two pictures: what a warp without motion gives."""
+    line = np.empty(columns, np.uint16)
     one_weight, other_weight = np.uint16(_SHARES - share), np.uint16(share)
     for row in range(rows):
         one, other = first[at + row * pitch :], second[at + row * pitch :]
         into = out[row * columns : (row + 1) * columns]
+        mixed = line if mirrored else into
         for column in range(columns):
             mean = np.uint16(np.uint16(one[column]) * one_weight)
             mean = np.uint16(mean + np.uint16(np.uint16(other[column]) * other_weight))
-            into[column] = np.uint16(np.uint16(mean + _HALF) >> _FINER)
+            mixed[column] = np.uint16(np.uint16(mean + _HALF) >> _FINER)
+        if mirrored:
+            for column in range(columns):
+                into[column] = line[np.uint64(columns - 1 - column)]  # a signed index would not be vectorised
 
 
 @compiled

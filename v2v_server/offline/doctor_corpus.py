@@ -10,8 +10,10 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 
 import numpy as np
+import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError, V2VError
+from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
 from v2v_server.config import recipe_setting
@@ -73,6 +75,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
     yield from _how_videos_are_stored(catalogue)
     yield from look_at_pictures(catalogue, int(np.median(spec.recipe.sequence_at(found.frames_per_second))) + 1)
     yield from look_at_motion(catalogue)
+    yield from _rates(found.frames_per_second, spec.recipe)
     table = SequenceTable(found, catalogue.rows, spec)
     useless = len(found) - table.videos
     if useless:
@@ -92,6 +95,24 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> I
         return
     text = f"{table.count} samples an epoch; one took {time.perf_counter() - began:.2f} s on one core"
     yield "ok", "corpus", text, ""
+
+
+def _rates(rates: npt.NDArray[np.float64], recipe: Recipe) -> Iterator[Line]:
+    """Advise ``voxel_seconds`` where a twentieth of the videos has a rate a tenth above or below the median."""
+    rates = rates[(rates > 0) & np.isfinite(rates)]
+    if recipe.is_timed or recipe.grids_per_frame or not len(rates):
+        return
+    seconds = recipe.steps_per_frame * recipe.frame_stride / rates
+    middle = float(np.median(seconds))
+    others = int(np.count_nonzero(np.abs(seconds / middle - 1) > 0.1))
+    if 20 * others <= len(rates):
+        return
+    text = (
+        f"frame rates differ ({rates.min():.3g} to {rates.max():.3g} frames/s): a voxel grid lasts {seconds.min():.2g} "
+        f"to {seconds.max():.2g} s"
+    )
+    also = "" if recipe.frames_per_bin == 1 else " --set frames_per_bin=1"
+    yield "note", "rates", text, f"--set voxel_seconds={middle:.2g}{also} gives all grids like durations"
 
 
 def _how_videos_are_stored(catalogue: Catalogue) -> Iterator[Line]:

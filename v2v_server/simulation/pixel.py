@@ -159,6 +159,27 @@ def crossed(potential, threshold_pos, threshold_neg, tolerance):
 
 
 @numba.njit(nogil=True, inline="always")
+def count_crossings(
+    levels, before, now, normal, odd, scale, residual, threshold_pos, threshold_neg, tolerance, is_first, count
+):  # fmt: skip
+    """Add the events of a block to ``count``, or set it if they are the first of a bin; ``residual`` is changed.
+
+    Args:
+        levels: its rows ``before`` and ``now`` are the log intensity at both ends.
+        normal, odd, scale: the noise is row ``odd`` times ``scale``.
+    """
+    if is_first:
+        for i in range(BLOCK_PX):
+            change = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
+            count[i], residual[i] = crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
+    else:
+        for i in range(BLOCK_PX):
+            change = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
+            signed, residual[i] = crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
+            count[i] += signed
+
+
+@numba.njit(nogil=True, inline="always")
 def store(counts, limit, stored):
     """Store one bin of each pixel in the voxels; return how many had to be clipped."""
     exceeded = False
@@ -253,15 +274,10 @@ def simulate_pixels(
             # Without noise its row is zeros. Adding them changes at most the sign of a zero, which has no effect.
             scale = noise_scale[step] if noisy else tolerance - tolerance
             of_bin = step - row * steps_per_bin
-            if of_bin == 0:
-                for i in range(BLOCK_PX):
-                    change = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
-                    count[i], residual[i] = crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
-            else:
-                for i in range(BLOCK_PX):
-                    change = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
-                    signed, residual[i] = crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
-                    count[i] += signed
+            count_crossings(
+                levels, before, now, normal, odd, scale, residual, threshold_pos, threshold_neg, tolerance, of_bin == 0,
+                count,
+            )  # fmt: skip
             if of_bin == steps_per_bin - 1:
                 saturated += store(count, limit, voxels[row, first:last])
                 row += 1

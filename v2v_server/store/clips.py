@@ -14,7 +14,7 @@ from v2v_protocol.errors import ProtocolError, VideoError
 from v2v_server.store.chroma import with_chroma
 from v2v_server.store.depth import DETAIL, detail_planes, read_levels
 from v2v_server.store.format import is_store_file
-from v2v_server.store.motion import MotionWatch, read_motion, with_motion
+from v2v_server.store.motion import MotionWatch, read_motion, with_motion, without_still_margins
 from v2v_server.store.planes import PLANES
 from v2v_server.store.reader import StoreFile
 from v2v_server.video.collect import Cut
@@ -65,10 +65,11 @@ def clips_of(
         if not stored.planes.issuperset(detail_planes(signal)):
             why = f"the store file lacks the plane {DETAIL} of its {bits} bits: re-create it with v2v-prepare"
             raise VideoError(os.fspath(path), None, why)
-        clips = tuple(stored_clip(stored, index, start, cut, stride, signal) for cut in cuts)
         files = [(stored, range(max(cut.count for cut in cuts)))]
-        clips = with_chroma(clips, cuts, files, start, stride)
-        return with_motion(clips, cuts, read_motion(files, start, cuts, stride, picture))
+        vectors = read_motion(files, start, cuts, stride, picture)
+        cuts = without_still_margins(cuts, vectors)
+        clips = tuple(stored_clip(stored, index, start, cut, stride, signal) for cut in cuts)
+        return with_motion(with_chroma(clips, cuts, files, start, stride), cuts, vectors)
 
 
 def stored_clip(

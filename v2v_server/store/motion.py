@@ -88,6 +88,19 @@ def with_motion(
     )
 
 
+def without_still_margins(cuts: Sequence[Cut], vectors: Sequence[Vectors]) -> list[Cut]:
+    """Return the cuts, those in whose cells nothing moves with their smaller window.
+
+    Args:
+        vectors: of those that ask for motion, in their order.
+    """
+    following = iter(vectors)
+    return [
+        cut if cut.cells is None or next(following).any() or cut.still is None else replace(cut, window=cut.still)
+        for cut in cuts
+    ]
+
+
 def has_motion(stored: StoreFile, stride: int, picture: Window) -> bool:
     """Return whether a store file has the motion between such frames of such a usable picture.
 
@@ -168,10 +181,10 @@ def with_planes(
 
 def _motion_across(before: StoreFile, after: StoreFile, at: int, cells: Cells, picture: Window) -> Vectors:
     """Return the motion to the first frame of a file, ``at``, from the last frame of the one before."""
-    from v2v_server.motion import MotionOfPictures, Pyramid
+    from v2v_server.motion import Pyramid, motion
 
-    following = MotionOfPictures()
-    for stored, number in ((before, at - 1), (after, at)):
-        for each in pictures_in(stored, range(1), number, 1, picture):
-            found = following.add(Pyramid.of(each), cells)
-    return found
+    first, second = (
+        Pyramid.of(next(pictures_in(stored, range(1), number, 1, picture)))
+        for stored, number in ((before, at - 1), (after, at))
+    )
+    return motion(first, second, cells)

@@ -27,12 +27,14 @@ class Cut:
         window: (top, left, height, width) in the upright picture, pixels; None takes all of it.
         chroma: what it takes of the colour; None takes none.
         cells: (top, left, rows, columns) of the cells whose motion is wanted (:mod:`v2v_server.motion`); None: none.
+        still: a smaller window, enough where nothing moves in the cells; a store file then reads it instead.
     """
 
     count: int
     window: Window | None = None
     chroma: ChromaCut | None = None
     cells: Window | None = None
+    still: Window | None = None
 
 
 class DecodedFrame(NamedTuple):

@@ -75,7 +75,7 @@ class SamplePlan:
         source: [steps + 1] int64, which decoded frame each position of the clip shows.
         frames: the frames of the sequence, and the part of the picture that is used.
         cut: the frames to decode after pauses are removed, cropped as far as possible before the resize.
-        margin_px: margin around the crop that ``cut`` includes, for flow and sub-steps; None: the whole picture.
+        margin_px: margin around the crop that the clip has, for flow and sub-steps; None: the whole picture.
         flow: settings of the flow if the lease asks for it.
         flow_plan: flow methods chosen from the statistics of the scene; None if the spec does not use them.
     """
@@ -137,17 +137,18 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
         params, place = drawn, f"crop drawn {'uniformly' if drawn is params else 'by motion'}"
     source = params.source_index(int(params.ends(recipe)[-1]))
     flow: FlowSettings | None = None
-    margin_px: int | None = MARGIN_PX if spec.substep_px else 0
+    still_px: int | None = 0
     flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture, place)
     if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
         if flow_plan is not None and flow_plan.still:
             flow = replace(flow, margin_px=0)
-        margin_px = None if flow.margin_px is None else max(flow.margin_px, margin_px or 0)
-    window = source_window(params, recipe, picture, margin_px)
+        still_px = flow.margin_px
+    margin_px = max(still_px, MARGIN_PX) if spec.substep_px and still_px is not None else still_px
+    window, still = (source_window(params, recipe, picture, margin) for margin in (margin_px, still_px))
     chroma = chroma_cut(lease, params, spec, frames, source) if "frames_rgb" in lease.arrays else None
     cells = cells_of(params, recipe, within_rows(lease, frames.sides)) if spec.substep_px else None
-    cut = Cut(frames.count(int(source[-1]) + 1), window, chroma, cells)
+    cut = Cut(frames.count(int(source[-1]) + 1), window, chroma, cells, still)
     return SamplePlan(spec, params, source, frames, cut, margin_px, flow, flow_plan)
 
 
@@ -187,8 +188,16 @@ def decode_for(
         why = "states different transfer characteristics within a clip: re-encode it with one, or set light to sdr"
         raise VideoError(lease.video, lease.start_frame, why)
     return tuple(
-        Decoded(plan, frames.pick(clip, int(plan.source[-1]) + 1)) for plan, clip in zip(plans, clips, strict=True)
+        Decoded(_with_its_margin(plan, clip), frames.pick(clip, int(plan.source[-1]) + 1))
+        for plan, clip in zip(plans, clips, strict=True)
     )
+
+
+def _with_its_margin(plan: SamplePlan, clip: DecodedClip) -> SamplePlan:
+    """Return the plan with the margin that was read: a still clip has none for sub-steps."""
+    if plan.cut.still is None or clip.frames.shape[1:] != plan.cut.still[2:]:
+        return plan
+    return replace(plan, margin_px=0 if plan.flow is None else plan.flow.margin_px)
 
 
 def sample_layout(lease: Lease) -> Layout:
@@ -294,10 +303,10 @@ def sample_context(
         flow = flow_for(
             eight_bits(part, signal), params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods
         )
-    if plan.spec.substep_px and not (into and into.keys().isdisjoint(ARRAYS)):
+    motion = decoded.clip.motion
+    if motion is not None and motion.any() and not (into and into.keys().isdisjoint(ARRAYS)):
         part = without_margin(frames, params, recipe, plan.margin_px, MARGIN_PX)
-        motion, picture = decoded.clip.motion, within_rows(lease, plan.frames.sides)
-        assert motion is not None
+        picture = within_rows(lease, plan.frames.sides)
         levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px, motion, picture)
     seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
     view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe, signal)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import socket
 import struct
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests.clips import damaged, panned_luma, write_clip
+from v2v_protocol.recipe import Recipe
 from v2v_server.commands import doctor as command
 from v2v_server.offline import doctor, doctor_corpus, doctor_motion, doctor_pictures
 from v2v_server.offline.doctor import BAD, NOTE, OK, Finding, control_group_memory
@@ -227,6 +229,26 @@ def test_the_loss_of_fast_motion_is_predicted(tmp_path: Path, capsys: pytest.Cap
     _, said = told(capsys, *flags)
     assert re.search(r"\nnote  motion        fast motion: 5.* px a frame .* lost within steps, .* of 2 videos\n", said)
     assert "so does substep_px: 1 in the spec" in said
+
+
+@pytest.mark.parametrize(
+    ("rates", "settings", "said"),
+    [
+        ([25, 25, 50, math.nan], {}, "(25 to 50 frames/s): a voxel grid lasts 0.1 to 0.2 s; --set voxel_seconds=0.2 "),
+        ([24, 60], {"frames_per_bin": 2}, "lasts 0.17 to 0.42 s; --set voxel_seconds=0.29 --set frames_per_bin=1 "),
+        ([25, 26, 24, math.nan], {}, ""),
+        ([25] * 40 + [50] * 2, {}, ""),
+        ([24, 60], {"voxel_seconds": 0.1}, ""),
+        ([24, 60], {"grids_per_frame": 2}, ""),
+        ([math.nan, math.inf], {}, ""),
+    ],
+)
+def test_mixed_frame_rates_are_said_with_the_duration_to_ask_for(
+    rates: list[float], settings: dict[str, float], said: str
+) -> None:
+    lines = list(doctor_corpus._rates(np.array(rates, np.float64), Recipe.from_dict(settings)))
+    assert len(lines) == bool(said)
+    assert all(said in f"{text}; {change}" for _, _, text, change in lines)
 
 
 @pytest.mark.slow

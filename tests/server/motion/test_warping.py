@@ -41,12 +41,20 @@ def cubic(distance: float) -> float:
     return -0.75 * d**3 + 3.75 * d**2 - 6 * d + 3 if d < 2 else 0.0
 
 
-def made(first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8], vector: tuple[int, int], count: int) -> Reals:
+def made(
+    first: npt.NDArray[np.uint8],
+    second: npt.NDArray[np.uint8],
+    vector: tuple[int, int],
+    count: int,
+    *,
+    mirrored: bool = False,
+) -> Reals:
     height, width = first.shape
     vectors = np.empty((2, -(-height // 4), -(-width // 4)), np.int16)
     vectors[0], vectors[1] = vector
     out = np.empty((count, height, width), np.uint16)
-    between(padded(np.ascontiguousarray(first)), padded(np.ascontiguousarray(second)), vectors, 0, 0, 0, out)
+    one, other = padded(np.ascontiguousarray(first)), padded(np.ascontiguousarray(second))
+    between(one, other, vectors, 0, 0, 0, out, mirrored=mirrored)
     return out / PARTS
 
 
@@ -83,3 +91,10 @@ def test_what_enters_the_picture_is_taken_from_the_frame_that_shows_it() -> None
     first, second = whole[:, 16:], whole[:, 8:-8]
     pictures = made(first, second, (8 * UNITS_PER_PX, 0), 1)
     np.testing.assert_array_equal(pictures[0, :, :4], whole[:, 12:16])
+
+
+def test_mirrored_pictures_are_the_others_turned_round() -> None:
+    first, second = np.random.default_rng(4).integers(0, 256, (2, 22, 31)).astype(np.uint8)
+    for vector in ((0, 0), (23, -9)):
+        upright, mirrored = (made(first, second, vector, 2, mirrored=mirrored) for mirrored in (False, True))
+        np.testing.assert_array_equal(mirrored, upright[:, :, ::-1])

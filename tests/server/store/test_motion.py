@@ -91,6 +91,24 @@ def test_samples_with_sub_steps_are_those_of_the_source(
     require_equal(samples(folders["planes"], spec), expected)
 
 
+@pytest.mark.parametrize("flow", [False, True])
+def test_where_nothing_moves_no_margin_is_read_for_sub_steps(tmp_path: Path, flow: bool) -> None:
+    (tmp_path / "source").mkdir()
+    write_clip(tmp_path / "source" / "still.mp4", np.repeat(panned_luma(1, 80, 90), 20, axis=0))
+    assert run(tmp_path / "source", tmp_path / "planes", LOSSLESS, rows=ROWS, planes=PLANES).complete
+    spec = StreamSpec(recipe=RECIPE.replace(resize_scale=(1.0, 1.0)), substep_px=0.5, flow_margin_px=4)
+    made = []
+    for folder in ("source", "planes"):
+        with open_leases(tmp_path / folder, ROWS, spec) as (root, leases):
+            lease = replace(next(leases), arrays=("voxels", "flow") if flow else ("voxels",))
+            (decoded,) = decode_for(lease, lease.indices, Folder(root))
+            made.append((decoded.clip.frames.shape[1:], make_sample(lease, decoded)))
+    ((around, expected), (read, found)) = made
+    require_equal([found], [expected])
+    assert read[0] - 26 <= (8 if flow else 0) < around[0] - 26
+    assert read[1] - 32 <= (8 if flow else 0) < around[1] - 32
+
+
 def test_motion_is_added_to_a_store_that_lacks_it(folders: dict[str, Path], tmp_path: Path) -> None:
     store = Path(shutil.copytree(folders["plain"], tmp_path / "store"))
     before = (store / "turned.mov").read_bytes()

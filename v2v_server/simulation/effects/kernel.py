@@ -20,6 +20,7 @@ from v2v_server.simulation.pixel import (
     BLOCK_PX,
     PITCH,
     ROWS_AHEAD,
+    count_crossings,
     crossed,
     folds_of,
     look_up,
@@ -132,6 +133,7 @@ def _simulate(
     count, pixels = len(segments.step), frames.shape[1]
     noisy = len(segments.noise_scale) > 0
     timed = out.is_listing or len(out.bilinear) > 0
+    is_plain = drifts_first and not timed and len(out.counts) == 0
     # One by one: rows that are unpacked from an array have unknown strides, and their loops are not vectorised.
     residual, change, signed, positive, negative, rises = state[0], state[1], state[2], state[3], state[4], state[5]
     falls, waited, blind, on, off, old = state[6], state[7], state[8], state[9], state[10], state[11]
@@ -187,57 +189,67 @@ def _simulate(
                 now, reached = 2 + (each & 1), segments.reached[each]
                 for i in range(BLOCK_PX):
                     levels[now, i] = levels[known_before, i] + (levels[known, i] - levels[known_before, i]) * reached
-            shown = frames[segments.shown[each], first:last]
-            at = At(first, each, moved, before, now, shown)
-            for i in range(BLOCK_PX):
-                change[i] = levels[now, i] - levels[before, i]
-            _see(tables, own, block, at)
-            if noisy:
-                pair, odd = step >> 1, step & 1
-                if pair != pair_done:
-                    of_pair, pair_done = (word(pair_radius, pair), word(pair_angle, pair)), pair
-                    two_normals(
-                        radius_words, angle_words, of_pair[0], of_pair[1], words[2], words[3], floats[2], normal
-                    )
-                scale = segments.noise_scale[each]
-                for i in range(BLOCK_PX):
-                    change[i] += normal[odd, i] * scale
-            _change(tables, own, block, at)
-            if timed:
-                for i in range(BLOCK_PX):
-                    old[i], waited[i], blind[i] = residual[i], zero, zero
-            drifting = residual if drifts_first else change
-            for spot in range(hot, next_hot):
-                drifting[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
-            if _cross(tables, own, block, at):
-                for i in range(BLOCK_PX):
-                    rises[i], falls[i] = max(signed[i], zero), max(zero - signed[i], zero)
-            else:
-                for i in range(BLOCK_PX):
-                    events, residual[i] = crossed(residual[i] + change[i], positive[i], negative[i], tolerance)
-                    signed[i], rises[i], falls[i] = events, max(events, zero), max(zero - events, zero)
-            _after(tables, own, block, at)
+            if noisy and step >> 1 != pair_done:
+                pair_done = step >> 1
+                two_normals(
+                    radius_words, angle_words, word(pair_radius, pair_done), word(pair_angle, pair_done), words[2],
+                    words[3], floats[2], normal,
+                )  # fmt: skip
+            scale, odd = segments.noise_scale[each] if noisy else zero, step & 1
             of_bin = segments.bin[each]
-            if each == 0 or segments.bin[each - 1] != of_bin:
-                for i in range(BLOCK_PX):
-                    on[i], off[i] = rises[i], falls[i]
+            is_first = each == 0 or segments.bin[each - 1] != of_bin
+            if is_plain:
+                for spot in range(hot, next_hot):
+                    residual[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
+                count_crossings(
+                    levels, before, now, normal, odd, scale, residual, threshold_pos, threshold_neg, tolerance,
+                    is_first, on,
+                )  # fmt: skip
             else:
+                shown = frames[segments.shown[each], first:last]
+                at = At(first, each, moved, before, now, shown)
                 for i in range(BLOCK_PX):
-                    on[i] += rises[i]
-                    off[i] += falls[i]
-            if timed:
-                if drifts_first:
-                    for spot in range(hot, next_hot):
-                        change[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
-                _time(segments, each, block, old, first, last, bins, time_folds, out)
+                    change[i] = levels[now, i] - levels[before, i]
+                _see(tables, own, block, at)
+                if noisy:
+                    for i in range(BLOCK_PX):
+                        change[i] += normal[odd, i] * scale
+                _change(tables, own, block, at)
+                if timed:
+                    for i in range(BLOCK_PX):
+                        old[i], waited[i], blind[i] = residual[i], zero, zero
+                drifting = residual if drifts_first else change
+                for spot in range(hot, next_hot):
+                    drifting[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
+                if _cross(tables, own, block, at):
+                    for i in range(BLOCK_PX):
+                        rises[i], falls[i] = max(signed[i], zero), max(zero - signed[i], zero)
+                else:
+                    for i in range(BLOCK_PX):
+                        events, residual[i] = crossed(residual[i] + change[i], positive[i], negative[i], tolerance)
+                        signed[i], rises[i], falls[i] = events, max(events, zero), max(zero - events, zero)
+                _after(tables, own, block, at)
+                if is_first:
+                    for i in range(BLOCK_PX):
+                        on[i], off[i] = rises[i], falls[i]
+                else:
+                    for i in range(BLOCK_PX):
+                        on[i] += rises[i]
+                        off[i] += falls[i]
+                if timed:
+                    if drifts_first:
+                        for spot in range(hot, next_hot):
+                            change[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
+                    _time(segments, each, block, old, first, last, bins, time_folds, out)
             if each == count - 1 or segments.bin[each + 1] != of_bin:
                 if len(out.counts) > 0:
                     grid, of_grid = of_bin // bins, of_bin % bins
                     out.tally[1] += store(off, limit, out.counts[grid, 0, of_grid, first:last])
                     out.tally[1] += store(on, limit, out.counts[grid, 1, of_grid, first:last])
                 if len(out.voxels) > 0:
-                    for i in range(BLOCK_PX):
-                        on[i] -= off[i]
+                    if not is_plain:
+                        for i in range(BLOCK_PX):
+                            on[i] -= off[i]
                     out.tally[0] += store(on, limit, out.voxels[of_bin, first:last])
 
 
