@@ -19,6 +19,7 @@ from typing import Any
 import av
 import numpy as np
 from av.video.frame import VideoFrame
+from PIL import Image
 
 from bench.frame import Column, Report, add_whole
 from v2v_protocol.command import Parser
@@ -133,6 +134,20 @@ def add_source(parser: Parser) -> None:
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep logs and outputs in this new folder")
 
 
+def write_labels(clip: Path, frames: int) -> None:
+    """Write boxes and masks beside a clip: one object that moves by 2 px a frame."""
+    masks = clip.with_suffix(".masks")
+    masks.mkdir(exist_ok=True)
+    lines = []
+    for frame in range(frames):
+        left, top = 20 + 2 * frame % (WIDTH_PX - 120), 30 + frame % 60
+        lines.append(f"{frame + 1},1,{left + 1},{top + 1},80,60,1,-1,-1,-1\n")
+        mask = np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8)
+        mask[top : top + 60, left : left + 80] = 1
+        Image.fromarray(mask).save(masks / f"{frame:06}.png")
+    clip.with_suffix(".boxes.txt").write_text("".join(lines), encoding="ascii")
+
+
 @contextmanager
 def run_folder(asked: argparse.Namespace) -> Iterator[tuple[Path, Path]]:
     """Yield a folder for the files of a run, temporary unless kept, and the corpus to serve."""
@@ -142,6 +157,8 @@ def run_folder(asked: argparse.Namespace) -> Iterator[tuple[Path, Path]]:
         if videos is None:
             videos = folder / "clips"
             webvid_like(asked.footage, videos, gop=12, frames=300, clips=len(asked.footage))
+            for clip in [*videos.iterdir()]:
+                write_labels(clip, frames=300)
         yield folder, videos
 
 

@@ -26,6 +26,14 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _probe_in_this_process() -> Iterator[None]:
+    """Probe videos of commands called in this process here; programs that tests start use other processes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("v2v_server.offline.remake.usable_cores", lambda: 0)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _one_process_compiles(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Let one test process compile at a time: the others wait, and then find its kernels in numba's cache."""
     dispatcher: Any = numba.core.dispatcher.Dispatcher

@@ -96,7 +96,7 @@ def serving() -> ServeConfig:
     """What the broker's pod is told, as the program itself understands it."""
     asked: list[ServeConfig] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(serve_command, "serve", lambda config, times: asked.append(config))
+        patch.setattr("v2v_server.serve.serve", lambda config, *_: asked.append(config))
         assert serve_command.main(container("v2v-broker")["args"]) == 0
     return asked[0]
 

@@ -52,7 +52,7 @@ def test_with_keys_the_manifests_build_and_the_broker_requires_them(
         if kind[0] != "ScaledObject":
             validate.validate(document, KUBERNETES_VERSION, strict=True)
     asked: list[ServeConfig] = []
-    monkeypatch.setattr(serve_command, "serve", lambda config, times: asked.append(config))
+    monkeypatch.setattr("v2v_server.serve.serve", lambda config, *_: asked.append(config))
     pods = {name: made["Deployment", name]["spec"]["template"]["spec"] for name in ("v2v-broker", "v2v-workers")}
     keys = KeyFolder(tmp_path / "keys")
     keys.init()

@@ -57,7 +57,7 @@ def test_panels_do_not_overlap() -> None:
 
 def test_prometheus_uses_a_host_name_that_the_page_accepts(monkeypatch: Any) -> None:
     asked: list[ServeConfig] = []
-    monkeypatch.setattr(serve_command, "serve", lambda config, times: asked.append(config))
+    monkeypatch.setattr("v2v_server.serve.serve", lambda config, *_: asked.append(config))
     server = COMPOSE["services"]["v2v-server"]
     flags = [flag.replace("${WORKERS:-8}", "8").replace("${ROWS:-full}", "full") for flag in server["command"]]
     assert serve_command.main(["--videos", "/videos", "--insecure", *flags]) == 0

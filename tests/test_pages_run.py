@@ -30,7 +30,7 @@ SMALLER = {
 }
 CANNOT = {
     r"^v2v-fit ": "recordings that may not be redistributed; tests/server/fit fits simulated ones",
-    r"^v2v-serve .*my_camera": "a recipe that v2v-fit writes",
+    r"^v2v-(serve|tradeoff) .*my_camera": "a recipe that v2v-fit writes",
     r"^v2v-convert ": "recordings that may not be redistributed",
     r"^v2v-eval ": "weights and recordings that may not be redistributed; the trainer's tests use synthetic ones",
     r"^v2v-train (e2vid|firenet-cpu|my\.yaml|scenes\.yaml) ": "weights of LPIPS, or the reader's own configuration",

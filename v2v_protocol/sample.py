@@ -219,7 +219,9 @@ class Provenance:
         unlabelled: reason by array, for each requested array that could not be made from the video's sidecars.
         boxes_dropped: boxes that ``max_boxes`` left out, in all frames of the sample.
         grid_seconds: actual duration of each voxel grid, where the recipe states ``voxel_seconds``.
-        left_out: effects of the draw that were not simulated (``tolerance`` of the spec).
+        left_out: effects of the draw that were not simulated (``tolerance`` of the spec); the others were.
+        substeps: parts that the clip's steps were divided into along the motion, undivided steps included; 0: the spec
+            states no ``substep_px``, so no motion was used.
     """
 
     id: SampleId
@@ -240,6 +242,7 @@ class Provenance:
     boxes_dropped: int = 0
     grid_seconds: tuple[float, ...] = ()
     left_out: tuple[str, ...] = ()
+    substeps: int = 0
 
     @property
     def labelled(self) -> bool:
@@ -263,7 +266,9 @@ class Provenance:
             "refusals": tuple(refusal.to_dict() for refusal in self.refusals),
             "params": self.params.to_dict(),
         }
-        optional = ("scene", "saturated", "sidecars", "unlabelled", "boxes_dropped", "grid_seconds", "left_out")
+        optional = (
+            "scene", "saturated", "sidecars", "unlabelled", "boxes_dropped", "grid_seconds", "left_out", "substeps",
+        )  # fmt: skip
         return {name: value for name, value in values.items() if value or name not in optional}
 
     @classmethod

@@ -53,7 +53,8 @@ from v2v_server.status.text import format_shutdown_summary
 from v2v_server.store.cache import make_cache
 from v2v_server.supervise.engines import make_pool
 from v2v_server.supervise.pool import Pool
-from v2v_server.supervise.scaling import Scaling
+from v2v_server.supervise.scaling import Scaling, question_workers
+from v2v_server.supervise.standby import Standby
 from v2v_server.system.clock import Clock
 from v2v_server.system.log import Level, Log
 from v2v_server.system.process import keep_freed_memory, open_many_files, usable_cores
@@ -62,7 +63,6 @@ from v2v_server.system.start_times import StartTimes
 from v2v_server.system.status_fields import GIB
 from v2v_server.video.rows import Rows
 
-_MANY_WORKERS_A_CORE = 4
 _FILES_A_WORKER = 4
 _TURN_SECONDS = 0.1
 """Longest wait of the loop without a message; also the interval of checks of deadlines and workers."""
@@ -70,16 +70,6 @@ _SOON_SECONDS = 5.0
 """Time after which blocked leases are reported."""
 _GIVE_BACK_SECONDS = 12.0
 """Time from the end of a connection until its memory is returned to the kernel; its session is forgotten by then."""
-
-
-def question_workers(workers: int, cores: int) -> str:
-    """Return a warning if there are more workers than cores; empty otherwise."""
-    if workers <= _MANY_WORKERS_A_CORE * cores:
-        return ""
-    return (
-        f"warning: --workers {workers} on {cores} cores: each uses one core, and more than {cores} only "
-        f"cost memory; --workers {cores} makes as many samples"
-    )
 
 
 def load_catalogue(config: ServeConfig) -> Catalogue:
@@ -109,11 +99,12 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
     return catalogue
 
 
-def serve(config: ServeConfig, times: StartTimes) -> None:
+def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None = None) -> None:
     """Run a server until SIGINT or SIGTERM.
 
     Args:
         times: logged once the first sample is sent, if they are to be.
+        standbys: see :func:`v2v_server.supervise.engines.make_pool`.
 
     Raises:
         CorpusError: the corpus gives no sequence.
@@ -160,7 +151,7 @@ def serve(config: ServeConfig, times: StartTimes) -> None:
     keys = KeyFolder(Path(config.keys)) if config.keys else None
     stop = threading.Event()
     with stop_on_signals(stop):
-        pool = make_pool(config, catalogue.source, label, worker_flags, keys)
+        pool = make_pool(config, catalogue.source, label, worker_flags, keys, standbys)
         sockets = Sockets(
             config.bind,
             config.worker_bind or _private_address(label),

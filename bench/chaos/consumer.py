@@ -35,11 +35,13 @@ PROFILES = (
         batch_size=3,
         think_seconds=0.2,
         save_every=3,
+        arrays=("voxels", "frames", "frames_rgb", "boxes", "masks"),
     ),
     # The stream of the first one in other batches: the samples of the two are compared with each other.
     Profile({"recipe": _SMALL, "max_sequences_per_video": 100}, seed=1, batch_size=5, think_seconds=0.05),
 )
-"""Small samples in large numbers, the paper's 40 voxel grids of 128 x 128, and a slow consumer of siblings."""
+"""Small samples in large numbers, the paper's 40 voxel grids of 128 x 128, and a slow consumer of siblings, colour and
+labels."""
 
 
 def profile(number: int) -> Profile:
@@ -68,6 +70,8 @@ def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, 
     dataset = V2VStreamDataset(
         address,
         batch_size=asked.batch_size,
+        arrays=asked.arrays,
+        labels="optional",  # a corpus of --videos may have none
         seed=asked.seed,
         rank=0,
         world_size=1,

@@ -597,7 +597,7 @@ def loader(stream, workers, method="fork", **options):
 
 @pytest.mark.parametrize(
     ("workers", "method"),
-    [(0, None), (1, "fork"), (2, "fork"), (1, "spawn"), pytest.param(2, "spawn", marks=pytest.mark.slow)],
+    [(0, None), (1, "fork"), (2, "fork"), pytest.param(2, "spawn", marks=pytest.mark.slow)],
 )
 def test_loader_workers_give_the_same_batches_and_the_epoch_advances(server, workers, method):
     stream = dataset(server)

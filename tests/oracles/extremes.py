@@ -344,11 +344,14 @@ def divided_rows() -> list[Row]:
     def check(setting: tuple[Any, ...]) -> Finding:
         return Finding(*in_time.excess_of_divided_steps(*setting))
 
+    def check_motion(px: float) -> Finding:
+        return Finding(*in_time.excess_along_motion(px))
+
     quantity = "more than a threshold left, log units"
     made = [Row(name, "counted", quantity, partial(check, setting)) for name, setting in asked.items()]
     for px in (0.0, 500.0, -2048.0):  # the last is the largest that is stored
         name = f"motion of {px:g} px a frame"
-        made.append(Row(name, "counted", quantity, lambda px=px: Finding(*in_time.excess_along_motion(px))))
+        made.append(Row(name, "counted", quantity, partial(check_motion, px)))
     return made
 
 

@@ -19,6 +19,7 @@ from typing import Any
 
 from tests.oracles.stream_log import BatchLine, Line, OrderVerdict, Sighting, Sightings, check_order, sighting
 from v2v_protocol.errors import VideoError
+from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
@@ -27,6 +28,7 @@ from v2v_server.offline.remake import remake
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.worker.produce import decode_for, make_sample
+from v2v_server.worker.sidecars import open_sidecars
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +40,7 @@ class Profile:
         seed, batch_size: of its stream.
         think_seconds: pause after each batch.
         save_every: batches between two saved states, as a trainer has steps between two checkpoints.
+        arrays: of its samples.
     """
 
     spec: Mapping[str, Any]
@@ -45,6 +48,7 @@ class Profile:
     batch_size: int
     think_seconds: float = 0.0
     save_every: int = 1
+    arrays: tuple[str, ...] = DEFAULT_ARRAYS
 
     @property
     def stream_spec(self) -> StreamSpec:
@@ -106,9 +110,11 @@ class StreamOracle:
             catalogue=self._catalogue,
             spec=self._spec,
             seed=self._asked.seed,
-            arrays=("voxels", "frames"),
+            arrays=self._asked.arrays,
         )
-        made = make_sample(lease, decode_for(lease, lease.indices, self._catalogue.source)[0])
+        source = self._catalogue.source
+        with open_sidecars(lease, source) as sidecars:
+            made = make_sample(lease, decode_for(lease, lease.indices, source)[0], sidecars=sidecars)
         return sighting(made.arrays, made.provenance)
 
 

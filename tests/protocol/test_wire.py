@@ -65,7 +65,7 @@ def test_every_message_travels_unchanged(cls: type[Any]) -> None:
 
 
 @given(messages)
-@settings(max_examples=200)
+@settings(max_examples=60)
 def test_any_message_travels_unchanged(message: Any) -> None:
     header = bytes(encode(message)[0])
     for buffer in (header, bytearray(header), memoryview(header)):
@@ -84,7 +84,7 @@ def test_whole_numbers_are_read_as_floats_where_floats_belong() -> None:
 
 
 @given(st.binary(max_size=200))
-@settings(max_examples=500)
+@settings(max_examples=150)
 def test_arbitrary_bytes(data: bytes) -> None:
     message_or_refusal(data)
 
@@ -104,7 +104,7 @@ def test_arbitrary_maps(fields: dict[Any, Any], right_version: bool) -> None:
 
 
 @given(st.data())
-@settings(max_examples=600)
+@settings(max_examples=200)
 def test_damaged_messages(data: st.DataObject) -> None:
     """Bytes changed, cut out, put in: near misses of every message, which reach further than noise does."""
     header = bytearray(encode(example(data.draw(st.sampled_from(MESSAGES))))[0])
@@ -123,7 +123,7 @@ def test_damaged_messages(data: st.DataObject) -> None:
 
 
 @given(st.data())
-@settings(max_examples=300)
+@settings(max_examples=120)
 def test_messages_with_a_replaced_field(data: st.DataObject) -> None:
     fields = plain(example(data.draw(st.sampled_from(MESSAGES))))
     fields[data.draw(st.sampled_from(sorted(fields)))] = data.draw(_values)

@@ -84,7 +84,7 @@ def test_single_fields_are_changed_in_the_recipe_of_the_file(
     file = tmp_path / "serve.yaml"
     file.write_text("videos: a\nrecipe: {preset: clean, gamma: 1.5}\n")
     served: list[ServeConfig] = []
-    monkeypatch.setattr("v2v_server.commands.serve.serve", lambda config, times: served.append(config))
+    monkeypatch.setattr("v2v_server.serve.serve", lambda config, *_: served.append(config))
     serve(["--config", str(file), *flags.split()])
     name, *changes = recipe.split()
     assert served[0].spec.recipe == recipe_setting(name, changes)

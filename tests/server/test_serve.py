@@ -30,7 +30,8 @@ from v2v_server.corpus.catalogue import Catalogue, CorpusPart
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.quarantine.file import read_quarantine
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
-from v2v_server.serve import Server, question_workers
+from v2v_server.serve import Server
+from v2v_server.supervise.scaling import question_workers
 from v2v_server.system import clock as clock_module
 
 VERDICT = QuarantineEntry(0, "v.mp4", "f", 0, "crash", "t")

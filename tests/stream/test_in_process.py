@@ -103,6 +103,8 @@ def test_a_sample_of_any_recipe_is_that_of_the_stream(
     clips: Path, index_folder: Path, server: LocalServer, shape: dict[str, int], fields: dict[str, Any], side: int,
     flow: bool, dtype: str, seed: int, epoch: int,
 ) -> None:  # fmt: skip
+    if dtype == "int16":  # the general kernel in int16 takes long to compile; test_times.py has it
+        fields = {name: value for name, value in fields.items() if name not in ("leak_hz", "threshold_mismatch_sigma")}
     recipe = {"preset": "paper", **shape, **fields, "crop_height_px": side, "crop_width_px": side + 1}
     arrays = ("voxels", "frames", *(("flow", "flow_valid") if flow else ()))
     given_ = {"recipe": recipe, "arrays": arrays, "seed": seed, "epoch": epoch, "voxel_dtype": dtype}

@@ -20,6 +20,8 @@ from v2v_protocol.sample import Provenance, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.remake import remake
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule.summary import corpus_summary
 from v2v_server.worker.scene_choice import MOVING
 
 Luma = npt.NDArray[np.uint8]
@@ -67,6 +69,22 @@ def test_a_still_a_dark_and_a_fast_clip_get_different_decisions(catalogue: Catal
     chosen = remake(catalogue, AUTO, seed=3, epoch=0, index=4, arrays=ARRAYS)
     assert chosen.provenance.video == by_name.provenance.video == "c-fast.mkv"
     np.testing.assert_array_equal(chosen.arrays["flow"], by_name.arrays["flow"])
+
+
+def test_the_provenance_says_how_a_crop_was_drawn(catalogue: Catalogue) -> None:
+    moving = dataclasses.replace(AUTO, moving_share=1.0)
+    still, fast = (remake(catalogue, moving, seed=3, epoch=0, index=index).provenance for index in (0, 4))
+    assert (still.video, fast.video) == ("a-still.mkv", "c-fast.mkv")
+    assert still.scene.endswith("; crop drawn uniformly")
+    assert fast.scene.endswith("; crop drawn by motion")
+
+
+def test_a_start_says_how_many_videos_are_longer_than_what_is_analysed(
+    catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("v2v_server.schedule.summary.MOST_FRAMES", 42)
+    said = corpus_summary(catalogue, AUTO, SequenceTable(catalogue.videos, catalogue.rows, AUTO))
+    assert any(line.startswith("1 videos are longer than the 42 frames that are analysed") for line in said)
 
 
 def test_no_sequence_holds_the_cut_or_shows_nothing(catalogue: Catalogue) -> None:

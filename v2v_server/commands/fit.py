@@ -16,8 +16,7 @@ from v2v_recordings.items import ConvertOptions, SensorSize
 from v2v_server.config import read_yaml_mapping, recipe_setting
 from v2v_server.fit.fit import FittedCamera, fit
 from v2v_server.fit.lab import camera_of, measure, table
-from v2v_server.fit.picture import draw_fit
-from v2v_server.fit.report import report_lines, write_recipe
+from v2v_server.fit.report import draw_fit, report_lines, write_recipe
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -10,7 +10,7 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_server.commands.spec_flags import add_spec
 from v2v_server.config import SERVE_KEYS, ServeConfig, recipe_setting
-from v2v_server.serve import serve
+from v2v_server.supervise.standby import start_ahead
 from v2v_server.system.log import report_errors
 from v2v_server.system.start_times import StartTimes
 
@@ -33,6 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    times = StartTimes(is_logged=arguments.debug)
     flags = {name: getattr(arguments, name) for name in SERVE_KEYS}
     # Without --recipe, --set changes fields of the file's recipe.
     settings = arguments.set if arguments.recipe is None else []
@@ -41,7 +42,10 @@ def _run(arguments: argparse.Namespace) -> None:
     with report_errors(lambda: arguments.log_format):
         config = ServeConfig.load(arguments.config, flags, settings)
         arguments.log_format = config.log_format  # the file may ask for JSON
-        serve(config, StartTimes(is_logged=arguments.debug))
+        with start_ahead(config) as standbys:
+            from v2v_server.serve import serve  # takes as long as the imports of a worker, which run meanwhile
+
+            serve(config, times, standbys)
 
 
 if __name__ == "__main__":

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import math
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
@@ -20,16 +19,16 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
 from v2v_protocol.spec import StreamSpec
 from v2v_server.config import recipe_setting
-from v2v_server.motion.prediction import SUBSTEP_PX, Prediction
+from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, Prediction
 from v2v_server.simulation.variants import warm_up
 from v2v_server.system.process import keep_freed_memory
-from v2v_server.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, accuracy, predicted_loss, spurious
+from v2v_server.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, Places, accuracy, parts, predicted_loss
 from v2v_server.tradeoff.diversity import diversity
 from v2v_server.tradeoff.forms import DEFAULT_FORMS, ENCODINGS, SOURCE, CorpusForm, forms
 from v2v_server.tradeoff.front import best
 from v2v_server.tradeoff.report import ERROR_KEY, error_fields, name_dominated, plot, tables
-from v2v_server.tradeoff.settings import EXACT, ServeSetting, settings, write_preset
-from v2v_server.tradeoff.speed import Speed, TimedWork, leases_of, making, measure
+from v2v_server.tradeoff.settings import ServeSetting, axes, full_model, settings
+from v2v_server.tradeoff.speed import leases_of, making, measure
 from v2v_server.video.rows import Rows
 
 _FORMS_SHARE, _ACCURACY_SHARE, _DIVERSITY_SHARE = 0.5, 0.7, 0.8
@@ -39,13 +38,14 @@ _FORMS_SHARE, _ACCURACY_SHARE, _DIVERSITY_SHARE = 0.5, 0.7, 0.8
 def _parser() -> Parser:
     parser = Parser(
         "v2v-tradeoff", "--videos DIR [flags]",
-        "Measure on your clips what each way to serve them costs: processor time of a sample, disk space, voxel error "
-        "and diversity, for the source, lossless stores and H.264, with 1, 2 or 4 samples a decode. A setting is "
-        "dominated when another one is at least as good in all four and better in one. Name the best setting for a "
-        "wish, and write it for v2v-serve --config.",
+        "Measure on your clips what each way to serve them costs: processor time, disk space, voxel error against the "
+        "recipe's own full model, and diversity, for the source, lossless stores and H.264, with every combination of "
+        "the values of some fields. A setting is dominated when another one is at least as good in everything and "
+        "better in one thing. Name the best setting for a wish, and write it for v2v-serve --config.",
         [
             "v2v-tradeoff --videos clips/ --json tradeoff.json --plot tradeoff.png",
-            "v2v-tradeoff --videos clips/ --target-rate 20 --most-samples-per-decode 2 --preset-out chosen.yaml",
+            "v2v-tradeoff --videos clips/ --target-rate 20 --vary samples_per_decode=1,2 --preset-out chosen.yaml",
+            "v2v-tradeoff --videos clips/ --recipe my_camera.yaml --vary tolerance=0,0.01 --max-error 0.02",
         ],
         "Exit status: 1 where no setting fulfils --target-rate or --max-error.",
     )  # fmt: skip
@@ -54,13 +54,14 @@ def _parser() -> Parser:
     videos.add_argument("--rows", default="top:0.54", help="rows to use (default top:0.54, as for WebVid)")
     videos.add_argument("--clips", type=int, default=4, metavar="N", help="different clips to take (default 4)")
     videos.add_argument("--places", type=int, default=8, metavar="N", help="sequences to sample (default 8)")
+    videos.add_argument("--recipe", default="paper", metavar="NAME", help="preset or YAML file (default paper)")
     videos.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field")
-    videos.add_argument(
-        "--vary", action="append", default=[], metavar="KEY=VALUE,VALUE",
-        help="also time samples with other values of one recipe field or of tolerance, for example "
-        "voxel_seconds=0.02,0.1",
-    )  # fmt: skip
     work = parser.group("Work")
+    work.add_argument(
+        "--vary", action="append", default=[], metavar="KEY=VALUE,VALUE",
+        help="values to compare of samples_per_decode (default 1,2,4), substep_px (default 0,1), tolerance, or a field "
+        "of the recipe such as voxel_seconds; may be repeated",
+    )  # fmt: skip
     work.add_argument(
         "--forms", default=",".join(DEFAULT_FORMS), metavar="FORM,FORM",
         help=f"ways to prepare the clips, of {', '.join(ENCODINGS)} (default {', '.join(DEFAULT_FORMS)})",
@@ -74,9 +75,6 @@ def _parser() -> Parser:
     wish = wishes.add_mutually_exclusive_group()
     wish.add_argument("--target-rate", type=float, metavar="X", help="samples a core second to reach")
     wish.add_argument("--max-error", type=float, metavar="X", help="largest voxel error, for example 0.05")
-    wishes.add_argument(
-        "--most-samples-per-decode", type=int, default=4, choices=(1, 2, 4), help="at most this K (default 4)"
-    )
     out = parser.group("Output")
     out.add_argument("--preset-out", type=Path, metavar="FILE.yaml", help="write the best setting for v2v-serve")
     out.add_argument("--json", type=Path, metavar="FILE", help="write the records")
@@ -107,146 +105,97 @@ def _run(asked: argparse.Namespace) -> int:
     _check(asked)
     budget = 60.0 * asked.budget_minutes
     rows = Rows.parse(asked.rows)
-    spec = StreamSpec.from_dict({"recipe": recipe_setting("paper", asked.set)})
-    varied = dict(each for text in asked.vary for each in _varied(spec, text))
+    spec = StreamSpec.from_dict({"recipe": recipe_setting(asked.recipe, asked.set)})
+    compared = settings(asked.forms, spec, axes(asked.vary))
     cv2.setNumThreads(1)
     keep_freed_memory()
     warm_up()
     with tempfile.TemporaryDirectory(prefix="v2v-tradeoff-") as folder, forms(
-        asked.videos, rows, spec, asked.forms, most_clips=asked.clips, folder=Path(folder),
-        until=begun + _FORMS_SHARE * budget, tell=_tell,
+        asked.videos, rows, spec, asked.forms, motion=any(setting.spec.substep_px for setting in compared),
+        most_clips=asked.clips, folder=Path(folder), until=begun + _FORMS_SHARE * budget, tell=_tell,
     ) as corpus:  # fmt: skip
-        records = _measured(corpus, spec, varied, asked.places, begun, budget)
+        compared = [setting for setting in compared if setting.form in corpus]
+        records = _measured(corpus, compared, asked.places, begun, budget)
     print(tables(records))
     print(f"{(time.monotonic() - begun) / 60:.1f} minutes; the budget was {asked.budget_minutes:g}")
     if asked.json is not None:
         write_json(asked.json, records)
     if asked.plot is not None:
         plot(records, asked.plot)
-    return 0 if asked.target_rate is asked.max_error is None else choose(records, asked)
-
-
-def _varied(spec: StreamSpec, text: str) -> Iterator[tuple[str, StreamSpec]]:
-    """Yield the streams of one ``--vary``, by name.
-
-    Raises:
-        UsageError: it is not KEY=VALUE,VALUE, or a value is wrong.
-    """
-    key, equals, values = text.partition("=")
-    if not equals:
-        raise UsageError(f"--vary {text}: write KEY=VALUE,VALUE, for instance --vary voxel_seconds=0.02,0.1")
-    for value in values.split(","):
-        if key == "tolerance":
-            yield f"{key} = {value}", StreamSpec.from_dict({key: value}, spec)
-        else:
-            changed = recipe_setting(None, [f"{key}={value}"], spec.recipe.to_dict())
-            yield f"{key} = {value}", dataclasses.replace(spec, recipe=changed)
+    return 0 if asked.target_rate is asked.max_error is None else choose(records, compared, asked)
 
 
 def _measured(
-    corpus: Mapping[str, CorpusForm], spec: StreamSpec, varied: Mapping[str, StreamSpec], places: int, begun: float,
-    budget: float,
-) -> list[dict[str, Any]]:  # fmt: skip
-    """Return the records of all settings, of the varied streams, of the two rows that give the scale, and of the
-    diversity.
-    """
-    chosen = settings([name for name in corpus if name != SOURCE])
-    sources = {name: (form.clips.folder, leases_of(form.clips, spec, places)) for name, form in corpus.items()}
-    _tell(f"comparing {len(sources)} forms of the corpus")
-    tallies = accuracy(sources, SOURCE, until=begun + _ACCURACY_SHARE * budget)
-    crop = spec.recipe.crop_height_px, spec.recipe.crop_width_px
-    still = {name: spurious(form.stills, crop) for name, form in corpus.items()}
-    _tell("measuring diversity")
-    alike = diversity(*sources[SOURCE], until=begun + _DIVERSITY_SHARE * budget)
-    _tell(f"timing {len(chosen)} settings")
-    works: dict[str, TimedWork] = {}
-    for setting in chosen:
-        root, leases = sources[setting.form]
-        works[setting.name] = making(root, leases, setting.samples_per_decode)
-    with_substeps = dataclasses.replace(spec, substep_px=SUBSTEP_PX)
-    for name, form in corpus.items():
-        works[_substeps_name(name, SUBSTEP_PX)] = making(
-            form.clips.folder, leases_of(form.clips, with_substeps, places)
-        )
-    count = len(sources[SOURCE][1])
-    for name, stream in varied.items():
-        leases = leases_of(corpus[SOURCE].clips, stream, places)  # longer grids may give fewer places
-        if not leases:
-            raise UsageError(f"--vary {name}: none of the clips is long enough for a sequence")
-        works[name] = making(corpus[SOURCE].clips.folder, list(islice(cycle(leases), count)))
-    speeds = measure(works, until=begun + budget)
-    records = [
-        _record(setting, speeds[setting.name], speeds[EXACT.name], corpus)
-        | error_fields(tallies[setting.form])
-        | {f"events_on_still_at_{threshold:g}": rate for threshold, rate in still[setting.form].items()}
-        for setting in chosen
-    ]
-    name_dominated(records)
-    scale = [{"measure": "scale", "name": name, **error_fields(tallies[name])} for name in (NOISE_ROW, DRAW_ROW)]
-    between = _substeps(corpus, speeds, predicted_loss(*sources[SOURCE]))
-    others = [
-        {
-            "measure": "varied", "name": name, "samples_per_core_second": 1.0 / speeds[name].fastest,
-            "cpu_seconds_per_sample": speeds[name].fastest,
-            "speed_ratio": speeds[EXACT.name].fastest / speeds[name].fastest,
-        }
-        for name in varied
-    ]  # fmt: skip
-    return records + others + between + scale + alike
-
-
-def _substeps_name(form: str, substep_px: float) -> str:
-    return f"{form}, substep_px = {substep_px:g}"
-
-
-def _substeps(corpus: Mapping[str, CorpusForm], speeds: Mapping[str, Speed], loss: Prediction) -> list[dict[str, Any]]:
-    """Return the cost of each form without and with sub-steps, one sample a decode, beside the predicted errors."""
-    records: list[dict[str, Any]] = []
-    for form in corpus:
-        for substep_px, key in ((0.0, "linear"), (SUBSTEP_PX, "divided")):
-            name = _substeps_name(form, substep_px)
-            seconds = speeds[name if substep_px else ServeSetting(form).name].fastest
-            records.append(
-                {
-                    "measure": "substeps", "name": name, "form": form, "substep_px": substep_px,
-                    "samples_per_core_second": 1.0 / seconds, "cpu_seconds_per_sample": seconds,
-                    "px_per_frame": loss.px_per_frame,
-                }
-                | {
-                    f"predicted_{error}": share if loss.can_be_followed or loss.is_slow else None
-                    for error, share in loss.errors(key)._asdict().items()
-                }
-            )  # fmt: skip
-    return records
-
-
-def _record(setting: ServeSetting, speed: Speed, exact: Speed, corpus: Mapping[str, CorpusForm]) -> dict[str, Any]:
-    form, source = corpus[setting.form], corpus[SOURCE]
-    return {
-        "measure": "setting",
-        "name": setting.name,
-        **dataclasses.asdict(setting),
-        "samples_per_core_second": 1.0 / speed.fastest,
-        "cpu_seconds_per_sample": speed.fastest,
-        "median_cpu_seconds_per_sample": speed.median,
-        "speed_ratio": exact.fastest / speed.fastest,
-        "rounds": speed.rounds,
-        "bytes_ratio": form.nbytes / source.nbytes,
-        "bytes_per_video_second": form.nbytes / form.seconds,
+    corpus: Mapping[str, CorpusForm], compared: Sequence[ServeSetting], places: int, begun: float, budget: float
+) -> list[dict[str, Any]]:
+    """Return the records of all settings, of the two rows that give the scale, of the parts, and of the diversity."""
+    models = {setting: full_model(setting, compared) for setting in compared}
+    sources = {
+        setting: Places(corpus[setting.form].clips.folder, leases_of(corpus[setting.form].clips, setting.spec, places))
+        for setting in dict.fromkeys((*(setting.single for setting in compared), *models.values()))
     }
+    for setting, source in sources.items():  # longer grids may give fewer places
+        if not source.leases:
+            raise UsageError(f"{setting.name}: none of the clips is long enough for a sequence")
+    records, scale = [], []
+    for number, model in enumerate(dict.fromkeys(models.values())):
+        mine = [setting for setting in compared if models[setting] == model]
+        singles = {setting.single.name: sources[setting.single] for setting in mine}
+        _tell(f"comparing {len(singles)} ways to make samples")
+        tallies = accuracy(sources[model], singles, until=begun + _ACCURACY_SHARE * budget)
+        loss = predicted_loss(sources[model])
+        for setting in mine:
+            records.append(_record(setting, corpus, loss) | error_fields(tallies[setting.single.name]))
+        if not number:
+            scale = [{"measure": "scale", "way": name, **error_fields(tallies[name])} for name in (NOISE_ROW, DRAW_ROW)]
+    _tell("measuring diversity and the parts of a sample")
+    first = sources[compared[0].single]
+    alike = diversity(first, until=begun + _DIVERSITY_SHARE * budget)
+    taken = [
+        {"measure": "parts", "way": setting.way} | parts(source, until=begun + _DIVERSITY_SHARE * budget)
+        for setting, source in sources.items()
+        if setting.form == SOURCE and setting in {each.single for each in compared}
+    ]
+    _tell(f"timing {len(compared)} settings")
+    count = max(len(source.leases) for source in sources.values())
+    works = {}
+    for setting in compared:
+        root, leases = sources[setting.single]
+        works[setting.name] = making(root, list(islice(cycle(leases), count)), setting.spec.samples_per_decode)
+    speeds = measure(works, until=begun + budget)
+    for record in records:
+        speed, exact = speeds[record["name"]], speeds[compared[0].name]
+        record |= {
+            "samples_per_core_second": 1.0 / speed.fastest, "cpu_seconds_per_sample": speed.fastest,
+            "median_cpu_seconds_per_sample": speed.median, "speed_ratio": exact.fastest / speed.fastest,
+            "rounds": speed.rounds,
+        }  # fmt: skip
+    for recipe in {setting.spec.recipe for setting in compared}:
+        same = {setting.name for setting in compared if setting.spec.recipe == recipe}
+        name_dominated([record for record in records if record["name"] in same])
+    return records + scale + taken + alike
+
+
+def _record(setting: ServeSetting, corpus: Mapping[str, CorpusForm], loss: Prediction) -> dict[str, Any]:
+    form, spec = corpus[setting.form], setting.spec
+    predicted = {0.0: loss.errors("linear"), SUBSTEP_PX: loss.errors("divided")}.get(spec.substep_px)
+    known = predicted if loss.can_be_followed or loss.is_slow else None
+    return {
+        "measure": "setting", "name": setting.name, "way": setting.way, "form": setting.form,
+        "samples_per_decode": spec.samples_per_decode, "substep_px": spec.substep_px, "tolerance": spec.tolerance,
+        "bytes_ratio": form.nbytes / corpus[SOURCE].nbytes, "bytes_per_video_second": form.nbytes / form.seconds,
+        "px_per_frame": loss.px_per_frame,
+        **{f"predicted_{name}": None if known is None else getattr(known, name) for name in PredictedErrors._fields},
+    }  # fmt: skip
 
 
 def _tell(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def choose(records: Sequence[Mapping[str, Any]], asked: argparse.Namespace) -> int:
+def choose(records: Sequence[Mapping[str, Any]], compared: Sequence[ServeSetting], asked: argparse.Namespace) -> int:
     """Print the best setting and write it to ``--preset-out``; return 1 where no setting fulfils the wish."""
-    fit = [
-        record
-        for record in records
-        if record["measure"] == "setting" and record["samples_per_decode"] <= asked.most_samples_per_decode
-    ]
+    fit = [record for record in records if record["measure"] == "setting"]
     try:
         record = best(fit, error_key=ERROR_KEY, target_rate=asked.target_rate, max_error=asked.max_error)
     except UsageError as error:
@@ -255,7 +204,8 @@ def choose(records: Sequence[Mapping[str, Any]], asked: argparse.Namespace) -> i
     why = f"{record['samples_per_core_second']:.3g} samples a core second, {ERROR_KEY} {record[ERROR_KEY]:.3g}"
     print(f"best: {record['name']}: {why}")
     if asked.preset_out is not None:
-        write_preset(asked.preset_out, record, asked.rows, why)
+        (chosen,) = (setting for setting in compared if setting.name == record["name"])
+        asked.preset_out.write_text(chosen.yaml(asked.rows, why), encoding="utf-8")
     return 0
 
 

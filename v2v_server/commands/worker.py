@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
@@ -13,13 +14,29 @@ from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_sou
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.packing import QUICK, RAW
 from v2v_server.system.log import LOG_FORMATS, Log, report_errors
+from v2v_server.system.process import die_with_parent
 from v2v_server.system.start_times import StartTimes
 from v2v_server.system.status_fields import GIB
 from v2v_server.worker.process import run_worker, unshared_name
+from v2v_server.worker.warm_up import warm_up_in_turn
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status."""
+    """Run the command line; return the exit status.
+
+    ``--standby PID``, from a server, gets ready and then reads the arguments from standard input.
+    """
+    times = StartTimes()
+    times.mark("imports")
+    argv = sys.argv[1:] if argv is None else argv
+    if argv[:1] == ["--standby"]:
+        die_with_parent(int(argv[1]))
+        warm_up_in_turn()
+        times.mark("kernels")
+        argv = sys.stdin.buffer.read().decode().split("\0")
+        times.mark("arguments")
+        if argv == [""]:
+            return 0
     parser = Parser(
         "v2v-worker", "--connect ADDRESS --videos DIR [flags]", "Work for a server: take leases, make samples.",
         ["v2v-worker --connect tcp://10.0.0.5:5556 --videos /data/webvid"],
@@ -54,15 +71,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
-    return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
+    return run_command(parser, partial(_run, times), argv, failures=(V2VError,), interrupted="")
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(times: StartTimes, arguments: argparse.Namespace) -> None:
+    times.is_logged = arguments.debug
     with report_errors(lambda: arguments.log_format):
-        _work(arguments)
+        _work(times, arguments)
 
 
-def _work(arguments: argparse.Namespace) -> None:
+def _work(times: StartTimes, arguments: argparse.Namespace) -> None:
     # A server names its own workers, and recognises them by these names.
     name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
     source = open_source(arguments.videos, SourceOptions(copies=arguments.copies, copies_gib=arguments.copies_gib))
@@ -78,9 +96,8 @@ def _work(arguments: argparse.Namespace) -> None:
         cache = Cache(folder, int(arguments.cache_gib * GIB), packing=packing)
     log = Log(is_json=arguments.log_format == "json")
     run_worker(
-        arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log,
-        StartTimes(is_logged=arguments.debug),
-    )  # fmt: skip
+        arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log, times
+    )
 
 
 if __name__ == "__main__":

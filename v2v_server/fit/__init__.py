@@ -5,10 +5,8 @@ increments  changes of brightness beside events, still stretches, intervals
 interval    estimates with intervals by a bootstrap over blocks
 regression  thresholds, low-pass and dark floor from the changes
 estimators  noise, mismatch, refractory period and defects
-simulated   the recording's frames through the product's kernel
-statistics  statistics of recording and simulation, and their distance
+statistics  the recording's frames through the product's kernel; statistics of both, and their distance
 fit         the whole fit, fit(); which effects stay
-report      the recipe file and the report in words
-picture     the report as a picture
+report      the recipe file, and the report in words and as a picture
 lab         a simulated camera on a test bench
 """

@@ -136,22 +136,13 @@ def refractory(gaps_us: Doubles) -> Estimate:
 def hot_mask(still: Still) -> npt.NDArray[np.bool_]:
     """Return which pixels fire far more often than the others while they see no change: [P]."""
     seconds, events = still.seconds.sum(axis=1), (still.on + still.off).sum(axis=1)
-    lit = still.light.sum(axis=1)
-    usual = np.zeros(len(seconds))
-    seen = seconds > 0
-    if not seen.any():
-        return np.zeros(len(seconds), bool)
-    light = np.divide(lit, seconds, out=np.zeros_like(lit), where=seen)
-    edges = np.quantile(light[seen], np.linspace(0, 1, 9)[1:-1])
-    group = np.searchsorted(edges, light)
-    for number in range(8):
-        mine = seen & (group == number)
-        if mine.any():
-            rates = events[mine] / seconds[mine]
-            rate = rates[rates <= 4 * max(float(np.median(rates)), 1.0 / float(np.median(seconds[mine])))]
-            usual[mine] = rate.mean() if len(rate) else 0.0
-    expected = usual * seconds
-    return np.asarray(seen & (events > expected + 5 * np.sqrt(expected) + 5))
+    seen, expected = np.flatnonzero(seconds > 0), np.full(len(seconds), np.inf)
+    by_light = seen[np.argsort(still.light.sum(axis=1)[seen] / seconds[seen], kind="stable")]
+    for mine in np.array_split(by_light, min(8, len(seen)) or 1):
+        rates = events[mine] / seconds[mine]
+        usual = rates <= 4 * max(np.median(rates), 1.0 / np.median(seconds[mine])) if len(mine) else rates
+        expected[mine] = rates[usual].mean() * seconds[mine] if len(mine) else 0.0
+    return np.asarray(events > expected + 5 * np.sqrt(expected) + 5)
 
 
 def hot_pixels(
@@ -196,14 +187,11 @@ def hot_pixels(
 
 def _untruncated(root_mean_square: float, least: float) -> float:
     """Return the deviation of a normal distribution from the rms of its values beyond ``least``."""
-    low, high = least / 6.0, root_mean_square
-    for _ in range(60):
-        sigma = (low + high) / 2
-        a = least / sigma
-        tail = math.erfc(a / math.sqrt(2.0)) / 2
-        rms = sigma * math.sqrt(1 + a * math.exp(-a * a / 2) / math.sqrt(2 * math.pi) / max(tail, 1e-300))
-        low, high = (sigma, high) if rms < root_mean_square else (low, sigma)
-    return (low + high) / 2
+    sigma = np.linspace(min(least / 6.0, root_mean_square), root_mean_square, 2000)
+    a = least / sigma
+    tail = np.array([max(math.erfc(each / math.sqrt(2.0)) / 2, 1e-300) for each in a])
+    rms = sigma * np.sqrt(1 + a * np.exp(-a * a / 2) / math.sqrt(2 * math.pi) / tail)
+    return float(np.interp(root_mean_square, rms, sigma))
 
 
 def dead_pixels(recording: Recorded, blocks: npt.NDArray[np.int64]) -> Estimate:

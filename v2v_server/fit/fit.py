@@ -15,10 +15,9 @@ from v2v_protocol.recipe import effect_settings
 from v2v_recordings.items import ConvertOptions, Progress
 from v2v_server.fit import estimators, regression
 from v2v_server.fit.increments import Still, increments_of, intervals_us, still_time
-from v2v_server.fit.interval import Doubles, Estimate, bootstrap, sums_by_block, unknown
+from v2v_server.fit.interval import Doubles, Estimate, unknown
 from v2v_server.fit.recording import Recorded, read_recording
-from v2v_server.fit.simulated import simulate_recording
-from v2v_server.fit.statistics import Panels, gain, panels_of
+from v2v_server.fit.statistics import Panels, gain, panels_of, simulate_recording
 
 LEAST_FRAMES = 3
 USUAL_THRESHOLD = 0.2
@@ -205,43 +204,18 @@ def _without_evidence(
         if not fitted.get(name):
             reasons[name] = "half of the sensor tells nothing of it"
             continue
-        if name in _NOISE_PANELS:
-            without = panels_of(simulate_recording(other, fitted | {name: 0.0}, 3), light, begin, end)
-            by, least = gain(measured, full, without, held_out, _NOISE_PANELS[name])
-        else:
-            by, least = _likelihood_gain(one, other, fitted, name)
+        if name not in _NOISE_PANELS:
+            # The simulation between frames of a low rate is too smooth to judge these.
+            if halves[name].low <= 0.0:
+                reasons[name] = "half of the sensor does not show it"
+            continue
+        without = panels_of(simulate_recording(other, fitted | {name: 0.0}, 3), light, begin, end)
+        by, least = gain(measured, full, without, held_out, _NOISE_PANELS[name])
         if least <= 0.0:
             reasons[name] = f"does not bring the other half of the sensor closer ({by:+.2g}, at least {least:+.2g})"
     if "hot_pixel_share" in reasons:
         reasons["hot_pixel_sigma"] = reasons["hot_pixel_share"]
     return reasons
-
-
-def _likelihood_gain(one: Recorded, other: Recorded, fitted: Mapping[str, float], name: str) -> tuple[float, float]:
-    """Return the mean gain in log likelihood of the other half's frames by an effect, and its interval's lower end.
-
-    The simulation between frames of a low rate is too smooth to judge these effects: frames, given events, are not.
-    """
-    sums = []
-    for is_on in (True, False):
-        period = fitted.get("refractory_seconds", 0.0) if is_on or name != "refractory_seconds" else 0.0
-        pair = []
-        for part in (one, other):
-            made = increments_of(part, period, 1e6 * _frame_seconds(part))
-            large = regression.is_large(made)
-            pair.append(made.take(large))
-        values = regression.held_out_likelihood(
-            pair[0], pair[1], fitted["log_eps"],
-            fitted.get("threshold_mismatch_sigma", 0.0) if is_on or name != "threshold_mismatch_sigma" else 0.0,
-            has_corner=fitted.get("photoreceptor_hz", 0.0) > 0.0 and (is_on or name != "photoreceptor_hz"),
-        )  # fmt: skip
-        block = other.blocks(_BLOCKS_SIDE)[pair[1].pixel]
-        sums.append(sums_by_block(block, np.stack([values, np.ones(len(values))], axis=1), _BLOCKS_SIDE**2))
-    table = np.concatenate(sums, axis=1)
-    value, low, _high = bootstrap(
-        table[table[:, 1] > 0], lambda s: np.array([s[0] / max(s[1], 1.0) - s[2] / max(s[3], 1.0)])
-    )
-    return float(value[0]), float(low[0])
 
 
 def _switches() -> tuple[str, ...]:

@@ -90,13 +90,18 @@ def _ramp_thresholds(camera: Mapping[str, float], seconds: float, *, falls: bool
     wanted = np.linspace(low, high, count + 1)
     greys = np.rint(255.0 * np.maximum(np.exp(wanted) - camera["log_eps"], 0.0) ** (1 / camera["gamma"]))
     events = _events(camera, greys[::-1] if falls else greys, count / seconds)
-    place = events.y.astype(np.int64) * events.width_px + events.x
-    number = np.bincount(place, minlength=SIDE_PX**2)
-    first, last = np.full(SIDE_PX**2, np.inf), np.zeros(SIDE_PX**2)
-    np.minimum.at(first, place, events.t.astype(np.float64))
-    np.maximum.at(last, place, events.t.astype(np.float64))
+    first, last, number = _spans(events)
     fires = number >= 3
     return np.asarray((last - first)[fires] / (number[fires] - 1) * 1e-6 / seconds * (high - low))
+
+
+def _spans(events: EventList) -> tuple[Doubles, Doubles, Doubles]:
+    """Return the times of the first and the last event of each pixel, us, and the number of its events."""
+    place, t = events.y.astype(np.int64) * events.width_px + events.x, events.t.astype(np.float64)
+    first, last = np.full(SIDE_PX**2, np.inf), np.zeros(SIDE_PX**2)
+    np.minimum.at(first, place, t)
+    np.maximum.at(last, place, t)
+    return first, last, np.bincount(place, minlength=SIDE_PX**2).astype(np.float64)
 
 
 def _ends(camera: Mapping[str, float]) -> tuple[float, float]:
@@ -118,25 +123,15 @@ def _latency_us(camera: Mapping[str, float], before: int, after: int) -> float:
     """Return the median time from a step of light to a pixel's first event: of a photoreceptor without delay, 0."""
     begin, frames_per_second = 3, 10_000.0
     greys = np.concatenate([np.full(begin, float(before)), np.full(2000, float(after))])
-    events = _events(camera, greys, frames_per_second)
-    since = events.t - int(1e6 * (begin - 1) / frames_per_second)
-    later = since >= 0
-    place = events.y[later].astype(np.int64) * events.width_px + events.x[later]
-    first = np.full(SIDE_PX**2, np.inf)
-    np.minimum.at(first, place, since[later].astype(np.float64))
-    return float(np.median(first)) if np.isfinite(np.median(first)) else math.nan
+    first = np.median(_spans(_events(camera, greys, frames_per_second))[0])
+    return float(first) - 1e6 * (begin - 1) / frames_per_second if np.isfinite(first) else math.nan
 
 
 def _bandwidth_hz(camera: Mapping[str, float]) -> float:
-    counts = []
-    for frequency in _FREQUENCIES_HZ:
-        turns = np.arange(0.0, 6.0, 1 / 32)
-        greys = 200.0 + 50.0 * np.sin(2 * math.pi * turns)
-        counts.append(len(_events({**camera, "refractory_seconds": 0.0}, greys, 32 * frequency)))
-    shares = np.array(counts) / max(counts[0], 1)
-    below = np.flatnonzero(shares < math.sqrt(0.5))
-    if not len(below) or below[0] == 0:
+    swings = 200.0 + 50.0 * np.sin(2 * math.pi * np.arange(0.0, 6.0, 1 / 32))
+    quick = {**camera, "refractory_seconds": 0.0}
+    counts = np.array([len(_events(quick, swings, 32 * frequency)) for frequency in _FREQUENCIES_HZ], np.float64)
+    falling = np.minimum.accumulate(counts)[::-1] / max(counts[0], 1.0)
+    if not falling[0] < math.sqrt(0.5) < falling[-1]:
         return math.nan
-    k = int(below[0])
-    part = (shares[k - 1] - math.sqrt(0.5)) / (shares[k - 1] - shares[k])
-    return float(_FREQUENCIES_HZ[k - 1] * (_FREQUENCIES_HZ[k] / _FREQUENCIES_HZ[k - 1]) ** part)
+    return float(np.exp(np.interp(math.sqrt(0.5), falling, np.log(_FREQUENCIES_HZ[::-1]))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,23 +66,21 @@ class Recorded:
         events = np.repeat(chosen, lengths)
         first = np.concatenate([[0], np.cumsum(lengths[chosen])])
         frames = np.ascontiguousarray(self.frames[:, chosen])
-        return Recorded(
-            self.height_px, self.width_px, self.pixels[chosen], first, self.t_us[events], self.p[events], frames,
-            self.frame_us, self.counts, self.seconds,
-        )  # fmt: skip
+        return dataclasses.replace(
+            self, pixels=self.pixels[chosen], first=first, t_us=self.t_us[events], p=self.p[events], frames=frames
+        )
 
 
-def chosen_pixels(height_px: int, width_px: int) -> Longs:
-    """Return the pixels that a fit looks at: all of a small sensor, or tiles spread evenly over a large one."""
-    if height_px * width_px <= MOST_PIXELS:
-        return np.arange(height_px * width_px)
-    y, x = np.mgrid[0:height_px, 0:width_px]
-    rows, columns = -(-height_px // TILE_PX), -(-width_px // TILE_PX)
-    stride = max(1.0, rows * columns * TILE_PX**2 / MOST_PIXELS)
-    kept = np.unique((np.arange(int(rows * columns / stride)) * stride).astype(np.int64))
-    # A step of tiles that has no common factor with the rows spreads them like a shuffle, the same on every host.
-    scattered = (kept * 7919) % (rows * columns) if (rows * columns) % 7919 else kept
-    return np.flatnonzero(np.isin(((y // TILE_PX) * columns + x // TILE_PX).ravel(), scattered))
+def chosen_pixels(height_px: int, width_px: int, most: int | None = None) -> Longs:
+    """Return the pixels that a fit looks at: tiles spread over the sensor, fewer of them being a part of more.
+
+    Args:
+        most: number of pixels; None: MOST_PIXELS.
+    """
+    y, x = np.divmod(np.arange(height_px * width_px), width_px)
+    tile = y // TILE_PX * -(-width_px // TILE_PX) + x // TILE_PX
+    rank = np.random.default_rng(0).permutation(tile[-1] + 1)[tile]
+    return np.sort(np.argsort(rank, kind="stable")[: most or MOST_PIXELS])
 
 
 def recorded(
@@ -216,11 +215,9 @@ class _Kept:
         )  # fmt: skip
 
     def _halve(self) -> None:
-        """Drop every second tile."""
-        y, x = np.divmod(self._pixels, self._size.width)
-        tiles, rank = np.unique(y // TILE_PX * (-(-self._size.width // TILE_PX)) + x // TILE_PX, return_inverse=True)
-        stays = rank % 2 == 0 if len(tiles) > 1 else np.arange(len(y)) % 2 == 0
-        self._pixels = self._pixels[stays]
+        """Drop half of the tiles."""
+        fewer = chosen_pixels(self._size.height, self._size.width, max(1, len(self._pixels) // 2))
+        stays, self._pixels = np.isin(self._pixels, fewer), fewer
         self._index = _index(self._pixels, self._size.height * self._size.width)
         self._frames = [frame[stays] for frame in self._frames]
         kept = [self._index[place] >= 0 for _, place, _ in self._events]

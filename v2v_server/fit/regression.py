@@ -59,12 +59,11 @@ class Regression:
         kept: [M] mask of the increments used.
     """
 
-    def __init__(self, increments: Increments, blocks: npt.NDArray[np.int64], log_eps: float | None = None) -> None:
+    def __init__(self, increments: Increments, blocks: npt.NDArray[np.int64]) -> None:
         """Fit.
 
         Args:
             blocks: [P] block of each pixel.
-            log_eps: epsilon inside the logarithm; None fits it.
         """
         self.kept = is_large(increments)
         self.residual = np.zeros(len(self.kept))
@@ -75,29 +74,23 @@ class Regression:
         given = increments.take(self.kept)
         block = np.unique(blocks[given.pixel] * 4 + given.block, return_inverse=True)[1]
         note = f"{self.kept.sum()} changes between frames"
-        if log_eps is None:
-            self.log_eps = _fit_log_eps(given, blocks)
-        else:
-            self.log_eps = Estimate(log_eps, log_eps, log_eps)
+        self.log_eps = _fit_log_eps(given, blocks)
         fit = _least_squares(given, self.log_eps.value)
         self.residual[self.kept] = fit.residual
         with_change = np.concatenate([fit.columns, fit.change[:, None]], axis=1)
         rows = fit.weight[:, None, None] * fit.columns[:, :, None] * with_change[:, None, :]
         sums = sums_by_block(block, rows.reshape(len(rows), -1), block.max() + 1).reshape(-1, 4, 5)
         value, low, high = bootstrap(sums, lambda s: _solve(s[:, :4], s[:, 4]))
-        others = [_least_squares(given, max(end, 1e-5)).solved for end in _finite(self.log_eps)]
+        eps = self.log_eps
+        ends = (eps.low, eps.high) if eps.told else (eps.value / 2, eps.value * 2)
+        others = [_least_squares(given, max(end, 1e-5)).solved for end in ends]
         doubt = np.abs(others[1] - others[0]) / 2
         usual = np.array([SYSTEMATIC[name] for name in _SOLVED]) * (1.0 if self.log_eps.told else 2.0)
         doubt = np.hypot(doubt[:3], np.abs(value[:3]) * usual)
         low, high = value[:3] - np.hypot(value[:3] - low[:3], doubt), value[:3] + np.hypot(high[:3] - value[:3], doubt)
         self.positive, self.negative = (Estimate(value[k], low[k], high[k], 0.0, note) for k in range(2))
-        ends = [max(float(end), 0.0) for end in (value[2], low[2], high[2])]
-        self.corner = Estimate(ends[0], ends[1], ends[2], 1.0 / 500.0, note)
-
-
-def _finite(made: Estimate) -> tuple[float, float]:
-    """Return the ends of an interval, or values around the estimate if it has none."""
-    return (made.low, made.high) if made.told else (made.value / 2, made.value * 2)
+        corner, least, most = (max(float(end[2]), 0.0) for end in (value, low, high))
+        self.corner = Estimate(corner, least, most, 1.0 / 500.0, note)
 
 
 class _Fit(NamedTuple):
@@ -125,13 +118,11 @@ def _rows(given: Increments, log_eps: float, solved: Doubles) -> tuple[Doubles, 
     return columns, change, variance
 
 
-def _least_squares(given: Increments, log_eps: float, turns: int = 7, *, has_corner: bool = True) -> _Fit:
+def _least_squares(given: Increments, log_eps: float, turns: int = 7) -> _Fit:
     """Solve for c+, c-, 1 / corner and a drift, with Huber's weights."""
     solved, robust = np.array([0.2, 0.2, 0.0, 0.0]), np.ones(len(given.on))
     for _ in range(turns):
         columns, change, variance = _rows(given, log_eps, solved)
-        if not has_corner:
-            columns[:, 2] = 0.0
         weight = robust / variance
         scaled = columns * weight[:, None]
         solved = _solve(scaled.T @ columns, scaled.T @ change)
@@ -161,26 +152,6 @@ def _likelihood(given: Increments, log_eps: float) -> Doubles:
 
 def _scale(residual: Doubles, variance: Doubles) -> float:
     return 1.4826 * float(np.median(np.abs(residual) / np.sqrt(variance)))
-
-
-def held_out_likelihood(
-    seen: Increments, other: Increments, log_eps: float, mismatch_sigma: float = 0.0, *, has_corner: bool = True
-) -> Doubles:
-    """Fit some increments, and return the log likelihood of others: [M].
-
-    Args:
-        mismatch_sigma: spread of the thresholds over pixels, as a share.
-        has_corner: whether the pixel has a low-pass.
-    """
-    solved = _least_squares(seen, log_eps, has_corner=has_corner).solved
-    scale, made = 1.0, []
-    for given in (seen, other):
-        columns, change, variance = _rows(given, log_eps, solved)
-        residual = change - columns @ solved
-        variance = variance + mismatch_sigma**2 * ((solved[0] * given.on) ** 2 + (solved[1] * given.off) ** 2)
-        made.append((given, residual, variance))
-        scale = scale if len(made) == 2 else _scale(residual, variance)
-    return _log_likelihood(made[1][0], log_eps, made[1][1], made[1][2], scale)
 
 
 def _solve(normal: Doubles, right: Doubles) -> Doubles:
@@ -231,10 +202,10 @@ def refractory_by_change(
     columns, counts = [], []
     for period in grid:
         increments = increments_of(recording, period, longest_us)
-        kept = is_large(increments)
-        if kept.sum() < LEAST_INCREMENTS:
+        large = increments.take(is_large(increments))
+        if len(large.on) < LEAST_INCREMENTS:
             return bound
-        given = _sample(increments.take(kept), _MOST_FOR_LOG_EPS // 4)
+        given = _sample(large, _MOST_FOR_LOG_EPS // 4)
         best = max((_likelihood(given, eps) for eps in np.geomspace(1e-4, 0.3, 12)), key=np.sum)
         size = int(blocks.max()) + 1
         columns.append(np.bincount(blocks[given.pixel], best, size))

@@ -1,16 +1,21 @@
-"""Write a fitted camera as a recipe, and report in words what was fitted and what was not."""
+"""Write a fitted camera as a recipe; report in words and draw what was fitted and what was not."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from v2v_pictures.colours import Image
+from v2v_pictures.comparison import Curves, draw_comparison
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.safe_yaml import format_yaml
 from v2v_protocol.settings import settings_of
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.fit.fit import FittedCamera
-from v2v_server.fit.interval import Estimate
+from v2v_server.fit.interval import Doubles, Estimate
+from v2v_server.fit.statistics import BRIGHTNESS_EDGES, COUNT_EDGES, INTERVAL_EDGES_US, Panels, per_second
 
 _UNITS = {"threshold_pos": "log units", "threshold_neg": "log units"}
 _DIGITS = 4
@@ -80,6 +85,41 @@ def report_lines(fitted: FittedCamera, source: str) -> list[str]:
     if {"threshold_pos", "threshold_neg"} <= fitted.camera.keys():
         lines.append("A recipe draws which polarity has the larger threshold: it keeps the ratio, not its direction.")
     return lines
+
+
+def draw_fit(fitted: FittedCamera, source: str) -> Image:
+    """Draw the page: [height, width, 3] uint8 RGB."""
+    measured = _curves(fitted.measured)
+    simulated = None if fitted.simulated is None else _curves(fitted.simulated)
+    grey = [f"{low}" for low in BRIGHTNESS_EDGES[:-1]]
+    gaps = ["" if number % 3 else f"{edge / 1e3:.3g} ms" for number, edge in enumerate(INTERVAL_EDGES_US[:-1])]
+    counts = [f"{low}" for low in COUNT_EDGES[:-1]]
+    titles = (
+        ("darker events a pixel and second, by grey level", grey),
+        ("brighter events a pixel and second, by grey level", grey),
+        ("noise, darker: pixels without a change, by grey level", grey),
+        ("noise, brighter: pixels without a change, by grey level", grey),
+        ("share of the pixels, by events of a pixel", counts),
+        ("brighter events as a share, by grey level", grey),
+        ("share of intervals between events of one polarity", gaps),
+        ("share of intervals between opposite events", gaps),
+    )
+    panels = [
+        Curves(title, ticks, measured[number], None if simulated is None else simulated[number])
+        for number, (title, ticks) in enumerate(titles)
+    ]
+    lines = report_lines(fitted, source)
+    return draw_comparison(lines[0], panels, lines[1:])
+
+
+def _curves(panels: Panels) -> list[Doubles]:
+    rates = per_second(panels["rates"].sum(axis=0), panels["exposure"].sum(axis=0))
+    still = per_second(panels["still"].sum(axis=0), panels["still_exposure"].sum(axis=0))
+    pixels, intervals = panels["pixels"].sum(axis=0), panels["intervals"].sum(axis=0)
+    off, on = rates[:8], rates[8:]
+    share = np.divide(on, on + off, out=np.zeros_like(on), where=on + off > 0)
+    intervals = intervals / max(intervals.sum(), 1.0)
+    return [off, on, still[:8], still[8:], pixels / max(pixels.sum(), 1.0), share, intervals[:22], intervals[22:]]
 
 
 def _range(low: float, high: float) -> list[float]:

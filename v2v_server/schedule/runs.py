@@ -17,7 +17,13 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.scenes.pieces import SplitVideos
 from v2v_server.corpus.scenes.scene import NO_BARS, Flag, Pieces, Sides, sides_of
 
-_SKIPPED = {"fades": Flag.FADE, "black": Flag.BLACK, "white": Flag.WHITE, "combed": Flag.COMBED}
+_SKIPPED = {
+    "fades": Flag.FADE,
+    "black": Flag.BLACK,
+    "white": Flag.WHITE,
+    "combed": Flag.COMBED,
+    "cuts": Flag.UNSEEN,  # there are most likely more of them
+}
 _Int64 = npt.NDArray[np.int64]
 
 

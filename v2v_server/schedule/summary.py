@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.scenes.scene import MOST_FRAMES
 from v2v_server.schedule.sequences import SequenceTable
 
 _SHOWN = 5
@@ -37,6 +40,11 @@ def corpus_summary(
             f"scene {spec.scene}: {split} videos have shot boundaries or empty parts; {table.spoilt} sequences are "
             "left out or moved"
         )
+        if long := int(np.count_nonzero(catalogue.videos.frames > MOST_FRAMES)):
+            lines.append(
+                f"{long} videos are longer than the {MOST_FRAMES} frames that are analysed: later frames are served "
+                "only of videos without defects; split long videos to use all of them"
+            )
     if refusals := table.refusals:
         lines.append(f"{len(refusals)} videos give none under the server's own recipe:")
         lines += _listed(refusals, list_refused)

@@ -213,7 +213,8 @@ def choose_crop(
     picture_width_px: int,
     weigh: Callable[[int, int], int],
 ) -> SampleParams:
-    """Return a draw whose crop lies, with a probability of ``share``, at one of eight places drawn with weights.
+    """Return a draw whose crop lies, with a probability of ``share``, at one of eight places drawn with weights;
+    otherwise ``params`` itself.
 
     Args:
         params, recipe: the draw and its recipe.

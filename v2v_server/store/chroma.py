@@ -67,7 +67,7 @@ def _read(cut: ChromaCut, files: Sequence[tuple[StoreFile, range]], start: int, 
         if len(frames):
             first = start + int(frames[0]) * stride
             count = int(frames[-1] - frames[0]) * stride + 1
-            parts.append(stored.plane(CHROMA, first, count, _cells_in(stored, cut))[(frames - frames[0]) * stride])
+            parts.append(stored.plane(CHROMA, first, count, _cells_in(stored, cut), (frames - frames[0]) * stride))
     return Chroma(np.concatenate(parts), files[0][0].head.matrix)
 
 

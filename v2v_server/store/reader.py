@@ -215,16 +215,19 @@ class StoreFile(BlockReader):
         """
         return frozenset(name for name, place in self._places.items() if place.version == PLANES[name].version)
 
-    def plane(self, name: str, start: int, count: int, cells: Window) -> npt.NDArray[Any]:
+    def plane(
+        self, name: str, start: int, count: int, cells: Window, wanted: npt.NDArray[np.int64] | None = None
+    ) -> npt.NDArray[Any]:
         """Read a part of a plane.
 
         Args:
             name: one of :attr:`planes`.
             start, count: ordinal of the first frame in the source, and number of frames.
             cells: (top, left, rows, columns) in the plane of the stored rows, cells.
+            wanted: which of these frames to return; None: all.
 
         Returns:
-            [count, values, rows, columns].
+            [n, values, rows, columns].
 
         Raises:
             UsageError: the file does not hold a requested frame or cell.
@@ -238,8 +241,8 @@ class StoreFile(BlockReader):
         window = kind.window(cells)
         pictures = np.zeros((count, *window[2:]), np.uint8)
         if not stored.read(start, 1, window, pictures):
-            return np.zeros((count, kind.values, *cells[2:]), kind.dtype)
-        return kind.from_pictures(pictures, cells)
+            return np.zeros((count if wanted is None else len(wanted), kind.values, *cells[2:]), kind.dtype)
+        return kind.from_pictures(pictures if wanted is None else pictures[wanted], cells)
 
     @cached_property
     def _places(self) -> Mapping[str, PlanePlace]:

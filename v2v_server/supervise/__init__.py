@@ -7,6 +7,7 @@ host         the seam between the pool and what runs the processes
 local_host   runs them on this host
 ray_host     runs them on a Ray cluster
 ray_actor    the part of ray_host on each node; only these two import Ray
+standby      workers of this host that are started before the server has work
 child        one worker's process: its start, its state, what its end means
 engines      makes the pool that a configuration names
 """

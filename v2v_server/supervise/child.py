@@ -19,12 +19,14 @@ from v2v_server.worker.logbook import Logbook
 
 STOPPED = (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
 _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
+PROGRAM = (sys.executable, "-m", "v2v_server.commands.worker")
+Program = subprocess.Popen[bytes]
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
 def start_child(
     address: str, root: str, name: str, flags: Sequence[str], logbook: Logbook, key: PeerKey | None = None
-) -> subprocess.Popen[bytes]:
+) -> Program:
     """Start a worker in a process of its own, which dies with this one.
 
     Args:
@@ -43,21 +45,31 @@ def start_child(
         if key is not None:
             handed.append(open_here.enter_context(nameless_key(key)).fileno())
             flags = [*flags, "--keys", f"/dev/fd/{handed[-1]}"]
-        return subprocess.Popen(
-            [*command(address, root, name), *flags, "--logbook-fd", str(logbook.descriptor)],
-            stdin=subprocess.DEVNULL,
-            pass_fds=handed,
-            env=environment() | _ONE_THREAD,
-            process_group=0,
-        )
+        return start_program(arguments(address, root, name, flags, logbook), handed)
 
 
-def command(address: str, root: str, name: str) -> list[str]:
-    """Return the command line of one worker."""
+def start_program(arguments: Sequence[str], handed: Sequence[int], stdin: int = subprocess.DEVNULL) -> Program:
+    """Start the program of a worker with these arguments, which has the descriptors ``handed``.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+    return subprocess.Popen(
+        [*PROGRAM, *arguments],
+        stdin=stdin,
+        pass_fds=handed,
+        env=environment() | _ONE_THREAD,
+        process_group=0,
+    )
+
+
+def arguments(address: str, root: str, name: str, flags: Sequence[str], logbook: Logbook) -> list[str]:
+    """Return the arguments of one worker, see :func:`start_child`."""
     return [
-        *(sys.executable, "-m", "v2v_server.commands.worker"),
         *("--connect", address, "--videos", root, "--name", name),
         *("--parent-pid", str(os.getpid())),
+        *flags,
+        *("--logbook-fd", str(logbook.descriptor)),
     ]
 
 

@@ -17,8 +17,16 @@ from dataclasses import replace
 from v2v_protocol.keys import PeerKey
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.config import ServeConfig
-from v2v_server.supervise.child import out_of_memory_kills, post_mortem, queued_seconds, start_child, status_of
+from v2v_server.supervise.child import (
+    arguments,
+    out_of_memory_kills,
+    post_mortem,
+    queued_seconds,
+    start_child,
+    status_of,
+)
 from v2v_server.supervise.host import Exit, ProcessStatus
+from v2v_server.supervise.standby import Standby
 from v2v_server.worker.logbook import Logbook
 
 _MEMORY_SECONDS = 5.0
@@ -27,9 +35,11 @@ _SHORTAGES = (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
 _AFTER_SHORTAGE_SECONDS = 5.0
 
 
-def make_host(config: ServeConfig, root: str, label: str, flags: Sequence[str], key: PeerKey | None) -> LocalHost:
+def make_host(
+    config: ServeConfig, root: str, label: str, flags: Sequence[str], key: PeerKey | None, standbys: list[Standby]
+) -> LocalHost:
     """Return the host that the configuration asks for."""
-    return LocalHost(root, flags)
+    return LocalHost(root, flags, standbys)
 
 
 class LocalHost:
@@ -38,14 +48,18 @@ class LocalHost:
     Args:
         root: the corpus, a folder or an address.
         flags: further flags of each worker.
+        standbys: processes to use first.
     """
 
     is_local = True
     status_seconds = 1.0
 
-    def __init__(self, root: str | os.PathLike[str], flags: Sequence[str] = ()) -> None:
+    def __init__(
+        self, root: str | os.PathLike[str], flags: Sequence[str] = (), standbys: list[Standby] | None = None
+    ) -> None:
         self.root = os.fspath(root)
         self.flags = flags
+        self.standbys = [] if standbys is None else standbys
         self._now = 0.0
         self._memory_kills = out_of_memory_kills()
         self._short_of_memory_until = -math.inf
@@ -107,8 +121,13 @@ class LocalPlace:
         towards the crash budget.
         """
         try:
-            self.logbook = Logbook()
-            self.process = start_child(address, self._host.root, name, self._host.flags, self.logbook)
+            if self._host.standbys:
+                standby = self._host.standbys.pop()
+                standby.begin(arguments(address, self._host.root, name, self._host.flags, standby.logbook))
+                self.logbook, self.process = standby.logbook, standby.process
+            else:
+                self.logbook = Logbook()
+                self.process = start_child(address, self._host.root, name, self._host.flags, self.logbook)
         except OSError as error:
             self._forget()
             loss = Loss(Cause.KILLED, f"could not be started: {error.strerror or error}")

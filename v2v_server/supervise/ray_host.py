@@ -40,7 +40,9 @@ _CALLS_AT_ONCE = 4
 """In an actor: to run the process, to observe it, and to signal it."""
 
 
-def make_host(config: ServeConfig, root: str, label: str, flags: Sequence[str], key: PeerKey | None) -> RayHost:
+def make_host(
+    config: ServeConfig, root: str, label: str, flags: Sequence[str], key: PeerKey | None, standbys: object
+) -> RayHost:
     """Return the host that the configuration asks for.
 
     Raises:

@@ -26,6 +26,7 @@ _IDLE = 0.35
 _LEFT_BUSY = 0.8
 _GROWTH = 1.5
 _PARTS = 6
+_MANY_WORKERS_A_CORE = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,3 +114,13 @@ class Scaling:
 
 def _reason(waiting: float, idle: float, seconds: float) -> str:
     return f"{waiting:.0%} of consumers waited and {idle:.0%} of workers were idle in {seconds:.3g} s"
+
+
+def question_workers(workers: int, cores: int) -> str:
+    """Return a warning if there are more workers than cores; empty otherwise."""
+    if workers <= _MANY_WORKERS_A_CORE * cores:
+        return ""
+    return (
+        f"warning: --workers {workers} on {cores} cores: each uses one core, and more than {cores} only "
+        f"cost memory; --workers {cores} makes as many samples"
+    )

@@ -1,6 +1,6 @@
 """`v2v-tradeoff`: speed against disk space, accuracy and diversity, measured on a user's own clips.
 
-forms      the corpus as it is and prepared in several ways, with still scenes
+forms      the corpus as it is and prepared in several ways
 settings   the ways to serve a corpus that are compared
 speed      processor time of a sample, all settings in turns
 errors     error measures between two voxel arrays

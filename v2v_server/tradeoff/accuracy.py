@@ -1,80 +1,63 @@
-"""Errors of each form of the corpus against exactly decoded frames, by contrast threshold.
+"""Errors of each setting against its full model, by contrast threshold; and the parts of a sample that take time.
 
-Both sides are the same camera: the sample's own draw and noise key, with both thresholds set to the value in question.
-Hot pixels are left out: they fire alike on both sides and would make every relative error look small.
+The full model has exactly decoded frames, all effects of the recipe, and the shortest sub-steps of all settings. Both
+sides are the same camera: the sample's own draw and noise key, with both thresholds set to the value in question. Hot
+pixels are left out: they fire alike on both sides and would make every relative error look small.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import statistics
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from v2v_protocol.messages import Lease
-from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.motion.prediction import Prediction, predict
-from v2v_server.simulation.clip import simulate, simulate_clip
+from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.intensity import eight_bits
-from v2v_server.simulation.view import Frames, apply_view
-from v2v_server.store.clips import clips_of
-from v2v_server.tradeoff.errors import Tally, Voxels, compare
-from v2v_server.video.collect import Cut
-from v2v_server.video.luma import Signal
-from v2v_server.worker.produce import decode_for, plan_sample, step_durations
+from v2v_server.simulation.result import Voxels
+from v2v_server.tradeoff.errors import Tally, compare
+from v2v_server.worker.arrays import SampleContext
+from v2v_server.worker.produce import decode_for, plan_sample, sample_context
 
 THRESHOLDS = (0.05, 0.2, 0.5, 1.0, 2.0)
 
-Tallies = dict[str, dict[float, Tally]]
-"""By name, by contrast threshold."""
+Tallies = dict[float, Tally]
+"""By contrast threshold."""
 
 
-@dataclass(frozen=True, slots=True)
-class CameraView:
-    """What one camera sees.
+class Places(NamedTuple):
+    """Folder of a form's videos, and a lease for each place, of its four views."""
 
-    Attributes:
-        frames: [n, H, W], after the view.
-        params: the draw.
-        recipe: of the draw.
-        step_seconds: duration of each step; None if the recipe does not use it.
-        other_params: another sample's draw, for scale.
-        signal: what the levels of the frames mean.
-    """
-
-    frames: Frames
-    params: SampleParams
-    recipe: Recipe
-    step_seconds: npt.NDArray[np.float64] | None
-    other_params: SampleParams
-    signal: Signal
-
-    def voxels(self, params: SampleParams) -> Voxels:
-        """Return voxels [T, B, H, W] float32 of a camera with these thresholds, noise and key."""
-        return simulate_clip(self.frames, params, self.recipe, "float32", self.step_seconds, signal=self.signal).voxels
+    root: Path
+    leases: Sequence[Lease]
 
 
-def seen(root: Path, lease: Lease) -> CameraView:
-    """Return a lease's first sample before simulation, without hot pixels."""
-    (decoded,) = decode_for(lease, lease.indices[:1], Folder(root))
-    recipe = decoded.plan.spec.recipe
-    params = dataclasses.replace(decoded.plan.params, hot_pixel_count=0)
-    signal = decoded.clip.signal
-    return CameraView(
-        apply_view(decoded.clip.frames, params, recipe, signal),
-        params,
-        recipe,
-        step_durations(lease, decoded),
-        plan_sample(lease, lease.indices[1]).params,
-        signal,
-    )
+def seen(places: Places, place: int, views: int = 1) -> list[SampleContext]:
+    """Return the first views of a place before simulation, without hot pixels, from one decode."""
+    lease, contexts = places.leases[place], []
+    for decoded in decode_for(lease, lease.indices[:views], Folder(places.root)):
+        context, _ = sample_context(lease, decoded, {})
+        context.params = dataclasses.replace(context.params, hot_pixel_count=0)
+        contexts.append(context)
+    return contexts
+
+
+def simulated(context: SampleContext, params: SampleParams, tolerance: float | None = None) -> Voxels:
+    """Simulate a camera of these parameters, float32; None takes the tolerance of the spec."""
+    tolerance = context.spec.tolerance if tolerance is None else tolerance
+    return simulate_clip(
+        context.view, params, context.recipe, "float32", context.step_seconds, levels=context.levels,
+        signal=context.signal, tolerance=tolerance,
+    )  # fmt: skip
 
 
 def at_threshold(params: SampleParams, threshold: float) -> SampleParams:
@@ -86,65 +69,83 @@ def at_threshold(params: SampleParams, threshold: float) -> SampleParams:
 NOISE_ROW, DRAW_ROW = "another noise seed", "another threshold draw"
 
 
-def accuracy(works: Mapping[str, tuple[Path, Sequence[Lease]]], reference: str, *, until: float) -> Tallies:
-    """Return the tallies of every form, and of two rows that give the scale.
+def accuracy(model: Places, others: Mapping[str, Places], *, until: float) -> dict[str, Tallies]:
+    """Return the tallies of settings that have one full model, and of two rows that give the scale.
 
     Args:
-        works: root and leases, by name; the same places in the same order.
-        reference: name of the exact one.
+        model: the full model.
+        others: by name; the same places in the same order.
         until: reading of ``time.monotonic`` after which no further place is compared; one is in any case.
 
     Returns:
-        also under NOISE_ROW the reference's frames with the noise of another key, and under DRAW_ROW with the
-        thresholds of another sample's draw.
+        also under NOISE_ROW the model with the noise of another key, and under DRAW_ROW with the thresholds of another
+        sample's draw.
     """
-    names = [*works, NOISE_ROW, DRAW_ROW]
-    tallies: Tallies = {name: dict.fromkeys(THRESHOLDS, Tally()) for name in names}
-    for place in range(len(works[reference][1])):
+    tallies = {name: dict.fromkeys(THRESHOLDS, Tally()) for name in [*others, NOISE_ROW, DRAW_ROW]}
+    for place, lease in enumerate(model.leases):
         if place and time.monotonic() >= until:
             break
-        views = {name: seen(root, leases[place]) for name, (root, leases) in works.items()}
-        exact = views[reference]
-        for threshold in THRESHOLDS:
-            camera = at_threshold(exact.params, threshold)
-            truth = exact.voxels(camera)
-            other = exact.other_params
-            scale = {
-                NOISE_ROW: dataclasses.replace(camera, noise_key=other.noise_key),
-                DRAW_ROW: dataclasses.replace(
-                    camera, threshold_pos=other.threshold_pos, threshold_neg=other.threshold_neg
-                ),
-            }
-            for name, view in views.items():
-                tallies[name][threshold] += compare(truth if name == reference else view.voxels(camera), truth)
-            for name, changed in scale.items():
-                tallies[name][threshold] += compare(exact.voxels(changed), truth)
+        (exact,), other = seen(model, place), plan_sample(lease, lease.indices[1]).params
+        cameras = {threshold: at_threshold(exact.params, threshold) for threshold in THRESHOLDS}
+        truth = {threshold: simulated(exact, camera).voxels for threshold, camera in cameras.items()}
+        for name, places in others.items():
+            (context,) = [exact] if places == model else seen(places, place)
+            for threshold, camera in cameras.items():
+                made = truth[threshold] if places == model else simulated(context, camera).voxels
+                tallies[name][threshold] += compare(made, truth[threshold])
+        for threshold, camera in cameras.items():
+            drawn = {"threshold_pos": other.threshold_pos, "threshold_neg": other.threshold_neg}
+            for name, changes in ((NOISE_ROW, {"noise_key": other.noise_key}), (DRAW_ROW, drawn)):
+                changed = dataclasses.replace(camera, **changes)
+                tallies[name][threshold] += compare(simulated(exact, changed).voxels, truth[threshold])
     return tallies
 
 
-def predicted_loss(root: Path, leases: Sequence[Lease]) -> Prediction:
-    """Predict what the first sample of each lease loses between its frames."""
-    views = (seen(root, lease) for lease in leases)
-    return sum((predict(eight_bits(view.frames, view.signal)) for view in views), Prediction())
+def predicted_loss(places: Places) -> Prediction:
+    """Predict what the first sample of each place loses between its frames."""
+    views = (seen(places, place)[0] for place in range(len(places.leases)))
+    return sum((predict(eight_bits(view.view, view.signal)) for view in views), Prediction())
 
 
-def spurious(stills: Catalogue, crop_px: tuple[int, int]) -> dict[float, float]:
-    """Return the events of noise-free cameras on still scenes, per pixel and frame, by contrast threshold.
+def parts(places: Places, *, until: float) -> dict[str, Any]:
+    """Return processor seconds of a sample by its parts, and the share of the samples in which each effect ran.
+
+    The seconds of an effect are those that the kernel takes less without it.
 
     Args:
-        stills: the scenes.
-        crop_px: height and width of the simulated part in the middle.
+        until: as for :func:`accuracy`.
     """
-    events = dict.fromkeys(THRESHOLDS, 0.0)
-    steps = 0
-    height, width = crop_px
-    for number, video in enumerate(stills.videos):
-        top, bottom = stills.rows.bounds(video.height_px)
-        window = (top + (bottom - top - height) // 2, (video.width_px - width) // 2, height, width)
-        cuts = [Cut(video.frames, window)]
-        (clip,) = clips_of(stills.path(video.id), video.fingerprint, stills.frame_index(video.id), 0, cuts, 1)
-        steps += (len(clip.frames) - 1) * height * width
-        for threshold in THRESHOLDS:
-            made = simulate(clip.frames, threshold_pos=threshold, bins=1, seed=number, dtype="float32").voxels
-            events[threshold] += float(np.abs(made).sum())
-    return {threshold: count / steps for threshold, count in events.items()}
+    seconds: dict[str, list[float]] = {}
+    ran: Counter[str] = Counter()
+    substeps = steps = count = 0
+    for place, lease in enumerate(places.leases):
+        if place and time.monotonic() >= until:
+            break
+        before, (decoded,) = time.process_time(), decode_for(lease, lease.indices[:1], Folder(places.root))
+        taken = {"decode": time.process_time() - before}
+        before, (context, _) = time.process_time(), sample_context(lease, decoded, {})
+        taken["view"] = time.process_time() - before
+        taken["kernel"], made = _timed(context, context.params, context.spec.tolerance)
+        whole, _ = _timed(context, context.params, 0.0)
+        for name in context.params.effects:
+            rest = {other: value for other, value in context.params.effects.items() if other != name}
+            without = dataclasses.replace(context.params, effects=rest)
+            taken[name] = whole - _timed(context, without, 0.0)[0]
+        ran.update(list(made.given.params.effects))
+        count, substeps, steps = count + 1, substeps + context.substeps, steps + len(context.source) - 1
+        for name, value in taken.items():
+            seconds.setdefault(name, []).append(value)
+    return (
+        {f"{name}_seconds": statistics.mean(values) for name, values in seconds.items()}
+        | {f"{name}_share": ran[name] / count for name in seconds if name not in ("decode", "view", "kernel")}
+        | {"substeps_per_step": substeps / steps or None}
+    )
+
+
+def _timed(context: SampleContext, params: SampleParams, tolerance: float) -> tuple[float, Voxels]:
+    """Return the processor seconds of the faster of two simulations, and the result."""
+    taken = []
+    for _ in range(2):
+        before, made = time.process_time(), simulated(context, params, tolerance)
+        taken.append(time.process_time() - before)
+    return min(taken), made

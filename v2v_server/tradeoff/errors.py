@@ -3,7 +3,6 @@
     voxel error    sum |V - R| / sum |R|            R: the exact reference
     count error    (sum |V| - sum |R|) / sum |R|
     bins changed   share of bins with V != R
-    rising share   sum of the positive counts / sum |V|
 
 Sums go over all clips together, so that a clip weighs as much as it has events.
 """
@@ -28,15 +27,12 @@ class Tally:
     Attributes:
         difference: sum of |V - R|.
         events, reference_events: sums of |V| and of |R|.
-        rising, reference_rising: sums of the positive counts.
         changed, bins: bins that differ, and all bins.
     """
 
     difference: float = 0.0
     events: float = 0.0
     reference_events: float = 0.0
-    rising: float = 0.0
-    reference_rising: float = 0.0
     changed: int = 0
     bins: int = 0
 
@@ -56,14 +52,6 @@ class Tally:
     def changed_share(self) -> float | None:
         return self.changed / self.bins if self.bins else None
 
-    @property
-    def rising_share(self) -> float | None:
-        return self.rising / self.events if self.events else None
-
-    @property
-    def reference_rising_share(self) -> float | None:
-        return self.reference_rising / self.reference_events if self.reference_events else None
-
 
 def compare(voxels: Voxels, reference: Voxels) -> Tally:
     """Return the tally of two arrays of the same shape, signed event counts.
@@ -80,8 +68,6 @@ def compare(voxels: Voxels, reference: Voxels) -> Tally:
         difference=_sum(np.abs(difference)),
         events=_sum(np.abs(one)),
         reference_events=_sum(np.abs(other)),
-        rising=_sum(np.maximum(one, 0)),
-        reference_rising=_sum(np.maximum(other, 0)),
         changed=int(np.count_nonzero(difference)),
         bins=one.size,
     )

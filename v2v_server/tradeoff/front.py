@@ -47,11 +47,9 @@ def best(
             raise UsageError(
                 f"--target-rate {target_rate:g}: the fastest setting makes {most:.3g} samples a core second"
             )
-        return min(fit, key=lambda r: (r[error_key], r["samples_per_decode"], -r["samples_per_core_second"]))
-    limit = 0.0 if max_error is None else max_error
-    fit = [record for record in records if record[error_key] <= limit]
+        return min(fit, key=lambda r: (r[error_key] or 0.0, r["samples_per_decode"], -r["samples_per_core_second"]))
+    errors = [record[error_key] or 0.0 for record in records]  # None: no events
+    fit = [record for record, error in zip(records, errors, strict=True) if max_error is None or error <= max_error]
     if not fit:
-        raise UsageError(
-            f"--max-error {limit:g}: the smallest error of a setting is {min(r[error_key] for r in records):.3g}"
-        )
+        raise UsageError(f"--max-error {max_error:g}: the smallest error of a setting is {min(errors):.3g}")
     return min(fit, key=lambda r: (-r["samples_per_core_second"], r["samples_per_decode"]))

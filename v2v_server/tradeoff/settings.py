@@ -1,16 +1,24 @@
-"""The ways to serve a corpus that are compared, each as a server's configuration."""
+"""The ways to serve a corpus that are compared: every form of it, with all values of some fields."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from v2v_protocol.safe_yaml import format_yaml
+from v2v_protocol.errors import UsageError
+from v2v_protocol.safe_yaml import format_yaml, parse_yaml
+from v2v_protocol.spec import StreamSpec
+from v2v_server.config import recipe_setting
 from v2v_server.tradeoff.forms import ENCODINGS, SOURCE
 
 SAMPLES_PER_DECODE = (1, 2, 4)
+DEFAULT_AXES = {"samples_per_decode": ("1", "2", "4"), "substep_px": ("0", "1")}
+"""Values of each field that are compared unless the user names others."""
+_SPEC_FIELDS = ("samples_per_decode", "substep_px", "tolerance")
+Axes = Mapping[str, Sequence[str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,16 +27,28 @@ class ServeSetting:
 
     Attributes:
         form: SOURCE, or how the corpus is prepared: a key of ENCODINGS.
-        samples_per_decode: of the StreamSpec.
+        spec: what is streamed.
+        values: what tells it from other settings of the form, for example "substep_px = 1"; K is apart.
     """
 
-    form: str = SOURCE
-    samples_per_decode: int = 1
+    form: str
+    spec: StreamSpec
+    values: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
         """Return the name for tables, for example "source, K = 2"."""
-        return f"{self.form}, K = {self.samples_per_decode}"
+        return ", ".join((self.form, f"K = {self.spec.samples_per_decode}", *self.values))
+
+    @property
+    def way(self) -> str:
+        """Return the name without K, on which the samples do not depend."""
+        return ", ".join((self.form, *self.values))
+
+    @property
+    def single(self) -> ServeSetting:
+        """Return the setting of one sample a decode, whose samples have the same bytes."""
+        return dataclasses.replace(self, spec=dataclasses.replace(self.spec, samples_per_decode=1, sibling_spacing=0))
 
     def yaml(self, rows: str, why: str) -> str:
         """Return the setting as a file for ``v2v-serve --config``; ``why`` is one line about the choice."""
@@ -36,21 +56,62 @@ class ServeSetting:
         if self.form != SOURCE:
             how = ENCODINGS[self.form]
             kind = f"--size {how.size}" if how.is_lossless else f"--quality {how.quality} --gop {how.gop}"
-            flags = f"--rows {rows} --codec {how.codec} {kind}"
+            planes = " --planes motion" if self.spec.substep_px and how.is_lossless else ""
+            flags = f"--rows {rows} --codec {how.codec} {kind}{planes}"
             lines += [f"# Prepare the corpus first: v2v-prepare SOURCE PREPARED {flags}", "# and serve PREPARED."]
-        chosen = {"rows": rows, "samples_per_decode": self.samples_per_decode}
-        return "\n".join([*lines, format_yaml(chosen)])
+        plain, usual = self.spec.to_dict(), StreamSpec().to_dict()
+        recipe = _different(plain.pop("recipe"), usual.pop("recipe"))
+        chosen = {"rows": rows, "samples_per_decode": self.spec.samples_per_decode, **_different(plain, usual)}
+        return "\n".join([*lines, format_yaml(chosen | ({"recipe": recipe} if recipe else {}))])
 
 
-EXACT = ServeSetting()
+def _different(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if name not in usual or value != usual[name]}
 
 
-def settings(forms: Sequence[str]) -> list[ServeSetting]:
-    """Return the settings to compare: source and prepared forms, each with every number of samples per decode."""
-    return [ServeSetting(form, count) for form in (SOURCE, *forms) for count in SAMPLES_PER_DECODE]
+def axes(texts: Iterable[str]) -> Axes:
+    """Return DEFAULT_AXES, changed by texts "KEY=VALUE,VALUE".
+
+    Raises:
+        UsageError: a text has another form.
+    """
+    found: dict[str, Sequence[str]] = dict(DEFAULT_AXES)
+    for text in texts:
+        key, equals, values = text.partition("=")
+        if not equals:
+            raise UsageError(f"--vary {text}: write KEY=VALUE,VALUE, for instance --vary voxel_seconds=0.02,0.1")
+        found[key] = [value.strip() for value in values.split(",")]
+    return found
 
 
-def write_preset(file: Path, record: Mapping[str, Any], rows: str, why: str) -> None:
-    """Write the setting of a record (``form``, ``samples_per_decode``) as YAML."""
-    chosen = ServeSetting(record["form"], record["samples_per_decode"])
-    file.write_text(chosen.yaml(rows, why), encoding="utf-8")
+def settings(forms: Sequence[str], spec: StreamSpec, varied: Axes) -> list[ServeSetting]:
+    """Return every combination of the source or a form, and one value of each axis.
+
+    Raises:
+        UsageError: a field is unknown, or a value is wrong.
+    """
+    streams = []
+    for values in itertools.product(*varied.values()):
+        stream, names = spec, []
+        for key, value in zip(varied, values, strict=True):
+            stream = _changed(stream, key, value)
+            if key != "samples_per_decode" and len(varied[key]) > 1:
+                names.append(f"{key} = {value}")
+        streams.append((stream, tuple(names)))
+    return [ServeSetting(form, *stream) for form in (SOURCE, *forms) for stream in streams]
+
+
+def full_model(setting: ServeSetting, compared: Sequence[ServeSetting]) -> ServeSetting:
+    """Return what a setting is judged by: the source, the shortest sub-steps of all that are compared, all effects."""
+    finest = min((each.spec.substep_px for each in compared if each.spec.substep_px), default=0.0)
+    single = setting.single
+    return ServeSetting(SOURCE, dataclasses.replace(single.spec, substep_px=finest, tolerance=0.0))
+
+
+def _changed(spec: StreamSpec, key: str, value: str) -> StreamSpec:
+    if key not in _SPEC_FIELDS:
+        return dataclasses.replace(spec, recipe=recipe_setting(None, [f"{key}={value}"], spec.recipe.to_dict()))
+    changed = StreamSpec.from_dict({key: parse_yaml(value)}, spec)
+    if changed.samples_per_decode not in SAMPLES_PER_DECODE:
+        raise UsageError(f"--vary {key}={value}: choose of {', '.join(map(str, SAMPLES_PER_DECODE))}")
+    return changed

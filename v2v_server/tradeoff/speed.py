@@ -134,9 +134,11 @@ def measure(works: Mapping[str, TimedWork], *, until: float) -> dict[str, Speed]
                 seconds[name][-1].append((time.process_time() - begun) / works[name].samples)
         rounds += 1
         longest = max(longest, time.monotonic() - started)
-    return {name: _speed(taken) for name, taken in seconds.items()}
-
-
-def _speed(rounds: Sequence[Sequence[float]]) -> Speed:
-    fastest = statistics.mean(min(of_place) for of_place in zip(*rounds, strict=True))
-    return Speed(fastest, statistics.median(statistics.mean(taken) for taken in rounds), len(rounds))
+    return {
+        name: Speed(
+            statistics.mean(min(of_place) for of_place in zip(*taken, strict=True)),
+            statistics.median(map(statistics.mean, taken)),
+            rounds,
+        )
+        for name, taken in seconds.items()
+    }

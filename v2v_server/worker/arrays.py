@@ -101,6 +101,12 @@ class SampleContext:
         return self.params.ends(self.recipe)[self.recipe.first_frame :]
 
     @property
+    def substeps(self) -> int:
+        """Return the number of parts of all steps together; 0 if the spec does not divide steps (``substep_px``)."""
+        levels = 0 if self.levels is None else len(self.levels.at.step)
+        return len(self.source) - 1 + levels if self.spec.substep_px else 0
+
+    @property
     def recipe(self) -> Recipe:
         """Return the spec's recipe."""
         return self.spec.recipe

@@ -14,7 +14,6 @@ from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.simulation.view import apply_view, source_window
 from v2v_server.video.colour.chroma import ChromaCut
-from v2v_server.video.colour.rgb import add_colour
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, makes
 from v2v_server.worker.cleaning import CleanFrames, usable_window
@@ -26,17 +25,24 @@ def frames_rgb(context: SampleContext, out: npt.NDArray[Any]) -> None:
     if context.clip.colour is None:
         raise VideoError(context.video, None, "was read without its colour")
     (cells, matrix), cut = context.clip.colour
-    # Colour differences are not grey levels: the contrast is a factor of them.
-    view = dataclasses.replace(context.params, contrast=0.0)
-    grey = np.empty((len(out), 1, *out.shape[2:]), np.uint8)
+    params, size = context.params, out.shape[2:]
+    grey = np.empty((len(out), 1, *size), np.uint8)
     ARRAY_BUILDERS["frames"](context, grey)
     # The cut names the delivered frames in ascending order.
     places = np.unique(context.source[context.target_steps], return_inverse=True)[1]
-    before, chroma = -1, np.empty(0, np.uint8)
-    for target, picture, place in zip(out, grey, places.tolist(), strict=True):
-        if place != before:  # a paused camera repeats its frame
-            before, chroma = place, apply_view(cut.pixels(cells[place]), view, context.recipe)
-        add_colour(picture[0], chroma, matrix, context.params.contrast or 1.0, target)
+    chroma = np.ascontiguousarray(cells).view(np.uint8) ^ 128  # the bits of int8 plus 128
+    rows, columns = cut.places
+    if params.scale == 1.0:
+        columns = np.ascontiguousarray(columns[::-1]) if params.flip else columns
+    else:
+        # Colour differences are not grey levels: the contrast is a factor of them.
+        view = dataclasses.replace(params, contrast=0.0)
+        chroma = np.stack([apply_view(each[:, rows[:, None], columns], view, context.recipe) for each in chroma])
+        rows, columns = (np.arange(side, dtype=np.int64) for side in size)
+    # Import lazily: most workers make no colour.
+    from v2v_server.video.colour.rgb import add_colour, differences_of
+
+    add_colour(grey[:, 0], chroma, places, rows, columns, differences_of(matrix, params.contrast or 1.0), out)
 
 
 def chroma_cut(

@@ -353,7 +353,6 @@ def run_worker(
     if parent_pid is not None:
         die_with_parent(parent_pid)
     times = times or StartTimes()
-    times.mark("imports")
     key_for(address, "worker", keys)  # reports a wrong key at once
     keep_freed_memory()
     limit_memory(LARGEST_MEMORY_BYTES)

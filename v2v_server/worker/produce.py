@@ -121,8 +121,9 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
         video_thresholds=_pair(lease.thresholds),
         times=frame_times(lease, spec, frames) if recipe.is_timed else None,
     )
+    place = ""
     if scene is not None and spec.moving_share:
-        params = choose_crop(
+        drawn = choose_crop(
             params,
             recipe,
             seed=lease.seed,
@@ -133,10 +134,11 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
             picture_width_px=picture.width_px,
             weigh=crop_weight(scene, frames, params.scale, recipe, picture),
         )
+        params, place = drawn, f"crop drawn {'uniformly' if drawn is params else 'by motion'}"
     source = params.source_index(int(params.ends(recipe)[-1]))
     flow: FlowSettings | None = None
     still_px: int | None = 0
-    flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture)
+    flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture, place)
     if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
         if flow_plan is not None and flow_plan.still:
@@ -232,7 +234,7 @@ def make_sample(
     """
     plan, index = decoded.plan, lease.indices[0]
     arrays = new_arrays(sample_layout(lease)) if into is None else into
-    context, irregular = _context(lease, decoded, arrays, sidecars)
+    context, irregular = sample_context(lease, decoded, arrays, sidecars)
     unlabelled = dict[str, str]()
     for name, array in context.into.items():
         try:
@@ -266,6 +268,7 @@ def make_sample(
             saturated={name: count for name, count in saturated.items() if count},
             grid_seconds=_grid_seconds(context),
             left_out=context.left_out,
+            substeps=0 if context.saturated is None else context.substeps,
         ),
     )
 
@@ -276,18 +279,21 @@ def list_sample_events(lease: Lease, decoded: Decoded) -> EventList:
     Raises:
         VideoError: as :func:`make_sample`; or the video's frame rate is unknown.
     """
-    context, _ = _context(lease, decoded, {})
+    context, _ = sample_context(lease, decoded, {})
     made, (seconds, _) = simulate(context, {}), _step_seconds(lease, decoded)
     return list_events(made.given, made.real, 1e6 * seconds)
 
 
-def _context(
+def sample_context(
     lease: Lease,
     decoded: Decoded,
     into: Mapping[str, npt.NDArray[Any]],
     sidecars: Mapping[str, Traversable | None] = MappingProxyType({}),
 ) -> tuple[SampleContext, int]:
-    """Return what the arrays are made from, and the number of irregular time stamps."""
+    """Return what the arrays are made from, and the number of irregular time stamps.
+
+    Without arrays in ``into``, there is all that a simulation needs, and no flow.
+    """
     plan = decoded.plan
     params, recipe = plan.params, plan.spec.recipe
     frames, signal, flow, levels = decoded.clip.frames, decoded.clip.signal, None, None
@@ -317,15 +323,6 @@ def _context(
     return SampleContext(
         lease.video, clip, plan.spec, params, plan.source, view, signal, seconds, flow, levels, into
     ), irregular
-
-
-def step_durations(lease: Lease, decoded: Decoded) -> npt.NDArray[np.float64] | None:
-    """Return the duration of each step of a sample, [steps] float64, s; None if the recipe does not use it.
-
-    Raises:
-        VideoError: the video's frame rate is unknown.
-    """
-    return _step_seconds(lease, decoded)[0] if decoded.plan.spec.recipe.needs_seconds else None
 
 
 def _grid_seconds(context: SampleContext) -> tuple[float, ...]:

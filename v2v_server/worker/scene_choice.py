@@ -75,7 +75,9 @@ class FlowPlan:
         return bool(self.methods) and all(name == STILL for name in self.methods)
 
 
-def plan_flow(scene: Scene, frames: CleanFrames, params: SampleParams, spec: StreamSpec, picture: Window) -> FlowPlan:
+def plan_flow(
+    scene: Scene, frames: CleanFrames, params: SampleParams, spec: StreamSpec, picture: Window, place: str = ""
+) -> FlowPlan:
     """Choose the flow method of each voxel of one drawn sample.
 
     Args:
@@ -83,6 +85,7 @@ def plan_flow(scene: Scene, frames: CleanFrames, params: SampleParams, spec: Str
         frames: the frames of the sequence.
         params, spec: the draw, and the spec that it was drawn for.
         picture: the usable part of the upright picture before the resize.
+        place: how the crop was drawn, for the reason.
     """
     recipe = spec.recipe
     tiles = _tiles(params, recipe, picture, frames.sides)
@@ -91,7 +94,7 @@ def plan_flow(scene: Scene, frames: CleanFrames, params: SampleParams, spec: Str
     ends = source[positions[recipe.lead_voxels :]].tolist()
     methods = tuple(_method(scene, earlier, later, tiles, params.scale) for earlier, later in pairwise(ends))
     values = scene.values(int(source[0]), int(source[-1]))
-    kind, figures = _kind(methods), "; ".join(filter(None, (_figures(values, tiles), frames.reason)))
+    kind, figures = _kind(methods), "; ".join(filter(None, (_figures(values, tiles), frames.reason, place)))
     if spec.flow_method != AUTO:
         return FlowPlan((), f"{kind}; flow {spec.flow_method} as asked; {figures}")
     return FlowPlan(methods, f"{kind}; flow {_counted(methods)}; {figures}")

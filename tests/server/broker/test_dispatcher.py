@@ -1051,7 +1051,7 @@ _near = st.one_of(
         max_size=25,
     )
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_any_conversation_leaves_it_serving(said: list[tuple[bool, bytes, list[Any], float]]) -> None:
     at = peers()
     for by_worker, identity, frames, seconds in said:

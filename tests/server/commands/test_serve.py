@@ -21,7 +21,7 @@ def test_a_page_has_a_port_of_its_own_or_the_usual_one(
     flags: list[str], port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[ServeConfig] = []
-    monkeypatch.setattr(command, "serve", lambda config, times: asked.append(config))
+    monkeypatch.setattr("v2v_server.serve.serve", lambda config, *_: asked.append(config))
     assert command.main(["--videos", "a", *flags]) == 0
     assert command.main([*flags, "--videos", "a"]) == 0
     assert [config.page for config in asked] == [port, port]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.oracles.rendered import Errors, counts_of, errors, log_levels, rendered_scene
-from tests.server.simulation.generic_processor import printed_on_a_generic_processor
+from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import MOST_SUBSTEPS
@@ -171,6 +171,7 @@ for name in ("coins", "parallax", "flicker"):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(COMPILE_SECONDS)
 def test_any_processor_makes_the_same_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = []
     for name in ("coins", "parallax", "flicker"):

@@ -19,10 +19,12 @@ from hypothesis import strategies as st
 from tests.clips import panned_luma, write_clip
 from tests.waiting import until
 from v2v_protocol.errors import UsageError
+from v2v_server.commands import catalogue
 from v2v_server.commands.catalogue import main
 from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.index.parts import Shard
 from v2v_server.corpus.refresh import index_path
+from v2v_server.offline.ahead import Ahead
 
 _SLOWLY = """
 import sys, time
@@ -56,7 +58,10 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def run(corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+def run(corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Return a function that runs the command, which probes in this process: the slow test starts the real ones."""
+    monkeypatch.setattr(catalogue, "Ahead", lambda **asked: Ahead(**(asked | {"processes": 0})))
+
     def on(host: str, *flags: str, videos: str = "") -> tuple[int, str, str]:
         """Exit status, and what was said and complained of, on a host with a cache folder of its own."""
         here = ["--videos", videos or str(corpus), "--cache-dir", str(tmp_path / host), "--workers", "1"]

@@ -15,6 +15,7 @@ from PIL import Image as Pictures
 from tests.clips import panned_luma, write_clip
 from tests.oracles.rendered import rendered_scene
 from v2v_pictures.camera import Camera
+from v2v_pictures.labels import class_colour
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_server.commands import preview as command
 from v2v_server.offline.preview import Shot, preview
@@ -41,6 +42,25 @@ def test_each_kind_of_file_is_what_its_name_says(clip: Path, tmp_path: Path) -> 
     with av.open(io.BytesIO((tmp_path / "preview.mp4").read_bytes())) as film:
         assert len(list(film.decode(video=0))) == 3 * 5
     assert "data:image/png;base64," in (tmp_path / "preview.html").read_text()
+
+
+def test_a_single_video_is_shown_with_the_boxes_beside_it(clip: Path, tmp_path: Path) -> None:
+    (tmp_path / clip.name).symlink_to(clip)
+    boxes = tmp_path / f"{clip.stem}.boxes.txt"
+    pages = []
+    for text in ("", "".join(f"{frame},1,33,25,61,50,1,-1,-1,-1\n" for frame in range(1, 41))):
+        if text:
+            boxes.write_text(text)
+        out = tmp_path / "p.png"
+        preview(
+            str(tmp_path / clip.name), out, [Shot("", TINY, 0)], {}, title="t", cache_dir=str(tmp_path),
+            with_flow=False, say=lambda line: None,
+        )  # fmt: skip
+        with Pictures.open(out) as picture:
+            pages.append(np.asarray(picture.convert("RGB")))
+    plain, labelled = ((page == class_colour(0)).all(axis=-1).sum() for page in pages)
+    assert plain == 0
+    assert labelled > 2 * (61 + 50)
 
 
 def test_a_video_too_short_or_too_small_is_shown_all_the_same_and_said(clip: Path, tmp_path: Path) -> None:

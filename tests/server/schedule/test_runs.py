@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -23,7 +25,10 @@ RECIPE = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=32)
 """21 frames a sequence, 20 apart."""
 AUTO = StreamSpec(recipe=RECIPE, scene="auto", still_share=1.0)
 BARS = Sides(8, 8, 0, 0)
-SKIPPED = {Flag.FADE: "fades", Flag.BLACK: "black", Flag.WHITE: "white", Flag.COMBED: "combed"}
+SKIPPED = {
+    Flag.FADE: "fades", Flag.BLACK: "black", Flag.WHITE: "white", Flag.COMBED: "combed", Flag.UNSEEN: "cuts",
+}  # fmt: skip
+TELLING = Flag.CUT | Flag.REPEAT | Flag.FADE | Flag.COMBED
 
 
 def video(name: str, frames: int, parts: Pieces | None = None) -> VideoEntry:
@@ -38,7 +43,8 @@ def starts(table: SequenceTable) -> list[tuple[str, int]]:
 def expected(parts: Pieces, frames: int, spec: StreamSpec) -> list[int]:
     """Collect runs frame by frame, and return where sequences begin."""
     kept, runs, before, first = spec.kept_defects, [list[int]()], None, 0
-    for end, flags, *bars in [*parts.tolist(), (frames, 0, *NO_BARS)]:
+    spoilt = any(flags & TELLING or any(bars) for _, flags, *bars in parts.tolist())
+    for end, flags, *bars in [*parts.tolist(), (frames, Flag.UNSEEN if spoilt else 0, *NO_BARS)]:
         sides = list(NO_BARS) if "bars" in kept else bars
         if first < end and ((flags & Flag.CUT and "cuts" not in kept) or sides != (before or sides)):
             runs.append([])
@@ -120,6 +126,15 @@ def test_no_sequence_holds_a_cut(cuts: list[int], most: int) -> None:
     for start in found:
         assert not any(start < cut < start + 21 for cut in cuts)
     assert all(later - earlier >= 20 for earlier, later in pairwise(found))
+
+
+def test_the_rest_of_a_long_video_is_served_if_the_analysed_part_has_no_defects() -> None:
+    """Films of many shots would otherwise be served from where they are not analysed."""
+    clean, many_cuts = video("a", 5000, shots(4096)), video("b", 5000, shots(4096, *range(15, 4096, 15)))
+    spec = replace(AUTO, max_sequences_per_video=1000)
+    assert Counter(name for name, _ in starts(SequenceTable([clean, many_cuts], Rows(), spec))) == {"a": 249}
+    kept = replace(spec, keep_defects="cuts")
+    assert Counter(name for name, _ in starts(SequenceTable([clean, many_cuts], Rows(), kept))) == {"a": 249, "b": 249}
 
 
 def test_a_catalogue_without_statistics_says_what_to_do() -> None:

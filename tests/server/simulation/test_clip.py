@@ -200,7 +200,8 @@ ALL = {
 EFFECTS = [*({name: value} for name, value in ALL.items()), ALL]
 
 
+@pytest.mark.timeout(1200)  # it compiles kernels
 def test_after_warm_up_nothing_is_compiled() -> None:
     command = [sys.executable, "-c", WARM_UP_AND_COUNT]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True)
+    run = subprocess.run(command, capture_output=True, text=True, timeout=1200, check=True)
     assert json.loads(run.stdout) == [[3, 1, 1]] * 3

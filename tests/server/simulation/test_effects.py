@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from tests.server.simulation import effect_oracle, reference
 from tests.server.simulation.effect_oracle import Camera, Chance
-from tests.server.simulation.generic_processor import printed_on_a_generic_processor
+from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from tests.server.simulation.test_pixel import moving_frames
 from v2v_protocol.bounds import LARGEST_NORMAL
 from v2v_protocol.errors import UsageError
@@ -402,7 +402,7 @@ def test_tables_against_their_equations() -> None:
             below = sum(math.exp(-means[d, level]) * means[d, level] ** j / math.factorial(j) for j in range(k + 1))
             expected = 1 - below if k < table.shape[1] else 0.0
             assert table[d, min(k, table.shape[1] - 1), level] == pytest.approx(expected, abs=3e-10)
-    slow, fast = photoreceptor.low_pass_table(30.0, light, 0.02)
+    slow, fast = photoreceptor.low_pass_tables(30.0, light, np.array([0.02]))[0]
     x = 2 * math.pi * 30.0 * 0.02
     assert slow[255] == pytest.approx(1 - math.exp(-x))
     assert fast[255] == pytest.approx(1 - (1 - math.exp(-x)) / x)
@@ -472,6 +472,7 @@ def test_golden_voxels(dtype: Any) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(COMPILE_SECONDS)
 def test_a_generic_processor_gives_the_same_bytes(tmp_path: Path) -> None:
     code = "from tests.server.simulation.test_effects import digest; print(digest('float32'))"
     assert printed_on_a_generic_processor(code, tmp_path) == [GOLDEN["float32"]]

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.server.simulation import oracle, reference
-from tests.server.simulation.generic_processor import printed_on_a_generic_processor
+from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation import noise, pixel, simulate, simulate_clip, simulate_log
@@ -297,6 +297,7 @@ def test_golden_voxels(dtype: Any) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(COMPILE_SECONDS)
 def test_a_generic_processor_gives_the_same_bytes(tmp_path: Path) -> None:
     code = "from tests.server.simulation.test_pixel import digest; print(digest('int8')); print(digest('float32'))"
     assert printed_on_a_generic_processor(code, tmp_path) == [GOLDEN["int8"], GOLDEN["float32"]]

@@ -13,11 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.oracles.in_time import bilinear_of, counts_of, stacked_histogram, watch
-from tests.server.simulation.generic_processor import printed_on_a_generic_processor
+from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from tests.server.simulation.test_pixel import moving_frames
 from tests.server.video.test_real_videos import FOLDER as REAL_VIDEOS
 from v2v_protocol.errors import UsageError
 from v2v_server.simulation import noise, simulate, simulate_log
+from v2v_server.simulation.intensity import log_table
 from v2v_server.simulation.kernels import ARRAYS, fill, list_events
 from v2v_server.simulation.result import Voxels
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, bin_edges, rounding_tolerance, timeline
@@ -176,7 +177,8 @@ def test_bins_of_any_length(scene: str, rate: str, bin_ms: int) -> None:
 
 def test_a_ramp_fires_at_even_times() -> None:
     """A threshold every 100 microseconds, from half a threshold on."""
-    made = simulate_log(np.array([0.0, 2.0])[:, None, None], threshold_pos=0.2, start_residual=0.1, bins=1)
+    level = np.array([0.0, 2.0])[:, None, None]
+    made = simulate_log(level, threshold_pos=0.2, start_residual=0.1, bins=1, dtype="float32")
     events = made.to_events(1000.0)
     np.testing.assert_allclose(events.t, np.arange(50, 1000, 100), atol=1)
     assert events.p.all()
@@ -184,8 +186,9 @@ def test_a_ramp_fires_at_even_times() -> None:
 
 def test_what_cancels_in_a_bin_has_both_polarities() -> None:
     made = simulate_log(
-        np.array([0.0, 1.0, 0.0])[:, None, None], threshold_pos=0.2, start_residual=0.01, frames_per_bin=2, bins=1
-    )
+        np.array([0.0, 1.0, 0.0])[:, None, None], threshold_pos=0.2, start_residual=0.01, frames_per_bin=2, bins=1,
+        dtype="float32",
+    )  # fmt: skip
     assert made.voxels.ravel().tolist() == [1]
     assert made.array("event_counts").ravel().tolist() == [4, 5]
 
@@ -204,16 +207,17 @@ def test_shot_noise_has_both_polarities_and_random_times() -> None:
     assert abs(np.corrcoef(within[:-1], within[1:])[0, 1]) < 0.05 or len(np.unique(events.t)) > 0.9 * len(events) / 2
 
 
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("int16", marks=pytest.mark.slow)])  # another kernel
 @pytest.mark.parametrize("effects", [{}, ALL])
 @pytest.mark.parametrize("grids", [0, 3])
-def test_arrays_and_events_agree(effects: dict[str, float], grids: int) -> None:
+def test_arrays_and_events_agree(effects: dict[str, float], grids: int, dtype: str) -> None:
     made = simulate(
         moving_frames(31, 37, 45, 5), threshold_pos=0.2, threshold_neg=0.25, noise_sigma=0.1, bins=5,
-        grids_per_frame=grids, dtype="int16", seed=9, **(effects and effects | {"frames_per_second": FPS}),
+        grids_per_frame=grids, dtype=dtype, seed=9, **(effects and effects | {"frames_per_second": FPS}),
     )  # fmt: skip
     assert made.voxels.shape == ((30 * grids, 5, 37, 45) if grids else (6, 5, 37, 45))
     counts, bilinear = made.array("event_counts"), made.array("voxels_bilinear").astype(np.float64)
-    assert counts.dtype == np.int16
+    assert counts.dtype == dtype
     assert bilinear.shape == made.voxels.shape
     np.testing.assert_array_equal(counts[:, 1] - counts[:, 0], made.voxels)
     # A bin's width apart from edges that do not fall on whole microseconds: 33_333.3.
@@ -244,7 +248,7 @@ def real_frames(name: str, count: int = 21, size: tuple[int, int] = (30, 40)) ->
 def test_the_published_stacked_histogram_of_the_events_is_the_array(video: str, grids: int) -> None:
     """Its bins reach from the first to the last event. A column beside the picture has one at either end of a grid."""
     frames = real_frames(video) if video else moving_frames(21, 30, 40, 5)
-    made = simulate(frames, threshold_pos=0.1, bins=10, grids_per_frame=grids, dtype="int16", seed=4)
+    made = simulate(frames, threshold_pos=0.1, bins=10, grids_per_frame=grids, dtype="float32", seed=4)
     counts, bin_us = made.array("event_counts"), 5000
     events = made.to_events(bin_us)
     for grid, expected in enumerate(counts):
@@ -273,21 +277,23 @@ def test_steps_of_a_still_camera_are_still() -> None:
 
 # --- limits -----------------------------------------------------------------------------------------------------------
 
+# Grey levels, not log intensities: each pair of types of frames and voxels is another kernel to compile.
+BLACK_WHITE_BLACK = np.array([0, 255, 0], np.uint8)[:, None, None]
+CONTRAST = float(np.ptp(log_table(2.2, 1e-3)))
+
 
 def test_every_array_saturates_and_counts_it() -> None:
-    level = np.array([0.0, 300.5, 0.0])[:, None, None]
-    made = simulate_log(level, threshold_pos=1.0, bins=1, frames_per_bin=2, start_residual=0.0)
+    made = simulate(BLACK_WHITE_BLACK, threshold_pos=CONTRAST / 300.5, bins=1, frames_per_bin=2, start_residual=0.0)
     arrays, saturated = fill(made.given, made.real, dict.fromkeys(ARRAYS))
     assert made.voxels.ravel().tolist() == [0]
     assert arrays["event_counts"].ravel().tolist() == [127, 127]
     assert saturated == {"voxels": 0, "event_counts": 2, "voxels_bilinear": 0}
 
 
-@pytest.mark.parametrize("height", [2049.5, 65504.5, 65520.5, 1e5 + 0.5])
+@pytest.mark.parametrize("height", [2047.5, 2049.5, 65503.5, 65504.5, 65521.5, 1e5 + 0.5])
 def test_float16_beyond_whole_numbers(height: float) -> None:
     """Above 2,048 float16 rounds to every second number and more; beyond its largest number it is clipped."""
-    level = np.array([0.0, height])[:, None, None]
-    made = simulate_log(level, threshold_pos=1.0, bins=1, start_residual=0.0)
+    made = simulate(BLACK_WHITE_BLACK[:2], threshold_pos=CONTRAST / height, bins=1, start_residual=0.0)
     arrays, saturated = fill(made.given, made.real, {"voxels_bilinear": None})
     whole = np.floor(height)
     assert arrays["voxels_bilinear"].dtype == np.float16
@@ -337,6 +343,7 @@ import numpy as np
 from tests.server.simulation.test_pixel import moving_frames
 from tests.server.simulation.test_times import ALL, FPS
 from v2v_server.simulation import simulate
+from v2v_server.simulation.intensity import log_table
 from v2v_server.simulation.kernels import ARRAYS, fill
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
 
@@ -357,6 +364,7 @@ print(digest.hexdigest()[:32])
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(COMPILE_SECONDS)
 def test_bytes_do_not_depend_on_the_processor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     exec(DIGEST)
     assert printed_on_a_generic_processor(DIGEST, tmp_path) == capsys.readouterr().out.split()

@@ -96,7 +96,8 @@ def test_every_draw_finds_its_kernel(recipe: Recipe, step_seconds: float) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)  # it compiles kernels
 def test_what_is_loaded_is_what_is_used() -> None:
     command = [sys.executable, "-c", LOAD_AND_COUNT]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True)
+    run = subprocess.run(command, capture_output=True, text=True, timeout=1200, check=True)
     assert json.loads(run.stdout) == [[3, 1], [3, 1], [4, 2], [4, 2]]

@@ -22,7 +22,7 @@ from v2v_server.supervise import child as child_module
 from v2v_server.supervise import local_host as host_module
 from v2v_server.supervise.local_host import LocalHost
 from v2v_server.supervise.pool import Death, Pool
-from v2v_server.worker.logbook import note
+from v2v_server.worker.logbook import Logbook, note
 
 SLEEPS = "import time\ntime.sleep(600)"
 NAPS = "import time\nwhile True:\n    time.sleep(0.01)"
@@ -45,9 +45,7 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, str], Pool
     pools: list[Pool] = []
 
     def make(workers: int, program: str) -> Pool:
-        monkeypatch.setattr(
-            child_module, "command", lambda address, root, name: [sys.executable, "-S", "-E", "-c", program, name]
-        )
+        monkeypatch.setattr(child_module, "PROGRAM", (sys.executable, "-S", "-E", "-c", program))
         pools.append(Pool(LocalHost("/corpus"), "label"))
         pools[-1].start("tcp://127.0.0.1:1")
         pools[-1].scale(workers)
@@ -92,8 +90,8 @@ def test_it_starts_as_many_as_asked_each_with_a_name_of_its_own(start: Callable[
     pids = pids_of(pool)
 
     def names() -> list[bytes]:
-        # The argument before the logbook's two; a process has none to show until its program has been loaded.
-        return [(b"\0\0\0" + Path(f"/proc/{pid}/cmdline").read_bytes()).split(b"\0")[-4] for pid in pids]
+        # Four arguments follow; a process has none to show until its program has been loaded.
+        return [(b"\0" * 5 + Path(f"/proc/{pid}/cmdline").read_bytes()).split(b"\0")[-6] for pid in pids]
 
     until(lambda: b"" not in names())
     assert names() == [b"label-0.1", b"label-1.1"]
@@ -454,7 +452,7 @@ def test_stop_reaps_what_ignores_every_request(start: Callable[[int, str], Pool]
         "import signal, sys, time\n"
         "for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):\n"
         "    signal.signal(number, signal.SIG_IGN)\n"
-        f"open({str(tmp_path)!r} + '/' + sys.argv[1], 'w').close()\n"
+        f"open({str(tmp_path)!r} + '/' + sys.argv[6], 'w').close()\n"
         "time.sleep(600)\n"
     )
     pool = start(2, stubborn)
@@ -476,10 +474,12 @@ def test_stop_after_a_crash_leaves_no_zombie_and_may_come_twice(start: Callable[
     assert all(is_gone(pid) for pid in pids)
 
 
-def test_the_programs_of_real_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    command = child_module.command("tcp://127.0.0.1:5556", "/a folder", "w-0.1")
-    assert command[:3] == [sys.executable, "-m", "v2v_server.commands.worker"]
-    assert command[3:] == [
+def test_the_programs_of_real_workers() -> None:
+    logbook = Logbook()
+    arguments = child_module.arguments("tcp://127.0.0.1:5556", "/a folder", "w-0.1", ["--debug"], logbook)
+    assert (sys.executable, "-m", "v2v_server.commands.worker") == child_module.PROGRAM
+    assert arguments == [
         *("--connect", "tcp://127.0.0.1:5556", "--videos", "/a folder", "--name", "w-0.1"),
-        *("--parent-pid", str(os.getpid())),
+        *("--parent-pid", str(os.getpid()), "--debug", "--logbook-fd", str(logbook.descriptor)),
     ]
+    logbook.close()

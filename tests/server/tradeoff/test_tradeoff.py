@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import time
 from pathlib import Path
 from typing import Any
@@ -18,25 +17,17 @@ from tests.bench.small import FLAGS, clips, records
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.commands import tradeoff
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.motion.prediction import Prediction
-from v2v_server.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, spurious
-from v2v_server.tradeoff.diversity import diversity, effective_samples, overlap
+from v2v_server.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, Places
+from v2v_server.tradeoff.diversity import diversity, effective_samples
 from v2v_server.tradeoff.errors import Tally, compare, correlation
 from v2v_server.tradeoff.forms import ENCODINGS, SOURCE
 from v2v_server.tradeoff.front import best, dominates, dominators
-from v2v_server.tradeoff.report import tables
-from v2v_server.tradeoff.settings import EXACT, ServeSetting, settings, write_preset
+from v2v_server.tradeoff.settings import ServeSetting, axes, full_model, settings
 from v2v_server.tradeoff.speed import Speed, TimedWork, leases_of, measure
-
-CAMERA = SampleParams(
-    threshold_pos=0.25, threshold_neg=0.25, noise_sigma=0.05, hot_pixel_count=0, hot_pixel_sigma=0.0, pauses=(),
-    scale=1.0, crop_top_px=0, crop_left_px=0, flip=False, contrast=0.0, noise_key=(1, 2, 3, 4),
-)  # fmt: skip
 
 
 def voxels(*values: float) -> np.ndarray[Any, Any]:
@@ -48,8 +39,6 @@ def test_measures_of_a_known_pair() -> None:
     assert tally.voxel_error == pytest.approx((1 + 2) / 5)
     assert tally.count_error == pytest.approx((4 - 5) / 5)
     assert tally.changed_share == 0.5
-    assert tally.rising_share == 0.75
-    assert tally.reference_rising_share == 0.4
 
 
 def test_equal_voxels_have_no_error() -> None:
@@ -63,9 +52,9 @@ def test_int8_counts_are_not_subtracted_in_int8() -> None:
 
 def test_without_reference_events_no_relative_error_is_named() -> None:
     tally = compare(voxels(1, 0), voxels(0, 0))
-    assert (tally.voxel_error, tally.count_error, tally.reference_rising_share) == (None, None, None)
+    assert (tally.voxel_error, tally.count_error) == (None, None)
     assert tally.changed_share == 0.5
-    assert (Tally().changed_share, Tally().rising_share) == (None, None)
+    assert Tally().changed_share is None
 
 
 def test_tallies_add_up_like_one_array() -> None:
@@ -83,13 +72,6 @@ def test_correlation_of_known_arrays() -> None:
     assert correlation([1, 2, 3], [5, 3, 1]) == pytest.approx(-1)
     assert correlation([1, -1, 1, -1], [1, 1, -1, -1]) == 0
     assert correlation([1, 2, 3], [7, 7, 7]) == 0
-
-
-def test_overlap_of_crops() -> None:
-    other = dataclasses.replace(CAMERA, crop_top_px=16, crop_left_px=32)
-    assert overlap(CAMERA, CAMERA, 64, 64) == 1
-    assert overlap(CAMERA, other, 64, 64) == pytest.approx(48 * 32 / 64**2)
-    assert overlap(CAMERA, dataclasses.replace(CAMERA, crop_left_px=64), 64, 64) == 0
 
 
 def test_siblings_are_worth_between_one_and_all_of_them() -> None:
@@ -153,34 +135,49 @@ def test_wishes_that_nothing_fulfils_name_the_nearest() -> None:
 def test_the_choice_is_written_and_a_wish_that_nothing_fulfils_is_status_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    compared = settings([], StreamSpec(), axes(["samples_per_decode=1,2", "tolerance=0.01"]))
     found = [
-        {"measure": "setting", "name": setting.name, **dataclasses.asdict(setting),
-         "samples_per_core_second": 5.0 * setting.samples_per_decode, "voxel_error_at_0.2": 0.25}
-        for setting in settings([])
+        {"measure": "setting", "name": setting.name, "samples_per_decode": setting.spec.samples_per_decode,
+         "samples_per_core_second": 5.0 * setting.spec.samples_per_decode, "voxel_error_at_0.2": 0.25}
+        for setting in compared
     ]  # fmt: skip
     out = tmp_path / "chosen.yaml"
-    flags = ["--videos", "clips", "--most-samples-per-decode", "2", "--preset-out", str(out)]
-    assert tradeoff.choose(found, tradeoff._parser().parse_args([*flags, "--target-rate", "11"])) == 1
+    flags = ["--videos", "clips", "--preset-out", str(out)]
+    assert tradeoff.choose(found, compared, tradeoff._parser().parse_args([*flags, "--target-rate", "11"])) == 1
     assert "v2v-tradeoff: --target-rate 11: the fastest setting makes 10" in capsys.readouterr().err
     assert not out.exists()
-    assert tradeoff.choose(found, tradeoff._parser().parse_args([*flags, "--max-error", "0.25"])) == 0
-    assert "best: source, K = 2" in capsys.readouterr().out
-    assert ServeConfig.load(str(out), {"videos": "clips"}).spec.samples_per_decode == 2
+    assert tradeoff.choose(found, compared, tradeoff._parser().parse_args([*flags, "--max-error", "0.25"])) == 0
+    assert "best: source, K = 2, substep_px = 0" in capsys.readouterr().out
+    assert ServeConfig.load(str(out), {"videos": "clips"}).spec == compared[2].spec
 
 
-def test_settings_have_names_of_their_own_and_begin_with_the_exact_one() -> None:
-    every = settings(list(ENCODINGS))
-    assert every[0] == EXACT
-    assert len({setting.name for setting in every}) == len(every) == 3 * (1 + len(ENCODINGS))
+AXES = ["tolerance=0,0.01", "voxel_seconds=0.1,0.2"]
+CAMERA_OF_A_USER = StreamSpec(recipe=Recipe(leak_hz=(0.1, 0.2)))
+EVERY = settings(list(ENCODINGS), CAMERA_OF_A_USER, axes(AXES))
 
 
-@pytest.mark.parametrize("setting", settings(list(ENCODINGS)), ids=lambda setting: setting.name)
+def test_settings_are_all_combinations_under_names_of_their_own() -> None:
+    assert EVERY[0].name == "source, K = 1, substep_px = 0, tolerance = 0, voxel_seconds = 0.1"
+    assert len({setting.name for setting in EVERY}) == len(EVERY) == 3 * 2 * 2 * 2 * (1 + len(ENCODINGS))
+    assert len({setting.way for setting in EVERY}) == len({setting.single for setting in EVERY}) == len(EVERY) // 3
+
+
+def test_the_full_model_keeps_the_recipe_and_has_everything_else() -> None:
+    for setting in EVERY:
+        full = full_model(setting, EVERY)
+        assert (full.form, full.spec.tolerance, full.spec.substep_px, full.spec.samples_per_decode) == (SOURCE, 0, 1, 1)
+        assert full.spec.recipe == setting.spec.recipe
+    plain = settings([], StreamSpec(), axes(["substep_px=0"]))
+    assert full_model(plain[0], plain) == plain[0]
+
+
+@pytest.mark.parametrize("setting", EVERY[::7], ids=lambda setting: setting.name)
 def test_every_setting_is_a_configuration_of_the_server(setting: ServeSetting, tmp_path: Path) -> None:
     file = tmp_path / "preset.yaml"
-    write_preset(file, dataclasses.asdict(setting), "top:0.54", "a test")
+    file.write_text(setting.yaml("top:0.54", "a test"), encoding="utf-8")
     config = ServeConfig.load(str(file), {"videos": "clips"})
     assert config.rows == "top:0.54"
-    assert config.spec.samples_per_decode == setting.samples_per_decode
+    assert config.spec == setting.spec
     how = ENCODINGS.get(setting.form)
     command = ""
     if how is not None:
@@ -216,31 +213,13 @@ def test_one_place_alone_has_no_diversity(tmp_path: Path) -> None:
     spec = StreamSpec(recipe=Recipe(voxels_per_clip=3, crop_height_px=64, crop_width_px=64))
     with contextlib.closing(open_catalogue(tmp_path / "clips", cache_dir=tmp_path / "cache", processes=0)) as catalogue:
         leases = leases_of(catalogue, spec, 2)
-    assert diversity(tmp_path / "clips", leases[:1]) == []
-    assert [record["name"] for record in diversity(tmp_path / "clips", leases)] == ["siblings", "batch"]
+    assert diversity(Places(tmp_path / "clips", leases[:1])) == []
+    assert [record["name"] for record in diversity(Places(tmp_path / "clips", leases))] == ["siblings", "batch"]
 
 
 def test_works_of_different_places_are_refused() -> None:
     with pytest.raises(UsageError, match=r"\[1, 2\] places"):
         measure({"a": TimedWork(print, 1), "b": TimedWork(print, 2)}, until=0.0)
-
-
-def test_events_on_scenes_are_counted_per_pixel_and_frame(tmp_path: Path) -> None:
-    # MJPEG codes every frame alike, and a flat one exactly but for its range.
-    folder = tmp_path / "scenes"
-    folder.mkdir()
-    frames = np.full((11, 32, 48), 60, np.uint8)
-    for name in ("still", "lamp"):
-        write_clip(folder / f"{name}.mp4", frames, codec="mjpeg", pixel_format="yuvj420p", full_range=True)
-        frames[1::2] = 240
-    with contextlib.closing(open_catalogue(folder, cache_dir=tmp_path / "cache", processes=0)) as catalogue:
-        found = spurious(catalogue, (16, 16))
-    step = np.log(1e-3 + (240 / 255) ** 2.2) - np.log(1e-3 + (60 / 255) ** 2.2)
-    for threshold in (0.05, 0.2, 0.5, 1.0):
-        # Half of the scenes; a step of the lamp fires its size in thresholds, give or take the residual.
-        assert found[threshold] == pytest.approx(0.5 * step / threshold, abs=0.5)
-    with contextlib.closing(open_catalogue(folder / "still.mp4", cache_dir=tmp_path / "cache", processes=0)) as still:
-        assert set(spurious(still, (16, 16)).values()) == {0.0}
 
 
 @pytest.mark.parametrize(
@@ -249,6 +228,7 @@ def test_events_on_scenes_are_counted_per_pixel_and_frame(tmp_path: Path) -> Non
         ["--budget-minutes", "0"], ["--budget-minutes", "nan"], ["--places", "0"], ["--clips", "0"],
         ["--target-rate", "-1"], ["--max-error", "nan"], ["--forms", "h265 1"], ["--preset-out", "x.yaml"],
         ["--set", "gama=1"], ["--rows", "upper"], ["--vary", "tolerance"], ["--vary", "tolerance=2"],
+        ["--vary", "samples_per_decode=3"],
         ["--vary", "voxel_seconds=0.1,101"],
     ],
 )  # fmt: skip
@@ -266,65 +246,44 @@ def test_a_corpus_without_videos_is_status_2(tmp_path: Path, capsys: pytest.Capt
     assert error.count("\n") == 1
 
 
-def test_no_error_is_predicted_where_motion_explains_nothing() -> None:
-    speeds = {name: Speed(0.5, 0.5, 1) for name in (EXACT.name, "source, substep_px = 1")}
-    form: Any = None
-    unexplained = Prediction((8.0,), 60.0, 100.0, 60.0, 10.0, 40.0, along_apart=9.0, mean_apart=10.0)
-    for loss, is_predicted in ((unexplained, False), (dataclasses.replace(unexplained, along_apart=2.0), True)):
-        off, on = tradeoff._substeps({SOURCE: form}, speeds, loss)
-        assert [off["name"], on["name"]] == ["source, substep_px = 0", "source, substep_px = 1"]
-        assert (on["predicted_lost"] is not None) == is_predicted
-    assert off["predicted_lost"] > on["predicted_lost"]
-    assert "source, substep_px = 1" in tables([off, on])
-
-
 @pytest.mark.slow
 def test_a_short_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, picture, chosen = tmp_path / "tradeoff.json", tmp_path / "tradeoff.png", tmp_path / "chosen.yaml"
     flags = ["--videos", str(clips(tmp_path / "clips")), "--rows", "full", "--clips", "2", "--places", "3"]
-    flags += [
-        "--forms",
-        "lossless fast,h264 23",
-        "--budget-minutes",
-        "0.5",
-        "--vary",
-        "voxel_seconds=0.1,0.2",
-        "--vary",
-        "tolerance=0.01",
-        "--max-error",
-        "0",
-        "--preset-out",
-        str(chosen),
-    ]
+    flags += ["--forms", "h264 23", "--budget-minutes", "0.5", "--vary", "samples_per_decode=1,4"]
+    flags += ["--vary", "tolerance=0,0.5", "--set", "leak_hz=0.01", "--max-error", "0", "--preset-out", str(chosen)]
     assert tradeoff.main([*flags, *FLAGS, "--json", str(out), "--plot", str(picture)]) == 0
     found = records(out)
     by_name = {item["name"]: item for item in found if item["measure"] == "setting"}
-    assert set(by_name) == {setting.name for setting in settings(["lossless fast", "h264 23"])}
-    exact, prepared = by_name[EXACT.name], by_name[ServeSetting("h264 23").name]
-    assert by_name[ServeSetting("lossless fast").name]["voxel_error_at_0.2"] == 0
-    assert exact["speed_ratio"] == 1
-    for threshold in ("0.05", "0.2", "0.5", "1", "2"):
-        assert exact[f"bins_changed_at_{threshold}"] == 0
-    assert exact["voxel_error_at_0.2"] == 0 < prepared["voxel_error_at_0.2"]
-    assert prepared["bytes_ratio"] > 0
-    per_second = {item["bytes_per_video_second"] for item in by_name.values() if item["form"] == SOURCE}
-    assert prepared["bytes_per_video_second"] / min(per_second) == pytest.approx(prepared["bytes_ratio"])
-    scale = {item["name"]: item["voxel_error_at_0.2"] for item in found if item["measure"] == "scale"}
+    spec = StreamSpec()
+    varied = axes(["samples_per_decode=1,4", "tolerance=0,0.5"])
+    assert set(by_name) == {setting.name for setting in settings(["h264 23"], spec, varied)}
+    way = {item["way"]: item for item in by_name.values()}
+    error = {name: item["voxel_error_at_0.2"] for name, item in way.items()}
+    # The full model is among the settings, so it has no error; each thing that it has more of changes something.
+    assert error["source, substep_px = 1, tolerance = 0"] == 0
+    assert 0 < error["source, substep_px = 1, tolerance = 0.5"] <= 0.5
+    assert 0 < error["source, substep_px = 0, tolerance = 0"] < error["h264 23, substep_px = 0, tolerance = 0"]
+    first = by_name["source, K = 1, substep_px = 0, tolerance = 0"]
+    assert first["speed_ratio"] == 1
+    prepared = by_name["h264 23, K = 1, substep_px = 0, tolerance = 0"]
+    assert prepared["bytes_per_video_second"] / first["bytes_per_video_second"] == pytest.approx(
+        prepared["bytes_ratio"]
+    )
+    assert 0 < way["source, substep_px = 1, tolerance = 0"]["predicted_lost"] < first["predicted_lost"] < 1
+    scale = {item["way"]: item["voxel_error_at_0.2"] for item in found if item["measure"] == "scale"}
     assert set(scale) == {NOISE_ROW, DRAW_ROW}
     assert min(scale.values()) > 0
-    varied = [item["name"] for item in found if item["measure"] == "varied" and item["cpu_seconds_per_sample"] > 0]
-    assert varied == ["voxel_seconds = 0.1", "voxel_seconds = 0.2", "tolerance = 0.01"]
-    between = {(item["form"], item["substep_px"]): item for item in found if item["measure"] == "substeps"}
-    assert set(between) == {(form, px) for form in (SOURCE, "lossless fast", "h264 23") for px in (0.0, 1.0)}
-    assert between[SOURCE, 0.0]["cpu_seconds_per_sample"] == exact["cpu_seconds_per_sample"]
-    assert {0.0 < item["predicted_signed"] < 1.0 for item in between.values()} == {True}
+    taken = {item["way"]: item for item in found if item["measure"] == "parts"}
+    assert set(taken) == {name for name in way if name.startswith(SOURCE)}
+    assert taken["source, substep_px = 0, tolerance = 0"]["leak_hz_share"] == 1
+    assert taken["source, substep_px = 0, tolerance = 0.5"]["leak_hz_share"] == 0
+    assert taken["source, substep_px = 1, tolerance = 0"]["substeps_per_step"] > 1
     alike = {item["name"]: item for item in found if item["measure"] == "diversity"}
     assert set(alike) == {"siblings", "batch"}
     assert 1 <= alike["siblings"]["effective_samples_of_2"] <= alike["siblings"]["effective_samples_of_4"] <= 4
-    assert 0 < alike["siblings"]["crop_overlap"] <= 1
     assert picture.read_bytes().startswith(b"\x89PNG")
     fastest = max((item for item in by_name.values() if not item["voxel_error_at_0.2"]),
                   key=lambda item: item["samples_per_core_second"])  # fmt: skip
-    captured = capsys.readouterr()
-    assert f"best: {fastest['name']}" in captured.out
-    assert yaml.safe_load(chosen.read_text(encoding="utf-8"))["samples_per_decode"] == fastest["samples_per_decode"]
+    assert f"best: {fastest['name']}" in capsys.readouterr().out
+    assert yaml.safe_load(chosen.read_text(encoding="utf-8"))["substep_px"] == 1

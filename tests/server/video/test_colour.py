@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from v2v_server.video.collect import ChromaCut
 from v2v_server.video.colour.chroma import ChromaStack
-from v2v_server.video.colour.rgb import add_colour
+from v2v_server.video.colour.rgb import add_colour, differences_of
 from v2v_server.video.luma import LumaFormat, luma_plane, range_table
 from v2v_server.video.orientation import Orientation
 
@@ -77,7 +77,9 @@ def test_each_pixel_has_the_colour_of_its_cell(
         np.minimum((window[0] + np.arange(window[2])) // 2, top // 2 + (rows + 1) // 2 - 1)[:, None] * 2,
         (window[1] + np.arange(window[3])) // 2 * 2,
     ]
-    np.testing.assert_array_equal(cut.pixels(chroma.cells[0]), expected + 128)
+    rows, columns = cut.places
+    np.testing.assert_array_equal(chroma.cells[0][:, rows[:, None], columns], expected)
+    assert cut.cells[2:] == (rows[-1] + 1, columns[-1] + 1) == chroma.cells.shape[2:]
 
 
 def rgb_of(frame: VideoFrame) -> npt.NDArray[np.uint8]:
@@ -88,9 +90,33 @@ def rgb_of(frame: VideoFrame) -> npt.NDArray[np.uint8]:
     cells, matrix = stack.chroma()
     luma = LumaFormat.of(frame)
     grey = range_table(luma.bits, luma.full_range)[luma_plane(frame, luma)]
-    out = np.empty((3, height, width), np.uint8)
-    add_colour(grey, cut.pixels(cells[0]), matrix, 1.0, out)
-    return out
+    out = np.empty((1, 3, height, width), np.uint8)
+    chroma, places = cells.view(np.uint8) ^ 128, np.zeros(1, np.int64)
+    add_colour(grey[None], chroma, places, *cut.places, differences_of(matrix, 1.0), out)
+    return out[0]
+
+
+@given(
+    seed=st.integers(0, 2**32),
+    contrast=st.floats(0.1, 3.0),
+    matrix=st.sampled_from(["BT.601", "BT.709", "BT.2020"]),
+    is_flipped=st.booleans(),
+)
+def test_colours_are_those_of_each_pixel_alone(seed: int, contrast: float, matrix: str, is_flipped: bool) -> None:
+    """Against a slow oracle: sums of whole numbers beyond all bounds, clipped at the end."""
+    random = np.random.default_rng(seed)
+    count, height, width = (int(side) for side in random.integers(1, 9, 3))
+    grey = random.integers(0, 256, (count, height, width), np.uint8)
+    chroma = random.integers(0, 256, (2, 2, 5, 5), np.uint8)
+    places, rows = random.integers(0, 2, count), np.sort(random.integers(0, 5, height))
+    columns = np.sort(random.integers(0, 5, width))[:: -1 if is_flipped else 1].copy()
+    table, out = differences_of(matrix, contrast), np.empty((count, 3, height, width), np.uint8)
+    add_colour(grey, chroma, places, rows, columns, table, out)
+    for t, y, x in np.ndindex(grey.shape):
+        cb, cr = (int(value) for value in chroma[places[t], :, rows[y], columns[x]])
+        red, of_cb, of_cr, blue = (int(table[row, value]) for row, value in enumerate((cr, cb, cr, cb)))
+        expected = [min(max(int(grey[t, y, x]) + each, 0), 255) for each in (red, of_cb + of_cr, blue)]
+        assert out[t, :, y, x].tolist() == expected
 
 
 @pytest.mark.parametrize("colorspace", [Colorspace.ITU601, Colorspace.ITU709, Colorspace.BT2020])

@@ -33,7 +33,7 @@ from v2v_server.simulation.intensity import light_table
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.depth import detail_of, levels_of
 from v2v_server.store.encoding import Encoding
-from v2v_server.tradeoff.accuracy import seen
+from v2v_server.tradeoff.accuracy import Places, seen, simulated
 from v2v_server.video.luma import Signal, range_table
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.produce import make_sample
@@ -172,9 +172,10 @@ def test_deep_clips_offline(tmp_path: Path) -> None:
         made = remaker.made(0, 0, 0)
         assert predicted_loss(made).errors("linear").lost >= 0
         whole = WholePictures(catalogue, spec).camera(remaker.sequence(0, 0, 0))
-        view = seen(tmp_path / "clips", replace(made.lease, indices=(0, 1)))
+        (view,) = seen(Places(tmp_path / "clips", [replace(made.lease, indices=(0, 1))]), 0)
     assert whole.voxels.any()
-    np.testing.assert_array_equal(view.voxels(made.sample.provenance.params), made.sample.arrays["voxels"])
+    voxels = simulated(view, made.sample.provenance.params).voxels
+    np.testing.assert_array_equal(voxels, made.sample.arrays["voxels"])
 
 
 def test_sub_steps_are_made_of_8_bits(tmp_path: Path) -> None:

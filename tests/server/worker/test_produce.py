@@ -74,13 +74,18 @@ def test_a_lease_that_leads_out_of_the_corpus_opens_nothing(catalogue: Catalogue
 
 def test_sub_steps_do_not_depend_on_the_arrays_that_are_asked_for(catalogue: Catalogue, lease: Lease) -> None:
     """They change the voxels of what moves, and flow with its larger margin changes nothing in them."""
-    plain = make_sample(lease, decode_for(lease, lease.indices, catalogue.source)[0]).arrays
     spec = dataclasses.replace(SMALL_SPEC, substep_px=0.5)
     divided = dataclasses.replace(lease, spec=spec.canonical(), spec_digest=spec.digest)
-    alone, beside_flow = (
-        make_sample(each, decode_for(each, each.indices, catalogue.source)[0]).arrays
-        for each in (divided, dataclasses.replace(divided, arrays=("voxels", "event_counts", "frames", "flow")))
-    )
+    asked = ("voxels", "event_counts", "frames", "flow"), ("frames",)
+    samples = [
+        make_sample(each, decode_for(each, each.indices, catalogue.source)[0])
+        for each in (lease, divided, *(dataclasses.replace(divided, arrays=names) for names in asked))
+    ]
+    plain, alone, beside_flow, _ = (sample.arrays for sample in samples)
+    substeps = [sample.provenance.substeps for sample in samples]
+    assert substeps[0] == substeps[3] == 0 < SMALL_SPEC.recipe.steps < substeps[1] == substeps[2]
+    assert Provenance.from_dict(samples[1].provenance.to_dict()) == samples[1].provenance
+    assert "substeps" not in samples[0].provenance.to_dict()
     np.testing.assert_array_equal(alone["frames"], plain["frames"])
     np.testing.assert_array_equal(beside_flow["voxels"], alone["voxels"])
     on_and_off = beside_flow["event_counts"].astype(int)

@@ -1,4 +1,4 @@
-"""Measure a :class:`v2v_server.corpus.scenes.scene.Scene` in one pass: every frame in blocks, every fourth for motion.
+"""Measure a :class:`v2v_server.corpus.scenes.scene.Scene` in one pass: every frame in blocks, some for motion.
 
 Shot boundaries. Let m_t be the means of the 8 x 8 blocks of frame t, less their own mean, so that flicker and exposure
 do not count, and d(s, t) = mean |m_s - m_t|. Frame t begins a shot if d(t-1, t) is
@@ -11,12 +11,13 @@ do not count, and d(s, t) = mean |m_s - m_t|. Frame t begins a shot if d(t-1, t)
 
 All of this is exact arithmetic, the same everywhere. Repeats are found in ``steps``, the other stretches in
 ``stretches``; dissolves are not found. Motion is that of dense inverse search on pictures of a quarter of the size,
-four frames apart, rounded to 1/64 px a frame.
+over the first four of every eight frames, rounded to 1/64 px a frame.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import nullcontext
 from itertools import islice
 
 import cv2
@@ -78,7 +79,7 @@ class SceneAnalysis:
         self._frames = 0
         self._blocks: list[npt.NDArray[np.int64]] = []  # of the last four frames, 1/64 grey level each
         self._last: Picture | None = None
-        self._reduced: tuple[int, Picture] | None = None  # the last frame with motion measured, and its number
+        self._reduced: tuple[int, Picture] | None = None  # a frame from which motion is to be measured, and its number
         self._means: list[float] = []
         self._variances: list[float] = []
         self._light: list[int] = []  # 1/64 grey level
@@ -96,7 +97,8 @@ class SceneAnalysis:
 
     def add(self, picture: Picture) -> None:
         """Add the next frame: [h, w] uint8, full-range luma, upright, of the size of the others."""
-        with one_thread():
+        # OpenCV has work only in the first two of four frames.
+        with one_thread() if self._frames % LAG_FRAMES < 2 else nullcontext():
             self._add(np.ascontiguousarray(picture))
 
     def _add(self, picture: Picture) -> None:
@@ -128,18 +130,19 @@ class SceneAnalysis:
 
     def _measure_motion(self, number: int, picture: Picture) -> None:
         reduced = _reduced(picture)
-        if self._reduced is not None:
-            before, earlier = self._reduced
-            field = self._search(earlier, reduced)
-            pace = _most(np.hypot(field[..., 0], field[..., 1])) * (_SHRINK / (number - before))
-            self._motions.append((before, number, pace))
-        self._reduced = (number, reduced)
+        if self._reduced is None:
+            self._reduced = (number, reduced)
+            return
+        (before, earlier), self._reduced = self._reduced, None
+        field = self._search(earlier, reduced)[::2, ::2]  # made of patches that are wider apart
+        pace = _most(np.hypot(field[..., 0], field[..., 1])) * (_SHRINK / (number - before))
+        self._motions.append((before, number, pace))
 
     def scene(self) -> Scene:
         """Return the statistics; no frame may be added afterwards."""
         if not self._frames:
             return Scene.unknown()
-        if self._last is not None and (self._frames - 1) % LAG_FRAMES:
+        if self._last is not None and self._reduced is not None and self._reduced[0] < self._frames - 1:
             with one_thread():
                 self._measure_motion(self._frames - 1, self._last)
         boundaries = self._shot_boundaries()

@@ -17,12 +17,13 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError
 
-ANALYSIS_VERSION = 2
+ANALYSIS_VERSION = 3
 """Raise it with every change of what an analysis finds: earlier ones are then repeated."""
 SEGMENT_FRAMES = 16
 """Frames of a segment. Segment i of a video holds frames 16 i .. 16 i + 15."""
 MOST_FRAMES = 4096
-"""Frames of a video that are analysed, from its beginning. Nothing is known of later ones."""
+"""Frames of a video that are analysed, from its beginning. Later ones may be like them: if those have cuts, repeats,
+fades, combing or bars, scene "auto" serves no later frame."""
 LAG_FRAMES = 4
 """Frames over which motion and change are measured."""
 UNKNOWN = 2**16 - 1
@@ -37,7 +38,7 @@ CONTRAST, DARK, CLIPPED, FLICKER, NOISE = range(2 * TILES**2, 2 * TILES**2 + 5)
 COLUMNS = NOISE + 1
 _UNITS = np.array([64.0] * TILES**2 + [64.0] * TILES**2 + [64.0, 1000.0, 1000.0, 64.0, 64.0])
 """How many of each column's units make one pixel, grey level or whole."""
-_MAGIC = b"VSC2"
+_MAGIC = b"VSC3"
 _HEADER = struct.Struct("<4sIIHI")  # magic, first, end, segments, pieces
 
 
@@ -58,6 +59,11 @@ class Flag:
     """There is nothing to see: white, or flat and brighter than middle grey."""
     COMBED = 64
     """Two fields of different times are woven together."""
+    UNSEEN = 128
+    """They were not analysed, and earlier frames of the video have defects."""
+
+
+_TELLING = Flag.CUT | Flag.REPEAT | Flag.FADE | Flag.COMBED
 
 
 class Sides(NamedTuple):
@@ -90,13 +96,14 @@ def clip_pieces(pieces: Pieces, first: int, start: int, end: int) -> Pieces:
     """Return the pieces of frames start .. end - 1.
 
     Args:
-        pieces: they begin at frame ``first``, at or before ``start``; frames after the last one have no flags and no
-            bars.
+        pieces: they begin at frame ``first``, at or before ``start``; frames after the last one have no bars, and no
+            flags unless earlier ones have defects.
     """
     if not len(pieces) or pieces["end"][-1] < end:
         rest = np.array([(end, 0, *NO_BARS)], PIECE)
-        if len(pieces) and pieces["flags"][-1] in (0, Flag.CUT) and not sides_of(pieces[-1:]).any():
-            rest["flags"] = pieces["flags"][-1]
+        if (pieces["flags"] & _TELLING).any() or sides_of(pieces).any():
+            rest["flags"] = Flag.UNSEEN
+        elif len(pieces) and not pieces["flags"][-1]:
             pieces = pieces[:-1]
         pieces = np.append(pieces, rest)
     firsts = firsts_of(pieces, first)
@@ -118,7 +125,7 @@ class Scene:
         pieces: [p] of :data:`PIECE`, frames ``first`` .. ``end`` - 1.
         segments: [n, 37] uint16, one row a segment, :data:`UNKNOWN` where a number could not be measured. Of each tile:
 
-            MOTION    95th percentile of its motion, the largest of the segment's quarters; 1/64 px a frame
+            MOTION    95th percentile of its motion, the larger of the segment's halves; 1/64 px a frame
             CHANGE    largest change of the mean of a block of 8 x 8 pixels over four frames; the fourth is any frame
                       of the segment after its first, or the next segment's first; 1/64 grey level
 

@@ -33,15 +33,15 @@ class Tables(NamedTuple):
 
 def prepare(value: float, clip: Clip) -> Tables:
     """Return the tables, see ``effects/__init__.py``."""
-    tables = [low_pass_table(value, clip.light, each) for each in clip.durations] if value > 0.0 else []
-    return Tables(np.array(tables, clip.real).reshape(-1, 2, len(clip.light)), clip.table_of_step)
+    durations = clip.durations if value > 0.0 else clip.durations[:0]
+    return Tables(low_pass_tables(value, clip.light, durations).astype(clip.real), clip.table_of_step)
 
 
-def low_pass_table(photoreceptor_hz: float, light: Doubles, seconds: float) -> Doubles:
-    """Return a and b of a step of that duration, [2, levels] float64."""
-    turns = 2.0 * np.pi * photoreceptor_hz * seconds * ((light + DARKEST) / (1.0 + DARKEST))
+def low_pass_tables(photoreceptor_hz: float, light: Doubles, seconds: Doubles) -> Doubles:
+    """Return a and b of steps of these durations, [durations, 2, levels] float64."""
+    turns = (2.0 * np.pi * photoreceptor_hz * seconds)[:, None] * ((light + DARKEST) / (1.0 + DARKEST))
     a = 1.0 - exponential(-turns)
-    return np.stack([a, 1.0 - a / turns])
+    return np.stack([a, 1.0 - a / turns], axis=1)
 
 
 @hook

@@ -23,6 +23,7 @@ from collections.abc import Mapping
 from functools import lru_cache
 from itertools import combinations
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -62,32 +63,65 @@ def changed_shares(given: KernelInput) -> dict[str, float]:
     part = np.ascontiguousarray(given.frames[: source[-1] + 1, ::_EVERY_PX, ::_EVERY_PX]).reshape(source[-1] + 1, -1)
     pixels, smaller = part.shape[1], min(params.threshold_pos, params.threshold_neg)
     moves = np.flatnonzero(source[1:] > source[:-1])  # other steps show a frame again
-    events = _plain_events(given, part)
-    moving, change = events[moves], np.abs(np.diff(_levels(intensity)[part], axis=0))
-    total, fires = int(np.abs(events).sum()), np.count_nonzero(moving, axis=1)
+    pace = 1.0 / (smaller * seconds[moves])  # thresholds a log unit and second
+    light, effects = linear_light(*intensity), params.effects
+    lag_hz = effects.get("photoreceptor_hz", math.inf)
+    lag = np.rint((1.0 + DARKEST) / (2.0 * np.pi * lag_hz * (light + DARKEST)) * 2**40).astype(np.int64) >> 20
+    blind = effects.get("refractory_seconds", 0.0) * pace
+    total, fires, lagged, lost, shown = _sums(part, _plain_events(given, part), moves, _levels(intensity), lag, blind)
     if not total:
         return {}
-    pace = 1.0 / (smaller * seconds[moves])  # thresholds a log unit and second
     clip_seconds, later = math.fsum(seconds), math.fsum(fires * (np.cumsum(seconds) - seconds)[moves])
-    light = linear_light(*intensity)
     changed = {}
-    for name, value in params.effects.items():
+    for name, value in effects.items():
         if name == "photoreceptor_hz":
-            lag = np.rint((1.0 + DARKEST) / (2.0 * np.pi * value * (light + DARKEST)) * 2**40).astype(np.int64)
-            by_step = (change * (lag[part[1:]] >> 20)).sum(axis=1)
-            changed[name] = 2.0 * math.fsum(by_step * pace) / 2.0**40
+            changed[name] = 2.0 * math.fsum(lagged * pace) / 2.0**40
         elif name == "refractory_seconds":
-            lost = np.rint((moving * change) * (value * pace)[:, None]).astype(np.int64)
-            shifted = np.minimum(np.abs(np.cumsum(lost, axis=0) - lost), _UNITS)
-            changed[name] = int(np.abs(lost).sum() + 2 * (shifted * (moving != 0)).sum()) / _UNITS
-            changed[name] += pixels * _lost_to_noise(given, value, smaller)
+            changed[name] = lost / _UNITS + pixels * _lost_to_noise(given, value, smaller)
         elif name == "shot_noise_hz":
-            shown = np.bincount(part.ravel(), minlength=len(light))
             rate = value * math.fsum(shown * (1.0 - (1.0 - WHITE_SHOT_NOISE) * light)) / part.size
             changed[name] = rate * (pixels * clip_seconds + later)
         elif name == "leak_hz":
             changed[name] = value * (pixels * clip_seconds + 2.0 * later)
     return {name: MARGINS[name] * number / total for name, number in changed.items()}
+
+
+@numba.njit(nogil=True, cache=True)
+def _sums(part, events, moves, levels, lag, blind):  # type: ignore[no-untyped-def]
+    """Sum up the figures of a clip, whole numbers.
+
+    Args:
+        part: [n, P] grey levels.
+        events: [steps, P] signed events.
+        moves: [n - 1] the steps that show another frame.
+        levels, lag: by grey level: log intensity, and the lag of the low-pass, seconds in 1/_UNITS.
+        blind: [n - 1] thresholds that a log unit, and an event, are lost in.
+
+    Returns:
+        all events; [n - 1] pixels that fire, [n - 1] change x lag; what a refractory period changes, in 1/_UNITS;
+        [levels] pixels of each grey level.
+    """
+    count, pixels = part.shape
+    fires, lagged = np.zeros(count - 1, np.int64), np.zeros(count - 1, np.int64)
+    shown, before = np.zeros(len(levels), np.int64), np.zeros(pixels, np.int64)
+    total = changed = 0
+    for step in range(len(events)):
+        for i in range(pixels):
+            total += abs(events[step, i])
+    for i in range(pixels):
+        shown[part[0, i]] += 1
+    for k in range(count - 1):
+        for i in range(pixels):
+            grey, fired = part[k + 1, i], events[moves[k], i]
+            change = abs(levels[grey] - levels[part[k, i]])
+            shown[grey] += 1
+            lagged[k] += change * lag[grey]
+            if fired != 0:
+                fires[k] += 1
+                lost = np.int64(np.rint(float(fired * change) * blind[k]))
+                changed += abs(lost) + 2 * min(abs(before[i]), _UNITS)
+                before[i] += lost
+    return total, fires, lagged, changed, shown
 
 
 def _plain_events(given: KernelInput, part: npt.NDArray[np.unsignedinteger]) -> Longs:

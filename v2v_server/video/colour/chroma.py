@@ -59,31 +59,28 @@ class ChromaCut:
     @property
     def cells(self) -> Window:
         """Return the cells that hold the window: (top, left, rows, columns)."""
-        _, left, _, width = self.window
-        rows, first_column = self._rows, left // CELL_PX
-        first_row = int(rows[0])
-        return first_row, first_column, int(rows[-1]) + 1 - first_row, (left + width - 1) // CELL_PX + 1 - first_column
+        rows, columns = self._places
+        top, left = int(rows[0]), int(columns[0])
+        return top, left, int(rows[-1]) + 1 - top, int(columns[-1]) + 1 - left
 
     @property
-    def _rows(self) -> npt.NDArray[np.int64]:
-        """Return the row of cells of each row of the window.
+    def places(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Return the row of :attr:`cells` of each row of the window, and the column of each column."""
+        rows, columns = self._places
+        return rows - rows[0], columns - columns[0]
+
+    @property
+    def _places(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Return row and column in the picture's cells of the rows and columns of the window.
 
         As many rows of cells are stored as the rows in use fill. If an even number of rows begins at an odd one, the
         last has the colour of the row before.
         """
-        top, _, height, _ = self.window
+        top, left, height, width = self.window
         first, count = self.usable_px
         last = first // CELL_PX + -(-count // CELL_PX) - 1
-        rows: npt.NDArray[np.int64] = np.minimum((top + np.arange(height, dtype=np.int64)) // CELL_PX, last)
-        return rows
-
-    def pixels(self, cells: npt.NDArray[np.int8]) -> npt.NDArray[np.uint8]:
-        """Return Cb and Cr of one frame for each pixel of the window: [2, height, width] uint8, 128 for no colour."""
-        _, left, _, width = self.window
-        column, rows = left % CELL_PX, self._rows
-        shifted = cells.view(np.uint8) ^ 128  # the bits of int8 plus 128
-        wide = shifted.repeat(CELL_PX, axis=2)[:, :, column : column + width]
-        return np.ascontiguousarray(wide[:, rows - rows[0]])
+        rows = np.minimum((top + np.arange(height, dtype=np.int64)) // CELL_PX, last)
+        return rows, (left + np.arange(width, dtype=np.int64)) // CELL_PX
 
 
 class ChromaStack:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.pieces import pieces, shots
@@ -83,6 +83,7 @@ def test_an_empty_table() -> None:
     assert table.ids.find("a") is None
 
 
+@settings(max_examples=25)
 @given(st.lists(st.booleans(), min_size=len(NAMES), max_size=len(NAMES)))
 def test_a_mask_selects_rows(mask: list[bool]) -> None:
     table = read(record.columns for record in ROWS)

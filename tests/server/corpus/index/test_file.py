@@ -19,7 +19,7 @@ from v2v_server.corpus.index.columns import VideoTable, joined
 from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.refresh import index_path
 from v2v_server.corpus.scenes.collect import SceneCollection, figures
-from v2v_server.corpus.scenes.scene import COLUMNS, Scene
+from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, COLUMNS, Scene
 from v2v_server.video.rows import Rows
 
 KIND = SceneCollection(Rows(), None).kind
@@ -166,9 +166,9 @@ def test_files_beside_the_index_of_earlier_releases_are_removed(corpus: Corpus) 
 def test_figures_of_other_versions_are_known(corpus: Corpus) -> None:
     put_scenes(corpus, *corpus.names)
     with closing(Store(corpus.index)) as store:
-        assert not store.has_other_versions("scene", ", look 2")
-        assert store.has_other_versions("scene", ", look 3")
-        assert not store.has_other_versions("other", ", look 3")
+        assert not store.has_other_versions("scene", f", look {ANALYSIS_VERSION}")
+        assert store.has_other_versions("scene", ", look 1")
+        assert not store.has_other_versions("other", ", look 1")
 
 
 def test_damaged_runs_count_as_unknown(corpus: Corpus) -> None:

@@ -171,7 +171,7 @@ def test_encoding_and_slices(scene: Scene, data: st.DataObject) -> None:
 
 @given(st.binary(max_size=60))
 def test_what_is_no_scene_is_refused(data: bytes) -> None:
-    for content in (data, b"VSC2" + data):
+    for content in (data, b"VSC3" + data):
         with pytest.raises(ProtocolError):
             Scene.from_bytes(content)
 

@@ -1,0 +1,124 @@
+"""Events that defects of a video add or take away, and samples that are mostly noise, with and without scene "auto"."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.accuracy.physics import Reals, log_intensity
+from v2v_protocol.errors import VideoError
+from v2v_protocol.recipe import preset
+from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.scenes.pieces import encoded_pieces
+from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.corpus.videos import VideoEntry
+from v2v_server.offline.motion import quiet_voxels
+from v2v_server.offline.remake import Remaker
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.simulation import simulate, simulate_log
+from v2v_server.simulation.variants import warm_up
+from v2v_server.video.rows import Rows
+from v2v_server.worker.cleaning import CleanFrames
+
+Film = npt.NDArray[np.uint8]
+THRESHOLD = 0.2
+SCENES: tuple[Literal["off"], Literal["auto"]] = ("off", "auto")
+SHARES = (0.0, 0.75, 1.0)
+"""Values of ``moving_share``."""
+_SEQUENCE = preset("noise-free").replace(voxels_per_clip=3, crop_height_px=64, crop_width_px=64)
+_LOG = log_intensity(np.arange(256) / 255.0)
+_SAMPLE = preset("paper").replace(voxels_per_clip=8)
+
+
+def sequences(
+    clips: Sequence[Film], scenes: Sequence[Scene], scene: Literal["off", "auto"]
+) -> Iterator[tuple[int, CleanFrames]]:
+    """Yield the sequences that clips give: the number of the clip, and the frames.
+
+    Args:
+        clips, scenes: pictures of each clip, and what was found in them.
+        scene: whether defects are left out.
+    """
+    spec = StreamSpec(recipe=_SEQUENCE, scene=scene)
+    videos = [
+        VideoEntry(
+            str(number), "", len(clip), clip.shape[2], clip.shape[1], 30.0, "",
+            pieces=encoded_pieces(found.pieces, found.end),
+        )
+        for number, (clip, found) in enumerate(zip(clips, scenes, strict=True))
+    ]  # fmt: skip
+    table = SequenceTable(videos, Rows.parse("full"), spec)
+    for rank in range(table.count):
+        number, start = int(table[rank].video.id), table[rank].start_frame
+        frames = CleanFrames.of(scenes[number] if scene == "auto" else None, start, spec, _SEQUENCE.frames_needed)
+        yield number, frames
+
+
+def between(film: Film, positions: Reals) -> Reals:
+    """Return log intensities [len(positions), h, w] at fractional frames of a film, linear in time."""
+    before = positions.astype(np.int64)
+    part = (positions - before)[:, None, None]
+    mixed: Reals = (1 - part) * _LOG[film[before]] + part * _LOG[film[np.minimum(before + 1, len(film) - 1)]]
+    return mixed
+
+
+def compared(frames: Film, levels: Reals) -> npt.NDArray[np.int64]:
+    """Simulate frames and the log intensities of the clean original.
+
+    Returns:
+        [4] number of events, of those that the original lacks, of the original's, of those that the frames lack; an
+        event counts for its pixel and step.
+    """
+    camera: dict[str, Any] = {
+        "threshold_pos": THRESHOLD, "bins": len(frames) - 1, "start_residual": 0.0, "dtype": "int16",
+    }  # fmt: skip
+    made, true = (each.voxels.astype(np.int64) for each in (simulate(frames, **camera), simulate_log(levels, **camera)))
+    false, missing = (
+        sum(int((np.maximum(sign * one, 0) - np.maximum(sign * other, 0)).clip(0).sum()) for sign in (1, -1))
+        for one, other in ((made, true), (true, made))
+    )
+    return np.array([np.abs(made).sum(), false, np.abs(true).sum(), missing])
+
+
+def noisy_samples(videos: Path, count: int) -> list[dict[str, Any]]:
+    """Return one record for each share of crops that are drawn by motion: how many samples are mostly noise.
+
+    A sample is if noise and hot pixels make most events of its voxel grid with the most events. The samples of all
+    shares have the same sequences and cameras.
+    """
+    warm_up()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        closing(open_catalogue(videos, cache_dir=folder, scene=True, processes=1)) as catalogue,
+    ):
+        remakers = [
+            Remaker(catalogue, StreamSpec(recipe=_SAMPLE, scene="auto", moving_share=share), ("voxels",))
+            for share in SHARES
+        ]
+        noisy: list[list[bool]] = []
+        for index in range(min(count, remakers[0].count)):
+            try:
+                noisy.append([_is_mostly_noise(remaker, index) for remaker in remakers])
+            except VideoError:
+                continue
+    return [
+        {"measure": "noise", "moving_share": share, "samples": len(noisy), "noisy_share": float(np.mean(each))}
+        for share, each in zip(SHARES, zip(*noisy, strict=True), strict=True)
+    ]
+
+
+def _is_mostly_noise(remaker: Remaker, index: int) -> bool:
+    made = remaker.made(0, 0, index)
+    each, quiet = (
+        np.abs(voxels, dtype=np.float64).reshape(len(voxels), -1).sum(axis=1)
+        for voxels in (made.sample.arrays["voxels"], quiet_voxels(made))
+    )
+    busiest = int(each.argmax())
+    return bool(2 * quiet[busiest] < each[busiest])
