@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import threading
+from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -164,13 +165,13 @@ def test_workers_neither_compile_nor_grow(tmp_path: Path) -> None:
     )
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     start = [sys.executable, "-c", code]
-    both = [subprocess.Popen(start, stdout=subprocess.PIPE, text=True, env=environment) for _ in range(2)]
-    try:
+    with ExitStack() as stack:
+        both = []
+        for _ in range(2):
+            process = subprocess.Popen(start, stdout=subprocess.PIPE, text=True, env=environment)
+            both.append(stack.enter_context(process))
+            stack.callback(process.kill)
         said = [process.communicate()[0].splitlines() for process in both]
-    finally:
-        for process in both:
-            process.kill()
-            process.communicate()
     assert [lines[0].split() for lines in said] == [["3", "1", "1", "1"]] * 2
     assert [lines[1].split() for lines in said] == [["0", "0", "0", "0"]] * 2
     workers, compilers = zip(*(map(int, lines[2].split()) for lines in said), strict=True)
