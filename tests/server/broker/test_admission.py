@@ -74,7 +74,7 @@ def test_a_stream_from_a_server_that_knows_more_verdicts_is_told_what_to_do() ->
         at.admit(b"c", hello(quarantine=3), 1, 0.0)
     for remedy in (
         "v2v-quarantine --videos DIR",
-        "start this server again",
+        "restart this server",
         'set "quarantine" of the saved state to None',
     ):
         assert remedy in str(refused.value)
