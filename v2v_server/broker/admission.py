@@ -92,10 +92,10 @@ class Admission:
         if quarantine > newest:
             raise CorpusError(
                 f"quarantine snapshot {quarantine} was asked for, this server has 0 .. {newest}: the stream follows "
-                "entries that this server has not read. Replace this server's quarantine file by that of the stream's "
-                "earlier server (v2v-quarantine --videos DIR prints its path), and restart this server; if they are "
-                'the same file, just restart. To continue without these entries, set "quarantine" of the saved state '
-                "to None: the sequences that they refused then return"
+                "entries that this server has not read. Replace this server's quarantine file with that of the "
+                "stream's earlier server (v2v-quarantine --videos DIR prints its path), and restart this server; if "
+                'they are the same file, just restart. To continue without these entries, set "quarantine" of the '
+                "saved state to None: the sequences that they refused then return"
             )
         table = self._table(spec)
         schedule = Schedule.of(table, spec)

@@ -4,6 +4,7 @@ A pixel model that sees two frames takes its light to change evenly in between. 
 that is wrong: the pixels on its way brighten and darken again. So a step in which things move is divided into sub-steps
 (``substep_px`` of the spec), and the levels between them are made of both frames, moved along.
 
+    pyramid.py     a picture from fine to coarse
     matching.py    block motion between two pictures
     plane.py       the motion along a video
     warping.py     the pictures between
@@ -15,8 +16,9 @@ All of it but the prediction is integer arithmetic, so that every host makes the
 """
 
 from v2v_server.motion.clip import MARGIN_PX, cells_of, levels_between, levels_of, load, substeps
-from v2v_server.motion.matching import Cells, Pyramid, Vectors, motion
+from v2v_server.motion.matching import Vectors, motion
 from v2v_server.motion.plane import MotionOfCuts, MotionOfPictures, motions
+from v2v_server.motion.pyramid import Cells, Pyramid
 
 __all__ = [
     "MARGIN_PX",

@@ -17,8 +17,9 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import MOST_SUBSTEPS
 from v2v_server.motion.lanes import CELL_PX
-from v2v_server.motion.matching import UNITS_PER_PX, Cells, Vectors, compiled, padded
+from v2v_server.motion.matching import UNITS_PER_PX, Vectors
 from v2v_server.motion.plane import motions
+from v2v_server.motion.pyramid import Cells, compiled, padded
 from v2v_server.motion.warping import between
 from v2v_server.simulation.draw import resized_size
 from v2v_server.simulation.view import Frames, Window, contrast_table, crop_place, crop_region, resized

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from v2v_server.motion.matching import Cells, Pyramid, Vectors, motion, motion_if_any
+from v2v_server.motion.matching import Vectors, motion, motion_if_any
+from v2v_server.motion.pyramid import Cells, Pyramid
 from v2v_server.simulation.view import Frames
 from v2v_server.video.collect import Cut
 

@@ -21,8 +21,9 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.motion.clip import levels_between
-from v2v_server.motion.matching import UNITS_PER_PX, Pyramid, Vectors, motion, without_slow
+from v2v_server.motion.matching import UNITS_PER_PX, Vectors, motion, without_slow
 from v2v_server.motion.plane import motions
+from v2v_server.motion.pyramid import Pyramid
 from v2v_server.motion.warping import between
 from v2v_server.simulation.intensity import fine_table, log_table
 from v2v_server.simulation.view import Frames

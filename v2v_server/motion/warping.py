@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.motion.lanes import CELL_PX, WEIGHT_BITS, warp_cell
-from v2v_server.motion.matching import PAD_PX, Picture, Vectors, compiled
+from v2v_server.motion.matching import Vectors
+from v2v_server.motion.pyramid import PAD_PX, Picture, compiled
 
 FineGrey = npt.NDArray[np.uint16]
 _FRACTIONS = 32

@@ -52,14 +52,7 @@ from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, simulate
-from v2v_server.worker.cleaning import (
-    CleanFrames,
-    frame_index,
-    frame_times,
-    most_frames,
-    usable_window,
-    within_rows,
-)
+from v2v_server.worker.cleaning import CleanFrames, frame_index, frame_times, most_frames, usable_window, within_rows
 from v2v_server.worker.colour import chroma_cut
 from v2v_server.worker.scene_choice import FlowPlan, crop_weight, plan_flow
 from v2v_server.worker.sidecars import errors_of_sidecar, sidecar_files

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.oracles.rendered import rendered_scene
-from v2v_server.motion.matching import UNITS_PER_PX, Pyramid, motion, without_slow
+from v2v_server.motion.matching import UNITS_PER_PX, motion, without_slow
+from v2v_server.motion.pyramid import Pyramid
 
 HALF_PX = UNITS_PER_PX // 2
 

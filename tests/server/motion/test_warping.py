@@ -7,7 +7,8 @@ import numpy.typing as npt
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from v2v_server.motion.matching import UNITS_PER_PX, padded
+from v2v_server.motion.matching import UNITS_PER_PX
+from v2v_server.motion.pyramid import padded
 from v2v_server.motion.warping import between
 
 Reals = npt.NDArray[np.float64]
