@@ -89,10 +89,14 @@ def clip(
         frames[t] = cv2.warpPerspective(background, step @ start, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT_101)
     for _ in range(random.integers(3, 7) if is_plain else random.integers(0, 4)):
         patch = cut_out(objects, random) if objects and random.random() < 0.5 else ellipse(photographs, random)
+        if plain > 0 and random.random() < plain:
+            patch[..., :3] = flat(patch[..., :3])
         for t, step in enumerate(motion(random, pace(random), count)):
             moved = cv2.warpPerspective(patch, step, (WIDTH, HEIGHT))
+            x, y, width, height = cv2.boundingRect(moved[..., 3])
+            moved, under = moved[y : y + height, x : x + width], frames[t, y : y + height, x : x + width]
             inside = moved[..., 3:] / np.float32(255)
-            frames[t] = np.rint(inside * moved[..., :3] + (1 - inside) * frames[t])
+            under[:] = np.rint(inside * moved[..., :3] + (1 - inside) * under)
     return tone(random)[frames]
 
 
@@ -125,7 +129,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--frames", type=int, default=130, help="frames of a clip")
     parser.add_argument("--rate", type=int, default=30, help="frames a second; motion is given per frame")
-    parser.add_argument("--plain", type=float, default=0.0, help="share of clips before a smooth gradient")
+    parser.add_argument("--plain", type=float, default=0.0, help="share of backgrounds, and of patches, that are a smooth gradient")
     args = parser.parse_args()
     files = sorted(p for p in args.photographs.rglob("*") if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
     pictures = [picture for p in files if (picture := cv2.imread(str(p), cv2.IMREAD_UNCHANGED)) is not None]

@@ -43,8 +43,10 @@ DEFECTS = ("bars", "black", "combed", "cuts", "duplicates", "fades", "white")
 MOST_SAMPLES_PER_DECODE = 32
 MOST_SUBSTEPS = 16
 """Largest number of sub-steps of a step between video frames."""
-LATER_FIELDS = ("substep_px", "keep_defects", "still_share", "moving_share", "tolerance")
+LATER_FIELDS = ("substep_px", "keep_defects", "still_share", "moving_share", "quiet_share", "tolerance")
 """Fields that the plain form leaves out at their defaults, so that older digests hold."""
+_OF_SCENES = {"quiet_share": 1.0, "moving_share": 0.0}
+"""Fields that scene "off" admits at these values only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +113,9 @@ class StreamSpec:
     )  # fmt: skip
     keep_defects: str = text("", f"what scene auto serves as it is, with commas between; of {', '.join(DEFECTS)}")
     still_share: float = number(0.1, 0.0, 1.0, "share of the still sequences that scene auto serves")
+    quiet_share: float = number(
+        1.0, 0.0, 1.0, "share of the quiet sequences, in which little of the picture changes, that scene auto serves"
+    )
     moving_share: float = number(
         0.0, 0.0, 1.0, "share of the samples whose crop is drawn with weight by how much changes there (scene auto)"
     )
@@ -133,11 +138,12 @@ class StreamSpec:
         kinds = sorted({kind.strip() for kind in self.keep_defects.split(",")} - {""})
         require_known(kinds, DEFECTS, "kind in spec keep_defects")
         object.__setattr__(self, "keep_defects", ",".join(kinds))
-        if self.moving_share and self.scene == "off":
-            raise UsageError(
-                f'spec moving_share = {self.moving_share:g} applies only to scene = "auto", which is "off": set '
-                "moving_share = 0, or scene = auto"
-            )
+        for name, default in _OF_SCENES.items():
+            if (share := getattr(self, name)) != default and self.scene == "off":
+                raise UsageError(
+                    f'spec {name} = {share:g} applies only to scene = "auto", which is "off": set {name} = '
+                    f"{default:g}, or scene = auto"
+                )
         if self.flow_from > self.recipe.voxels_per_clip:
             raise UsageError(
                 f"spec flow_from = {self.flow_from}: give a whole number from 0 to the recipe's voxels_per_clip "
@@ -201,7 +207,7 @@ class StreamSpec:
         if changes.get("samples_per_decode") == 1:
             changes.setdefault("sibling_spacing", 0)
         if changes.get("scene") == "off":
-            changes.setdefault("moving_share", 0.0)
+            changes = _OF_SCENES | changes
         return dataclasses.replace(base, **changes)
 
     def canonical(self) -> bytes:
@@ -233,6 +239,7 @@ class SpecOptions(TypedDict, total=False):
     scene: SceneChoice | None
     keep_defects: str | None
     still_share: float | None
+    quiet_share: float | None
     moving_share: float | None
     substep_px: float | None
     tolerance: float | None

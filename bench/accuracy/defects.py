@@ -222,6 +222,7 @@ _EVENTS: tuple[Column, ...] = (
 )
 _NOISE: tuple[Column, ...] = (
     ("moving_share", "moving_share", "{:g}", 1),
+    ("quiet_share", "quiet_share", "{:g}", 1),
     ("samples", "samples", "{}", 1),
     ("noisy_share", "mostly noise", "{:.1%}", 1),
 )
@@ -231,7 +232,7 @@ _REAL: tuple[Column, ...] = (("video", "video as it is", "{}", 1), ("kind", "kin
 def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     add_videos(parser, "real videos")
-    add_whole(parser, "--clips", 10, "clips to make defects of")
+    add_whole(parser, "--clips", 10, "clips to make defects of; 0: look for noise only", least=0)
     add_whole(parser, "--samples", 120, "samples of the videos to look for noise in")
 
 
@@ -246,12 +247,12 @@ def measure(asked: argparse.Namespace) -> Report:
         real += [{"measure": "real", "video": name, "kind": each.kind, "text": each.text} for each in defects]
         parts_of += [(number, name, film) for number, film in enumerate(parts)]
     clips = [(name, film) for _, name, film in sorted(parts_of, key=lambda each: each[:2])[: asked.clips]]
-    if len(clips) < 4:
+    if 0 < asked.clips and len(clips) < 4:
         raise UsageError(f"--videos {asked.videos}: {len(clips)} videos are clean and move; give four")
     records: list[dict[str, Any]] = []
     false: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
-        for name, (kind, change, _) in MADE.items():
+        for name, (kind, change, _) in MADE.items() if clips else ():
             said, missed = list[str](), list[str]()
             made = list[Film]()
             for seed, (_, film) in enumerate(clips):
@@ -274,8 +275,9 @@ def measure(asked: argparse.Namespace) -> Report:
                  "others_found": len(said), "others": ", ".join(said), "missed": ", ".join(missed)}
             )  # fmt: skip
             progress(f"{name}: missed {len(missed)} of {cases}; others {said}; {missed}; {false[-2:]}")
-    share = sum(each["found"] or 0 for each in records) / ((len(MADE) - 1) * len(clips) * len(_BIT_RATES))
-    lines = [f"{share:.1%} of the defects are found"]
+    cases = (len(MADE) - 1) * len(clips) * len(_BIT_RATES)
+    share = sum(each["found"] or 0 for each in records) / cases if clips else 1.0
+    lines = [f"{share:.1%} of the defects are found"] if clips else []
     bars = [] if share >= LEAST_FOUND else [f"{share:.1%} of the defects are found; the bar is {LEAST_FOUND:.0%}"]
     noise = noisy_samples(asked.videos, asked.samples)
     tables = [(records, _CASES), (real, _REAL), (false, _EVENTS), (noise, _NOISE)]

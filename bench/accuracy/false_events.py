@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,8 +30,8 @@ from v2v_server.worker.cleaning import CleanFrames
 Film = npt.NDArray[np.uint8]
 THRESHOLD = 0.2
 SCENES: tuple[Literal["off"], Literal["auto"]] = ("off", "auto")
-SHARES = (0.0, 0.75, 1.0)
-"""Values of ``moving_share``."""
+SHARES = ((0.0, 1.0), (0.75, 1.0), (0.75, 0.25), (1.0, 0.25))
+"""Values of ``moving_share`` and ``quiet_share``."""
 _SEQUENCE = preset("noise-free").replace(voxels_per_clip=3, crop_height_px=64, crop_width_px=64)
 _LOG = log_intensity(np.arange(256) / 255.0)
 _SAMPLE = preset("paper").replace(voxels_per_clip=8)
@@ -88,30 +88,27 @@ def compared(frames: Film, levels: Reals) -> npt.NDArray[np.int64]:
 
 
 def noisy_samples(videos: Path, count: int) -> list[dict[str, Any]]:
-    """Return one record for each share of crops that are drawn by motion: how many samples are mostly noise.
+    """Return one record for each of :data:`SHARES`: how many samples of the paper's cameras are mostly noise.
 
-    A sample is if noise and hot pixels make most events of its voxel grid with the most events. The samples of all
-    shares have the same sequences and cameras.
+    A sample is if noise and hot pixels make most events of its voxel grid with the most events.
     """
     warm_up()
+    records = []
     with (
         tempfile.TemporaryDirectory() as folder,
         closing(open_catalogue(videos, cache_dir=folder, scene=True, processes=1)) as catalogue,
     ):
-        remakers = [
-            Remaker(catalogue, StreamSpec(recipe=_SAMPLE, scene="auto", moving_share=share), ("voxels",))
-            for share in SHARES
-        ]
-        noisy: list[list[bool]] = []
-        for index in range(min(count, remakers[0].count)):
-            try:
-                noisy.append([_is_mostly_noise(remaker, index) for remaker in remakers])
-            except VideoError:
-                continue
-    return [
-        {"measure": "noise", "moving_share": share, "samples": len(noisy), "noisy_share": float(np.mean(each))}
-        for share, each in zip(SHARES, zip(*noisy, strict=True), strict=True)
-    ]
+        for moving, quiet in SHARES:
+            spec = StreamSpec(recipe=_SAMPLE, scene="auto", moving_share=moving, quiet_share=quiet)
+            remaker, noisy = Remaker(catalogue, spec, ("voxels",)), list[bool]()
+            for index in range(min(count, remaker.count)):
+                with suppress(VideoError):
+                    noisy.append(_is_mostly_noise(remaker, index))
+            records.append(
+                {"measure": "noise", "moving_share": moving, "quiet_share": quiet, "samples": len(noisy),
+                 "noisy_share": float(np.mean(noisy))}
+            )  # fmt: skip
+    return records
 
 
 def _is_mostly_noise(remaker: Remaker, index: int) -> bool:

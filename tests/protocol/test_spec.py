@@ -70,6 +70,7 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
     "scene": "auto",
     "keep_defects": "bars,cuts",
     "still_share": 0.5,
+    "quiet_share": 0.5,
     "moving_share": 0.5,
 }
 
@@ -126,7 +127,8 @@ def test_every_field_changes_the_digest() -> None:
     for name, value in OTHER_RECIPE_VALUES.items():
         digests.add(StreamSpec.from_dict({"recipe": {name: value}}).digest)
     for name, value in OTHER_SPEC_VALUES.items():
-        needed = {"sibling_spacing": {"samples_per_decode": 3}, "moving_share": {"scene": "auto"}}.get(name, {})
+        auto = {"scene": "auto"}
+        needed = {"sibling_spacing": {"samples_per_decode": 3}, "moving_share": auto, "quiet_share": auto}.get(name, {})
         digests.add(StreamSpec.from_dict({name: value, **needed}).digest)
     # lead_frames alone is the preset paper-flow: one digest comes twice.
     assert len(digests) == 1 + len(OTHER_RECIPE_VALUES) + len(OTHER_SPEC_VALUES) - 1

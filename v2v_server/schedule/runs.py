@@ -2,7 +2,8 @@
 
 A run is what a spec may read in one go: frames of one shot with one set of bars, without the pieces that are skipped.
 Repeated frames do not count. Sequences begin at 0, L, 2L ... of each run, as many as ``max_sequences_per_video`` of a
-video. Of the still ones, a share is kept: which, depends on a hash of the video's number and the first frame.
+video. Of those that are still for three quarters, and of the others that are quiet for half, shares are kept: which,
+depends on a hash of the video's number and the first frame.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Runs:
 
     Attributes:
         piece_first, piece_run: [U] first frame and run of each usable piece.
-        piece_still: [U], whether it is still.
+        piece_flags: [U], its flags.
         ends: [U], usable frames up to the end of each piece, of all videos together.
         first: [R], the usable frames before each run.
         frames: [R], usable frames of each run.
@@ -80,14 +81,12 @@ class Runs:
         usable = ~skipped & ~repeated
         runs, self.piece_run = np.unique(np.cumsum(begins)[usable], return_inverse=True)
         lengths = (pieces["end"] - firsts)[usable]
-        self.piece_first, self.piece_still = firsts[usable], (flags[usable] & Flag.STILL) != 0
+        self.piece_first, self.piece_flags = firsts[usable], flags[usable]
         self.ends: _Int64 = np.cumsum(lengths)
         at = np.searchsorted(self.piece_run, np.arange(len(runs)))  # the first piece of each run
         self.first: _Int64 = (self.ends - lengths)[at]
         self.frames: _Int64 = np.diff(np.concatenate((self.first, self.ends[-1:])))
         self.owners, self.sides = owners[usable][at], sides[usable][at]
-        still = np.where(self.piece_still, lengths, 0)
-        self._still_before = np.cumsum(still) - still
         self._piece_begin = self.ends - lengths
 
     def frame(self, place: _Int64) -> _Int64:
@@ -96,15 +95,18 @@ class Runs:
         frames: _Int64 = self.piece_first[piece] + place - self._piece_begin[piece]
         return frames
 
-    def still(self, first: _Int64, count: _Int64) -> _Int64:
-        """Return how many of ``count`` usable frames from each place on are still."""
-        return self._still_upto(first + count - 1) - self._still_upto(first - 1)
+    def flagged(self, flag: int, first: _Int64, count: _Int64) -> _Int64:
+        """Return how many of ``count`` usable frames from each place on have a flag."""
+        has = (self.piece_flags & flag) != 0
+        lengths = np.where(has, self.ends - self._piece_begin, 0)
+        before = np.cumsum(lengths) - lengths
 
-    def _still_upto(self, place: _Int64) -> _Int64:
-        """Return how many usable frames up to a place, including it, are still."""
-        piece = np.minimum(self.ends.searchsorted(place, side="right"), len(self.ends) - 1)
-        inside = np.where(self.piece_still[piece], place + 1 - self._piece_begin[piece], 0)
-        return self._still_before[piece] + inside
+        def upto(place: _Int64) -> _Int64:
+            piece = np.minimum(self.ends.searchsorted(place, side="right"), len(self.ends) - 1)
+            found: _Int64 = before[piece] + np.where(has[piece], place + 1 - self._piece_begin[piece], 0)
+            return found
+
+        return upto(first + count - 1) - upto(first - 1)
 
 
 class SplitSequences:
@@ -146,10 +148,11 @@ class SplitSequences:
         owners = runs.owners[number]
         places = runs.first[number] + strides[owners] * within
         starts = runs.frame(places) if len(places) else places
-        if spec.still_share < 1 and len(places):
+        if min(spec.still_share, spec.quiet_share) < 1 and len(places):
             needed = strides[owners] + 1
-            is_still = 4 * runs.still(places, needed) >= 3 * needed
-            kept = ~is_still | (_hash(split.numbers[owners], starts) < spec.still_share)
+            shares = np.where(2 * runs.flagged(Flag.QUIET, places, needed) >= needed, spec.quiet_share, 1.0)
+            shares[4 * runs.flagged(Flag.STILL, places, needed) >= 3 * needed] = spec.still_share
+            kept = (shares >= 1) | (_hash(split.numbers[owners], starts) < shares)
             owners, starts = owners[kept], starts[kept]
         found = np.bincount(owners, minlength=len(split)) if len(owners) else np.zeros(len(split), np.int64)
         self._begin = np.cumsum(found) - found

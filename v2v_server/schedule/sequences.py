@@ -292,7 +292,7 @@ def _all_cut(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal:
     for sides in runs.sides[runs.frames >= needed].tolist():
         if (refusal := _too_small(video, rows, recipe, Sides(*sides))) is not None:
             return refusal
-    return _unsuited(video, "all its sequences are still", "still_share 1")
+    return _unsuited(video, "all its sequences are still or quiet", "still_share 1 and quiet_share 1")
 
 
 def _frame_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec) -> int:

@@ -62,7 +62,7 @@ def expected(parts: Pieces, frames: int, spec: StreamSpec) -> list[int]:
 @st.composite
 def divided(draw: st.DrawFn) -> Pieces:
     ends = sorted(draw(st.sets(st.integers(1, 300), min_size=1, max_size=8)))
-    flags = st.sampled_from([0, 0, Flag.CUT, Flag.REPEAT, Flag.REPEAT, Flag.STILL, *SKIPPED])
+    flags = st.sampled_from([0, 0, Flag.CUT, Flag.REPEAT, Flag.REPEAT, Flag.STILL, Flag.QUIET, *SKIPPED])
     return pieces(*((end, draw(flags), draw(st.sampled_from([NO_BARS, NO_BARS, BARS]))) for end in ends))
 
 
@@ -92,7 +92,7 @@ def test_what_can_be_done_about_a_video_is_said() -> None:
             "picture 64x24 after rows full and without its bars, the crop is 32x32",
             "resize_scale up to 1.334, or a smaller crop",
         ),
-        ("all its sequences are still", "still_share 1"),
+        ("all its sequences are still or quiet", "still_share 1 and quiet_share 1"),
     ]
     assert table.count == 0
 
@@ -105,6 +105,29 @@ def test_a_share_of_the_still_sequences_is_served(share: float) -> None:
     found = np.array([start for _, start in starts(SequenceTable([video("a", 20_000, parts)], Rows(), spec))])
     assert np.count_nonzero(found > 16_000) == 198
     assert abs(np.count_nonzero(found <= 16_000) - share * 801) <= 50
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+def test_a_share_of_the_quiet_sequences_is_served(share: float) -> None:
+    """Quiet for half, and not still; what is still is up to still_share alone."""
+    quiet, still = Flag.QUIET, Flag.QUIET | Flag.STILL
+    parts = pieces((16_000, quiet), (16_011, 0), (16_020, quiet), (20_000, 0), (24_000, still))
+    spec = StreamSpec(
+        recipe=RECIPE, scene="auto", still_share=1.0, quiet_share=share, max_sequences_per_video=10_000
+    )
+    found = np.array([start for _, start in starts(SequenceTable([video("a", 24_000, parts)], Rows(), spec))])
+    assert found[found >= 16_000].tolist() == list(range(16_000, 23_980, 20))
+    assert abs(np.count_nonzero(found < 16_000) - share * 800) <= 50
+
+
+@given(divided(), st.floats(0, 1), st.floats(0, 1))
+def test_shares_are_nested(parts: Pieces, one: float, other: float) -> None:
+    """A larger share serves all sequences of a smaller one."""
+    few, many = (
+        set(starts(SequenceTable([video("a", 300, parts)], Rows(), replace(AUTO, quiet_share=share))))
+        for share in sorted((one, other))
+    )
+    assert few <= many <= set(starts(SequenceTable([video("a", 300, parts)], Rows(), AUTO)))
 
 
 @given(st.integers(21, 300), st.integers(1, 12))

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError
 
-ANALYSIS_VERSION = 3
+ANALYSIS_VERSION = 4
 """Raise it with every change of what an analysis finds: earlier ones are then repeated."""
 SEGMENT_FRAMES = 16
 """Frames of a segment. Segment i of a video holds frames 16 i .. 16 i + 15."""
@@ -38,7 +38,7 @@ CONTRAST, DARK, CLIPPED, FLICKER, NOISE = range(2 * TILES**2, 2 * TILES**2 + 5)
 COLUMNS = NOISE + 1
 _UNITS = np.array([64.0] * TILES**2 + [64.0] * TILES**2 + [64.0, 1000.0, 1000.0, 64.0, 64.0])
 """How many of each column's units make one pixel, grey level or whole."""
-_MAGIC = b"VSC3"
+_MAGIC = b"VSC4"
 _HEADER = struct.Struct("<4sIIHI")  # magic, first, end, segments, pieces
 
 
@@ -61,6 +61,8 @@ class Flag:
     """Two fields of different times are woven together."""
     UNSEEN = 128
     """They were not analysed, and earlier frames of the video have defects."""
+    QUIET = 256
+    """Little of the picture changes: less than 35 grey levels over four frames in the mean of the tiles."""
 
 
 _TELLING = Flag.CUT | Flag.REPEAT | Flag.FADE | Flag.COMBED

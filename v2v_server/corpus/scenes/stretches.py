@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.corpus.scenes.bars import common_bars
-from v2v_server.corpus.scenes.scene import LAG_FRAMES, NO_BARS, PIECE, Flag, Pieces, Sides
+from v2v_server.corpus.scenes.scene import LAG_FRAMES, NO_BARS, PIECE, SEGMENT_FRAMES, Flag, Pieces, Sides
 from v2v_server.corpus.scenes.steps import Spans, runs_of
 
 _STILL_CHANGE = 2 * 64
@@ -111,6 +111,7 @@ def pieces_of(
     contrast: npt.NDArray[np.int64],
     still: npt.NDArray[np.bool_],
     flat: npt.NDArray[np.bool_],
+    quiet: npt.NDArray[np.bool_],
     repeats: npt.NDArray[np.bool_],
     boundaries: Sequence[int],
     combed: Sequence[tuple[int, bool]],
@@ -121,7 +122,7 @@ def pieces_of(
 
     Args:
         light, contrast: see :func:`fades_of`.
-        still, flat: [N] of each frame.
+        still, flat, quiet: [N] of each frame.
         repeats: [N - 1] of each step.
         boundaries: frames at which another shot begins.
         combed: see :func:`combed_runs`.
@@ -136,6 +137,7 @@ def pieces_of(
     spans = {
         Flag.FADE: fades_of(light, contrast),
         Flag.STILL: runs_of(still & ~flat, _STILL_FRAMES, _STILL_GAP),
+        Flag.QUIET: runs_of(quiet, SEGMENT_FRAMES),
         Flag.BLACK: runs_of(flat & ~bright, _FLAT_FRAMES),
         Flag.WHITE: runs_of(flat & bright, _FLAT_FRAMES),
         Flag.COMBED: [run for first, end in shots for run in combed_runs(combed, first, end)],

@@ -93,6 +93,16 @@ def test_change_and_contrast_against_their_definitions() -> None:
     assert values[0, CONTRAST] == pytest.approx(max(blocks[t].std() for t in range(16)), abs=1 / 64)
 
 
+def test_what_changes_little_of_the_picture_is_quiet() -> None:
+    """The mean over the tiles decides, for whole segments."""
+    corner = np.repeat(pan(1, 0, 96, 128), 40, axis=0)
+    corner[:, :24, :32] = other(40, 3, 24, 32)
+    scene = analyse(np.concatenate([pan(24, 4, 96, 128), corner]))
+    is_quiet = [bool(flags & Flag.QUIET) for _, flags, *_ in scene.pieces.tolist()]
+    assert (scene.values(0, 64)[:, CHANGE].mean(axis=1) < 35).tolist() == [False, False, True, True]
+    assert np.repeat(is_quiet, np.diff(scene.pieces["end"], prepend=0)).tolist() == [False] * 32 + [True] * 32
+
+
 @pytest.mark.parametrize(("level", "dark", "clipped"), [(15, 1, 0), (16, 0, 0), (249, 0, 0), (250, 0, 1)])
 def test_dark_and_clipped_shares(level: int, dark: float, clipped: float) -> None:
     luma = np.full((5, 40, 64), 100, np.uint8)
@@ -171,7 +181,7 @@ def test_encoding_and_slices(scene: Scene, data: st.DataObject) -> None:
 
 @given(st.binary(max_size=60))
 def test_what_is_no_scene_is_refused(data: bytes) -> None:
-    for content in (data, b"VSC3" + data):
+    for content in (data, b"VSC4" + data):
         with pytest.raises(ProtocolError):
             Scene.from_bytes(content)
 
@@ -267,7 +277,7 @@ def test_storage_that_fails_while_a_video_is_looked_at_is_asked_again(
 def test_only_the_rows_in_use_are_looked_at(folder: Path) -> None:
     luma = np.concatenate([pan(60, 1, 96), np.repeat(pan(1, 0, 64), 60, axis=0)], axis=1)
     luma[30:, :96] = other(30)
-    still = pieces((60, Flag.STILL)).tobytes()
+    still = pieces((60, Flag.STILL | Flag.QUIET)).tobytes()
     write_clip(folder / "below.mkv", luma, codec="ffv1", pixel_format="gray")
     for rows, expected in (("full", shots(60, 30).tobytes()), ("0.6:1", still)):
         with opened(folder, rows=Rows.parse(rows)) as catalogue:
