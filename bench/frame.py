@@ -14,12 +14,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from v2v_client.tools import loadtest
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe
 from v2v_protocol.records import write_json
-from v2v_protocol.spec import StreamSpec
 
 Record = Mapping[str, Any]  # Flat: keys with SI units -> text, number, bool or None
 Column = tuple[str, str, str, float]  # Key of a record, title, format, and the factor from SI units to what is shown
@@ -145,24 +142,3 @@ def add_videos(parser: Parser, what: str = "corpus to serve", rows: str | None =
     parser.add_argument("--videos", required=True, type=Path, metavar="DIR", help=what)
     if rows is not None:
         parser.add_argument("--rows", default=rows, help=f"rows of --videos to use (default {rows})")
-
-
-def add_changes(parser: Parser) -> None:
-    """Add ``--set``."""
-    parser.add_argument(
-        "--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field"
-    )
-
-
-def recipe_of(changes: Sequence[str]) -> Recipe:
-    """Return the paper's recipe with the changes of ``--set``.
-
-    Raises:
-        RecipeError, UsageError: a change is not valid.
-    """
-    return StreamSpec.from_dict({"recipe": loadtest.recipe_of("paper", changes)}).recipe
-
-
-def server_flags(changes: Sequence[str]) -> list[str]:
-    """Return the changes of ``--set`` as flags of ``v2v-serve``."""
-    return [flag for change in changes for flag in ("--set", change)]

@@ -1,11 +1,7 @@
 """Processes: CPU time by role, resident memory and the line through it over time, free ports.
 
-The slope of memory is that of ordinary least squares, with one slope for all processes and an intercept for each (a
-restarted server is another process):
-
-    y_ij = a_i + b t_ij + e_ij
-
-Neighbouring points are correlated, so the textbook standard error is far too small; it is multiplied by
+The slope of memory is that of ordinary least squares. Neighbouring points are correlated, so the textbook standard
+error is far too small; it is multiplied by
 sqrt((1 + r) / (1 - r)), where r is the lag-one autocorrelation of the residuals (the effective sample size of an AR(1)
 process; von Storch and Zwiers, "Statistical Analysis in Climate Research", 1999, section 6.6).
 """
@@ -19,11 +15,10 @@ import socket
 import time
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import psutil
 
 from v2v_client.batch import Batch
@@ -71,46 +66,29 @@ def cpu_seconds_of(roles: Roles) -> dict[str, float]:
     return {role: sum(map(cpu_seconds, pids)) for role, pids in roles.items()}
 
 
-@dataclass(frozen=True, slots=True)
-class Consumed:
-    """One measured stretch of a stream.
+def consume(dataset: V2VStreamDataset, roles: Roles, *, seconds: float, warmup_batches: int) -> dict[str, float]:
+    """Consume batches as fast as they come, over as many epochs as needed; count after the warm-up.
 
-    Attributes:
-        batches: received.
-        nbytes: of their tensors.
-        seconds: by the clock.
-        cpu_seconds: by role.
+    Returns:
+        a flat record: batches, bytes of their tensors, seconds and rates by the clock, processor time of each role.
     """
-
-    batches: int
-    nbytes: int
-    seconds: float
-    cpu_seconds: Mapping[str, float]
-
-    @property
-    def batches_per_second(self) -> float:
-        """Return the rate by the clock."""
-        return self.batches / self.seconds
-
-    def cpu_seconds_per_batch(self, role: str | None = None) -> float:
-        """Return the CPU seconds a batch of one role, or of all."""
-        return (sum(self.cpu_seconds.values()) if role is None else self.cpu_seconds[role]) / self.batches
-
-
-def consume(dataset: V2VStreamDataset, roles: Roles, *, seconds: float, warmup_batches: int) -> Consumed:
-    """Consume batches as fast as they come, over as many epochs as needed; count after the warm-up."""
     batches = endless(dataset)
     for _ in range(warmup_batches):
         next(batches)
     before, began, taken, nbytes = cpu_seconds_of(roles), time.perf_counter(), 0, 0
-    while True:
+    while (elapsed := time.perf_counter() - began) < seconds or not taken:
         nbytes += next(batches).nbytes
         taken += 1
-        elapsed = time.perf_counter() - began
-        if elapsed >= seconds:
-            batches.close()
-            used = {role: total - before[role] for role, total in cpu_seconds_of(roles).items()}
-            return Consumed(taken, nbytes, elapsed, used)
+    batches.close()
+    after = cpu_seconds_of(roles)
+    return {
+        "batches": taken,
+        "bytes": nbytes,
+        "seconds": elapsed,
+        "batches_per_second": taken / elapsed,
+        "bytes_per_second": nbytes / elapsed,
+        **{f"{role}_cpu_seconds_per_batch": (after[role] - before[role]) / taken for role in roles},
+    }
 
 
 def endless(dataset: Iterable[Batch]) -> Generator[Batch, None, None]:
@@ -119,73 +97,29 @@ def endless(dataset: Iterable[Batch]) -> Generator[Batch, None, None]:
         yield from dataset
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
-    """A line through memory over time.
-
-    Attributes:
-        slope: MiB a minute.
-        standard_error: of the slope.
-        residual: standard deviation of the residuals, MiB.
-        points, series: numbers used.
-        first, last, most: MiB at both ends of the last series, and the most in any.
-    """
+class Fit(NamedTuple):
+    """Slope of a line through memory over time, and its standard error, MiB a minute."""
 
     slope: float
     standard_error: float
-    residual: float
-    points: int
-    series: int
-    first: float
-    last: float
-    most: float
 
 
-def fit(series: Sequence[Series], *, skip_seconds: float = 0.0) -> Fit:
-    """Fit the common slope of several series.
-
-    Args:
-        series: of each process.
-        skip_seconds: warm-up at the beginning of each; series with fewer than three later points are left out.
+def fit(series: Series) -> Fit:
+    """Fit a line to memory over time.
 
     Raises:
-        UsageError: no series is left.
+        UsageError: there are fewer than three points.
     """
-    used = []
-    for each in series:
-        points = np.array(each, dtype=np.float64).reshape(-1, 2)
-        points = points[points[:, 0] - points[:1, 0] >= skip_seconds]
-        if len(points) >= 3 and np.ptp(points[:, 0]) > 0:
-            used.append(points)
-    if not used:
-        raise UsageError(f"no process has three points after {skip_seconds:g} s of warm-up: run for longer")
-    centred = [points - points.mean(axis=0) for points in used]
-    both = np.concatenate(centred)
-    spread = float(both[:, 0] @ both[:, 0])
-    slope = float(both[:, 0] @ both[:, 1]) / spread
-    residuals = [points[:, 1] - slope * points[:, 0] for points in centred]
-    error = np.concatenate(residuals)
-    freedom = max(1, len(error) - len(used) - 1)
-    variance = float(error @ error) / freedom
-    r = _autocorrelation(residuals)
-    widened = math.sqrt(variance / spread * (1 + r) / (1 - r))
-    return Fit(
-        slope=60.0 * slope,
-        standard_error=60.0 * widened,
-        residual=math.sqrt(variance),
-        points=len(error),
-        series=len(used),
-        first=float(used[-1][0, 1]),
-        last=float(used[-1][-1, 1]),
-        most=max(float(points[:, 1].max()) for points in used),
-    )
-
-
-def _autocorrelation(residuals: Sequence[npt.NDArray[np.float64]]) -> float:
-    """Return the lag-one autocorrelation over all series, at least 0: a negative one would narrow the error."""
-    power = sum(float(each @ each) for each in residuals)
-    lagged = sum(float(each[:-1] @ each[1:]) for each in residuals)
-    return min(max(lagged / power, 0.0), _MOST_AUTOCORRELATION) if power > 0 else 0.0
+    if len(series) < 3:
+        raise UsageError(f"a process has {len(series)} points after its warm-up; three are needed: run for longer")
+    seconds, mib = np.array(series, dtype=np.float64).T
+    slope, start = np.polyfit(seconds, mib, 1)
+    residuals = mib - start - slope * seconds
+    power = float(residuals @ residuals)
+    # A negative autocorrelation would narrow the error.
+    r = np.clip(residuals[:-1] @ residuals[1:] / power, 0.0, _MOST_AUTOCORRELATION) if power > 0 else 0.0
+    variance = power / max(1, len(seconds) - 2) / (len(seconds) * np.var(seconds))
+    return Fit(60.0 * float(slope), 60.0 * math.sqrt(variance * (1 + r) / (1 - r)))
 
 
 def rss_mib(pid: int) -> float | None:

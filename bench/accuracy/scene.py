@@ -23,10 +23,11 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from bench.frame import Column, Record, Report, add_changes, add_videos, add_whole, progress, recipe_of
+from bench.frame import Column, Record, Report, add_videos, add_whole, progress
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.messages import Lease
+from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
@@ -164,7 +165,6 @@ def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     add_videos(parser, "real videos")
     add_whole(parser, "--sequences", 3, "most sequences of each video")
-    add_changes(parser)
 
 
 def measure(asked: argparse.Namespace) -> Report:
@@ -173,7 +173,7 @@ def measure(asked: argparse.Namespace) -> Report:
     Raises:
         UsageError: no video gives a sequence.
     """
-    recipe = recipe_of(["voxels_per_clip=8", *asked.changes])  # short clips, so that videos of two seconds take part
+    recipe = Recipe(voxels_per_clip=8)  # short clips, so that videos of two seconds take part
     specs = [StreamSpec(recipe=recipe, scene=scene) for scene in SCENES]
     warm_up()
     with (

@@ -14,33 +14,22 @@ from __future__ import annotations
 
 import argparse
 import os
-import time
-from collections.abc import Iterable
-from contextlib import closing
-from dataclasses import dataclass, field
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from bench.frame import (
-    Column,
-    Report,
-    add_changes,
-    add_positive,
-    add_videos,
-    add_whole,
-    recipe_of,
-    server_flags,
-    whole,
-)  # fmt: skip
-from bench.processes import Fit, endless, fit, roles_of, rss_mib
+from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole
+from bench.processes import Fit, fit, roles_of, rss_mib
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_client.tools.schedule_check import ScheduleCheck
+from v2v_client.tools import loadtest
 from v2v_protocol.command import Parser
 
 _POINT_SECONDS = 1.0
 _WARM_UP_SHARE = 0.2
 _MOST_WARM_UP_SECONDS = 60.0
 _STANDARD_ERRORS = 3.0
+_ORDER = ("lost", "duplicated", "out_of_order")
 _COLUMNS: tuple[Column, ...] = (
     ("process", "process", "{}", 1),
     ("rss_slope_mib_per_minute", "MiB/min", "{:+.3f}", 1),
@@ -50,51 +39,35 @@ _COLUMNS: tuple[Column, ...] = (
     ("rss_most_mib", "most MiB", "{:.1f}", 1),
     ("points", "points", "{}", 1),
 )
+Memory = Mapping[str, Sequence[tuple[float, float]]]
+"""(seconds, MiB) of each process, by name: "broker", "worker 0", "client"."""
 
 
-@dataclass(slots=True)
-class Soak:
-    """What was observed.
+def soak(dataset: V2VStreamDataset, server: LocalServer, asked: argparse.Namespace) -> tuple[Record, Memory]:
+    """Consume as fast as samples come; return the record of the stream and the memory of each process."""
+    memory = defaultdict[str, list[tuple[float, float]]](list)
 
-    Attributes:
-        memory: (seconds, MiB) of each process, by name: "broker", "worker 0", "client".
-        samples, seconds: of the stream.
-        check: of its order.
-    """
+    def note(seconds: float, total: float, text: str) -> None:
+        if memory["client"] and seconds < memory["client"][-1][0] + _POINT_SECONDS:
+            return
+        workers = {f"worker {number}": pid for number, pid in enumerate(roles_of(server)["workers"])}
+        for name, pid in {"broker": server.pid, **workers, "client": os.getpid()}.items():
+            if (resident := rss_mib(pid)) is not None:
+                memory[name].append((seconds, resident))
 
-    memory: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
-    samples: int = 0
-    seconds: float = 0.0
-    check: ScheduleCheck = field(default_factory=lambda: ScheduleCheck(0, 1, 0))
-
-
-def soak(dataset: V2VStreamDataset, server: LocalServer, *, seconds: float, samples: int | None) -> Soak:
-    """Consume as fast as samples come: for that time, or that number of samples if it is given."""
-    seen = Soak()
-    first_epoch = dataset.epoch
-    began = next_point = time.monotonic()
-    with closing(endless(dataset)) as batches:
-        for batch in batches:
-            if not seen.samples and dataset.stream is not None:
-                seen.check = ScheduleCheck(dataset.stream.sequences, len(batch), first_epoch)
-            seen.check.observe(batch.epoch, batch.indices)
-            seen.samples += len(batch)
-            seen.seconds = time.monotonic() - began
-            over = seen.samples >= samples if samples is not None else seen.seconds >= seconds
-            if began + seen.seconds >= next_point or over:
-                next_point = began + seen.seconds + _POINT_SECONDS
-                _note(seen, server)
-            if over:
-                break
-    return seen
+    record, _ = loadtest.measure(
+        dataset, address=server.address, workers=asked.workers, server=server, batch_size=asked.batch_size,
+        seconds=60.0 * asked.minutes, warmup_batches=0, trainer_seconds=0.0, progress=note,
+    )  # fmt: skip
+    return record, memory
 
 
-def _note(seen: Soak, server: LocalServer) -> None:
-    workers = roles_of(server)["workers"]
-    pids = {"broker": server.pid, **{f"worker {number}": pid for number, pid in enumerate(workers)}}
-    for name, pid in {**pids, "client": os.getpid()}.items():
-        if (resident := rss_mib(pid)) is not None:
-            seen.memory.setdefault(name, []).append((seen.seconds, resident))
+def after(memory: Memory, warm_up_seconds: float) -> Memory:
+    """Return the memory of each process after the warm-up."""
+    return {
+        name: [point for point in points if point[0] >= points[0][0] + warm_up_seconds]
+        for name, points in memory.items()
+    }
 
 
 def grows(line: Fit, most_mib_per_hour: float) -> bool:
@@ -102,30 +75,27 @@ def grows(line: Fit, most_mib_per_hour: float) -> bool:
     return line.slope - most_mib_per_hour / 60.0 > _STANDARD_ERRORS * line.standard_error
 
 
-def records_of(seen: Soak, fits: dict[str, Fit]) -> list[dict[str, Any]]:
-    """Return one record for each process."""
+def records_of(stream: Record, memory: Memory, fits: Mapping[str, Fit]) -> list[dict[str, Any]]:
+    """Return one record for each process, of its memory after the warm-up."""
     return [
         {
             "process": name,
-            "rss_slope_mib_per_minute": line.slope,
-            "rss_slope_standard_error_mib_per_minute": line.standard_error,
-            "rss_first_mib": line.first,
-            "rss_last_mib": line.last,
-            "rss_most_mib": line.most,
-            "points": line.points,
-            "samples": seen.samples,
-            "seconds": seen.seconds,
-            "samples_per_second": seen.samples / seen.seconds,
-            **{name: getattr(seen.check, name) for name in ("lost", "duplicated", "out_of_order")},
+            "rss_slope_mib_per_minute": fits[name].slope,
+            "rss_slope_standard_error_mib_per_minute": fits[name].standard_error,
+            "rss_first_mib": points[0][1],
+            "rss_last_mib": points[-1][1],
+            "rss_most_mib": max(mib for _, mib in points),
+            "points": len(points),
+            "samples": round(stream["samples_per_second"] * stream["seconds"]),
+            **{key: stream[key] for key in ("seconds", "samples_per_second", *_ORDER)},
         }
-        for name, line in fits.items()
+        for name, points in memory.items()
     ]
 
 
-def missed(seen: Soak, growing: Iterable[str]) -> list[str]:
+def missed(stream: Record, growing: Iterable[str]) -> list[str]:
     """Return the bars that were missed."""
-    counts = {name: getattr(seen.check, name) for name in ("lost", "duplicated", "out_of_order")}
-    texts = [f"{count} samples {name.replace('_', ' ')}; the bar is 0" for name, count in counts.items() if count]
+    texts = [f"{stream[key]} samples {key.replace('_', ' ')}; the bar is 0" for key in _ORDER if stream[key]]
     return texts + [f"{name} grows" for name in growing]
 
 
@@ -133,22 +103,20 @@ def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     add_videos(parser)
     add_positive(parser, "--minutes", 15.0, "duration, minutes")
-    parser.add_argument("--samples", type=whole(1), metavar="N", help="stop after this many samples instead")
     add_whole(parser, "--workers", 2, "workers of the server")
     add_whole(parser, "--batch-size", 12, "samples of a batch")
-    add_changes(parser)
     add_positive(parser, "--most-mib-per-hour", 16.0, "allowed growth, MiB an hour")
 
 
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
-    recipe = recipe_of(asked.changes)
-    with LocalServer(asked.videos, workers=asked.workers, flags=server_flags(asked.changes)) as server:
-        dataset = V2VStreamDataset(server.address, batch_size=asked.batch_size, recipe=recipe, rank=0, world_size=1)
-        seen = soak(dataset, server, seconds=60.0 * asked.minutes, samples=asked.samples)
-    warm_up = min(_MOST_WARM_UP_SECONDS, _WARM_UP_SHARE * seen.seconds)
-    fits = {name: fit([series], skip_seconds=warm_up) for name, series in seen.memory.items()}
+    with LocalServer(asked.videos, workers=asked.workers) as server:
+        dataset = V2VStreamDataset(server.address, batch_size=asked.batch_size, rank=0, world_size=1)
+        stream, memory = soak(dataset, server, asked)
+    warm_up = min(_MOST_WARM_UP_SECONDS, _WARM_UP_SHARE * stream["seconds"])
+    memory = after(memory, warm_up)
+    fits = {name: fit(points) for name, points in memory.items()}
     growing = [name for name, line in fits.items() if grows(line, asked.most_mib_per_hour)]
-    records = records_of(seen, fits)
-    line = f"{seen.samples} samples in {seen.seconds:.0f} s; {warm_up:.0f} s of warm-up excluded from the fit"
-    return Report(records, [(records, _COLUMNS)], lines=[line], missed=missed(seen, growing))
+    records = records_of(stream, memory, fits)
+    line = f"{records[0]['samples']} samples in {stream['seconds']:.0f} s; {warm_up:.0f} s of warm-up excluded"
+    return Report(records, [(records, _COLUMNS)], lines=[line], missed=missed(stream, growing))

@@ -24,16 +24,7 @@ from typing import Any
 import numpy as np
 
 from bench.cable import NEAR, Cable
-from bench.frame import (
-    Column,
-    Report,
-    add_changes,
-    add_positive,
-    add_videos,
-    add_whole,
-    recipe_of,
-    server_flags,
-)  # fmt: skip
+from bench.frame import Column, Report, add_positive, add_videos, add_whole
 from bench.processes import consume
 from bench.speed.null_workers import NullService, null_service
 from tests.oracles.leases import open_leases, whole_sample
@@ -64,10 +55,10 @@ _COLUMNS: tuple[Column, ...] = (
 )
 
 
-def make_samples(folder: Path, videos: Path, rows: str, recipe: Recipe, count: int) -> None:
+def make_samples(folder: Path, videos: Path, rows: str, count: int) -> None:
     """Write the samples that null workers send: ``NAME.npy``, [count, ...] of each array."""
     warm_up()
-    with open_leases(videos, rows, StreamSpec(recipe=recipe)) as (root, leases):
+    with open_leases(videos, rows, StreamSpec()) as (root, leases):
         samples = [whole_sample(lease, root) for lease in islice(leases, count)]
     for name in samples[0].arrays:
         np.save(folder / f"{name}.npy", np.stack([sample.arrays[name] for sample in samples]))
@@ -84,27 +75,26 @@ def stretch(service: NullService, cable: Cable, asked: argparse.Namespace, *, co
         before = cable.bytes_received()
         done = consume(dataset, roles, seconds=asked.seconds, warmup_batches=2)
         came = cable.bytes_received() - before
-    bytes_per_batch = came / (done.batches + 2 + 1)  # the warm-up, and about one batch in flight at the end
-    return {
-        "batches_per_second": done.batches_per_second,
+    bytes_per_batch = came / (done["batches"] + 2 + 1)  # the warm-up, and about one batch in flight at the end
+    cores = done["batches_per_second"] * sum(done[f"{role}_cpu_seconds_per_batch"] for role in roles)
+    return done | {
         "wire_bytes_per_batch": bytes_per_batch,
-        "link_busy": bytes_per_batch * done.batches_per_second / (asked.mbit * 125e3),
-        "cpu_busy": sum(done.cpu_seconds.values()) / done.seconds / usable_cores(),
-        **{f"{role}_cpu_seconds_per_batch": done.cpu_seconds_per_batch(role) for role in roles},
+        "link_busy": bytes_per_batch * done["batches_per_second"] / (asked.mbit * 125e3),
+        "cpu_busy": cores / usable_cores(),
     }
 
 
-def compare(asked: argparse.Namespace, recipe: Recipe, folder: Path) -> list[dict[str, Any]]:
+def compare(asked: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     """Return the records of raw and of compressed samples: medians over the turns.
 
     Raises:
         UsageError: raw samples do not fill the link, or come faster than it.
     """
-    flags = [*server_flags(asked.changes), "--bind", f"tcp://{NEAR}:*", "--insecure"]
+    flags = ["--bind", f"tcp://{NEAR}:*", "--insecure"]
     found: dict[str, list[dict[str, float]]] = {"raw": [], "compressed": []}
     with (
         Cable(asked.mbit, asked.delay_ms, mtu=_MTU_BYTES) as cable,
-        null_service(recipe, workers=2, flags=flags, samples=folder) as service,
+        null_service(Recipe(), workers=2, flags=flags, samples=folder) as service,
     ):
         for _ in range(asked.turns):
             for name, stretches in found.items():
@@ -141,15 +131,13 @@ def add_flags(parser: Parser) -> None:
     add_whole(parser, "--samples", 24, "different samples")
     add_whole(parser, "--batch-size", 12, "samples of a batch")
     add_whole(parser, "--turns", 3, "stretches of each kind")
-    add_changes(parser)
 
 
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
-    recipe = recipe_of(asked.changes)
     with tempfile.TemporaryDirectory(prefix="v2v-link-") as name:
-        make_samples(Path(name), asked.videos, asked.rows, recipe, asked.samples)
-        records = compare(asked, recipe, Path(name))
+        make_samples(Path(name), asked.videos, asked.rows, asked.samples)
+        records = compare(asked, Path(name))
     ratio = records[1]["ratio_to_raw"]
     missed = [f"compressed: {ratio:.2f} times raw; the bar is {BAR:g}"] if ratio < BAR else []
     return Report(records, [(records, _COLUMNS)], missed=missed)

@@ -18,23 +18,13 @@ import statistics
 from collections.abc import Sequence
 from typing import Any
 
-from bench.frame import (
-    Column,
-    Record,
-    Report,
-    add_changes,
-    add_positive,
-    add_videos,
-    add_whole,
-    recipe_of,
-    server_flags,
-    whole_numbers,
-)  # fmt: skip
+from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, whole_numbers
 from bench.processes import Roles, consume, peak_rss_bytes, roles_of
 from bench.speed.null_workers import null_service
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser
+from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS, array_layout, layout_bytes
 from v2v_server.broker.admission import MOST_CREDIT, suggested_credit
 from v2v_server.system.process import usable_cores
@@ -61,18 +51,13 @@ _COLUMNS: tuple[Column, ...] = (
 def _consumed(asked: argparse.Namespace, server: LocalServer, roles: Roles, warmup_batches: int) -> dict[str, float]:
     dataset = V2VStreamDataset(server.address, batch_size=asked.batch_size, rank=0, world_size=1)
     done = consume(dataset, roles, seconds=asked.seconds, warmup_batches=warmup_batches)
-    return {
-        "batches_per_second": done.batches_per_second,
-        "bytes_per_second": done.nbytes / done.seconds,
-        **{f"{role}_cpu_seconds_per_batch": done.cpu_seconds_per_batch(role) for role in roles},
-        "broker_peak_rss_bytes": peak_rss_bytes(server.pid),
-    }
+    return done | {"broker_peak_rss_bytes": peak_rss_bytes(server.pid)}
 
 
 def end_to_end(asked: argparse.Namespace) -> list[dict[str, Any]]:
     """Return one record for each number of workers: medians over the turns, of ratios within a turn too."""
     turns: list[dict[int, dict[str, float]]] = []
-    flags = ["--rows", asked.rows, *server_flags(asked.changes)]
+    flags = ["--rows", asked.rows]
     for turn in range(asked.repeat):
         found: dict[int, dict[str, float]] = {}
         # Every other turn goes backwards, so that a drift of the machine cancels.
@@ -95,8 +80,8 @@ def end_to_end(asked: argparse.Namespace) -> list[dict[str, Any]]:
 
 def broker_alone(asked: argparse.Namespace, workers: int) -> dict[str, Any]:
     """Return the record of one number of null workers."""
-    recipe = recipe_of(asked.changes)
-    with null_service(recipe, workers=workers, flags=server_flags(asked.changes)) as service:
+    recipe = Recipe()
+    with null_service(recipe, workers=workers) as service:
         found = _consumed(asked, service.server, service.roles, 2)
     samples = min(suggested_credit(asked.batch_size, workers, 1), MOST_CREDIT)
     window = samples * layout_bytes(array_layout(recipe, "int8", DEFAULT_ARRAYS))
@@ -130,7 +115,6 @@ def add_flags(parser: Parser) -> None:
         parser.add_argument(flag, type=whole_numbers, default=default, metavar="N,N", help=f"default {default}")
     add_whole(parser, "--repeat", 3, "turns of the workers part")
     add_whole(parser, "--batch-size", 12, "samples of a batch")
-    add_changes(parser)
 
 
 def measure(asked: argparse.Namespace) -> Report:

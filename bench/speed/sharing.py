@@ -15,7 +15,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from bench.frame import Column, Report, add_changes, add_videos, add_whole, server_flags
+from bench.frame import Column, Report, add_videos, add_whole
 from bench.processes import cpu_seconds_of, roles_of
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
@@ -37,7 +37,7 @@ _COLUMNS: tuple[Column, ...] = (
 
 def equal_trainers(asked: argparse.Namespace, trainers: int) -> dict[str, Any]:
     """Return the record of a server from its start, with trainers that take one epoch of equal samples each."""
-    flags = ["--rows", asked.rows, "--share-gib", "2" if trainers > 1 else "0", *server_flags(asked.changes)]
+    flags = ["--rows", asked.rows, "--share-gib", "2" if trainers > 1 else "0"]
     with LocalServer(asked.videos, workers=1, flags=flags) as server:
 
         def take(dataset: V2VStreamDataset) -> int:
@@ -63,7 +63,6 @@ def add_flags(parser: Parser) -> None:
     add_videos(parser, "clips", rows="top:0.54")
     add_whole(parser, "--batch-size", 12, "samples of a batch")
     add_whole(parser, "--turns", 9, "turns of one trainer and of equal ones")
-    add_changes(parser)
 
 
 def measure(asked: argparse.Namespace) -> Report:

@@ -10,7 +10,7 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -99,7 +99,7 @@ def percentile(values: Sequence[float], share: float) -> float:
     return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
 
 
-def _show(progress: Progress, measured: float, seconds: float, batches: int) -> None:
+def _show(progress: Callable[[float, float, str], object], measured: float, seconds: float, batches: int) -> None:
     rate = f"{batches / measured:.1f} batches/s" if measured > 0 and batches else "warm-up"
     progress(min(measured, seconds), seconds, rate)
 
@@ -114,7 +114,7 @@ def measure(
     seconds: float,
     warmup_batches: int,
     trainer_seconds: float,
-    progress: Progress | None = None,
+    progress: Callable[[float, float, str], object] | None = None,
 ) -> tuple[dict[str, Any], ScheduleCheck]:
     """Consume the dataset for ``seconds`` after warm-up, over as many epochs as needed.
 
