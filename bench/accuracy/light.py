@@ -1,9 +1,9 @@
-"""Measure what bit depth, transfer and dithering change in slow scenes.
+"""Measure what bit depth and transfer change in slow scenes.
 
     python -m bench light --json light.json
 
 Photographs that move by 0.24 px a frame (those of the physics bench), c = 0.1, against their exact events. The frames
-are stored in every signal. Those of 8 bits are also dithered, or smoothed within half a grey level.
+are stored in every signal.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy import ndimage  # type: ignore[import-untyped]
 
 from bench.accuracy.physics import (
     BIN_FRAMES,
@@ -64,21 +63,9 @@ def _simulated(grey: Reals) -> Iterator[tuple[str, Reals]]:
     """Yield what the frames are, and the signed events [steps, pixels] of each step."""
     camera: dict[str, Any] = {"threshold_pos": THRESHOLD, "bins": len(grey) - 1, "seed": SEED, "dtype": "int16"}
 
-    def of_levels(levels: Reals) -> Reals:
-        log = log_intensity(np.clip(levels / 255.0, 0.0, 1.0))
-        return np.asarray(simulate_log(log, **camera).voxels.reshape(len(grey) - 1, -1))
-
-    yield "not rounded", of_levels(255.0 * grey)
+    yield "not rounded", simulate_log(log_intensity(grey), **camera).voxels.reshape(len(grey) - 1, -1)
     for transfer, bits in product(("", "pq", "hlg"), (8, 10, 12)):
         signal = Signal(bits, transfer)
         stored = np.rint(signal.white * transfers.encode(grey**GAMMA, transfer, GAMMA)).astype(signal.dtype)
         made = simulate(stored, gamma=GAMMA, log_eps=LOG_EPS, bits=bits, transfer=transfer, **camera).voxels
         yield str(signal), made.reshape(len(grey) - 1, -1)
-    rounded, random = np.rint(255.0 * grey), np.random.default_rng(SEED)
-    for name, shape in (("fixed", grey.shape[1:]), ("fresh", grey.shape)):
-        for width in (0.5, 1.0):
-            noise = width * random.uniform(-0.5, 0.5, shape)
-            yield f"8 bits, {name} dither of {width:g} levels", of_levels(rounded + noise)
-    for sigma in (0.7, 1.5):
-        smooth = ndimage.gaussian_filter(rounded, (0.0, sigma, sigma))
-        yield f"8 bits, smoothed by {sigma:g} px", of_levels(np.clip(smooth, rounded - 0.5, rounded + 0.5))

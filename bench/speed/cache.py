@@ -7,9 +7,6 @@ The samples of one epoch of the paper's recipe, one after the other in this proc
 median of the ratios within a turn.
 
     of source      multiple of the time without a cache; bar: at most 1.2 for ``fill``
-    read           share of getting the clip: decode, or read and unpack; for ``fill`` also compress and write
-    view           share of crop, resize and flip
-    kernel         share of the pixel kernel
     MiB            size of the cache
 """
 
@@ -24,53 +21,39 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bench.frame import Column, Record, Report, add_videos, add_whole
 from tests.oracles.leases import open_leases
 from v2v_protocol.command import Parser
 from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.simulation.view import apply_view
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.worker.produce import decode_for, make_sample
 
 FILL_BAR = 1.2
 WAYS = ("source", "fill", "hits")
-_PARTS = ("read", "view", "kernel")
 _COLUMNS: tuple[Column, ...] = (
     ("way", "", "{}", 1.0),
     ("cpu_seconds_per_sample", "CPU ms a sample", "{:.1f}", 1e3),
     ("ratio_to_source", "of source", "{:.2f}", 1.0),
     ("ratio_to_source_lowest", "lowest", "{:.2f}", 1.0),
     ("ratio_to_source_highest", "highest", "{:.2f}", 1.0),
-    *((f"{part}_share", part, "{:.0%}", 1.0) for part in _PARTS),
     ("cache_bytes", "MiB", "{:.0f}", 2.0**-20),
 )
 
 
-def epoch(leases: Sequence[Lease], root: Path, cache: Cache | None) -> list[float]:
-    """Make every sample once; return the processor seconds of read, view and kernel."""
-    spent = np.zeros(3)
+def epoch(leases: Sequence[Lease], root: Path, cache: Cache | None) -> float:
+    """Make every sample once; return the processor seconds."""
+    began = time.process_time()
     for lease in leases:
-        clock = [time.process_time()]
-        decoded = decode_for(lease, lease.indices, Folder(root), cache)[0]
-        clock.append(time.process_time())
-        make_sample(lease, decoded)
-        clock.append(time.process_time())
-        # make_sample contains the view: time it once more by itself.
-        apply_view(decoded.clip.frames, decoded.plan.params, decoded.plan.spec.recipe)
-        clock.append(time.process_time())
-        read, made, view = np.diff(clock)
-        spent += read, view, made - view
-    return [float(part) for part in spent]
+        make_sample(lease, decode_for(lease, lease.indices, Folder(root), cache)[0])
+    return time.process_time() - began
 
 
 def compare(leases: Sequence[Lease], root: Path, turns: int) -> list[dict[str, Any]]:
     """Run the three ways in turns, each turn with an empty cache; return one record for each way."""
     epoch(leases, root, None)  # warms files and kernels
-    found: dict[str, list[list[float]]] = {way: [] for way in WAYS}
+    found: dict[str, list[float]] = {way: [] for way in WAYS}
     cache_bytes = 0
     for _ in range(turns):
         with tempfile.TemporaryDirectory(prefix="v2v-cache-") as folder:
@@ -81,18 +64,14 @@ def compare(leases: Sequence[Lease], root: Path, turns: int) -> list[dict[str, A
             cache_bytes = cache.used_bytes
     records = []
     for way, epochs in found.items():
-        ratios = [sum(mine) / sum(source) for mine, source in zip(epochs, found["source"], strict=True)]
+        ratios = [mine / source for mine, source in zip(epochs, found["source"], strict=True)]
         records.append(
             {
                 "way": way,
-                "cpu_seconds_per_sample": statistics.median(map(sum, epochs)) / len(leases),
+                "cpu_seconds_per_sample": statistics.median(epochs) / len(leases),
                 "ratio_to_source": statistics.median(ratios),
                 "ratio_to_source_lowest": min(ratios),
                 "ratio_to_source_highest": max(ratios),
-                **{
-                    f"{part}_share": statistics.median(each[number] / sum(each) for each in epochs)
-                    for number, part in enumerate(_PARTS)
-                },
                 "cache_bytes": 0 if way == "source" else cache_bytes,
                 "samples": len(leases),
                 "turns": turns,

@@ -1,16 +1,14 @@
-"""Measure time and memory of a catalogue of a million videos, and the time to the first batch.
+"""Measure time and memory of a catalogue of a million videos.
 
     python -m bench catalogue --clip FILE.mp4 --videos 1000000
 
 The corpus is synthetic: one clip under many names (hard links to a few copies), a thousand names a folder, and a
-complete index, as a second start finds it. Files and index are below --folder and are removed at the end. A fresh
-process opens the catalogue. Then a server with two workers starts on it.
+complete index, as a second start finds it. Files and index are below TMPDIR and are removed at the end. A fresh
+process opens the catalogue.
 
     open           seconds to open the catalogue, and processor time
     table          seconds to build the sequence table of the paper's recipe
     resident       memory that both added to the process, and the peak
-    first batch    seconds from the start of v2v-serve to the first batch of 12
-    server         memory of the v2v-serve process then
 """
 
 from __future__ import annotations
@@ -32,8 +30,6 @@ import numpy as np
 
 from bench.frame import Column, Report, add_whole
 from tests.pieces import shots
-from v2v_client.dataset import V2VStreamDataset
-from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import StreamSpec
@@ -57,8 +53,6 @@ _COLUMNS: tuple[Column, ...] = (
     ("table_seconds", "table s", "{:.2f}", 1.0),
     ("resident_bytes", "resident MiB", "{:.0f}", 2.0**-20),
     ("peak_bytes", "peak MiB", "{:.0f}", 2.0**-20),
-    ("first_batch_seconds", "first batch s", "{:.2f}", 1.0),
-    ("server_bytes", "server MiB", "{:.0f}", 2.0**-20),
 )
 
 
@@ -129,37 +123,19 @@ def opened(folder: Path, cache: Path, scene: bool = False) -> dict[str, Any]:
     return record
 
 
-def _in_a_fresh_process(folder: Path, cache: Path, scene: bool) -> dict[str, Any]:
-    # The processes of a Pool must not have children.
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as fresh:
-        return fresh.submit(opened, folder, cache, scene).result()
-
-
-def first_batch(folder: Path, cache: Path, scene: bool = False) -> dict[str, Any]:
-    """Return the seconds from the start of a server to its first batch, and the memory of its process."""
-    began = time.perf_counter()
-    with LocalServer(
-        folder, workers=2, flags=["--cache-dir", str(cache), "--scene", "auto" if scene else "off"]
-    ) as server:
-        batches = iter(V2VStreamDataset(server.address, rank=0, world_size=1, keys=""))
-        next(batches)
-        seconds, resident = time.perf_counter() - began, server.rss_bytes()[server.pid]
-        batches.close()  # type: ignore[attr-defined]
-    return {"first_batch_seconds": seconds, "server_bytes": resident}
-
-
 def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     parser.add_argument("--clip", required=True, type=Path, help="a short video of at least 201 frames")
     add_whole(parser, "--videos", 1_000_000, "names to make")
     parser.add_argument("--scene", action="store_true", help="with scene data, as v2v-serve --scene auto")
-    parser.add_argument("--folder", type=Path, help="where to make the names (default: that of temporary files)")
 
 
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
-    with tempfile.TemporaryDirectory(prefix="v2v-catalogue-", dir=asked.folder) as place:
+    with tempfile.TemporaryDirectory(prefix="v2v-catalogue-") as place:
         folder, cache = Path(place, "videos"), Path(place, "cache")
         make_up(asked.clip, folder, cache, asked.videos, asked.scene)
-        record = _in_a_fresh_process(folder, cache, asked.scene) | first_batch(folder, cache, asked.scene)
+        # The processes of a Pool must not have children.
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as fresh:
+            record = fresh.submit(opened, folder, cache, asked.scene).result()
     return Report([record], [([record], _COLUMNS)])
