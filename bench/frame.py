@@ -5,18 +5,16 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
+from v2v_server.tradeoff.report import format_table
 
 Record = Mapping[str, Any]  # Flat: keys with SI units -> text, number, bool or None
 Column = tuple[str, str, str, float]  # Key of a record, title, format, and the factor from SI units to what is shown
@@ -76,12 +74,7 @@ def report(bench: ModuleType, asked: argparse.Namespace) -> int:
 def show(records: Sequence[Record], columns: Sequence[Column]) -> None:
     """Print a table; a value that is missing or None is a dash; a column without values is left out."""
     shown = [column for column in columns if any(record.get(column[0]) is not None for record in records)]
-    table = Table(box=None, pad_edge=False)
-    for number, (_, title, _, _) in enumerate(shown):
-        table.add_column(title, justify="right" if number else "left", no_wrap=True)
-    for record in records:
-        table.add_row(*(_cell(record.get(key), form, factor) for key, _, form, factor in shown))
-    Console(width=None if sys.stdout.isatty() else 200, highlight=False).print(table)
+    print(format_table(records, shown), end="")
 
 
 def key_values(record: Record) -> tuple[list[Record], list[Column]]:
@@ -91,12 +84,6 @@ def key_values(record: Record) -> tuple[list[Record], list[Column]]:
         for key, value in record.items()
     ]
     return lines, [("key", "", "{}", 1), ("value", "", "{}", 1)]
-
-
-def _cell(value: Any, form: str, factor: float) -> str:
-    if value is None:
-        return "-"
-    return form.format(value if isinstance(value, str) else value * factor)
 
 
 def progress(text: str) -> None:
@@ -125,6 +112,18 @@ def positive(text: str) -> float:
 def whole_numbers(text: str) -> tuple[int, ...]:
     """Read whole numbers from 1 on, separated by commas: an argparse type."""
     return tuple(map(whole(1), text.split(",")))
+
+
+def chosen(text: str | None, possible: Iterable[str], flag: str) -> tuple[str, ...]:
+    """Return the words of a flag, separated by commas; all possible ones if it is not given.
+
+    Raises:
+        UsageError: an unknown word.
+    """
+    words = tuple(possible) if text is None else tuple(text.split(","))
+    if unknown := set(words) - set(possible):
+        raise UsageError(f"{flag} {','.join(sorted(unknown))}: choose of {', '.join(possible)}")
+    return words
 
 
 def add_whole(parser: Parser, flag: str, default: int, what: str, least: int = 1) -> None:

@@ -10,8 +10,8 @@ Bars: moving photographs (mean of three) at substep_px 1: 10 % signed and 30 % s
 a frame; in bins of 10 ms at 30 frames a second 45, 38 and 50 % signed at 2, 4 and 10 px, and never worse than linear at
 0.3 and 0.8 px.
 
-"predicted" is what ``v2v_server/motion/prediction.py`` predicts from the frames, in bins of a frame, beside what is
-measured. Its constants (FITS) are least squares over the moving photographs; the other scenes and films check it.
+"predicted" is what ``v2v_server/motion/prediction.py`` predicts from the frames, in bins of a frame. Its constants
+(FITS) are least squares over the moving photographs; the other scenes and films check it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.accuracy.physics import VIDEO_SIDE_PX, liveliest
-from bench.frame import Column, Report, add_positive, add_whole, progress
+from bench.frame import Column, Report, add_whole, progress
 from tests.oracles.rendered import (
     NAMES,
     PHOTOGRAPHS,
@@ -72,13 +72,14 @@ _COLUMNS: tuple[Column, ...] = (
     ("split_divided", "split", "{:.1%}", 1),
 )
 _PREDICTED: tuple[Column, ...] = (
-    ("scene", "predicted / measured", "{}", 1),
+    ("scene", "predicted", "{}", 1),
     ("px_per_frame", "px a frame", "{:g}", 1),
     ("frames_per_second", "frames/s", "{:g}", 1),
     ("predicted_px_per_frame", "found", "{:.1f}", 1),
     ("explained", "explained", "{:.0%}", 1),
-    *((f"{key}_{name}", f"{key}{title}", "{}", 1) for name, title in SETTINGS for key in PredictedErrors._fields),
-)
+    *((f"predicted_{key}_{name}", f"{key}{title}", "{:.0%}", 1)
+      for name, title in SETTINGS for key in PredictedErrors._fields),
+)  # fmt: skip
 
 
 def light_of(frames: Frames, levels: Levels | None, seconds: Reals) -> tuple[Reals, Reals]:
@@ -93,9 +94,9 @@ def light_of(frames: Frames, levels: Levels | None, seconds: Reals) -> tuple[Rea
     return light[order], moments[order]
 
 
-def compared(frames: Frames, seconds: Reals, edges: Reals, true: Counts, substep_px: float) -> dict[str, float]:
+def compared(frames: Frames, seconds: Reals, edges: Reals, true: Counts) -> dict[str, float]:
     """Return the errors of frames alone and with sub-steps."""
-    levels = levels_between(frames, (0, 0, *frames.shape[1:]), np.arange(len(frames)), substep_px, motions(frames))
+    levels = levels_between(frames, (0, 0, *frames.shape[1:]), np.arange(len(frames)), SUBSTEP_PX, motions(frames))
     found: dict[str, float] = {"substeps": 1 + (0 if levels is None else len(levels.grey) / (len(frames) - 1))}
     for name, between in (("linear", None), ("divided", levels)):
         light, moments = light_of(frames, between, seconds)
@@ -112,15 +113,6 @@ def predicted(frames: Frames) -> dict[str, float]:
     for name, _ in SETTINGS:
         record |= {f"predicted_{key}_{name}": value for key, value in found.errors(name)._asdict().items()}
     return record
-
-
-def side_by_side(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record with a text of each predicted and measured error, per cent."""
-    return {**record} | {
-        f"{key}_{name}": f"{100 * record[f'predicted_{key}_{name}']:.0f} / {100 * measured_loss(record, key, name):.0f}"
-        for name, _ in SETTINGS
-        for key in PredictedErrors._fields
-    }
 
 
 def measured_loss(record: Mapping[str, Any], key: str, name: str) -> float:
@@ -145,7 +137,7 @@ def fits(records: Records) -> Iterator[str]:
             yield f"predictions off by, {which}, {name}, points rms: {', '.join(texts)}"
 
 
-def rendered(substep_px: float, side: int, steps: int) -> Iterator[dict[str, Any]]:
+def rendered(side: int, steps: int) -> Iterator[dict[str, Any]]:
     """Yield one record for each scene, speed and bin."""
     seconds = np.arange(steps + 1) / FRAMES_PER_SECOND
     bins = {"frame": seconds, "10 ms": np.arange(0.0, seconds[-1] + 1e-9, BIN_SECONDS)}
@@ -156,15 +148,15 @@ def rendered(substep_px: float, side: int, steps: int) -> Iterator[dict[str, Any
             frames = scene.frames(FRAMES_PER_SECOND, steps + 1)
             for size, edges in bins.items():
                 true = scene.counts(edges, THRESHOLD, FRAMES_PER_SECOND * max(24, round(8 * px)))
-                found = compared(frames, seconds, edges, true, substep_px)
+                found = compared(frames, seconds, edges, true)
                 yield {
                     "measure": "rendered", "scene": name, "px_per_frame": px, "bin": size,
-                    "frames_per_second": FRAMES_PER_SECOND, "substep_px": substep_px,
+                    "frames_per_second": FRAMES_PER_SECOND,
                     **found, **(predicted(frames) if size == "frame" else {}),
                 }  # fmt: skip
 
 
-def filmed(path: Path, substep_px: float) -> Iterator[dict[str, Any]]:
+def filmed(path: Path) -> Iterator[dict[str, Any]]:
     """Yield one record for each n: every n-th frame against all of them, in bins of n frames, where most changes.
 
     Raises:
@@ -177,9 +169,9 @@ def filmed(path: Path, substep_px: float) -> Iterator[dict[str, Any]]:
     seconds = np.arange(count) / facts.frames_per_second
     for every in EVERY:
         true = counts_of(log_levels(frames.reshape(count, -1) / 255.0), seconds, seconds[::every], THRESHOLD)
-        found = compared(frames[::every], seconds[::every], seconds[::every], true, substep_px)
+        found = compared(frames[::every], seconds[::every], seconds[::every], true)
         yield {
-            "measure": "film", "scene": path.name, "bin": "frame", "substep_px": substep_px,
+            "measure": "film", "scene": path.name, "bin": "frame",
             "frames_per_second": facts.frames_per_second / every, **found, **predicted(frames[::every]),
         }  # fmt: skip
 
@@ -206,7 +198,6 @@ def missed(records: Records) -> list[str]:
 
 def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
-    add_positive(parser, "--substep-px", 1.0, "substep_px of the spec")
     add_whole(parser, "--side", 160, "side of the scenes, px", least=32)
     add_whole(parser, "--steps", 4, "steps between frames of each scene")
     parser.add_argument("--video", action="append", default=[], type=Path, metavar="FILE", help="film of high rate")
@@ -214,13 +205,7 @@ def add_flags(parser: Parser) -> None:
 
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
-    scenes = list(rendered(asked.substep_px, asked.side, asked.steps))
-    films = [each for path in asked.video for each in filmed(path, asked.substep_px)]
-    tables: list[tuple[Records, tuple[Column, ...]]] = [(scenes + films, _COLUMNS)]
-    if asked.substep_px != SUBSTEP_PX:
-        return Report(scenes + films, tables)
-    held_out = [
-        side_by_side(each) for each in scenes + films if "explained" in each and each["scene"] not in PHOTOGRAPHS
-    ]
-    tables.append((held_out, _PREDICTED))
-    return Report(scenes + films, tables, list(fits(scenes + films)), missed(scenes))
+    scenes = list(rendered(asked.side, asked.steps))
+    records = scenes + [each for path in asked.video for each in filmed(path)]
+    tables = [(records, _COLUMNS), ([each for each in records if "explained" in each], _PREDICTED)]
+    return Report(records, tables, list(fits(records)), missed(scenes))

@@ -17,7 +17,7 @@ from bench.chaos import chaos
 from bench.chaos.faults import Chaos
 from bench.chaos.fleet import Fleet
 from bench.corpus import run_folder
-from bench.frame import Report, add_positive
+from bench.frame import Report, add_positive, chosen
 from v2v_protocol.command import Parser
 
 IN_OWN_NETWORK = True
@@ -61,7 +61,7 @@ def add_flags(parser: Parser) -> None:
 
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
-    kinds = chaos.kinds_of(asked, _KINDS)
+    kinds = chosen(asked.faults, _KINDS, "--faults")
     with run_folder(asked) as (folder, videos), Cable(asked.mbit, asked.delay_ms, asked.loss) as cable:
         fleet = Fleet(
             folder / "run", videos, asked.workers, asked.consumers, asked.lease_deadline_seconds,

@@ -25,20 +25,18 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
 from typing import Any
 
 from bench.chaos.consumer import log_path, profile
 from bench.chaos.faults import WEIGHTS, Chaos, Fault
 from bench.chaos.fleet import Fleet
 from bench.corpus import add_source, run_folder
-from bench.frame import Column, Record, Report, add_positive, add_whole, key_values
+from bench.frame import Column, Record, Report, add_positive, add_whole, chosen, key_values
 from tests.leftovers import abandoned_memory, shared_memory
 from tests.oracles.stream import check
 from tests.oracles.stream_log import BatchLine, Kill, read_log, recovery_seconds
 from v2v_client.tools.loadtest import percentile
 from v2v_protocol.command import Parser
-from v2v_protocol.errors import UsageError
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.names import VIDEO_SUFFIXES
 from v2v_server.quarantine.file import quarantine_path, read_quarantine
@@ -59,39 +57,21 @@ _FAULTS: tuple[Column, ...] = (
 )
 
 
-@dataclass(slots=True)
-class Run:
-    """What was observed while the fleet ran.
-
-    Attributes:
-        faults: committed.
-        stalled: consumers without a batch after the last fault.
-        seconds: duration of the faults.
-    """
-
-    faults: list[Fault] = field(default_factory=list)
-    stalled: int = 0
-    seconds: float = 0.0
-
-
-def torment(fleet: Fleet, chaos: Chaos, seconds: float) -> Run:
-    """Run the fleet under faults, then wait until every consumer has another batch."""
-    run = Run(faults=chaos.done)
+def torment(fleet: Fleet, chaos: Chaos, seconds: float) -> int:
+    """Run the fleet under faults, then wait until every consumer has another batch; return how many have none."""
     began = time.monotonic()
     while (now := time.monotonic()) < began + seconds:
         fleet.restart(now)
         chaos.act(now)
         time.sleep(_POLL_SECONDS)
     chaos.end()
-    run.seconds = time.monotonic() - began
     # Two more batches, because a consumer may hold the first already.
     wanted = [count + 2 for count in fleet.committed()]
     deadline = time.monotonic() + _LAST_BATCH_SECONDS
     while (behind := sum(map(int.__lt__, fleet.committed(), wanted))) and (now := time.monotonic()) < deadline:
         fleet.restart(now)
         time.sleep(_POLL_SECONDS)
-    run.stalled = behind
-    return run
+    return behind
 
 
 def kills(faults: Sequence[Fault], ready_at: Sequence[float]) -> list[Kill]:
@@ -112,35 +92,35 @@ def checked(fleet: Fleet, remakes: int, seed: int) -> dict[str, Any]:
         return check(catalogue, logs, remakes=remakes, seed=seed).to_dict()
 
 
-def record_of(fleet: Fleet, run: Run, verdict: dict[str, Any], left: Sequence[str]) -> tuple[Record, list[Record]]:
-    """Return the record of a run, and one record for each kind of fault."""
+def record_of(
+    fleet: Fleet, done: Sequence[Fault], seconds: float, verdict: dict[str, Any]
+) -> tuple[dict[str, Any], list[Record]]:
+    """Return the record of a run of that many seconds, and one record for each kind of fault."""
     logs = [[line for line in read_log(log_path(place.folder)) if isinstance(line, BatchLine)] for place in fleet.crowd]
     batches = [[line.at for line in log] for log in logs]
     recoveries: dict[str, list[float]] = {}
-    ended = kills(run.faults, fleet.ready_at)
+    ended = kills(done, fleet.ready_at)
     for kill in ended:
-        if (seconds := recovery_seconds(kill, batches)) is not None:
-            recoveries.setdefault(kill.kind, []).append(seconds)
-    counts = Counter(fault.kind for fault in run.faults)
+        if (recovery := recovery_seconds(kill, batches)) is not None:
+            recoveries.setdefault(kill.kind, []).append(recovery)
+    counts = Counter(fault.kind for fault in done)
     faults: list[Record] = [
         {"fault": kind, "times": counts[kind], **_percentiles(recoveries.get(kind, []))} for kind in WEIGHTS
     ]
-    every = [seconds for of_kind in recoveries.values() for seconds in of_kind]
+    every = [recovery for of_kind in recoveries.values() for recovery in of_kind]
     quarantined = read_quarantine(quarantine_path(fleet.videos, fleet.cache)).lines
     record: dict[str, Any] = {
         "kills": len(ended),
         **verdict,
         "condemned": sum("SIGSEGV" not in line.reason for line in quarantined),
-        "leftovers": len(left),
         **_percentiles(every),
         "unrecovered": len(ended) - len(every),
         "longest_wait_seconds": max((line.wait for log in logs for line in log), default=None),
-        "stalled": run.stalled,
         "failures": len(fleet.failures),
-        "seconds": run.seconds,
+        "seconds": seconds,
         "workers": fleet.workers,
         "consumers": fleet.consumers,
-        "samples_per_second": verdict["sightings"] / run.seconds,
+        "samples_per_second": verdict["sightings"] / seconds,
     }
     return record | {f"faults_{kind.replace('-', '_')}": counts[kind] for kind in WEIGHTS}, faults
 
@@ -158,19 +138,20 @@ def run_fleet(fleet: Fleet, chaos: Chaos, asked: argparse.Namespace) -> Report:
     Raises:
         UsageError: the fleet does not start.
     """
-    shared = shared_memory()
+    shared, seconds = shared_memory(), 60.0 * asked.minutes
     try:
         fleet.start()
-        run = torment(fleet, chaos, 60.0 * asked.minutes)
+        stalled = torment(fleet, chaos, seconds)
         left = fleet.stop()
     finally:
         fleet.kill()
     left += [f"shared memory {name}" for name in abandoned_memory(shared)]
-    record, faults = record_of(fleet, run, checked(fleet, asked.remakes, asked.seed), left)
+    record, faults = record_of(fleet, chaos.done, seconds, checked(fleet, asked.remakes, asked.seed))
+    record |= {"leftovers": len(left), "stalled": stalled}
     shown = {key: value for key, value in record.items() if not key.startswith("faults_")}
     missed = [f"{key} {record[key]}; the bar is 0" for key in FAILING if record[key]]
     missed += [f"left over: {text}" for text in left[:20]]
-    missed += [f"{each.name} ended unasked, status {each.status}: {each.text}" for each in fleet.failures[:20]]
+    missed += fleet.failures[:20]
     return Report([record], [(faults, _FAULTS), key_values(shown)], missed=missed)
 
 
@@ -195,21 +176,9 @@ def add_flags(parser: Parser) -> None:
     add_whole(parser, "--seed", 0, "of the faults", least=0)
 
 
-def kinds_of(asked: argparse.Namespace, possible: Sequence[str]) -> tuple[str, ...]:
-    """Return the kinds of ``--faults``, by default all possible ones.
-
-    Raises:
-        UsageError: an unknown kind.
-    """
-    kinds = tuple(asked.faults.split(",")) if asked.faults else tuple(possible)
-    if unknown := set(kinds) - set(possible):
-        raise UsageError(f"--faults {','.join(sorted(unknown))}: choose of {', '.join(possible)}")
-    return kinds
-
-
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
-    kinds = kinds_of(asked, tuple(WEIGHTS))
+    kinds = chosen(asked.faults, WEIGHTS, "--faults")
     with run_folder(asked) as (folder, videos):
         cache = folder / "decoded" if asked.cache else None
         fleet = Fleet(

@@ -9,8 +9,7 @@
     server-kill                   SIGKILL; the server restarts on the same address
     consumer-kill                 SIGKILL; the consumer resumes from its last saved state
     consumer-pause                one is stopped for a few seconds; it must not hold up the others
-    peers-parts, -headers, ...    eight hostile peers for some seconds, see :mod:`bench.chaos.hostile`
-    peers-slow                    an honest one whose samples take long
+    peers-hello, -headers, ...    eight hostile peers for some seconds, see :mod:`bench.chaos.hostile`
     cache-delete                  with a cache: its folder is deleted
     cache-flip, -cut              one bit of a cached file is flipped, or its end is cut off
 

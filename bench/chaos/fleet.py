@@ -21,10 +21,10 @@ from pathlib import Path
 import psutil
 
 from bench.chaos.consumer import log_path
-from bench.chaos.keyring import KeyRing
 from bench.processes import free_ports, last_in_line
 from v2v_protocol.errors import UsageError
 from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
+from v2v_server.keys.folder import KeyFolder
 
 MARK = "V2V_CHAOS_RUN"
 _STOP_SECONDS = 30.0
@@ -65,15 +65,6 @@ class Process:
         return "\n".join(lines[-most:]) or "(no output)"
 
 
-@dataclass(frozen=True, slots=True)
-class Failure:
-    """A process that ended without a fault."""
-
-    name: str
-    status: int
-    text: str
-
-
 @dataclass(slots=True)
 class Fleet:
     """A server, consumers and further workers.
@@ -107,13 +98,12 @@ class Fleet:
     host: str = "127.0.0.1"
     elsewhere: tuple[str, ...] = ()
     keyed: bool = False
-    failures: list[Failure] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
     ready_at: list[float] = field(default_factory=list)
     token: str = field(default_factory=lambda: f"{os.getpid()}-{time.monotonic_ns()}")
     server: Process = field(init=False)
     further_workers: list[Process] = field(init=False, default_factory=list)
     crowd: list[Process] = field(init=False)
-    keys: KeyRing | None = field(init=False)
     _address: str = field(init=False)
     _worker_address: str = field(init=False)
     _awaited: bool = field(init=False, default=False)
@@ -122,7 +112,8 @@ class Fleet:
     def __post_init__(self) -> None:
         for name in ("tmp", "cache", "server"):
             (self.folder / name).mkdir(parents=True)
-        self.keys = KeyRing.made(self.folder / "keys") if self.keyed else None
+        if self.keyed:
+            self._make_keys()
         self._address, self._worker_address = (f"tcp://{self.host}:{port}" for port in free_ports(2))
         self.server = Process("server", self._server_command(), self.folder / "server")
         self.crowd = []
@@ -163,6 +154,17 @@ class Fleet:
         """Return all places."""
         return [self.server, *self.further_workers, *self.crowd]
 
+    def key(self, name: str) -> Path:
+        """Return the file of a key: "consumer", "worker", or "revoked", which was a consumer's."""
+        return self.folder / f"{name}.key"
+
+    def _make_keys(self) -> None:
+        server = KeyFolder(self.folder / "keys")
+        server.init()
+        for name in ("consumer", "worker", "revoked"):
+            server.new(name, "worker" if name == "worker" else "consumer", self.key(name))
+        server.revoke("revoked")
+
     def _server_command(self) -> list[str]:
         return [
             *(sys.executable, "-m", self.server_module, "--videos", str(self.videos)),
@@ -174,7 +176,7 @@ class Fleet:
             *("--parent-pid", str(os.getpid())),
             *self.server_flags,
             *(() if self.clip_cache is None else ("--cache", str(self.clip_cache), "--cache-gib", "4")),
-            *(() if self.keys is None else ("--keys", str(self.keys.server))),
+            *(("--keys", str(self.folder / "keys")) if self.keyed else ()),
         ]
 
     def start(self, start_seconds: float = 400.0) -> None:
@@ -199,7 +201,7 @@ class Fleet:
         while not done():
             self.restart(time.monotonic())
             if self.failures:
-                raise UsageError(f"{self.failures[0].name} ended: {self.failures[0].text}")
+                raise UsageError(self.failures[0])
             if time.monotonic() > deadline:
                 raise UsageError(f"no batches in time; the server: {self.server.last_lines()}")
             time.sleep(0.05)
@@ -214,7 +216,7 @@ class Fleet:
             if status is None:
                 continue
             if not place.expected:
-                self.failures.append(Failure(place.name, status, place.last_lines()))
+                self.failures.append(f"{place.name} ended unasked, status {status}: {place.last_lines()}")
             if place in self.further_workers:
                 self.further_workers.remove(place)
             else:
@@ -240,8 +242,8 @@ class Fleet:
         """
         command = [sys.executable, "-m", "bench.chaos.hostile", "--address", self._address, "--kind", kind]
         command += ["--tally", str(self.tally)]
-        if self.keys is not None:
-            command += ["--worker-address", self._worker_address, "--revoked", str(self.keys.revoked)]
+        if self.keyed:
+            command += ["--worker-address", self._worker_address, "--revoked", str(self.key("revoked"))]
         return subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -294,7 +296,7 @@ class Fleet:
             )
 
     def _environment(self, side: str) -> dict[str, str]:
-        key = "" if self.keys is None or not side else str(getattr(self.keys, side))
+        key = str(self.key(side)) if self.keyed and side else ""
         return os.environ | {MARK: self.token, "TMPDIR": str(self.tmp), KEY_VARIABLE: key}
 
     def stop(self) -> list[str]:

@@ -14,7 +14,6 @@ All frames follow from the seed; a failure shows the number of its frame and the
 from __future__ import annotations
 
 import argparse
-import math
 import random
 import tempfile
 import time
@@ -23,7 +22,7 @@ from typing import Any
 
 from bench.chaos.chaos import checked
 from bench.chaos.fleet import Fleet
-from bench.chaos.trimming_server import MODULE, trimmed_mib
+from bench.chaos.trimming_server import MODULE, settled_mib
 from bench.frame import Report, add_whole, key_values
 from tests.oracles.hostile_frames import MOST_GROWTH_MIB, failed, fuzz_decoder
 from tests.oracles.hostile_peers import Attack
@@ -32,8 +31,6 @@ from v2v_protocol.errors import UsageError
 
 _UNDER_ATTACK_SECONDS = 60.0  # Longest extension of the attack until the healthy consumer has a batch
 _LAST_BATCHES_SECONDS = 120.0
-_SETTLE_SECONDS = 30.0
-_SETTLED_POLLS = 4
 
 
 def fuzz_live(
@@ -57,11 +54,11 @@ def fuzz_live(
         fleet.start()
         pid = fleet.server.pid or 0
         # The memory of the first messages (arenas, caches) is not a leak.
-        files = () if fleet.keys is None else (fleet.keys.consumer, fleet.keys.worker)
+        files = (fleet.key("consumer"), fleet.key("worker")) if keyed else ()
         keys = dict(zip(fleet.addresses, files, strict=False))
         with Attack(*fleet.addresses, random.Random(seed), keys) as warm_up:
             warm_up.send(max(1, messages // 10))
-        before = _settled_mib(pid)
+        before = settled_mib(pid)
         with Attack(*fleet.addresses, random.Random(f"{seed} after warm-up"), keys) as attack:
             began, committed = time.monotonic(), fleet.committed()[0]
             attack.send(messages - messages // 10)
@@ -71,7 +68,7 @@ def fuzz_live(
             seconds = time.monotonic() - began
             under_attack = fleet.committed()[0] - committed
             alive = attack.answered()
-        after = _settled_mib(pid, before + MOST_GROWTH_MIB)
+        after = settled_mib(pid, before + MOST_GROWTH_MIB)
         wanted = fleet.committed()[0] + 3
         fleet.wait_for(lambda: fleet.committed()[0] >= wanted, time.monotonic() + _LAST_BATCHES_SECONDS)
         left = fleet.stop()
@@ -98,18 +95,6 @@ def fuzz_live(
         "rss_after_mib": after,
         **{f"sent_{kind}": count for kind, count in sorted(sent.items())},
     }
-
-
-def _settled_mib(pid: int, limit_mib: float = math.inf) -> float:
-    """Return a trimming server's memory once it is within the limit and stable, at the latest after 30 s."""
-    deadline = time.monotonic() + _SETTLE_SECONDS
-    lowest, unchanged = math.inf, 0
-    while True:
-        held = trimmed_mib(pid)
-        unchanged = 0 if held < lowest - 1.0 else unchanged + 1
-        lowest = min(lowest, held)
-        if time.monotonic() > deadline or (held <= limit_mib and unchanged >= _SETTLED_POLLS):
-            return held
 
 
 def add_flags(parser: Parser) -> None:

@@ -1,25 +1,22 @@
 """Eight hostile peers of one kind, as a process that runs until SIGTERM.
 
-    python -m bench.chaos.hostile --address tcp://127.0.0.1:5555 --kind parts
+    python -m bench.chaos.hostile --address tcp://127.0.0.1:5555 --kind headers
 
-    parts      raw peers that send a message without end: every part has the MORE flag
     unfinished opens connections and sends 380 kB of empty parts on each, just below the limit of one connection
     segments   the same with parts of 34 bytes, each in a TCP segment of its own
     headers    the largest and most expensive header that is allowed, as fast as possible
     hello      sends Hello ten times a second, requests as much as allowed, and never reads
     leave      sends Hello under a new name and disconnects, repeatedly: its sessions stay
-    thief      takes the ids that the status shows for routing ids, and sends Hello and Goodbye under each of them
     look       requests the state of the service without a pause, and never reads
     idle       opens connections, half of them in the middle of the handshake, and sends nothing
     flood      bytes that are not ZMTP, as fast as possible
     trickle    opens connections and sends a handshake on each, one byte at a time, without the end
-    slow       not an attack: an allowed stream whose samples take long (flow on whole pictures)
     refused    only with keys: connects with an unknown key, with a revoked one, and with a consumer's key to the port
                of the workers, again and again
     handshakes only with keys: sends the recorded first message of a handshake over new connections: cheap for the
                sender, expensive for the server
 
-If `V2V_KEYS` names a consumer's key they use it, except for `parts`, `unfinished` and `segments`. A disconnected peer
+If `V2V_KEYS` names a consumer's key they use it, except for `unfinished` and `segments`. A disconnected peer
 reconnects. Nothing is checked here: the effect on other peers counts.
 """
 
@@ -28,7 +25,6 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
-import json
 import os
 import select
 import signal
@@ -47,29 +43,19 @@ from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
 from v2v_protocol.keys import PeerKey, key_for, read_key
 from v2v_protocol.link.curve import new_key_pair
 from v2v_protocol.link.dealer import Dealer
-from v2v_protocol.messages import GetStatus, Goodbye, Hello, Status, Want
-from v2v_protocol.spec import SpecOptions
-from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, decode, encode
+from v2v_protocol.messages import GetStatus, Hello, Want
+from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, encode
 
 PEERS = 8
 IDLE_EACH = 125  # Connections of each idle peer: a thousand of all eight
 _GREETING = b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0%s" + bytes(1 + 31)
 _READY = b"\x04\x1c\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
-_PART = b"\x01\xff" + bytes(255)
 SPEC = {"recipe": {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}}
 _REFUSAL_SECONDS = 2.0
 _UNFINISHED_EACH = 8  # connections with unfinished messages of each peer
 _UNFINISHED_BYTES = 380_000
 _tally: Path | None = None
 _GREETING_BYTES, _HELLO_BYTES, _WELCOME_BYTES = 64, 202, 170  # with their framing
-SLOW_SPEC: SpecOptions = {"flow_method": "dis-fast-1", "flow_margin_px": -1}
-
-
-def parts(address: str, number: int) -> None:
-    """Act as a peer of this kind until it is disconnected; likewise the functions below."""
-    with _raw(address) as peer:
-        while True:
-            _push(peer, _PART * 256)
 
 
 def _hold(piece: bytes, address: str, number: int) -> None:
@@ -88,7 +74,7 @@ def _hold(piece: bytes, address: str, number: int) -> None:
 
 
 def headers(address: str, number: int) -> None:
-    """See the module."""
+    """Act as a peer of this kind until it is disconnected; likewise the functions below."""
     items = LARGEST_REQUEST_BYTES - 5
     costly = b"\xdd" + items.to_bytes(4, "big") + b"\x90" * MOST_CONTAINERS + bytes(items - MOST_CONTAINERS)
     with _dealer(address, number) as peer:
@@ -112,23 +98,6 @@ def leave(address: str, number: int) -> None:
         peer.receive(1.0)
 
 
-def thief(address: str, number: int) -> None:
-    """See the module."""
-    with _dealer(address, number) as peer:
-        peer.send(encode(GetStatus()))
-        frames = peer.receive(_REFUSAL_SECONDS)
-        if frames is None:
-            return
-        seen = decode(frames[0])
-    shown = json.loads(seen.json)["consumers"] if isinstance(seen, Status) else []
-    for each in shown:
-        for name in (each["id"].encode(), bytes.fromhex(each["id"])):
-            with _dealer(address, name) as peer:
-                peer.send(encode(Goodbye()))
-                peer.send(encode(Hello(SPEC, ("voxels",), 8, number)))
-                peer.receive(0.1)
-
-
 def look(address: str, number: int) -> None:
     """See the module."""
     with _dealer(address, number) as peer:
@@ -138,16 +107,12 @@ def look(address: str, number: int) -> None:
 
 def idle(address: str, number: int) -> None:
     """See the module."""
-    links = []
-    try:
+    with ExitStack() as stack:
         for count in range(IDLE_EACH):
-            links.append(_connected(address))
+            link = stack.enter_context(_connected(address))
             if count % 2:
-                links[-1].sendall(_greeting(address))
+                link.sendall(_greeting(address))
         time.sleep(2.0)
-    finally:
-        for link in links:
-            link.close()
 
 
 def flood(address: str, number: int) -> None:
@@ -159,29 +124,13 @@ def flood(address: str, number: int) -> None:
 
 def trickle(address: str, number: int) -> None:
     """See the module."""
-    said = _greeting(address)
-    links: list[socket.socket] = []
-    try:
-        for _ in range(IDLE_EACH):
-            links.append(_connected(address))
-        for byte in said[:-1]:
+    with ExitStack() as stack:
+        links = [stack.enter_context(_connected(address)) for _ in range(IDLE_EACH)]
+        for byte in _greeting(address)[:-1]:
             for link in links:
                 with suppress(OSError):  # it was disconnected
                     link.send(bytes([byte]))
             time.sleep(0.1)
-    finally:
-        for link in links:
-            link.close()
-
-
-def slow(address: str, number: int) -> None:
-    """See the module."""
-    from v2v_client.dataset import V2VStreamDataset  # lazily: only this kind needs PyTorch
-
-    arrays = ("voxels", "flow", "flow_valid")
-    dataset = V2VStreamDataset(address, 1, arrays, "paper-flow", seed=number, rank=0, world_size=1, **SLOW_SPEC)
-    for _ in dataset:
-        pass
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,16 +191,15 @@ class Handshakes:
 
 
 KINDS: dict[str, Callable[[str, int], None]] = {
-    "parts": parts,
     "unfinished": functools.partial(_hold, b"\x01\x00" * 1000),
     "segments": functools.partial(_hold, b"\x01\x22" + bytes(34)),
-    **{each.__name__: each for each in (headers, hello, leave, thief, look, idle, flood, trickle, slow)},
+    **{each.__name__: each for each in (headers, hello, leave, look, idle, flood, trickle)},
 }
 REFUSED, HANDSHAKES = "refused", "handshakes"
 KEYED_KINDS = (REFUSED, HANDSHAKES)
 
 
-def attack(address: str, kind: str, act: Callable[[str, int], None]) -> NoReturn:
+def attack(address: str, act: Callable[[str, int], None]) -> NoReturn:
     """Run :data:`PEERS` peers, which reconnect when disconnected, until this process ends."""
 
     def live(number: int) -> NoReturn:
@@ -260,7 +208,7 @@ def attack(address: str, kind: str, act: Callable[[str, int], None]) -> NoReturn
                 act(address, number)
             time.sleep(0.01)
 
-    for number in range(1, 1 if kind == "slow" else PEERS):
+    for number in range(1, PEERS):
         threading.Thread(target=live, args=(number,), daemon=True).start()
     live(0)
 
@@ -329,17 +277,9 @@ def _closing(peer: Dealer) -> Iterator[Dealer]:
 
 
 @contextmanager
-def _dealer(address: str, number: int | bytes | None) -> Iterator[Dealer]:
-    """Connect a peer that takes one message at a time.
-
-    Args:
-        address: of the server.
-        number: of the peer, which makes its routing id; or that id; None takes a new one.
-    """
-    if isinstance(number, bytes):
-        name = number
-    else:
-        name = b"leaver-" + os.urandom(8) if number is None else b"hostile-%d-%d" % (os.getpid(), number)
+def _dealer(address: str, number: int | None) -> Iterator[Dealer]:
+    """Connect a peer that takes one message at a time, under a name of its number; None takes a new name."""
+    name = b"leaver-" + os.urandom(8) if number is None else b"hostile-%d-%d" % (os.getpid(), number)
     options: dict[str, int | bytes] = {"ROUTING_ID": name, "RCVHWM": 1, "SNDHWM": 1000, "SNDTIMEO": 2000}
     with _closing(Dealer(address, options=options, beside=_first())) as peer:
         yield peer
@@ -361,7 +301,7 @@ def main() -> NoReturn:
         act: Callable[[str, int], None] = Refused(asked.worker_address, asked.revoked)
     else:
         act = Handshakes.recorded() if asked.kind == HANDSHAKES else KINDS[asked.kind]
-    attack(asked.address, asked.kind, act)
+    attack(asked.address, act)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ a leak be told from it.
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import time
@@ -19,6 +20,8 @@ from v2v_server.commands.serve import main
 
 MODULE = "bench.chaos.trimming_server"
 _TRIM_SECONDS = 0.5
+_SETTLE_SECONDS = 30.0
+_SETTLED_POLLS = 4
 
 
 def trimmed_mib(pid: int) -> float:
@@ -27,6 +30,18 @@ def trimmed_mib(pid: int) -> float:
         psutil.Process(pid).send_signal(signal.SIGUSR2)
         time.sleep(_TRIM_SECONDS)
     return rss_mib(pid) or 0.0
+
+
+def settled_mib(pid: int, limit_mib: float = math.inf) -> float:
+    """Return a trimming server's memory once it is within the limit and stable, at the latest after 30 s."""
+    deadline = time.monotonic() + _SETTLE_SECONDS
+    lowest, unchanged = math.inf, 0
+    while True:
+        held = trimmed_mib(pid)
+        unchanged = 0 if held < lowest - 1.0 else unchanged + 1
+        lowest = min(lowest, held)
+        if time.monotonic() > deadline or (held <= limit_mib and unchanged >= _SETTLED_POLLS):
+            return held
 
 
 if __name__ == "__main__":

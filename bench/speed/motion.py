@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.frame import Column, Report, add_positive, add_whole, progress
+from bench.frame import Column, Report, add_whole, progress
 from tests.clips import write_clip
 from tests.oracles.leases import open_leases
 from v2v_protocol.command import Parser
@@ -44,7 +44,7 @@ from v2v_server.worker.produce import decode_for, make_sample
 
 BARS = {("walking", "source"): 2.0, ("walking", "motion"): 5.0, ("still", "source"): 1.03, ("still", "motion"): 1.05}
 COLOUR_BARS = {("walking", "source"): 1.4, ("walking", "chroma"): 1.25}
-STILL_FRAMES = 240
+STILL_FRAMES, SUBSTEP_PX = 240, 1.0
 _COLUMNS: tuple[Column, ...] = (
     ("clip", "clip", "{}", 1),
     ("form", "form", "{}", 1),
@@ -91,7 +91,7 @@ def compared(asked: argparse.Namespace, folder: Path) -> Iterator[dict[str, Any]
         works = []
         for substep_px, more in (
             (0.0, ()),
-            (0.0, ("frames_rgb",)) if asked.colour else (asked.substep_px, ()),
+            (0.0, ("frames_rgb",)) if asked.colour else (SUBSTEP_PX, ()),
         ):
             with open_leases(videos, "full", StreamSpec(substep_px=substep_px)) as (root, leases):
                 taken = [replace(each, arrays=(*each.arrays, *more)) for each in islice(leases, asked.samples)]
@@ -101,7 +101,7 @@ def compared(asked: argparse.Namespace, folder: Path) -> Iterator[dict[str, Any]
         turns = [[work() for work in works] for _ in range(asked.turns)]
         yield {
             "measure": "colour" if asked.colour else "sub-steps", "clip": clip, "form": form,
-            "substep_px": 0.0 if asked.colour else asked.substep_px,
+            "substep_px": 0.0 if asked.colour else SUBSTEP_PX,
             "plain_seconds": min(turn[0] for turn in turns), "divided_seconds": min(turn[1] for turn in turns),
             "ratio": statistics.median(turn[1] / turn[0] for turn in turns),
         }  # fmt: skip
@@ -111,7 +111,6 @@ def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     parser.add_argument("--video", type=Path, required=True, metavar="FILE", help="film of someone who walks")
     parser.add_argument("--colour", action="store_true", help="measure frames_rgb in place of sub-steps")
-    add_positive(parser, "--substep-px", 1.0, "substep_px of the spec")
     add_whole(parser, "--samples", 3, "samples of a turn")
     add_whole(parser, "--turns", 7, "turns")
 

@@ -21,21 +21,21 @@ ERROR_KEY = f"voxel_error_at_{ERROR_THRESHOLD:g}"
 """The error that settings are judged by."""
 
 Record = Mapping[str, Any]
-_Columns = Sequence[tuple[str, str, str, float]]
+Columns = Sequence[tuple[str, str, str, float]]
 """Key of a record, title, format, and the factor from SI units to what is shown."""
-_WIDTH = 160
+_WIDTH = 200
 _MARKERS = dict(zip(SAMPLES_PER_DECODE, "o^s", strict=True))
 
 BATCH = 12
 """Samples of the batch whose processor time is shown."""
 
-_ERRORS: _Columns = (
+_ERRORS: Columns = (
     ("way", "per cent, at c", "{}", 1),
     *((f"voxel_error_at_{c:g}", f"voxels {c:g}", "{:.2f}", 100) for c in (0.05, 0.2, 0.5, 1, 2)),
     *((f"count_error_at_{c:g}", f"count {c:g}", "{:+.2f}", 100) for c in (0.05, 0.2, 1)),
     ("bins_changed_at_0.2", "bins 0.2", "{:.2f}", 100),
 )
-_SETTINGS: _Columns = (
+_SETTINGS: Columns = (
     ("name", "", "{}", 1),
     ("samples_per_core_second", "samples/core s", "{:.2f}", 1),
     ("speed_ratio", "x first", "{:.2f}", 1),
@@ -47,14 +47,14 @@ _SETTINGS: _Columns = (
     ("predicted_signed", "wrong", "{:.0f}", 100),
     ("dominated_by", "dominated by", "{}", 1),
 )
-_PARTS: _Columns = (
+_PARTS: Columns = (
     ("way", "CPU ms of a sample, from the source", "{}", 1),
     ("decode_seconds", "decode, motion", "{:.1f}", 1e3),
     ("view_seconds", "view, levels", "{:.1f}", 1e3),
     ("kernel_seconds", "kernel", "{:.1f}", 1e3),
     ("substeps_per_step", "sub-steps a step", "{:.2f}", 1),
 )
-_DIVERSITY: _Columns = (
+_DIVERSITY: Columns = (
     ("name", "correlation between", "{}", 1),
     ("pairs", "pairs", "{}", 1),
     ("pixel_correlation", "pixels", "{:.3f}", 1),
@@ -113,16 +113,17 @@ def tables(records: Sequence[Record]) -> str:
         "that sees all motion; -: unpredictable\n"
     )
     parts = [
-        _table(listed, _SETTINGS) + about,
-        _table([*ways, *of["scale"]], _ERRORS),
-        _table(of["parts"], (*_PARTS, *of_effects)) + "%: samples in which the effect ran\n",
+        format_table(listed, _SETTINGS) + about,
+        format_table([*ways, *of["scale"]], _ERRORS),
+        format_table(of["parts"], (*_PARTS, *of_effects)) + "%: samples in which the effect ran\n",
     ]
     if of["diversity"]:
-        parts.append(_table(of["diversity"], _DIVERSITY))
+        parts.append(format_table(of["diversity"], _DIVERSITY))
     return "\n".join(parts)
 
 
-def _table(records: Sequence[Record], columns: _Columns) -> str:
+def format_table(records: Sequence[Record], columns: Columns) -> str:
+    """Format records as a table; a missing value is a dash."""
     table = Table(box=None, pad_edge=False)
     for number, (_, title, _, _) in enumerate(columns):
         table.add_column(title, justify="right" if number else "left", no_wrap=True)
