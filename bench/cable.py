@@ -1,8 +1,7 @@
 """A second host on this machine: a network namespace, and a cable to it with a rate, a delay, losses and a switch.
 
 The cable is a process in the far namespace that forwards packets between two TUN devices. The kernels' own TCP handles
-the losses, as on a network; namespaces and /dev/net/tun suffice, without traffic-shaping modules. The process ends with
-its standard input, on which it reads "cut", "heal", and "count"; it answers the last with the packets passed and lost.
+the losses, as on a network; namespaces and /dev/net/tun suffice, without traffic-shaping modules.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ from __future__ import annotations
 import argparse
 import ctypes
 import fcntl
+import multiprocessing
 import os
 import random
 import select
@@ -22,13 +22,16 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from v2v_protocol.errors import UsageError
 from v2v_server.system.process import die_with_parent
 
 NEAR, FAR = "10.77.0.1", "10.77.0.2"
 _INSIDE = "V2V_BENCH_NETWORK"
+_SPAWN = multiprocessing.get_context("spawn")
 _NETWORK = 0x40000000  # CLONE_NEWNET
 _SET_DEVICE, _PACKETS_ONLY = 0x400454CA, 0x1001  # TUNSETIFF; IFF_TUN | IFF_NO_PI
 _LONGEST_QUEUE_SECONDS = 0.05
@@ -81,45 +84,30 @@ class Cable:
     """
 
     def __init__(self, mbit: float, delay_ms: float = 0.0, loss: float = 0.0, mtu: int = 1500) -> None:
-        self._command = [sys.executable, "-m", "bench.cable"]
-        self._command += [str(each) for each in (mbit, delay_ms, loss, mtu, os.getpid())]
+        self._state = _State(*(_SPAWN.RawValue("q", 0) for _ in _State._fields))
+        self._reason, theirs = _SPAWN.Pipe(duplex=False)
+        forward = (mbit * 125e3, delay_ms * 1e-3, loss)
+        self._process = _SPAWN.Process(target=_run, args=(os.getpid(), mtu, theirs, self._state, forward))
 
     def __enter__(self) -> Cable:
-        pipe = subprocess.PIPE
-        self._process = subprocess.Popen(self._command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
-        self.pid = self._process.pid
+        self._process.start()
+        self.pid = self._process.pid or 0
         self.far = ("nsenter", "--target", str(self.pid), "--net")
-        if self._answer() != "ready":
-            _, said = self._process.communicate()
-            raise UsageError(f"no second network: {said.strip()[-300:]}; a TUN device and `ip` are needed")
+        if reason := self._reason.recv():
+            raise UsageError(f"no second network: {reason}; a TUN device and `ip` are needed")
         return self
 
     def __exit__(self, *_: object) -> None:
         self._process.kill()
-        self._process.communicate()
+        self._process.join()
 
-    def cut(self) -> None:
-        """Drop all packets from now on."""
-        self._send("cut")
-
-    def heal(self) -> None:
-        """Forward packets again."""
-        self._send("heal")
+    def set_cut(self, cut: bool) -> None:
+        """Drop all packets from now on, or forward them again."""
+        self._state.is_cut.value = int(cut)
 
     def count(self) -> tuple[int, int]:
         """Return the packets that passed, and those lost to chance or to a cut, so far."""
-        self._send("count")
-        passed, lost = map(int, self._answer().split())
-        return passed, lost
-
-    def _send(self, word: str) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.write(word + "\n")
-        self._process.stdin.flush()
-
-    def _answer(self) -> str:
-        assert self._process.stdout is not None
-        return self._process.stdout.readline().strip()
+        return self._state.passed.value, self._state.lost.value
 
     @contextmanager
     def on_far_host(self) -> Iterator[None]:
@@ -165,35 +153,35 @@ def _device(name: str, own: str, other: str, mtu: int) -> int:
     return device
 
 
+class _State(NamedTuple):
+    """Numbers that both processes share: whether the cable is cut, and packets."""
+
+    is_cut: Any
+    passed: Any
+    lost: Any
+
+
 class _Forwarder:
     """The cable's process."""
 
-    def __init__(self, near: int, far: int, bytes_per_second: float, delay_seconds: float, loss: float) -> None:
+    def __init__(
+        self, near: int, far: int, state: _State, bytes_per_second: float, delay_seconds: float, loss: float
+    ) -> None:
         self._ways = (_Way(near, far), _Way(far, near))
+        self._state = state
         self._rate, self._delay, self._loss = bytes_per_second, delay_seconds, loss
-        self._is_cut, self.passed, self.lost = False, 0, 0
 
     def run(self) -> None:
-        """Forward packets until standard input ends."""
+        """Forward packets until the process ends."""
         sources = [way.source for way in self._ways]
         while True:
             due = min((way.queue[0][0] for way in self._ways if way.queue), default=None)
             wait = None if due is None else max(0.0, due - time.monotonic())
-            ready, _, _ = select.select([*sources, 0], [], [], wait)
-            if 0 in ready and not self._obey(os.read(0, 4096)):
-                return
+            ready, _, _ = select.select(sources, [], [], wait)
             for way in self._ways:
                 if way.source in ready:
                     self._take(way)
                 self._pass_on(way)
-
-    def _obey(self, said: bytes) -> bool:
-        for word in said.split():
-            if word == b"count":
-                print(self.passed, self.lost, flush=True)
-            else:
-                self._is_cut = word == b"cut"
-        return bool(said)
 
     def _take(self, way: _Way) -> None:
         for _ in range(_AT_ONCE):
@@ -204,8 +192,8 @@ class _Forwarder:
             now = time.monotonic()
             way.free_at = max(now, way.free_at)
             is_full = way.free_at - now > _LONGEST_QUEUE_SECONDS
-            if self._is_cut or is_full or random.random() < self._loss:
-                self.lost += not is_full
+            if self._state.is_cut.value or is_full or random.random() < self._loss:
+                self._state.lost.value += not is_full
                 continue
             way.free_at += len(packet) / self._rate
             way.queue.append((way.free_at + self._delay, packet))
@@ -215,21 +203,18 @@ class _Forwarder:
         while way.queue and way.queue[0][0] <= now:
             with suppress(OSError):  # the device is full: the packet is lost
                 os.write(way.sink, way.queue.popleft()[1])
-                self.passed += 1
+                self._state.passed.value += 1
 
 
-def main() -> int:
-    """Run the cable's process: ``mbit delay_ms loss mtu parent_pid``."""
-    mbit, delay_ms, loss = map(float, sys.argv[1:4])
-    mtu, parent_pid = map(int, sys.argv[4:])
+def _run(parent_pid: int, mtu: int, reason: Connection, state: _State, forward: tuple[float, float, float]) -> None:
+    """Run the cable's process; send why it cannot, or an empty text."""
     die_with_parent(parent_pid)
-    near = _device("near", NEAR, FAR, mtu)
-    _system("unshare", _NETWORK)
-    far = _device("far", FAR, NEAR, mtu)
-    print("ready", flush=True)
-    _Forwarder(near, far, mbit * 125e3, delay_ms * 1e-3, loss).run()
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        near = _device("near", NEAR, FAR, mtu)
+        _system("unshare", _NETWORK)
+        far = _device("far", FAR, NEAR, mtu)
+    except (OSError, subprocess.CalledProcessError) as error:
+        reason.send(str(error))
+        return
+    reason.send("")
+    _Forwarder(near, far, state, *forward).run()

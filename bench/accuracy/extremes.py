@@ -16,7 +16,6 @@ from bench.frame import Column, Record, Report
 from bench.plots import panels
 from tests.oracles.extremes import record_of, rows
 from v2v_protocol.command import Parser
-from v2v_protocol.errors import UsageError
 
 _COLUMNS: tuple[Column, ...] = (
     ("row", "", "{}", 1),
@@ -30,22 +29,14 @@ _COLUMNS: tuple[Column, ...] = (
 
 
 def add_flags(parser: Parser) -> None:
-    """Add the bench's flags."""
-    parser.add_argument("--rows", metavar="WORD", default="", help="only rows with this in their name")
+    """Add the bench's flags: there are none."""
 
 
 def measure(asked: argparse.Namespace) -> Report:
-    """Run the rows.
-
-    Raises:
-        UsageError: no row has the word in its name.
-    """
-    records = [record_of(row) for row in rows() if asked.rows in row.name]
-    if not records:
-        raise UsageError(f"--rows {asked.rows}: no row has that in its name")
-    return Report(
-        records, [(records, _COLUMNS)], missed=[f"{r['row']}: {r['note']}" for r in records if not r["passed"]]
-    )
+    """Run the rows."""
+    records = [record_of(row) for row in rows()]
+    missed = [f"{record['row']}: {record['note']}" for record in records if not record["passed"]]
+    return Report(records, [(records, _COLUMNS)], missed=missed)
 
 
 def plot(records: Sequence[Record], file: Path) -> None:

@@ -36,9 +36,7 @@ from v2v_server.flow import flow_for
 from v2v_server.flow.methods import one_thread
 from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.variants import warm_up
-from v2v_server.simulation.view import apply_view, without_margin
 from v2v_server.worker.produce import Decoded, decode_for
 from v2v_server.worker.scene_choice import TOLERANCE_PX
 
@@ -82,7 +80,6 @@ def _record_of(leases: Sequence[Lease], source: VideoSource) -> dict[str, Any]:
     for scene, lease in zip(SCENES, leases, strict=True):
         decoded, record[f"decode_{scene}_cpu_seconds"] = _timed(lambda: decode_for(lease, lease.indices, source)[0])  # noqa: B023
         flow, record[f"flow_{scene}_cpu_seconds"] = _timed(lambda: _flow(decoded))  # noqa: B023
-        _, record[f"simulation_{scene}_cpu_seconds"] = _timed(lambda: _simulated(decoded))  # noqa: B023
         flows.append(flow)
         plan = decoded.plan.flow_plan
         if scene == "off":
@@ -111,16 +108,10 @@ def _flow(decoded: Decoded, method: str | None = None) -> npt.NDArray[np.float16
     return flow_for(decoded.clip.frames, plan.params, plan.spec.recipe, settings, plan=methods).flow
 
 
-def _simulated(decoded: Decoded) -> object:
-    params, spec = decoded.plan.params, decoded.plan.spec
-    view = without_margin(decoded.clip.frames, params, spec.recipe, decoded.plan.margin_px)
-    return simulate_clip(apply_view(view, params, spec.recipe), params, spec.recipe, spec.voxel_dtype, None)
-
-
 def totals(clips: Sequence[Record]) -> list[dict[str, Any]]:
     """Return one record for each part of a sample: its cost with scene off and auto, and the error that auto adds."""
     records: list[dict[str, Any]] = []
-    for part in ("decode", "simulation", "flow"):
+    for part in ("decode", "flow"):
         off, auto = (float(np.mean([clip[f"{part}_{scene}_cpu_seconds"] for clip in clips])) for scene in SCENES)
         records.append(
             {"measure": "part", "part": part, "samples": len(clips), "off_cpu_seconds_per_sample": off,

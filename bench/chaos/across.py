@@ -37,18 +37,17 @@ class Cutting(Chaos):
     def act(self, now: float) -> None:
         """Do what is due."""
         Chaos.act(self, now)
-        if self._turn_at is None or (now >= self._turn_at and self._is_cut):
-            self.cable.heal()
-            self._is_cut, self._turn_at = False, now + random.expovariate(1.0 / (2 * self.mean_seconds))
-        elif now >= self._turn_at:
-            self.cable.cut()
-            self.cuts += 1
-            self._is_cut, self._turn_at = True, now + random.uniform(0.2, _LONGEST_CUT_SECONDS)
+        if self._turn_at is None or now >= self._turn_at:
+            self._is_cut = self._turn_at is not None and not self._is_cut
+            self.cable.set_cut(self._is_cut)
+            self.cuts += self._is_cut
+            lasts = random.uniform(0.2, _LONGEST_CUT_SECONDS)
+            self._turn_at = now + (lasts if self._is_cut else random.expovariate(1.0 / (2 * self.mean_seconds)))
 
     def end(self) -> None:
         """End all faults."""
         Chaos.end(self)
-        self.cable.heal()
+        self.cable.set_cut(False)
 
 
 def add_flags(parser: Parser) -> None:

@@ -20,12 +20,14 @@ videos, because a long clip may be a video's only sequence.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import random
 import shutil
 import signal
-import subprocess
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 from bench.chaos.fleet import Fleet
 from bench.chaos.hostile import KINDS
@@ -100,20 +102,17 @@ class Chaos:
     _next: float | None = field(init=False, default=None)
     _last: float = field(init=False, default=0.0)
     _logged: int = field(init=False, default=0)
-    _paused: list[tuple[float, int]] = field(init=False, default_factory=list)
-    _peers: list[tuple[float, subprocess.Popen[bytes]]] = field(init=False, default_factory=list)
+    _lasting: list[tuple[float, Callable[[], None]]] = field(init=False, default_factory=list)
+    _siege_until: float = field(init=False, default=0.0)
 
     def __post_init__(self) -> None:
         self._random = random.Random(self.seed)
 
     def act(self, now: float) -> None:
         """Do what is due; must be called often."""
-        self._continue([pid for until, pid in self._paused if until <= now])
-        self._paused = [(until, pid) for until, pid in self._paused if until > now]
-        self._dismiss([peers for until, peers in self._peers if until <= now])
-        self._peers = [(until, peers) for until, peers in self._peers if until > now]
+        self._end_those_due(now)
         if self._next is not None and now >= self._next and self._progressed(now):
-            possible = [kind for kind in self.kinds if self._possible(kind)]
+            possible = [kind for kind in self.kinds if self._possible(kind, now)]
             if possible:
                 kind = self._random.choices(possible, [WEIGHTS[kind] for kind in possible])[0]
                 self._commit(kind, now)
@@ -131,11 +130,15 @@ class Chaos:
 
     def end(self) -> None:
         """End all faults: continue paused processes, end hostile peers."""
-        self._continue([pid for _, pid in self._paused])
-        self._dismiss([peers for _, peers in self._peers])
-        self._paused, self._peers = [], []
+        self._end_those_due(math.inf)
 
-    def _possible(self, kind: str) -> bool:
+    def _end_those_due(self, now: float) -> None:
+        for until, end in self._lasting:
+            if until <= now:
+                end()
+        self._lasting = [(until, end) for until, end in self._lasting if until > now]
+
+    def _possible(self, kind: str, now: float) -> bool:
         who, _, how = kind.partition("-")
         if how == "segv" and sum(fault.kind == kind for fault in self.done) >= self.most_segv:
             return False
@@ -145,7 +148,7 @@ class Chaos:
             # Kill only a ready server: otherwise a busy host may never serve the corpus.
             return self.fleet.server.pid is not None and self.fleet.port_file.exists()
         if who == "peers":
-            return not self._peers
+            return now >= self._siege_until
         if who == "cache":
             return bool(self.fleet.cached_pieces())
         if how == "add":
@@ -159,8 +162,10 @@ class Chaos:
         if how == "add":
             self.fleet.add_worker()
         elif who == "peers":
-            until = now + self._random.uniform(0.3, 1.0) * _LONGEST_SIEGE_SECONDS
-            self._peers.append((until, self.fleet.peers(how)))
+            self._siege_until = now + self._random.uniform(0.3, 1.0) * _LONGEST_SIEGE_SECONDS
+            siege = contextlib.ExitStack()
+            siege.enter_context(self.fleet.attacked(how))
+            self._lasting.append((self._siege_until, siege.close))
         elif who == "cache":
             self._spoil(how)
         elif who == "worker":
@@ -202,17 +207,10 @@ class Chaos:
                 if pid in {place.pid for place in self.fleet.further_workers}
                 else 4.0
             )
-            self._paused.append((now + self._random.uniform(0.2, longest), pid))
-        with contextlib.suppress(ProcessLookupError):  # it has ended already
-            os.kill(pid, _SIGNALS.get(how, signal.SIGSTOP))
+            self._lasting.append((now + self._random.uniform(0.2, longest), partial(_send, pid, signal.SIGCONT)))
+        _send(pid, _SIGNALS.get(how, signal.SIGSTOP))
 
-    def _continue(self, pids: list[int]) -> None:
-        for pid in pids:
-            with contextlib.suppress(ProcessLookupError):  # it was killed meanwhile
-                os.kill(pid, signal.SIGCONT)
 
-    @staticmethod
-    def _dismiss(all_peers: list[subprocess.Popen[bytes]]) -> None:
-        for peers in all_peers:
-            peers.kill()
-            peers.wait()
+def _send(pid: int, number: signal.Signals) -> None:
+    with contextlib.suppress(ProcessLookupError):  # it has ended already
+        os.kill(pid, number)

@@ -13,8 +13,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -234,8 +234,9 @@ class Fleet:
         self._spawn(place)
         self.further_workers.append(place)
 
-    def peers(self, kind: str, *, last: bool = True) -> subprocess.Popen[bytes]:
-        """Start hostile peers of that kind (:mod:`bench.chaos.hostile`); the caller ends them.
+    @contextmanager
+    def attacked(self, kind: str, *, last: bool = True) -> Iterator[subprocess.Popen[bytes]]:
+        """Run hostile peers of that kind (:mod:`bench.chaos.hostile`), inside ``with``.
 
         Args:
             last: they get the lowest priority.
@@ -244,7 +245,7 @@ class Fleet:
         command += ["--tally", str(self.tally)]
         if self.keyed:
             command += ["--worker-address", self._worker_address, "--revoked", str(self.key("revoked"))]
-        return subprocess.Popen(
+        peers = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -253,6 +254,11 @@ class Fleet:
             start_new_session=True,
             preexec_fn=last_in_line if last else None,
         )
+        try:
+            yield peers
+        finally:
+            peers.kill()
+            peers.wait()
 
     def cached_pieces(self) -> list[Path]:
         """Return the files of the cache of decoded clips."""

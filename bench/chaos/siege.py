@@ -20,10 +20,9 @@ Bars: kept at least 0.8; peak at most 300 MiB above the credit windows; after at
 from __future__ import annotations
 
 import argparse
-import contextlib
 import statistics
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from bench.chaos.fleet import Fleet
@@ -85,17 +84,6 @@ def stretch(fleet: Fleet, seconds: float) -> Stretch:
     return Stretch(rate, cpu, came, peak)
 
 
-@contextlib.contextmanager
-def attacked(fleet: Fleet, kind: str, *, urgent: bool = False) -> Iterator[None]:
-    """Run peers of one kind, inside ``with``."""
-    peers = fleet.peers(kind, last=not urgent)
-    try:
-        yield
-    finally:
-        peers.kill()
-        peers.wait()
-
-
 def besiege(
     fleet: Fleet, kinds: Sequence[str], turns: int, seconds: float, *, urgent: bool = False
 ) -> list[dict[str, Any]]:
@@ -106,7 +94,7 @@ def besiege(
     for turn in range(turns):
         for kind in kinds:
             before = stretch(fleet, seconds / 2)
-            with attacked(fleet, kind, urgent=urgent):
+            with fleet.attacked(kind, last=not urgent):
                 time.sleep(2.0)  # the peers start
                 under = stretch(fleet, seconds)
             after = settled_mib(fleet.server.pid or 0, start + AFTER_BAR_MIB) - start

@@ -1,24 +1,21 @@
 """A server with null workers: workers that answer every lease at once with constant arrays, or with samples made ahead.
 
-    python -m bench.speed.null_workers --connect ADDRESS --workers 64 --parent-pid PID
-
 They connect to ``v2v-serve --worker-bind`` and speak the workers' protocol, so that such a server does the work of the
 broker and nothing else. All of them are sockets of one process, because 64 interpreters would compete for the cores.
 """
 
 from __future__ import annotations
 
-import argparse
+import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 from collections import defaultdict, deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +51,7 @@ Ready = Mapping[str, npt.NDArray[Any]]  # Samples made ahead: [samples, ...] of 
 
 CREDIT = 2  # Leases that each holds at a time, as a real worker does
 _PING_SECONDS = 5.0
+_JOIN_POLL_SECONDS = 0.1
 _SEQUENCES_PER_VIDEO = 2
 
 CAMERA = SampleParams(
@@ -74,10 +72,18 @@ CAMERA = SampleParams(
 
 
 class NullWorkers:
-    """``count`` null workers in one thread; ``samples`` as for :func:`answer`."""
+    """``count`` null workers in one thread.
 
-    def __init__(self, address: str, count: int, samples: Ready | None = None) -> None:
+    Args:
+        address: of the server's workers.
+        count: number of null workers.
+        joined: set once the server knows all of them.
+        samples: as for :func:`answer`.
+    """
+
+    def __init__(self, address: str, count: int, joined: Event, samples: Ready | None) -> None:
         self._samples = samples
+        self._joined = joined
         self._first = Dealer(address, "", "worker")
         self._names: dict[Dealer, str] = {}
         self._stopped: list[Dealer] = []
@@ -95,7 +101,7 @@ class NullWorkers:
             link.send(encode(Ping()))
 
     def run(self) -> None:
-        """Answer leases until the server stops all workers; print "joined" once it knows all of them.
+        """Answer leases until the server stops all workers.
 
         Raises:
             RemoteError: the server refuses a worker.
@@ -125,7 +131,7 @@ class NullWorkers:
             case Pong() if link in self._joining:
                 self._joining.remove(link)
                 if not self._joining:
-                    print("joined", flush=True)
+                    self._joined.set()
             case Stop():
                 link.send(encode(Goodbye()))
                 del self._names[link]
@@ -236,41 +242,25 @@ def null_service(
             (corpus / f"{number}.mp4").hardlink_to(first)
         own = ["--worker-bind", address, "--cache-dir", folder]
         with LocalServer(corpus, workers=0, flags=[*flags, *own]) as server:
-            command = [
-                sys.executable,
-                "-m",
-                "bench.speed.null_workers",
-                "--connect",
-                address,
-                "--workers",
-                str(workers),
-            ]
-            command += ["--parent-pid", str(os.getpid()), *([] if samples is None else ["--samples", str(samples)])]
-            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
+            spawn = multiprocessing.get_context("spawn")
+            joined = spawn.Event()
+            process = spawn.Process(target=_work, args=(os.getpid(), address, workers, joined, samples))
+            process.start()
             try:
                 # A consumer that connects earlier gets the credit of a server without workers.
-                if process.stdout is None or process.stdout.readline() != "joined\n":
-                    raise ServerLost("the null workers ended before they joined the server")
-                yield NullService(server, process.pid)
+                while not joined.wait(_JOIN_POLL_SECONDS):
+                    if process.exitcode is not None:
+                        raise ServerLost("the null workers ended before they joined the server")
+                yield NullService(server, process.pid or 0)
             finally:
                 process.terminate()
-                process.communicate()
+                process.join()
 
 
-def main() -> None:
-    """Run the null workers."""
-    parser = argparse.ArgumentParser(prog="python -m bench.speed.null_workers", description=__doc__)
-    parser.add_argument("--connect", required=True, metavar="ADDRESS", help="the server's --worker-bind")
-    parser.add_argument("--workers", type=int, required=True, metavar="N", help="number of null workers")
-    parser.add_argument("--samples", type=Path, metavar="DIR", help="samples to send: NAME.npy of each array")
-    parser.add_argument("--parent-pid", type=int, required=True, metavar="PID", help="end when this process ends")
-    asked = parser.parse_args()
-    die_with_parent(asked.parent_pid)
+def _work(parent_pid: int, address: str, count: int, joined: Event, folder: Path | None) -> None:
+    """Run the process of the null workers."""
+    die_with_parent(parent_pid)
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    samples = None if asked.samples is None else {file.stem: np.load(file) for file in asked.samples.glob("*.npy")}
-    NullWorkers(asked.connect, asked.workers, samples).run()
-
-
-if __name__ == "__main__":
-    main()
+    samples = None if folder is None else {file.stem: np.load(file) for file in folder.glob("*.npy")}
+    NullWorkers(address, count, joined, samples).run()

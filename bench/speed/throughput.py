@@ -16,25 +16,23 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import multiprocessing
-import os
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import psutil
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
 from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, progress
-from bench.processes import cpu_seconds, endless
+from bench.processes import cpu_seconds
 from bench.speed.released import ReleasedStyleDataset
 from tests.oracles.leases import open_leases
-from v2v_client import Batch, V2VStreamDataset
+from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
+from v2v_client.tools import loadtest
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import SPEED_PRESETS, StreamSpec
@@ -106,8 +104,12 @@ class Contender:
     def measure(self, asked: argparse.Namespace) -> Measured:
         """Run one turn."""
         if self.name == BASELINE:
-            return _released(self.corpus, asked)
-        return _decode(self.corpus, asked) if self.name == LIMIT else _preset(self.name, self.corpus, asked)
+            return _loaded(ReleasedStyleDataset(self.corpus.videos, rows=self.corpus.rows), asked)
+        return (
+            _loaded(_Decoding(self.corpus), asked, "spawn")
+            if self.name == LIMIT
+            else _preset(self.name, self.corpus, asked)
+        )
 
 
 def line_up(source: Corpus, prepared: list[Corpus], presets: list[str]) -> list[Contender]:
@@ -116,84 +118,45 @@ def line_up(source: Corpus, prepared: list[Corpus], presets: list[str]) -> list[
     return [Contender(BASELINE, source)] + [Contender(name, corpus) for corpus in (source, *prepared) for name in names]
 
 
-def _released(corpus: Corpus, asked: argparse.Namespace) -> Measured:
-    dataset = ReleasedStyleDataset(corpus.videos, rows=corpus.rows)
-    loader = DataLoader(dataset, batch_size=asked.batch_size, num_workers=asked.workers)
-    return _measure(asked, iter(loader), _own_cpu_seconds, burst=asked.workers)
+class _Decoding(IterableDataset[int]):
+    """Decode the frames of one sample after the other, shared among the loader's workers; yield a zero for each."""
+
+    def __init__(self, corpus: Corpus) -> None:
+        self._corpus = corpus
+
+    def __iter__(self) -> Iterator[int]:
+        worker = get_worker_info()
+        assert worker is not None  # a contender has at least one
+        with open_leases(self._corpus.videos, self._corpus.rows, StreamSpec()) as (root, leases):
+            for lease in itertools.islice(leases, worker.id, None, worker.num_workers):
+                decode_for(lease, lease.indices, Folder(root))
+                yield 0
 
 
 def _preset(name: str, corpus: Corpus, asked: argparse.Namespace) -> Measured:
     options: dict[str, Any] = {"recipe": "paper", "preset": name}
     with LocalServer(corpus.videos, workers=asked.workers, flags=["--rows", corpus.rows]) as server:
-        made = {"samples": 0, "decodes": 0}
-
-        def batches() -> Iterator[Batch]:
-            dataset = V2VStreamDataset(server.address, asked.batch_size, **options)
-            for batch in endless(dataset):
-                made["samples"] += len(batch)
-                made["decodes"] += batch.decodes
-                yield batch
-
-        def used() -> float:
-            return sum(server.cpu_seconds().values()) + cpu_seconds(os.getpid())
-
-        views = int(SPEED_PRESETS[name]["samples_per_decode"])
-        measured = _measure(asked, batches(), used, burst=views)
-    return measured._replace(samples_per_decode=made["samples"] / made["decodes"])
+        dataset = V2VStreamDataset(server.address, asked.batch_size, **options)
+        record, _ = loadtest.measure(
+            dataset, address=server.address, workers=asked.workers, server=server, batch_size=asked.batch_size,
+            seconds=asked.seconds, warmup_batches=asked.warmup_batches, trainer_seconds=0.0,
+        )  # fmt: skip
+    return Measured(*(record[key] for key in Measured._fields))
 
 
-def _decode(corpus: Corpus, asked: argparse.Namespace) -> Measured:
-    context = multiprocessing.get_context("spawn")
-    counts = [context.Value("q", 0) for _ in range(asked.workers)]
-    stop = context.Event()
-    processes = [
-        context.Process(target=_decode_jobs, args=(corpus, asked.workers, number, count, stop), daemon=True)
-        for number, count in enumerate(counts)
-    ]
-    for process in processes:
-        process.start()
+def _loaded(dataset: Dataset[Any], asked: argparse.Namespace, context: str | None = None) -> Measured:
+    """Count the batches of a loader after the warm-up until the time is over.
 
-    def batches() -> Iterator[int]:
-        for given in itertools.count(1):
-            while sum(count.value for count in counts) < given * asked.batch_size:
-                if not all(process.is_alive() for process in processes):
-                    raise RuntimeError("a decoding process died, see above")
-                time.sleep(0.002)
-            yield given
-
-    try:
-        return _measure(asked, batches(), _own_cpu_seconds)
-    finally:
-        stop.set()
-        for process in processes:
-            process.join()
-
-
-def _decode_jobs(corpus: Corpus, workers: int, number: int, count: Any, stop: Event) -> None:
-    with open_leases(corpus.videos, corpus.rows, StreamSpec()) as (root, leases):
-        for lease in itertools.islice(leases, number, None, workers):
-            if stop.is_set():
-                return
-            decode_for(lease, lease.indices, Folder(root))
-            count.value += 1
-
-
-def _measure(
-    asked: argparse.Namespace, stream: Iterator[object], used: Callable[[], float], burst: int = 1
-) -> Measured:
-    """Count whole batches after the warm-up until the time is over.
-
-    Args:
-        burst: batches that arrive together (one of each loader process; siblings finish K batches together). Only whole
-            bursts count: a window that ends within one is off by half of it.
+    Only whole rounds of its workers count, because their batches arrive together.
     """
-    for _ in range(-(-asked.warmup_batches // burst) * burst):
+    stream = iter(DataLoader(dataset, asked.batch_size, num_workers=asked.workers, multiprocessing_context=context))
+    for _ in range(-(-asked.warmup_batches // asked.workers) * asked.workers):
         next(stream)
-    cpu, started, taken = used(), time.perf_counter(), 0
-    while time.perf_counter() - started < asked.seconds or taken % burst:
+    cpu, started, taken = _own_cpu_seconds(), time.perf_counter(), 0
+    while time.perf_counter() - started < asked.seconds or taken % asked.workers:
         next(stream)
         taken += 1
-    return Measured(taken / (time.perf_counter() - started), (used() - cpu) / taken)
+    return Measured(taken / (time.perf_counter() - started), (_own_cpu_seconds() - cpu) / taken)
 
 
 def _own_cpu_seconds() -> float:

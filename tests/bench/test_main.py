@@ -82,7 +82,6 @@ def test_every_bench_has_a_parser_and_a_line_in_the_list() -> None:
         ("siege --footage film --kinds refused", "--kinds refused: choose of unfinished, "),
         ("fuzz --live 5", "--live needs a corpus: give --videos DIR"),
         ("flow --methods dis", "flow_method"),
-        ("extremes --rows zzz", "--rows zzz: no row has that in its name"),
         ("flow --videos none", "No such file or directory: 'none'"),
     ],
 )
