@@ -1,20 +1,24 @@
-"""The frame of every bench: its parser, its tables, its records on disk, its exit status."""
+"""The frame of every bench: its parser, its tables and plots, its records on disk, its exit status."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
 from v2v_server.tradeoff.report import format_table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Record = Mapping[str, Any]  # Flat: keys with SI units -> text, number, bool or None
 Column = tuple[str, str, str, float]  # Key of a record, title, format, and the factor from SI units to what is shown
@@ -75,6 +79,24 @@ def show(records: Sequence[Record], columns: Sequence[Column]) -> None:
     """Print a table; a value that is missing or None is a dash; a column without values is left out."""
     shown = [column for column in columns if any(record.get(column[0]) is not None for record in records)]
     print(format_table(records, shown), end="")
+
+
+@contextmanager
+def panels(file: Path, count: int, *, title: str, height_inches: float = 4.0) -> Iterator[Sequence[Axes]]:
+    """Yield axes side by side; write the PNG when the block ends without an error."""
+    import matplotlib  # lazily: a bench without --plot must not need it
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, count, figsize=(2.2 + 4.6 * count, height_inches), squeeze=False)
+    try:
+        figure.suptitle(title)
+        yield list(axes[0])
+        figure.tight_layout()
+        figure.savefig(file, dpi=110)
+    finally:
+        pyplot.close(figure)
 
 
 def key_values(record: Record) -> tuple[list[Record], list[Column]]:

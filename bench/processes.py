@@ -54,11 +54,18 @@ def peak_rss_bytes(pid: int) -> int:
     return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) << 10
 
 
+def workers_of(pid: int) -> list[int]:
+    """Return the worker processes of a server's main process; none once it has ended."""
+    try:
+        children = psutil.Process(pid).children()
+        return [child.pid for child in children if "v2v_server.commands.worker" in child.cmdline()]
+    except (psutil.NoSuchProcess, psutil.ZombieProcess):
+        return []
+
+
 def roles_of(server: LocalServer) -> dict[str, list[int]]:
     """Return the processes of the broker (the server's main process), its workers, and the client (this process)."""
-    children = psutil.Process(server.pid).children()
-    workers = [child.pid for child in children if "v2v_server.commands.worker" in child.cmdline()]
-    return {"workers": workers, "broker": [server.pid], "client": [os.getpid()]}
+    return {"workers": workers_of(server.pid), "broker": [server.pid], "client": [os.getpid()]}
 
 
 def cpu_seconds_of(roles: Roles) -> dict[str, float]:

@@ -129,7 +129,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--frames", type=int, default=130, help="frames of a clip")
     parser.add_argument("--rate", type=int, default=30, help="frames a second; motion is given per frame")
-    parser.add_argument("--plain", type=float, default=0.0, help="share of backgrounds, and of patches, that are a smooth gradient")
+    parser.add_argument(
+        "--plain", type=float, default=0.0, help="share of backgrounds, and of patches, that are a smooth gradient"
+    )
     args = parser.parse_args()
     files = sorted(p for p in args.photographs.rglob("*") if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
     pictures = [picture for p in files if (picture := cv2.imread(str(p), cv2.IMREAD_UNCHANGED)) is not None]

@@ -86,7 +86,7 @@ class Recipe:
     voxel_seconds: Range = span(
         (0.0, 0.0), 1e-6, 100.0,
         "duration of a voxel grid: it spans the number of steps between video frames that comes nearest, and its bins "
-        "are equal parts of its time; 0: a grid spans bins x frames_per_bin steps",
+        "are equal parts of its time",
         unit="s", off=True,
     )  # fmt: skip
     lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
@@ -120,8 +120,8 @@ class Recipe:
     )
     light: str = word(
         "sdr", ("sdr", "declared"),
-        "sdr: read 8 bits of every video, and apply gamma; declared: read the bit depth that the video has, up to 12, "
-        "and apply the transfer that it states (PQ, HLG, log, linear), or gamma where it states none of these",
+        "sdr: read 8 bits and apply gamma; declared: read up to 12 bits and apply the transfer that the video states "
+        "(PQ, HLG, log, linear), else gamma",
     )  # fmt: skip
 
     threshold: Range = span(

@@ -128,8 +128,7 @@ class StreamSpec:
     )  # fmt: skip
     tolerance: float = number(
         0.0, 0.0, 0.5,
-        "share of a clip's events that effects may change which are left out of it because they change little; 0: all "
-        "effects of the recipe are simulated",
+        "largest share of a clip's events that the effects left out of it may change; 0: no effect is left out",
         group="Effects",
     )  # fmt: skip
 

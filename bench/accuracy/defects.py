@@ -247,7 +247,7 @@ def measure(asked: argparse.Namespace) -> Report:
         real += [{"measure": "real", "video": name, "kind": each.kind, "text": each.text} for each in defects]
         parts_of += [(number, name, film) for number, film in enumerate(parts)]
     clips = [(name, film) for _, name, film in sorted(parts_of, key=lambda each: each[:2])[: asked.clips]]
-    if 0 < asked.clips and len(clips) < 4:
+    if asked.clips > 0 and len(clips) < 4:
         raise UsageError(f"--videos {asked.videos}: {len(clips)} videos are clean and move; give four")
     records: list[dict[str, Any]] = []
     false: list[dict[str, Any]] = []

@@ -12,8 +12,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from bench.frame import Column, Record, Report
-from bench.plots import panels
+from bench.frame import Column, Record, Report, panels
 from tests.oracles.extremes import record_of, rows
 from v2v_protocol.command import Parser
 

@@ -24,8 +24,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from bench.frame import Column, Record, Report
-from bench.plots import panels
+from bench.frame import Column, Record, Report, panels
 from tests.oracles.analytic_scenes import SECONDS, START_SHARE, analytic_scenes, moved_photograph
 from tests.oracles.dense import bin_events, dense_events
 from v2v_protocol.command import Parser

@@ -19,6 +19,7 @@ from tests.oracles.stream import Profile
 from tests.oracles.stream_log import BatchLine, LifeLine, LogWriter, sighting
 from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import V2VError
+from v2v_protocol.write_aside import write_aside_and_rename
 
 _SMALL = {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}
 PROFILES = (
@@ -110,10 +111,8 @@ def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, 
 
 
 def _replace(path: Path, text: str) -> None:
-    """Write the file atomically: readers see the old text or the new one."""
-    partial = path.with_suffix(".partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    with write_aside_and_rename(path) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def main() -> int:

@@ -21,7 +21,7 @@ from pathlib import Path
 import psutil
 
 from bench.chaos.consumer import log_path
-from bench.processes import free_ports, last_in_line
+from bench.processes import free_ports, last_in_line, workers_of
 from v2v_protocol.errors import UsageError
 from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
 from v2v_server.keys.folder import KeyFolder
@@ -266,13 +266,7 @@ class Fleet:
 
     def server_workers(self) -> list[int]:
         """Return the process ids of the server's workers."""
-        if self.server.pid is None:
-            return []
-        try:
-            children = psutil.Process(self.server.pid).children()
-            return [child.pid for child in children if "v2v_server.commands.worker" in child.cmdline()]
-        except (psutil.NoSuchProcess, psutil.ZombieProcess):
-            return []
+        return [] if self.server.pid is None else workers_of(self.server.pid)
 
     def committed(self) -> list[int]:
         """Return the number of batches that each consumer has committed."""

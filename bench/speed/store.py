@@ -18,6 +18,7 @@ import math
 import statistics
 import tempfile
 import time
+import timeit
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -29,7 +30,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, progress
+from bench.frame import Column, Record, Report, add_videos, add_whole, progress
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.catalogue import open_catalogue
@@ -47,7 +48,7 @@ CROP = (149, 128, 128)  # Frames, rows and columns
 FORMS = {"store dense": DENSE, "store fast": FAST, "store raw": RAW, "cache": QUICK}
 MOST_ADDED = 0.15
 _MOST_FRAMES = 450
-_TURNS = 3
+_TURNS, _READS = 3, 10
 _COLUMNS: tuple[Column, ...] = (
     ("form", "", "{}", 1.0),
     ("ratio_to_source_bytes", "x source", "{:.2f}", 1.0),
@@ -84,16 +85,11 @@ def read_crop(path: Path, place: Sequence[int]) -> Luma:
     return out
 
 
-def fastest_seconds(calls: Sequence[Callable[[], object]], seconds: float) -> float:
-    """Time calls in turns for that long; return the fastest of each, the median over them."""
-    fastest = [float("inf")] * len(calls)
-    end = time.perf_counter() + seconds
-    while fastest[-1] == float("inf") or time.perf_counter() < end:
-        for number, call in enumerate(calls):
-            started = time.process_time()
-            call()
-            fastest[number] = min(fastest[number], time.process_time() - started)
-    return statistics.median(fastest)
+def fastest_seconds(calls: Sequence[Callable[[], object]]) -> float:
+    """Return the fastest processor time of each call, the median over them."""
+    return statistics.median(
+        min(timeit.repeat(call, timer=time.process_time, number=1, repeat=_READS)) for call in calls
+    )
 
 
 def clips(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -124,7 +120,7 @@ def clips(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
             yield common | {
                 "form": "source",
                 "bytes": source_bytes,
-                "read_cpu_seconds": fastest_seconds(reads, asked.seconds),
+                "read_cpu_seconds": fastest_seconds(reads),
             }
             for form, packing in FORMS.items():
                 progress(f"{video.id}: {form}")
@@ -138,7 +134,7 @@ def clips(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 yield common | {
                     "form": form,
                     "bytes": file.stat().st_size,
-                    "read_cpu_seconds": fastest_seconds([partial(read_crop, file, at) for at in places], asked.seconds),
+                    "read_cpu_seconds": fastest_seconds([partial(read_crop, file, at) for at in places]),
                     "write_bytes_per_cpu_second": luma.size / writing,
                 }
 
@@ -197,7 +193,6 @@ def add_flags(parser: Parser) -> None:
     add_videos(parser, "clips (python -m bench corpus)", rows="top:0.54")
     add_whole(parser, "--clips", 6, "most clips to take")
     add_whole(parser, "--places", 8, "crops to read of each clip")
-    add_positive(parser, "--seconds", 2.0, "of reading each form of each clip")
 
 
 def measure(asked: argparse.Namespace) -> Report:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.plots import panels
+from bench.frame import panels
 from v2v_pictures.colours import BRIGHTER, DARKER
 from v2v_server.simulation import simulate
 

@@ -39,7 +39,7 @@ def of_two_bins(text: str) -> str:
 
 
 def test_the_page_has_examples() -> None:
-    assert [name for name, _ in EXAMPLES] == ["A plain loop", "DataLoader", "StatefulDataLoader", *OTHERS]
+    assert [name for name, _ in EXAMPLES] == ["DataLoader", "StatefulDataLoader", *OTHERS]
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Python's, of a fork in a process with threads

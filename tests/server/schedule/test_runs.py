@@ -112,9 +112,7 @@ def test_a_share_of_the_quiet_sequences_is_served(share: float) -> None:
     """Quiet for half, and not still; what is still is up to still_share alone."""
     quiet, still = Flag.QUIET, Flag.QUIET | Flag.STILL
     parts = pieces((16_000, quiet), (16_011, 0), (16_020, quiet), (20_000, 0), (24_000, still))
-    spec = StreamSpec(
-        recipe=RECIPE, scene="auto", still_share=1.0, quiet_share=share, max_sequences_per_video=10_000
-    )
+    spec = StreamSpec(recipe=RECIPE, scene="auto", still_share=1.0, quiet_share=share, max_sequences_per_video=10_000)
     found = np.array([start for _, start in starts(SequenceTable([video("a", 24_000, parts)], Rows(), spec))])
     assert found[found >= 16_000].tolist() == list(range(16_000, 23_980, 20))
     assert abs(np.count_nonzero(found < 16_000) - share * 800) <= 50

@@ -66,8 +66,9 @@ _COMB_BLOCKS = 1000
 """One of that number of blocks are combed in a combed picture, and four at least: fine texture has two or three."""
 
 _QUIET_CHANGE = 35
-"""Grey levels over four frames, in the mean of the tiles. Of samples of the paper's cameras from quieter sequences, half
-were mostly noise; of the others, a fifth."""
+"""Grey levels over four frames, in the mean of the tiles. Of the samples of the paper's cameras, half of those from
+quieter sequences were mostly noise, and a fifth of the others."""
+
 _EVEN_BYTES = np.uint64(0x00FF00FF00FF00FF)
 _EACH_WORD = np.uint64(0x0001000100010001)
 _Tiles = npt.NDArray[np.float64]
