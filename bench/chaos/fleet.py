@@ -85,6 +85,7 @@ class Fleet:
     Attributes:
         failures: processes that ended without a fault.
         ready_at: when servers became ready, ascending.
+        address, worker_address: of the server, for consumers and for workers.
     """
 
     folder: Path
@@ -104,8 +105,8 @@ class Fleet:
     server: Process = field(init=False)
     further_workers: list[Process] = field(init=False, default_factory=list)
     crowd: list[Process] = field(init=False)
-    _address: str = field(init=False)
-    _worker_address: str = field(init=False)
+    address: str = field(init=False)
+    worker_address: str = field(init=False)
     _awaited: bool = field(init=False, default=False)
     _added: int = field(init=False, default=0)
 
@@ -114,14 +115,14 @@ class Fleet:
             (self.folder / name).mkdir(parents=True)
         if self.keyed:
             self._make_keys()
-        self._address, self._worker_address = (f"tcp://{self.host}:{port}" for port in free_ports(2))
+        self.address, self.worker_address = (f"tcp://{self.host}:{port}" for port in free_ports(2))
         self.server = Process("server", self._server_command(), self.folder / "server")
         self.crowd = []
         for number in range(self.consumers):
             folder = self.folder / f"consumer{number}"
             folder.mkdir()
             command = [*self.elsewhere, sys.executable, "-X", "faulthandler", "-m", "bench.chaos.consumer"]
-            command += ["--address", self._address, "--profile", str(number), "--folder", str(folder)]
+            command += ["--address", self.address, "--profile", str(number), "--folder", str(folder)]
             self.crowd.append(Process(f"consumer {number}", command, folder, side="consumer"))
 
     @property
@@ -145,11 +146,6 @@ class Fleet:
         return self.folder / "tmp"
 
     @property
-    def addresses(self) -> tuple[str, str]:
-        """Return the server's addresses, for consumers and for workers."""
-        return self._address, self._worker_address
-
-    @property
     def everyone(self) -> list[Process]:
         """Return all places."""
         return [self.server, *self.further_workers, *self.crowd]
@@ -169,7 +165,7 @@ class Fleet:
         return [
             *(sys.executable, "-m", self.server_module, "--videos", str(self.videos)),
             *("--workers", str(self.workers)),
-            *("--bind", self._address, "--worker-bind", self._worker_address, "--port-file", str(self.port_file)),
+            *("--bind", self.address, "--worker-bind", self.worker_address, "--port-file", str(self.port_file)),
             *("--cache-dir", str(self.cache), "--lease-deadline-seconds", str(self.lease_deadline_seconds)),
             # The server's recipe only has to fit the corpus: every consumer states its own.
             *("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=32"),
@@ -229,7 +225,7 @@ class Fleet:
         folder = self.folder / name
         folder.mkdir()
         command = [*self.elsewhere, sys.executable, "-m", "v2v_server.commands.worker"]
-        command += ["--connect", self._worker_address, "--videos", str(self.videos), "--name", name]
+        command += ["--connect", self.worker_address, "--videos", str(self.videos), "--name", name]
         place = Process(f"worker {name}", command, folder, side="worker")
         self._spawn(place)
         self.further_workers.append(place)
@@ -241,10 +237,10 @@ class Fleet:
         Args:
             last: they get the lowest priority.
         """
-        command = [sys.executable, "-m", "bench.chaos.hostile", "--address", self._address, "--kind", kind]
+        command = [sys.executable, "-m", "bench.chaos.hostile", "--address", self.address, "--kind", kind]
         command += ["--tally", str(self.tally)]
         if self.keyed:
-            command += ["--worker-address", self._worker_address, "--revoked", str(self.key("revoked"))]
+            command += ["--worker-address", self.worker_address, "--revoked", str(self.key("revoked"))]
         peers = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -342,7 +338,7 @@ class Fleet:
         for child in psutil.Process().children():
             if child.status() == psutil.STATUS_ZOMBIE:
                 left.append(f"zombie {child.pid}")
-        for port in (int(address.rpartition(":")[2]) for address in self.addresses):
+        for port in (int(address.rpartition(":")[2]) for address in (self.address, self.worker_address)):
             with socket.socket() as probe:
                 if probe.connect_ex((self.host, port)) == 0:
                     left.append(f"port {port} still listens")

@@ -54,12 +54,11 @@ def fuzz_live(
         fleet.start()
         pid = fleet.server.pid or 0
         # The memory of the first messages (arenas, caches) is not a leak.
-        files = (fleet.key("consumer"), fleet.key("worker")) if keyed else ()
-        keys = dict(zip(fleet.addresses, files, strict=False))
-        with Attack(*fleet.addresses, random.Random(seed), keys) as warm_up:
+        keys = {fleet.address: fleet.key("consumer"), fleet.worker_address: fleet.key("worker")} if keyed else {}
+        with Attack(fleet.address, fleet.worker_address, random.Random(seed), keys) as warm_up:
             warm_up.send(max(1, messages // 10))
         before = settled_mib(pid)
-        with Attack(*fleet.addresses, random.Random(f"{seed} after warm-up"), keys) as attack:
+        with Attack(fleet.address, fleet.worker_address, random.Random(f"{seed} after warm-up"), keys) as attack:
             began, committed = time.monotonic(), fleet.committed()[0]
             attack.send(messages - messages // 10)
             # A few messages are sent before the healthy consumer has a batch: send some more.
