@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import statistics
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -79,6 +80,17 @@ def show(records: Sequence[Record], columns: Sequence[Column]) -> None:
     """Print a table; a value that is missing or None is a dash; a column without values is left out."""
     shown = [column for column in columns if any(record.get(column[0]) is not None for record in records)]
     print(format_table(records, shown), end="")
+
+
+def medians(turns: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """Return the median over the turns of each figure."""
+    return {key: statistics.median(turn[key] for turn in turns) for key in turns[0]}
+
+
+def ratios(name: str, mine: Iterable[float], base: Iterable[float]) -> dict[str, float]:
+    """Return the ratios within turns, so that a drift of the machine cancels: median, lowest and highest."""
+    each = [one / other for one, other in zip(mine, base, strict=True)]
+    return {name: statistics.median(each), f"{name}_lowest": min(each), f"{name}_highest": max(each)}
 
 
 @contextmanager

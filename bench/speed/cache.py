@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.frame import Column, Record, Report, add_videos, add_whole
+from bench.frame import Column, Record, Report, add_videos, add_whole, ratios
 from tests.oracles.leases import open_leases
 from v2v_protocol.command import Parser
 from v2v_protocol.messages import Lease
@@ -62,22 +62,17 @@ def compare(leases: Sequence[Lease], root: Path, turns: int) -> list[dict[str, A
             for way, where in zip(WAYS, (None, cache, cache), strict=True):
                 found[way].append(epoch(leases, root, where))
             cache_bytes = cache.used_bytes
-    records = []
-    for way, epochs in found.items():
-        ratios = [mine / source for mine, source in zip(epochs, found["source"], strict=True)]
-        records.append(
-            {
-                "way": way,
-                "cpu_seconds_per_sample": statistics.median(epochs) / len(leases),
-                "ratio_to_source": statistics.median(ratios),
-                "ratio_to_source_lowest": min(ratios),
-                "ratio_to_source_highest": max(ratios),
-                "cache_bytes": 0 if way == "source" else cache_bytes,
-                "samples": len(leases),
-                "turns": turns,
-            }
-        )
-    return records
+    return [
+        {
+            "way": way,
+            "cpu_seconds_per_sample": statistics.median(epochs) / len(leases),
+            **ratios("ratio_to_source", epochs, found["source"]),
+            "cache_bytes": 0 if way == "source" else cache_bytes,
+            "samples": len(leases),
+            "turns": turns,
+        }
+        for way, epochs in found.items()
+    ]
 
 
 def missed(records: Sequence[Record]) -> list[str]:

@@ -15,7 +15,6 @@ Bar: 5 times raw. Where processors are the limit, give a slower link.
 from __future__ import annotations
 
 import argparse
-import statistics
 import tempfile
 from itertools import islice
 from pathlib import Path
@@ -24,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from bench.cable import NEAR, Cable
-from bench.frame import Column, Report, add_positive, add_videos, add_whole
+from bench.frame import Column, Report, add_positive, add_videos, add_whole, medians, ratios
 from bench.processes import consume
 from bench.speed.null_workers import NullService, null_service
 from tests.oracles.leases import open_leases, whole_sample
@@ -99,26 +98,19 @@ def compare(asked: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
         for _ in range(asked.turns):
             for name, stretches in found.items():
                 stretches.append(stretch(service, cable, asked, compress=name == "compressed"))
-    ratios = [
-        mine["batches_per_second"] / raw["batches_per_second"]
-        for mine, raw in zip(found["compressed"], found["raw"], strict=True)
-    ]
     records: list[dict[str, Any]] = [
         {
             "samples": name,
             "link_bits_per_second": 1e6 * asked.mbit,
             "batch_size": asked.batch_size,
-            **{key: statistics.median(each[key] for each in stretches) for key in stretches[0]},
+            **medians(stretches),
         }
         for name, stretches in found.items()
     ]
     if not 0.8 <= (busy := records[0]["link_busy"]) <= 1.05:
         raise UsageError(f"raw samples fill {busy:.0%} of {asked.mbit:g} Mbit/s; 80 to 105 % is usable: lower --mbit")
-    records[1] |= {
-        "ratio_to_raw": statistics.median(ratios),
-        "ratio_to_raw_lowest": min(ratios),
-        "ratio_to_raw_highest": max(ratios),
-    }
+    compressed, raw = ([each["batches_per_second"] for each in found[name]] for name in ("compressed", "raw"))
+    records[1] |= ratios("ratio_to_raw", compressed, raw)
     return records
 
 

@@ -14,11 +14,10 @@ both within a turn; the broker carries at least 1 GB/s, in at most 150 MB plus i
 from __future__ import annotations
 
 import argparse
-import statistics
 from collections.abc import Sequence
 from typing import Any
 
-from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, whole_numbers
+from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, medians, whole_numbers
 from bench.processes import Roles, consume, peak_rss_bytes, roles_of
 from bench.speed.null_workers import null_service
 from v2v_client.dataset import V2VStreamDataset
@@ -72,8 +71,7 @@ def end_to_end(asked: argparse.Namespace) -> list[dict[str, Any]]:
                 )
         turns.append(found)
     return [
-        {"measure": "workers", "workers": workers, "turns": asked.repeat}
-        | {key: statistics.median(turn[workers][key] for turn in turns) for key in turns[0][workers]}
+        {"measure": "workers", "workers": workers, "turns": asked.repeat} | medians([turn[workers] for turn in turns])
         for workers in asked.workers
     ]
 

@@ -10,12 +10,10 @@ Bar: four take at most 1.2 times the time of one, the median of the turns.
 from __future__ import annotations
 
 import argparse
-import statistics
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
-from bench.frame import Column, Report, add_videos, add_whole
+from bench.frame import Column, Report, add_videos, add_whole, medians, ratios
 from bench.processes import cpu_seconds_of, roles_of
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
@@ -24,7 +22,7 @@ from v2v_protocol.command import Parser
 EQUAL_TRAINERS, MOST_RATIO = 4, 1.2
 _SETTLE_SECONDS = 0.3
 _COLUMNS: tuple[Column, ...] = (
-    ("name", "", "{}", 1),
+    ("trainers", "equal trainers", "{}", 1),
     ("workers_cpu_seconds_per_batch", "workers ms", "{:.1f}", 1e3),
     ("broker_cpu_seconds_per_batch", "broker ms", "{:.1f}", 1e3),
     ("client_cpu_seconds_per_batch", "clients ms", "{:.1f}", 1e3),
@@ -35,7 +33,7 @@ _COLUMNS: tuple[Column, ...] = (
 )
 
 
-def equal_trainers(asked: argparse.Namespace, trainers: int) -> dict[str, Any]:
+def equal_trainers(asked: argparse.Namespace, trainers: int) -> dict[str, float]:
     """Return the record of a server from its start, with trainers that take one epoch of equal samples each."""
     flags = ["--rows", asked.rows, "--share-gib", "2" if trainers > 1 else "0"]
     with LocalServer(asked.videos, workers=1, flags=flags) as server:
@@ -52,7 +50,6 @@ def equal_trainers(asked: argparse.Namespace, trainers: int) -> dict[str, Any]:
         time.sleep(_SETTLE_SECONDS)  # the server still handles the Goodbye
         after = cpu_seconds_of(roles)
     return {
-        "name": f"equal trainers: {trainers}",
         **{f"{role}_cpu_seconds_per_batch": (after[role] - before[role]) / batches for role in roles},
         "batches_per_second": batches / elapsed,
     }
@@ -68,16 +65,13 @@ def add_flags(parser: Parser) -> None:
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench: medians over the turns."""
     turns = [[equal_trainers(asked, trainers) for trainers in (1, EQUAL_TRAINERS)] for _ in range(asked.turns)]
-    records = []
-    for runs in zip(*turns, strict=True):
-        keys = [key for key in runs[0] if key != "name"]
-        records.append({"name": runs[0]["name"], **{key: statistics.median(run[key] for run in runs) for key in keys}})
-
-    def server_seconds(run: dict[str, Any]) -> float:
-        return float(run["workers_cpu_seconds_per_batch"] + run["broker_cpu_seconds_per_batch"])
-
-    ratios = [server_seconds(equal) / server_seconds(one) for one, equal in turns]
-    ratio = statistics.median(ratios)
-    records[1] |= {"ratio_to_one": ratio, "ratio_to_one_lowest": min(ratios), "ratio_to_one_highest": max(ratios)}
+    one, equal = zip(*turns, strict=True)
+    records = [{"trainers": 1, **medians(one)}, {"trainers": EQUAL_TRAINERS, **medians(equal)}]
+    records[1] |= ratios("ratio_to_one", map(_server_seconds, equal), map(_server_seconds, one))
+    ratio = records[1]["ratio_to_one"]
     missed = [f"{EQUAL_TRAINERS} trainers take {ratio:.2f} times the time of one; the bar is {MOST_RATIO}"]
     return Report(records, [(records, _COLUMNS)], missed=missed if ratio > MOST_RATIO else [])
+
+
+def _server_seconds(run: dict[str, float]) -> float:
+    return run["workers_cpu_seconds_per_batch"] + run["broker_cpu_seconds_per_batch"]

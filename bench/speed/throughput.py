@@ -16,9 +16,8 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +25,7 @@ from typing import Any, NamedTuple
 import psutil
 from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
-from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, progress
+from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, medians, progress, ratios
 from bench.processes import cpu_seconds
 from bench.speed.released import ReleasedStyleDataset
 from tests.oracles.leases import open_leases
@@ -177,25 +176,20 @@ def compare(contenders: Sequence[Contender], asked: argparse.Namespace) -> list[
     baseline = contenders[0]
     limits = {contender.corpus: contender for contender in contenders if contender.name == LIMIT}
 
-    def record(of: Contender) -> dict[str, Any]:
-        def each(value: Callable[[Measured, Measured], float], beside: Contender = baseline) -> list[float]:
-            return [value(turn[of], turn[beside]) for turn in found]
+    def each(of: Contender, key: str) -> list[float]:
+        return [getattr(turn[of], key) for turn in found]
 
-        ratios = each(lambda mine, base: mine.batches_per_second / base.batches_per_second)
-        to_limit = each(lambda mine, limit: mine.batches_per_second / limit.batches_per_second, limits[of.corpus])
-        cpu_ratios = each(lambda mine, base: base.cpu_seconds_per_batch / mine.cpu_seconds_per_batch)
+    def record(of: Contender) -> dict[str, Any]:
+        rates, cpu = each(of, "batches_per_second"), each(of, "cpu_seconds_per_batch")
+        limit = each(limits[of.corpus], "batches_per_second")
         return {
             "label": of.label,
-            "samples_per_decode": statistics.median(each(lambda mine, _: mine.samples_per_decode)),
             "workers": asked.workers,
             "batch_size": asked.batch_size,
-            "batches_per_second": statistics.median(each(lambda mine, _: mine.batches_per_second)),
-            "cpu_seconds_per_batch": statistics.median(each(lambda mine, _: mine.cpu_seconds_per_batch)),
-            "ratio_to_baseline": statistics.median(ratios),
-            "ratio_to_baseline_lowest": min(ratios),
-            "ratio_to_baseline_highest": max(ratios),
-            "cpu_ratio_to_baseline": statistics.median(cpu_ratios),
-            "ratio_to_decode_limit": statistics.median(to_limit),
+            **medians([turn[of]._asdict() for turn in found]),
+            **ratios("ratio_to_baseline", rates, each(baseline, "batches_per_second")),
+            "cpu_ratio_to_baseline": ratios("cpu", each(baseline, "cpu_seconds_per_batch"), cpu)["cpu"],
+            "ratio_to_decode_limit": ratios("limit", rates, limit)["limit"],
             "turns": asked.turns,
             "seconds": asked.seconds,
         }
