@@ -34,7 +34,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
 
@@ -133,20 +133,14 @@ def trickle(address: str, number: int) -> None:
             time.sleep(0.1)
 
 
-@dataclass(frozen=True, slots=True)
-class Refused:
+def refused(worker_address: str, revoked: Path, address: str, number: int) -> None:
     """See the module; ``revoked`` is the file of a revoked key."""
-
-    worker_address: str
-    revoked: Path
-
-    def __call__(self, address: str, number: int) -> None:
-        known, revoked = read_key(Path(os.environ[KEY_VARIABLE])), read_key(self.revoked)
-        public, secret = new_key_pair()
-        unknown = replace(known, public=public, secret=secret)
-        for key, where in ((unknown, address), (revoked, address), (known, self.worker_address)):
-            if _is_refused(where, key):
-                _count()
+    known = read_key(Path(os.environ[KEY_VARIABLE]))
+    public, secret = new_key_pair()
+    unknown = replace(known, public=public, secret=secret)
+    for key, where in ((unknown, address), (read_key(revoked), address), (known, worker_address)):
+        if _is_refused(where, key):
+            _count()
 
 
 def _is_refused(address: str, key: PeerKey) -> bool:
@@ -161,33 +155,28 @@ def _is_refused(address: str, key: PeerKey) -> bool:
     return False
 
 
-@dataclass(frozen=True, slots=True)
-class Handshakes:
-    """See the module; ``said`` is the greeting and first message of a peer with a valid key."""
+def recorded_handshake() -> bytes:
+    """Return what a peer with the key of ``V2V_KEYS`` sends to a server that only listens: greeting, first message."""
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        _closing(Dealer(f"tcp://127.0.0.1:{server.getsockname()[1]}", beside=_first())),
+        server.accept()[0] as link,
+    ):
+        link.sendall(_GREETING % b"CURVE".ljust(20, b"\0"))
+        said = b""
+        while len(said) < _GREETING_BYTES + _HELLO_BYTES:
+            said += link.recv(4096)
+    return said
 
-    said: bytes
 
-    @classmethod
-    def recorded(cls) -> Handshakes:
-        """Record what a peer with the key of ``V2V_KEYS`` sends to a server that only listens."""
-        with (
-            socket.create_server(("127.0.0.1", 0)) as server,
-            _closing(Dealer(f"tcp://127.0.0.1:{server.getsockname()[1]}", beside=_first())),
-            server.accept()[0] as link,
-        ):
-            link.sendall(_GREETING % b"CURVE".ljust(20, b"\0"))
-            said = b""
-            while len(said) < _GREETING_BYTES + _HELLO_BYTES:
-                said += link.recv(4096)
-        return cls(said)
-
-    def __call__(self, address: str, number: int) -> None:
-        while True:
-            with _connected(address) as peer:
-                peer.sendall(self.said)
-                answer = b""
-                while len(answer) < _GREETING_BYTES + _WELCOME_BYTES and (piece := peer.recv(4096)):
-                    answer += piece
+def handshakes(said: bytes, address: str, number: int) -> None:
+    """See the module; ``said`` is what :func:`recorded_handshake` returns."""
+    while True:
+        with _connected(address) as peer:
+            peer.sendall(said)
+            answer = b""
+            while len(answer) < _GREETING_BYTES + _WELCOME_BYTES and (piece := peer.recv(4096)):
+                answer += piece
 
 
 KINDS: dict[str, Callable[[str, int], None]] = {
@@ -298,9 +287,9 @@ def main() -> NoReturn:
     _tally = asked.tally
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
     if asked.kind == REFUSED:
-        act: Callable[[str, int], None] = Refused(asked.worker_address, asked.revoked)
+        act: Callable[[str, int], None] = functools.partial(refused, asked.worker_address, asked.revoked)
     else:
-        act = Handshakes.recorded() if asked.kind == HANDSHAKES else KINDS[asked.kind]
+        act = functools.partial(handshakes, recorded_handshake()) if asked.kind == HANDSHAKES else KINDS[asked.kind]
     attack(asked.address, act)
 
 
