@@ -23,7 +23,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from bench.frame import Column, Record, Report, add_videos, add_whole, progress
+from bench.frame import Column, Record, Report, add_videos, add_whole, beyond, progress
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.messages import Lease
@@ -111,16 +111,6 @@ def total_of(clips: Sequence[Record]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def missed(flow: Record) -> list[str]:
-    """Return the bars that the record of all clips misses."""
-    texts = []
-    if flow["saved_share"] < LEAST_SAVED:
-        texts.append(f"flow takes {flow['saved_share']:.0%} less CPU; the bar is {LEAST_SAVED:.0%}")
-    if flow["added_error_median_px"] > TOLERANCE_PX:
-        texts.append(f"the median error rises by {flow['added_error_median_px']:.3f} px; the bar is {TOLERANCE_PX} px")
-    return texts
-
-
 _CLIPS: tuple[Column, ...] = (
     ("video", "video", "{}", 1),
     ("start_frame", "from", "{}", 1),
@@ -164,4 +154,5 @@ def measure(asked: argparse.Namespace) -> Report:
     if not clips:
         raise UsageError(f"--videos {asked.videos}: no video gives a sequence of {recipe.frames_needed} frames")
     total = total_of(clips)
-    return Report([total, *clips], [(clips, _CLIPS), ([total], _TOTAL)], missed=missed(total))
+    missed = beyond("flow", total, least={"saved_share": LEAST_SAVED}, most={"added_error_median_px": TOLERANCE_PX})
+    return Report([total, *clips], [(clips, _CLIPS), ([total], _TOTAL)], missed=missed)

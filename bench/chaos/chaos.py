@@ -31,7 +31,7 @@ from bench.chaos.consumer import log_path, profile
 from bench.chaos.faults import WEIGHTS, Chaos, Fault
 from bench.chaos.fleet import Fleet
 from bench.corpus import add_source, run_folder
-from bench.frame import Column, Record, Report, add_positive, add_whole, chosen, key_values
+from bench.frame import Column, Record, Report, add_positive, add_whole, beyond, chosen, key_values
 from tests.leftovers import abandoned_memory, shared_memory
 from tests.oracles.stream import check
 from tests.oracles.stream_log import BatchLine, Kill, read_log, recovery_seconds
@@ -149,7 +149,7 @@ def run_fleet(fleet: Fleet, chaos: Chaos, asked: argparse.Namespace) -> Report:
     record, faults = record_of(fleet, chaos.done, seconds, checked(fleet, asked.remakes, asked.seed))
     record |= {"leftovers": len(left), "stalled": stalled}
     shown = {key: value for key, value in record.items() if not key.startswith("faults_")}
-    missed = [f"{key} {record[key]}; the bar is 0" for key in FAILING if record[key]]
+    missed = beyond("run", record, most=dict.fromkeys(FAILING, 0))
     missed += [f"left over: {text}" for text in left[:20]]
     missed += fleet.failures[:20]
     return Report([record], [(faults, _FAULTS), key_values(shown)], missed=missed)

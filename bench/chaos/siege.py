@@ -29,7 +29,7 @@ from bench.chaos.fleet import Fleet
 from bench.chaos.hostile import KEYED_KINDS, KINDS, PEERS
 from bench.chaos.trimming_server import MODULE, settled_mib, trimmed_mib
 from bench.corpus import add_source, run_folder
-from bench.frame import Column, Record, Report, add_positive, add_whole, chosen, progress
+from bench.frame import Column, Record, Report, add_positive, add_whole, beyond, chosen, progress
 from bench.processes import cpu_seconds, rss_mib
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
@@ -119,13 +119,8 @@ def besiege(
 
 def missed(record: Record) -> list[str]:
     """Return the bars that a kind misses."""
-    most_peak = PEAK_BAR_MIB + CREDIT_MIB * (PEERS + 1)
-    bars = [
-        ("kept", record["kept"] >= KEPT_BAR, f"at least {KEPT_BAR}"),
-        ("peak_mib", record["peak_mib"] <= most_peak, f"at most {most_peak:.0f}"),
-        ("after_mib", record["after_mib"] <= AFTER_BAR_MIB, f"at most {AFTER_BAR_MIB:.0f}"),
-    ]
-    return [f"{record['kind']}: {key} {record[key]:.2f}; the bar is {limit}" for key, holds, limit in bars if not holds]
+    most = {"peak_mib": PEAK_BAR_MIB + CREDIT_MIB * (PEERS + 1), "after_mib": AFTER_BAR_MIB}
+    return beyond(record["kind"], record, least={"kept": KEPT_BAR}, most=most)
 
 
 def add_flags(parser: Parser) -> None:

@@ -15,10 +15,10 @@ from __future__ import annotations
 import argparse
 import os
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole
+from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, beyond
 from bench.processes import Fit, fit, roles_of, rss_mib
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
@@ -93,12 +93,6 @@ def records_of(stream: Record, memory: Memory, fits: Mapping[str, Fit]) -> list[
     ]
 
 
-def missed(stream: Record, growing: Iterable[str]) -> list[str]:
-    """Return the bars that were missed."""
-    texts = [f"{stream[key]} samples {key.replace('_', ' ')}; the bar is 0" for key in _ORDER if stream[key]]
-    return texts + [f"{name} grows" for name in growing]
-
-
 def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     add_videos(parser)
@@ -116,7 +110,8 @@ def measure(asked: argparse.Namespace) -> Report:
     warm_up = min(_MOST_WARM_UP_SECONDS, _WARM_UP_SHARE * stream["seconds"])
     memory = after(memory, warm_up)
     fits = {name: fit(points) for name, points in memory.items()}
-    growing = [name for name, line in fits.items() if grows(line, asked.most_mib_per_hour)]
+    missed = beyond("stream", stream, most=dict.fromkeys(_ORDER, 0))
+    missed += [f"{name} grows" for name, line in fits.items() if grows(line, asked.most_mib_per_hour)]
     records = records_of(stream, memory, fits)
     line = f"{records[0]['samples']} samples in {stream['seconds']:.0f} s; {warm_up:.0f} s of warm-up excluded"
-    return Report(records, [(records, _COLUMNS)], lines=[line], missed=missed(stream, growing))
+    return Report(records, [(records, _COLUMNS)], lines=[line], missed=missed)

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.frame import Column, Record, Report, add_videos, add_whole, ratios
+from bench.frame import Column, Report, add_videos, add_whole, beyond, ratios
 from tests.oracles.leases import open_leases
 from v2v_protocol.command import Parser
 from v2v_protocol.messages import Lease
@@ -75,12 +75,6 @@ def compare(leases: Sequence[Lease], root: Path, turns: int) -> list[dict[str, A
     ]
 
 
-def missed(records: Sequence[Record]) -> list[str]:
-    """Return the bar that these records miss."""
-    ratio = next(record["ratio_to_source"] for record in records if record["way"] == "fill")
-    return [f"fill: {ratio:.2f} times source; the bar is {FILL_BAR}"] if ratio > FILL_BAR else []
-
-
 def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     add_videos(parser, "clips of at least 201 frames (python -m bench corpus)", rows="top:0.54")
@@ -93,4 +87,5 @@ def measure(asked: argparse.Namespace) -> Report:
     with open_leases(asked.videos, asked.rows, StreamSpec()) as (root, endless):
         leases = list(itertools.takewhile(lambda lease: lease.epoch == 0, itertools.islice(endless, asked.samples)))
         records = compare(leases, root, asked.turns)
-    return Report(records, [(records, _COLUMNS)], missed=missed(records))
+    fill = records[WAYS.index("fill")]
+    return Report(records, [(records, _COLUMNS)], missed=beyond("fill", fill, most={"ratio_to_source": FILL_BAR}))

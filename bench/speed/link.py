@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from bench.cable import NEAR, Cable
-from bench.frame import Column, Report, add_positive, add_videos, add_whole, medians, ratios
+from bench.frame import Column, Report, add_positive, add_videos, add_whole, beyond, medians, ratios
 from bench.processes import consume
 from bench.speed.null_workers import NullService, null_service
 from tests.oracles.leases import open_leases, whole_sample
@@ -130,6 +130,5 @@ def measure(asked: argparse.Namespace) -> Report:
     with tempfile.TemporaryDirectory(prefix="v2v-link-") as name:
         make_samples(Path(name), asked.videos, asked.rows, asked.samples)
         records = compare(asked, Path(name))
-    ratio = records[1]["ratio_to_raw"]
-    missed = [f"compressed: {ratio:.2f} times raw; the bar is {BAR:g}"] if ratio < BAR else []
+    missed = beyond("compressed", records[1], least={"ratio_to_raw": BAR})
     return Report(records, [(records, _COLUMNS)], missed=missed)

@@ -17,7 +17,7 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, medians, whole_numbers
+from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, beyond, medians, whole_numbers
 from bench.processes import Roles, consume, peak_rss_bytes, roles_of
 from bench.speed.null_workers import null_service
 from v2v_client.dataset import V2VStreamDataset
@@ -90,19 +90,16 @@ def missed(records: Sequence[Record], cores: int) -> list[str]:
     """Return the bars that these records miss."""
     texts = []
     for record in records:
+        name = f"{record['measure']}, {record['workers']}"
         if record["measure"] == "broker":
-            limit = MOST_BROKER_BYTES + record["credit_window_bytes"]
-            if record["broker_peak_rss_bytes"] > limit:
-                held = record["broker_peak_rss_bytes"] / 1e6
-                texts.append(f"{record['workers']} null workers: {held:.0f} MB; the bar is {limit / 1e6:.0f} MB")
-        elif record["workers"] == 2 and record.get("ratio_to_1_worker", 2.0) < LEAST_GAIN_OF_TWO:
-            texts.append(f"2 workers: {record['ratio_to_1_worker']:.2f} times one; the bar is {LEAST_GAIN_OF_TWO}")
-        elif record["workers"] == 8 and cores <= _FEW_CORES and record.get("ratio_to_2_workers", 1.0) < 1.0:
-            texts.append(f"8 workers: {record['ratio_to_2_workers']:.3f} times two; the bar is 1")
+            most_bytes = MOST_BROKER_BYTES + record["credit_window_bytes"]
+            texts += beyond(name, record, most={"broker_peak_rss_bytes": most_bytes})
+        elif record["workers"] == 2:
+            texts += beyond(name, record, least={"ratio_to_1_worker": LEAST_GAIN_OF_TWO})
+        elif record["workers"] == 8 and cores <= _FEW_CORES:
+            texts += beyond(name, record, least={"ratio_to_2_workers": 1.0})
     best = max(record["bytes_per_second"] for record in records if record["measure"] == "broker")
-    if best < LEAST_BYTES_PER_SECOND:
-        texts.append(f"the broker carries {best / 1e9:.2f} GB/s; the bar is {LEAST_BYTES_PER_SECOND / 1e9:g}")
-    return texts
+    return texts + beyond("broker", {"bytes_per_second": best}, least={"bytes_per_second": LEAST_BYTES_PER_SECOND})
 
 
 def add_flags(parser: Parser) -> None:

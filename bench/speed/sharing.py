@@ -13,7 +13,7 @@ import argparse
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-from bench.frame import Column, Report, add_videos, add_whole, medians, ratios
+from bench.frame import Column, Report, add_videos, add_whole, beyond, medians, ratios
 from bench.processes import cpu_seconds_of, roles_of
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
@@ -68,9 +68,8 @@ def measure(asked: argparse.Namespace) -> Report:
     one, equal = zip(*turns, strict=True)
     records = [{"trainers": 1, **medians(one)}, {"trainers": EQUAL_TRAINERS, **medians(equal)}]
     records[1] |= ratios("ratio_to_one", map(_server_seconds, equal), map(_server_seconds, one))
-    ratio = records[1]["ratio_to_one"]
-    missed = [f"{EQUAL_TRAINERS} trainers take {ratio:.2f} times the time of one; the bar is {MOST_RATIO}"]
-    return Report(records, [(records, _COLUMNS)], missed=missed if ratio > MOST_RATIO else [])
+    missed = beyond(f"{EQUAL_TRAINERS} trainers", records[1], most={"ratio_to_one": MOST_RATIO})
+    return Report(records, [(records, _COLUMNS)], missed=missed)
 
 
 def _server_seconds(run: dict[str, float]) -> float:

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import psutil
 from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
-from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, medians, progress, ratios
+from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, beyond, medians, progress, ratios
 from bench.processes import cpu_seconds
 from bench.speed.released import ReleasedStyleDataset
 from tests.oracles.leases import open_leases
@@ -204,13 +204,8 @@ def missed(records: Sequence[Record]) -> list[str]:
         label = record["label"]
         form = label.partition("-")[0]
         least_ratio = BARS.get(label, BARS.get(form, 0.0))
-        for key, least in (
-            ("ratio_to_baseline", least_ratio),
-            ("cpu_ratio_to_baseline", least_ratio),
-            ("ratio_to_decode_limit", LIMIT_BARS.get(form, 0.0)),
-        ):
-            if record[key] < least:
-                found.append(f"{label}: {key} {record[key]:.2f}; the bar is {least:g}")
+        least = {"ratio_to_baseline": least_ratio, "cpu_ratio_to_baseline": least_ratio}
+        found += beyond(label, record, least=least | {"ratio_to_decode_limit": LIMIT_BARS.get(form, 0.0)})
     return found
 
 

@@ -43,10 +43,16 @@ def test_bars_that_are_kept_are_not_mentioned() -> None:
 @pytest.mark.parametrize(
     ("record", "words"),
     [
-        (workers(2, ratio_to_1_worker=1.74, ratio_to_2_workers=1.0), "2 workers: 1.74 times one"),
-        (workers(8, ratio_to_1_worker=1.8, ratio_to_2_workers=0.99), "8 workers: 0.990 times two"),
-        (broker(8, 0.99e9), "0.99 GB/s"),
-        (broker(8, 1e9, peak=201 * MB), "8 null workers: 201 MB; the bar is 200 MB"),
+        (
+            workers(2, ratio_to_1_worker=1.74, ratio_to_2_workers=1.0),
+            "workers, 2: ratio_to_1_worker 1.74; the bar is at least 1.75",
+        ),
+        (
+            workers(8, ratio_to_1_worker=1.8, ratio_to_2_workers=0.99),
+            "workers, 8: ratio_to_2_workers 0.99; the bar is at least 1",
+        ),
+        (broker(8, 0.99e9), "broker: bytes_per_second 9.9e+08; the bar is at least 1e+09"),
+        (broker(8, 1e9, peak=201 * MB), "broker, 8: broker_peak_rss_bytes 2.01e+08; the bar is at most 2e+08"),
     ],
 )
 def test_each_bar_is_missed_by_itself(record: dict[str, Any], words: str) -> None:
