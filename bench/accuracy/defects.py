@@ -6,7 +6,7 @@ Ten defects are made of clean clips of the videos, 320 px wide, and coded at two
 themselves. Clips that are dark, or in which little moves (median below 0.4 px a frame), are left out: a bar, a field or
 a frame more makes no difference there. Short ones are played to and fro. A defect is found if its kind is, at the right
 place: four fifths of the repeats (half of the random ones), each cut, most frames of a fade or still stretch, bars to
-2 px. Then the first frames of the videos as they are are analysed, and what is found is listed, to be checked by eye.
+2 px.
 
 The clips' sequences of 16 frames are simulated (c = 0.2, no noise) with scene "off" and "auto", and compared with the
 film before defects and coding, in each pixel and step. A converted rate or twos are compared with evenly paced
@@ -48,8 +48,8 @@ FRAMES = 120
 _WIDTH = 320
 _LEAST_MOTION_PX = 0.4
 _LEAST_LEVEL = 16
-_LOOKED_AT = 300
-"""Frames of each video as it is."""
+_MOST_FRAMES = 300
+"""Frames of each video that are read."""
 _BIT_RATES = {"fine": ({"crf": "20"}, 2), "coarse": ({"crf": "34"}, 0)}
 """Options of the encoder, and B-frames."""
 _BARS = {"letterbox": (24, 24, 0, 0), "pillarbox": (0, 0, 40, 40)}
@@ -180,12 +180,12 @@ def _false_events(
     return record
 
 
-def films(folder: Path) -> Iterator[tuple[str, list[Film], tuple[Defect, ...]]]:
-    """Yield name, small films without defects, and the defects as it is of each video that decodes."""
+def films(folder: Path) -> Iterator[tuple[str, list[Film]]]:
+    """Yield name and small films without defects of each video that decodes."""
     for path in sorted(folder.iterdir()):
         try:
             index = probe(path).index
-            pictures = np.stack(list(stream_luma(path, index, 0, min(len(index), _LOOKED_AT))))
+            pictures = np.stack(list(stream_luma(path, index, 0, min(len(index), _MOST_FRAMES))))
         except VideoError as error:
             progress(f"left out: {error}")
             continue
@@ -194,7 +194,7 @@ def films(folder: Path) -> Iterator[tuple[str, list[Film], tuple[Defect, ...]]]:
         rounds = FRAMES // len(small) + 1
         to_and_fro = np.array(small if len(small) >= FRAMES else [*small, *small[-2:0:-1]] * rounds, np.uint8)
         parts = [to_and_fro[:FRAMES], *([to_and_fro[-FRAMES:]] if len(small) >= 2 * FRAMES else [])]
-        yield path.name, [part for part in parts if _is_suited(part)], defects_of(analyse(pictures))
+        yield path.name, [part for part in parts if _is_suited(part)]
 
 
 def _is_suited(film: Film) -> bool:
@@ -226,7 +226,6 @@ _NOISE: tuple[Column, ...] = (
     ("samples", "samples", "{}", 1),
     ("noisy_share", "mostly noise", "{:.1%}", 1),
 )
-_REAL: tuple[Column, ...] = (("video", "video as it is", "{}", 1), ("kind", "kind", "{}", 1), ("text", "", "{}", 1))
 
 
 def add_flags(parser: Parser) -> None:
@@ -242,10 +241,7 @@ def measure(asked: argparse.Namespace) -> Report:
     Raises:
         UsageError: fewer than four clips are clean and move.
     """
-    parts_of, real = list[tuple[int, str, Film]](), list[dict[str, Any]]()
-    for name, parts, defects in films(asked.videos):
-        real += [{"measure": "real", "video": name, "kind": each.kind, "text": each.text} for each in defects]
-        parts_of += [(number, name, film) for number, film in enumerate(parts)]
+    parts_of = [(number, name, film) for name, parts in films(asked.videos) for number, film in enumerate(parts)]
     clips = [(name, film) for _, name, film in sorted(parts_of, key=lambda each: each[:2])[: asked.clips]]
     if asked.clips > 0 and len(clips) < 4:
         raise UsageError(f"--videos {asked.videos}: {len(clips)} videos are clean and move; give four")
@@ -280,5 +276,5 @@ def measure(asked: argparse.Namespace) -> Report:
     lines = [f"{share:.1%} of the defects are found"] if clips else []
     bars = [] if share >= LEAST_FOUND else [f"{share:.1%} of the defects are found; the bar is {LEAST_FOUND:.0%}"]
     noise = noisy_samples(asked.videos, asked.samples)
-    tables = [(records, _CASES), (real, _REAL), (false, _EVENTS), (noise, _NOISE)]
-    return Report([*records, *real, *false, *noise], tables, lines, bars)
+    tables = [(records, _CASES), (false, _EVENTS), (noise, _NOISE)]
+    return Report([*records, *false, *noise], tables, lines, bars)

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.frame import Column, Report, add_whole, progress
+from bench.frame import Column, Report, add_whole, beyond, progress
 from tests.oracles.cameras import (
     FRAMES_PER_SECOND,
     SCENES,
@@ -76,27 +76,23 @@ def measure(asked: argparse.Namespace) -> Report:
     if asked.outside:
         return _outside()
     records = list(fits(asked.cameras, asked.first_seed, asked.film))
-    rows, missed, told, held = [], [], 0, 0
+    rows: list[dict[str, Any]] = []
+    missed: list[str] = []
     for name in dict.fromkeys(entry["parameter"] for entry in records):
         mine = [entry for entry in records if entry["parameter"] == name]
         some = [entry for entry in mine if entry["told"]]
-        inside = sum(entry["held"] for entry in some)
         present = [entry for entry in some if entry["true"] > 0]
-        rows.append(
-            {
-                "parameter": name, "cameras": len(mine), "told": len(some), "held": inside,
-                "width": float(np.median([r["half_width"] for r in present])) if present else None,
-                "error": float(np.median([abs(r["value"] / r["true"] - 1) for r in present])) if present else None,
-            }
-        )  # fmt: skip
-        told, held = told + len(some), held + inside
-        is_threshold = name in _ALWAYS_THERE
-        if len(some) < len(mine) * (2 if is_threshold else 1) / 3:
-            missed.append(f"{name} is told in {len(some)} of {len(mine)} cameras")
-        if is_threshold and not (rows[-1]["width"] or 1.0) <= WIDEST_THRESHOLD:
-            missed.append(f"the median interval of {name} is wider than {WIDEST_THRESHOLD:.0%}")
-    if held < LEAST_HELD * told:
-        missed.append(f"{held} of {told} intervals hold the truth; at least {LEAST_HELD:.0%} should")
+        row = {
+            "parameter": name, "cameras": len(mine), "told": len(some), "held": sum(entry["held"] for entry in some),
+            "width": float(np.median([r["half_width"] for r in present])) if present else None,
+            "error": float(np.median([abs(r["value"] / r["true"] - 1) for r in present])) if present else None,
+            "told_share": len(some) / len(mine),
+        }  # fmt: skip
+        rows.append(row)
+        least, most = (2 / 3, {"width": WIDEST_THRESHOLD}) if name in _ALWAYS_THERE else (1 / 3, {})
+        missed += beyond(name, row, least={"told_share": least}, most=most)
+    told, held = (sum(row[key] for row in rows) for key in ("told", "held"))
+    missed += beyond("intervals", {"held_share": held / max(told, 1)}, least={"held_share": LEAST_HELD})
     return Report(records, [(rows, _COLUMNS)], [f"{held} of {told} intervals told hold the truth"], missed)
 
 

@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from bench.frame import Column, Record, Report, panels
+from bench.frame import Column, Record, Report, beyond, panels
 from tests.oracles.analytic_scenes import SECONDS, START_SHARE, analytic_scenes, moved_photograph
 from tests.oracles.dense import bin_events, dense_events
 from v2v_protocol.command import Parser
@@ -169,11 +169,12 @@ def missed(records: Sequence[Record]) -> list[str]:
     """Return the bars that these records miss."""
     texts = []
     for r in records:
-        if r.get("monotone") and (r["count_error"] or r["voxel_error"]):
-            texts.append(f"{r['scene']} at {r['frame_rate_hz']} Hz: voxel error {r['voxel_error']:.2e}; the bar is 0")
-        if r["measure"] == "film" and r["every"] == 1 and r["differing_bins_ppm"] > LARGEST_DIFFERENCE_PPM:
-            found = f"{r['differing_bins_ppm']:.0f} ppm of bins differ"
-            texts.append(f"{r['measure']} at c = {r['threshold']:g}: {found}; the bar is {LARGEST_DIFFERENCE_PPM:.0f}")
+        if r.get("monotone"):
+            none = {"count_error": 0.0, "voxel_error": 0.0}
+            texts += beyond(f"{r['scene']} at {r['frame_rate_hz']} Hz", r, least=none, most=none)
+        if r["measure"] == "film" and r["every"] == 1:
+            most = {"differing_bins_ppm": LARGEST_DIFFERENCE_PPM}
+            texts += beyond(f"film at c = {r['threshold']:g}", r, most=most)
     return texts
 
 

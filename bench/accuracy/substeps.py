@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.accuracy.physics import VIDEO_SIDE_PX, liveliest
-from bench.frame import Column, Report, add_whole, progress
+from bench.frame import Column, Report, add_whole, beyond, progress
 from tests.oracles.rendered import (
     NAMES,
     PHOTOGRAPHS,
@@ -178,7 +178,7 @@ def filmed(path: Path) -> Iterator[dict[str, Any]]:
 
 def missed(records: Records) -> list[str]:
     """Return the bars that the mean of the moving photographs misses."""
-    texts = []
+    texts: list[str] = []
     cells: dict[tuple[str, float], Records] = {}
     for record in records:
         if record.get("scene") in PHOTOGRAPHS:
@@ -187,12 +187,9 @@ def missed(records: Records) -> list[str]:
         mean = {key: float(np.mean([each[key] for each in found])) for key in found[0] if key.endswith(("ear", "ded"))}
         signed, split = BARS.get((size, px), (9.0, 9.0))
         if px < SLOW_PX:
-            signed = mean["signed_linear"]
-        for key, bar in (("signed", signed), ("split", split)):
-            if mean[f"{key}_divided"] > bar + 1e-9:
-                texts.append(
-                    f"{key} in bins of {size} at {px:g} px: {mean[f'{key}_divided']:.1%}; the bar is {bar:.1%}"
-                )
+            signed = mean["signed_linear"] + 1e-9
+        most = {"signed_divided": signed, "split_divided": split}
+        texts += beyond(f"bins of {size} at {px:g} px", mean, most=most)
     return texts
 
 
