@@ -140,6 +140,8 @@ def _preset(name: str, corpus: Corpus, asked: argparse.Namespace) -> Measured:
             dataset, address=server.address, workers=asked.workers, server=server, batch_size=asked.batch_size,
             seconds=asked.seconds, warmup_batches=asked.warmup_batches, trainer_seconds=0.0,
         )  # fmt: skip
+    if record["interrupted"]:
+        raise KeyboardInterrupt  # v2v-loadtest shows what it has; here the other contenders would follow
     return Measured(*(record[key] for key in Measured._fields))
 
 
