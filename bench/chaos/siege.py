@@ -63,10 +63,6 @@ def _totals(fleet: Fleet) -> tuple[float, float, float]:
     return fleet.committed()[0], used, fleet.tally.stat().st_size if fleet.tally.exists() else 0
 
 
-def _held_mib(fleet: Fleet) -> float:
-    return 0.0 if fleet.server.pid is None else rss_mib(fleet.server.pid) or 0.0
-
-
 def stretch(fleet: Fleet, seconds: float) -> Stretch:
     """Watch the honest consumer and the server for that long.
 
@@ -78,7 +74,7 @@ def stretch(fleet: Fleet, seconds: float) -> Stretch:
         fleet.restart(now)
         if fleet.failures:
             raise UsageError(fleet.failures[0])
-        peak = max(peak, _held_mib(fleet))
+        peak = max(peak, rss_mib(fleet.server.pid or 0) or 0.0)
         time.sleep(0.05)
     rate, cpu, came = ((new - old) / (now - began) for new, old in zip(_totals(fleet), before, strict=True))
     return Stretch(rate, cpu, came, peak)
