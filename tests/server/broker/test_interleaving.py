@@ -91,12 +91,17 @@ class Interleaving(RuleBasedStateMachine):
             if identity not in self.at.remote:
                 self.stuck.discard(identity)
                 self.late += [(identity, lease) for lease in self.at.leases.pop(identity, ())]
+        unknown: list[bytes] = []
         for identity, told in self.at.told.items():
             for message in told:
                 if isinstance(message, Denied) and identity in self.at.leases:
                     assert message.code == ErrorCode.UNKNOWN_SESSION
-                    self.at.join(identity)
+                    unknown.append(identity)
             told.clear()
+        for identity in unknown:
+            self.at.join(identity)
+        if unknown:  # a worker that joins may bring a waiting consumer its sample at once
+            self._listen()
 
     # What a consumer and a worker do about slots: nothing, here.
 
