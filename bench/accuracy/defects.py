@@ -241,7 +241,8 @@ def measure(asked: argparse.Namespace) -> Report:
     Raises:
         UsageError: fewer than four clips are clean and move.
     """
-    parts_of = [(number, name, film) for name, parts in films(asked.videos) for number, film in enumerate(parts)]
+    named = films(asked.videos) if asked.clips else ()
+    parts_of = [(number, name, film) for name, parts in named for number, film in enumerate(parts)]
     clips = [(name, film) for _, name, film in sorted(parts_of, key=lambda each: each[:2])[: asked.clips]]
     if asked.clips > 0 and len(clips) < 4:
         raise UsageError(f"--videos {asked.videos}: {len(clips)} videos are clean and move; give four")
