@@ -11,7 +11,7 @@ from v2v_pictures.colours import draw_events, draw_grey
 from v2v_pictures.strip import LABEL_PX, draw_strip
 
 _TEXT_PX, _BELOW_PX, _STRIP_PX = 34, 34, 54
-_LEAST_STRIP_PX = 420
+_LEAST_STRIP_PX = 490
 _LEAST_HEIGHT_PX = 150
 _HIGHEST_TILES = 1.75
 """Height of an upright picture, in tiles."""
