@@ -178,6 +178,12 @@ def test_missing_fields_take_the_default_spec() -> None:
     assert StreamSpec.from_dict({"voxel_dtype": "int8"}, default) == dataclasses.replace(default, voxel_dtype="int8")
 
 
+def test_what_applies_to_scenes_stays_until_scene_is_off() -> None:
+    assert StreamSpec.from_dict({"preset": "natural", "quiet_share": 0.5}).moving_share == 0.75
+    off = StreamSpec.from_dict({"scene": "off"}, StreamSpec(scene="auto", moving_share=0.5, quiet_share=0.5))
+    assert (off.moving_share, off.quiet_share) == (0.0, 1.0)
+
+
 def test_recipe_fields_change_the_default_recipe_unless_a_preset_is_named() -> None:
     default = StreamSpec(recipe=preset("paper-eraft"))
     assert StreamSpec.from_dict({"recipe": {"bins": 3}}, default).recipe == preset("paper-eraft").replace(bins=3)

@@ -8,16 +8,17 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tests.pieces import pieces, shots
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import DEFECTS, StreamSpec
-from v2v_server.corpus.scenes.pieces import encoded_pieces
+from v2v_server.corpus.scenes.pieces import SplitVideos, encoded_pieces
 from v2v_server.corpus.scenes.scene import NO_BARS, Flag, Pieces, Sides
 from v2v_server.corpus.videos import VideoEntry
+from v2v_server.schedule.runs import Cleaning, Runs
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.rows import Rows
 
@@ -64,6 +65,18 @@ def divided(draw: st.DrawFn) -> Pieces:
     ends = sorted(draw(st.sets(st.integers(1, 300), min_size=1, max_size=8)))
     flags = st.sampled_from([0, 0, Flag.CUT, Flag.REPEAT, Flag.REPEAT, Flag.STILL, Flag.QUIET, *SKIPPED])
     return pieces(*((end, draw(flags), draw(st.sampled_from([NO_BARS, NO_BARS, BARS]))) for end in ends))
+
+
+@given(st.lists(divided(), min_size=1, max_size=3), st.data())
+def test_flagged_frames_are_counted_one_by_one(all_parts: list[Pieces], data: st.DataObject) -> None:
+    split = SplitVideos.of(encoded_pieces(parts, 300) for parts in all_parts)
+    runs = Runs(split, Cleaning.of(StreamSpec(scene="auto", keep_defects=",".join(DEFECTS))))
+    flags = np.repeat(split.pieces["flags"], split.pieces["end"] - split.firsts())
+    assume(len(flags))
+    first = data.draw(st.integers(0, len(flags) - 1))
+    count = data.draw(st.integers(1, len(flags) - first))
+    found = runs.flagged(Flag.STILL, np.array([first]), np.array([count]))
+    assert found == ((flags[first : first + count] & Flag.STILL) != 0).sum()
 
 
 @given(st.lists(divided(), min_size=1, max_size=4), st.integers(1, 8), st.sets(st.sampled_from(DEFECTS)))
