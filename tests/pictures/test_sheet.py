@@ -204,6 +204,17 @@ def test_arrows_of_flow_point_where_pixels_move() -> None:
     assert tall.index(max(tall)) > drawn.mean()  # the head is at its right
 
 
+@pytest.mark.parametrize(("height", "width"), [(16, 32), (32, 16)])
+def test_arrows_of_flow_lie_in_the_picture(height: int, width: int) -> None:
+    page = Canvas(148, 148)
+    flow_panel(page, 10, 10, np.full((2, height, width), 1.0, np.float32), 3.0, 128)
+    dark = (page.image() == INK).all(axis=-1)
+    shown = np.zeros_like(dark)
+    shown[74 - 2 * height : 74 + 2 * height, 74 - 2 * width : 74 + 2 * width] = True
+    assert (dark & shown).any()
+    assert not (dark & ~shown).any()
+
+
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 300), (300, 1), (128, 128), (300, 200)])
 def test_a_panel_keeps_the_shape_of_its_picture(height: int, width: int) -> None:
     page = Canvas(200, 200)

@@ -21,7 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -167,15 +167,19 @@ def read_contexts(database: Path, root: Path) -> dict[tuple[str, int], list[str]
     return found
 
 
-def tests_for(mutant: Mutant, contexts: dict[tuple[str, int], list[str]], root: Path) -> list[str]:
-    """Choose the tests of a mutant: at most MOST_TESTS that run its line, those of the mirrored folder first."""
+def lines_of(contexts: Mapping[tuple[str, int], list[str]]) -> Counter[str]:
+    """Count the lines that each test runs."""
+    return Counter(name for names in contexts.values() for name in set(names))
+
+
+def tests_for(
+    mutant: Mutant, contexts: Mapping[tuple[str, int], list[str]], lines: Mapping[str, int], root: Path
+) -> list[str]:
+    """Choose the tests of a mutant: at most MOST_TESTS that run its line, those that run the fewest lines first."""
+    if names := set(contexts.get((mutant.path, mutant.line), [])):
+        return sorted(names, key=lambda name: (lines[name], name))[:MOST_TESTS]
     package, *rest = Path(mutant.path).with_suffix("").parts
     mirror = Path("tests", package.removeprefix("v2v_"), *rest[:-1])
-    names = sorted(set(contexts.get((mutant.path, mutant.line), [])))
-    if names:
-        names.sort(key=lambda name: (Path(mirror) not in Path(name.split("::")[0]).parents, name))
-        step = max(1, len(names) // MOST_TESTS)
-        return names[: MOST_TESTS // 2] + names[MOST_TESTS // 2 :: step][: MOST_TESTS // 2]
     own = mirror / f"test_{rest[-1]}.py"
     if (root / own).is_file():
         return [str(own)]
@@ -235,6 +239,7 @@ def main() -> int:
     options = parser.parse_args()
     root = Path.cwd()
     contexts = read_contexts(options.coverage, (options.coverage_root or root).resolve())
+    lines = lines_of(contexts)
     rows: list[dict[str, object]] = json.loads(options.out.read_text()) if options.out.exists() else []
     known = {(row["path"], row["line"], row["column"], row["new"]) for row in rows}
     drawn = draw(options.product or root, options.count, options.seed)
@@ -257,7 +262,7 @@ def main() -> int:
         def run(pair: tuple[Mutant, str]) -> Verdict:
             tree = free.pop()
             try:
-                return judge(*pair, tests_for(pair[0], contexts, root), tree)
+                return judge(*pair, tests_for(pair[0], contexts, lines, root), tree)
             finally:
                 free.append(tree)
 

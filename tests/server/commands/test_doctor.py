@@ -46,6 +46,7 @@ def test_nothing_is_in_the_way_where_tests_run(capsys: pytest.CaptureFixture[str
     status, said = told(capsys, "--port", str(free_port()))
     assert status == 0
     assert "is free" in said
+    assert "encodes libx264" in said
     assert f"\n{BAD} " not in said
     assert said.endswith("no problems found\n")
 
