@@ -174,29 +174,45 @@ def lines_of(contexts: Mapping[tuple[str, int], list[str]]) -> Counter[str]:
 
 def tests_for(
     mutant: Mutant, contexts: Mapping[tuple[str, int], list[str]], lines: Mapping[str, int], root: Path
-) -> list[str]:
-    """Choose the tests of a mutant: at most MOST_TESTS that run its line, those that run the fewest lines first."""
-    if names := set(contexts.get((mutant.path, mutant.line), [])):
-        return sorted(names, key=lambda name: (lines[name], name))[:MOST_TESTS]
+) -> list[list[str]]:
+    """Choose the tests of a mutant: at most MOST_TESTS that run its line, those that run the fewest lines first.
+
+    What survives them meets the folder of tests that mirrors the module: results of fixtures that tests share count
+    for one test only.
+    """
     package, *rest = Path(mutant.path).with_suffix("").parts
     mirror = Path("tests", package.removeprefix("v2v_"), *rest[:-1])
-    own = mirror / f"test_{rest[-1]}.py"
-    if (root / own).is_file():
-        return [str(own)]
-    return [str(mirror)] if (root / mirror).is_dir() else []
+    names = sorted(set(contexts.get((mutant.path, mutant.line), [])), key=lambda name: (lines[name], name))
+    folder = [str(mirror)] if (root / mirror).is_dir() else []
+    return [chosen for chosen in (names[:MOST_TESTS], folder) if chosen]
 
 
-def judge(mutant: Mutant, source: str, tests: list[str], tree: Path) -> Verdict:
-    """Run a mutant's tests in a copy of the tree, and restore the file."""
-    if not tests:
-        return Verdict(mutant, "untested", 0, 0.0)
+def judge(mutant: Mutant, source: str, tests: list[list[str]], tree: Path) -> Verdict:
+    """Run a mutant's tests in a copy of the tree until some fail, and restore the file."""
     began = time.monotonic()
     path = tree / mutant.path
     healthy, when = path.read_bytes(), path.stat()
     path.write_text(source, "utf-8")
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests]
+    outcome = "untested"
+    try:
+        for chosen in tests:
+            passed = _pass(chosen, tree)
+            if passed is None and outcome != "survived":
+                outcome = "unfinished"
+            elif passed is not None:
+                outcome = "survived" if passed else "killed"
+            if outcome != "survived":
+                break
+    finally:
+        path.write_bytes(healthy)
+        os.utime(path, ns=(when.st_atime_ns, when.st_mtime_ns))  # its bytecode is valid again
+    return Verdict(mutant, outcome, sum(map(len, tests)), time.monotonic() - began)
+
+
+def _pass(tests: list[str], tree: Path) -> bool | None:
+    """Return whether tests pass; None if they take longer than TIMEOUT_SECONDS."""
     running = subprocess.Popen(
-        command,
+        [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests],
         cwd=tree,
         env=os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"},
         stdout=subprocess.DEVNULL,
@@ -204,15 +220,11 @@ def judge(mutant: Mutant, source: str, tests: list[str], tree: Path) -> Verdict:
         start_new_session=True,
     )
     try:
-        outcome = "survived" if running.wait(TIMEOUT_SECONDS) in (0, 5) else "killed"
+        return running.wait(TIMEOUT_SECONDS) in (0, 5)
     except subprocess.TimeoutExpired:
-        outcome = "unfinished"
         os.killpg(running.pid, signal.SIGKILL)
         running.wait()
-    finally:
-        path.write_bytes(healthy)
-        os.utime(path, ns=(when.st_atime_ns, when.st_mtime_ns))  # its bytecode is valid again
-    return Verdict(mutant, outcome, len(tests), time.monotonic() - began)
+        return None
 
 
 def module_of(path: str) -> str:
