@@ -1,4 +1,4 @@
-"""Product code uses plain words: the forbidden ones do not appear."""
+"""Product code uses plain words, and pages hold no marks of an unfinished merge."""
 
 import re
 from pathlib import Path
@@ -29,3 +29,10 @@ def test_packages_use_no_forbidden_words() -> None:
     checked = sources()
     assert checked
     assert [line for path in checked for line in found(path)] == []
+
+
+def test_pages_hold_no_marks_of_a_merge() -> None:
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+    assert ROOT / "docs" / "accuracy.md" in pages
+    marks = ("<<<<<<<", ">>>>>>>", "|||||||")
+    assert [str(page) for page in pages for line in page.read_text("utf-8").splitlines() if line.startswith(marks)] == []

@@ -99,7 +99,7 @@ class StreamSpec:
         "forward", FlowDirection, "flow on the pixel grid of a step's earlier frame (forward) or later frame (backward)"
     )
     flow_from: int = whole(
-        0, 0, 1_000_000, "index of the first voxel with computed flow; flow of earlier voxels is zero"
+        0, 0, 1_000_000, "index of the first voxel grid with computed flow; flow of earlier grids is zero"
     )
     flow_margin_px: int = whole(
         64, -1, LARGEST_SIDE_PX, "margin around the crop in which flow is also estimated; -1: the whole picture",

@@ -70,7 +70,7 @@ def page() -> str:
         HEAD,
         *_section("Server", ServeConfig),
         *_section("Stream", StreamSpec),
-        "### Speed presets: `preset`\n",
+        "### Stream presets: `preset`\n",
         *_presets(SPEED_PRESETS),
         *_section("Recipe", Recipe),
         *_sources(),

@@ -107,3 +107,4 @@ def test_a_hostile_folder_is_served_within_bounds(corpus: Path, tmp_path: Path) 
     opened = re.findall(r'open(?:at)?\([^"]*"([^"]+)"', log.read_text(errors="replace"))
     assert any(path.endswith("good0.mp4") for path in opened)  # the trace sees what is opened
     assert not [path for path in opened if "outside/" in path]
+    assert "root:x" not in said
