@@ -23,6 +23,7 @@ from v2v_client.local_server import LocalServer, recipe_flags
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_SEED
+from v2v_protocol.spec import StreamSpec
 
 HELD_OUT_SEED = 1 << 32
 """Added to the seed: the held-out batch has the same virtual cameras throughout, none of which is trained on."""
@@ -57,7 +58,8 @@ def server_flags(settings: StreamConfig, recipe: Recipe) -> list[str]:
 
     The server's recipe decides which videos are long enough, so it gets ours; it analyses scenes only if asked.
     """
-    asked = {"--list": settings.list, "--scene": settings.spec.get("scene")}
+    scene = StreamSpec.from_dict({key: settings.spec.get(key) for key in ("preset", "scene")}).scene
+    asked = {"--list": settings.list, "--scene": "" if scene == "off" else scene}
     flags = [part for flag, value in asked.items() if value for part in (flag, value)]
     return ["--rows", settings.rows, *recipe_flags(recipe), *flags]
 

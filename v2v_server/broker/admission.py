@@ -160,6 +160,9 @@ class Admission:
             recipe.resize_scale,
             spec.max_sequences_per_video,
             spec.scene,
+            spec.kept_defects,
+            spec.still_share,
+            spec.quiet_share,
         )
         table = self._tables.get(geometry)
         if table is None:

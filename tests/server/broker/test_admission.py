@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from tests.pieces import pieces
 from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import CorpusError, UsageError, V2VError
 from v2v_protocol.messages import Hello
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.admission import MOST_BATCH_SIZE, Admission
+from v2v_server.corpus.scenes.pieces import encoded_pieces
+from v2v_server.corpus.scenes.scene import Flag
+from v2v_server.corpus.videos import CorpusFacts
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.schedule import sequences
+from v2v_server.video.rows import Rows
 
 SAMPLE_BYTES = 2 * 2 * 8 * 8
 VERDICTS = [QuarantineEntry(number, "v0.mp4", "f", 0, "crash", "t") for number in (1, 2, 3)]
@@ -102,6 +108,20 @@ def test_one_table_serves_all_specs_of_a_geometry() -> None:
     other = at.admit(b"c", hello(max_sequences_per_video=3), 1, 0.0)[0].schedule._table
     assert of[0] is of[1]
     assert (other.count, of[0].count) == (15, 50)
+
+
+@pytest.mark.parametrize("asked", [{"still_share": 1.0}, {"quiet_share": 0.0}, {"keep_defects": "black"}])
+def test_the_sequences_of_a_spec_do_not_depend_on_who_came_before(asked: dict[str, Any]) -> None:
+    parts = pieces((50, 0), (100, Flag.BLACK), (200, Flag.QUIET), (400, Flag.STILL | Flag.QUIET))
+    entry = replace(video("v.mp4", 400), pieces=encoded_pieces(parts, 400))
+    facts = CorpusFacts((entry,), Rows(), "c" * 32, "s" * 32)
+    default, other = ({"scene": "auto", "max_sequences_per_video": 1000} | changed for changed in ({}, asked))
+
+    def count(*specs: dict[str, Any]) -> int:
+        at = Admission(facts, SMALL_SPEC, 2**30, 600.0, Quarantine())
+        return [at.admit(b"c", hello(**spec), 1, 0.0)[1].sequences for spec in specs][-1]
+
+    assert count(default, other) == count(other) != count(default)
 
 
 def test_a_refused_hello_may_be_followed_by_a_good_one() -> None:
