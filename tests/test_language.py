@@ -35,4 +35,6 @@ def test_pages_hold_no_marks_of_a_merge() -> None:
     pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
     assert ROOT / "docs" / "accuracy.md" in pages
     marks = ("<<<<<<<", ">>>>>>>", "|||||||")
-    assert [str(page) for page in pages for line in page.read_text("utf-8").splitlines() if line.startswith(marks)] == []
+    assert [
+        str(page) for page in pages for line in page.read_text("utf-8").splitlines() if line.startswith(marks)
+    ] == []

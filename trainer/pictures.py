@@ -112,11 +112,15 @@ def write_png(path: Path, image: Image) -> None:
     Raises:
         UsageError: the folder cannot be written to.
     """
+    _make_folder(path)
+    files.write_png(path, image)
+
+
+def _make_folder(path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror or error}") from error
-    files.write_png(path, image)
 
 
 class Video:
@@ -135,12 +139,12 @@ class Video:
         """Append a frame [H, W, 3]. All frames must have the same size.
 
         Raises:
-            UsageError: OpenCV cannot write the file, or was built without the codec.
+            UsageError: the folder cannot be written to, or OpenCV was built without the codec.
         """
         # Colour is stored at half resolution, so the encoder needs even sizes.
         image = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), constant_values=255)
         if self._writer is None:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            _make_folder(self._path)
             size = (image.shape[1], image.shape[0])
             self._writer = cv2.VideoWriter(str(self._path), cv2.VideoWriter.fourcc(*CODEC), self._fps, size)
             if not self._writer.isOpened():

@@ -140,7 +140,10 @@ def run(arguments: argparse.Namespace) -> int:
         require_fresh(out)
     else:
         # Not the default folder of the configuration, which may hold another run.
-        out = Path(config.run.out or Path(arguments.resume).parent)
+        begun_in = Path(arguments.resume).parent
+        out = Path(config.run.out or begun_in)
+        if out.resolve() != begun_in.resolve():
+            require_fresh(out)
         resume = load_checkpoint(arguments.resume)
         config = config.with_network_options(resume.config["network"]["options"], weights="")
         for change in require_same_run(resume, config):

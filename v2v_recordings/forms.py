@@ -44,12 +44,15 @@ def recognise(path: Path) -> str:
     """Return the key of FORMS for a file or folder.
 
     Raises:
-        UsageError: it is missing, or has a form that is not in FORMS.
+        UsageError: it is missing, cannot be read, or has a form that is not in FORMS.
     """
     if not path.exists():
         raise UsageError(f"no file or folder {path}")
-    for name, form in FORMS.items():
-        if form.recognises(path):
-            return name
+    try:
+        for name, form in FORMS.items():
+            if form.recognises(path):
+                return name
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror or error}") from error
     forms = "; ".join(form.title for form in FORMS.values())
     raise UsageError(f"{path} is not a known recording. Known forms: {forms}. Give the form with --form")

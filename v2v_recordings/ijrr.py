@@ -44,8 +44,11 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
             done += count
             progress(done, total)
 
-        with path.open("rb") as stream:
-            yield from read_text_events(stream, str(path), time_unit=options.time_unit, advance=advance)
+        try:
+            with path.open("rb") as stream:
+                yield from read_text_events(stream, str(path), time_unit=options.time_unit, advance=advance)
+        except OSError as error:
+            raise UsageError(f"{path} cannot be read: {error.strerror or error}") from error
         return
     with Archive(path) as archive:
         yield from _read_archive(archive, options, progress)

@@ -85,6 +85,8 @@ def test_a_picture_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="file"):
         write_png(tmp_path / "file" / "a.png", np.zeros((2, 2, 3), np.uint8))
+    with pytest.raises(UsageError, match="file"), Video(tmp_path / "file" / "a.mp4", 25.0) as video:
+        video.add(np.zeros((16, 16, 3), np.uint8))
 
 
 @pytest.mark.parametrize("fps", [1.0, 65.5354, 149.993, 1000.123])

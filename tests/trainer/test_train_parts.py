@@ -37,7 +37,9 @@ def test_a_local_server_gets_the_options_it_needs_at_its_start() -> None:
     asked = server_flags(StreamConfig(videos="clips", list="some.txt", spec={"scene": "auto"}), recipe)
     assert asked[-4:] == ["--list", "some.txt", "--scene", "auto"]
     assert server_flags(StreamConfig(videos="clips", spec={"preset": "natural"}), recipe)[-2:] == ["--scene", "auto"]
-    assert "--scene" not in server_flags(StreamConfig(videos="clips", spec={"preset": "natural", "scene": "off"}), recipe)
+    assert "--scene" not in server_flags(
+        StreamConfig(videos="clips", spec={"preset": "natural", "scene": "off"}), recipe
+    )
 
 
 def test_the_started_server_is_announced_before_it_is_ready(

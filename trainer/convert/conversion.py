@@ -30,7 +30,7 @@ class Converted:
 
 def default_name(source: Path) -> str:
     """Return the name of the new file: the sequence's name in data sets, with the ending .h5."""
-    stem = source.name if source.is_dir() else source.stem
+    stem = source.resolve().name if source.is_dir() else source.stem  # "." has no name
     return stem.removesuffix("_data") + layout.SUFFIXES[0]
 
 

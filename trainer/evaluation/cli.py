@@ -31,6 +31,19 @@ from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
 from v2v_recordings.items import SensorSize
 
+OF_PICTURES = (
+    "metrics",
+    "lpips",
+    "stretch",
+    "window_seconds",
+    "window_events",
+    "window_pictures",
+    "fps",
+    "rows",
+    "video",
+    "per_frame",
+)
+"""Flags that a flow network has no use for."""
 LEAST_WIDTH = 110
 """Width of tables that are not written to a terminal, in characters."""
 
@@ -167,8 +180,13 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _run_flow(arguments: argparse.Namespace, config: EvaluationConfig, run: Run, model: str) -> int:
+    parser = _parser()
+    given = [name for name in OF_PICTURES if getattr(arguments, name) != parser.get_default(name)]
+    if given:
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise UsageError(f"{flags}: for networks that reconstruct pictures, and {model} estimates flow; leave it out")
     data = Path(arguments.data)
-    flow_run = FlowRun(run.network, run.voxels, run.device, run.as_published, run.drawing.folder)
+    flow_run = FlowRun(run.network, run.voxels, run.device, run.as_published, run.drawing.folder, run.size)
     settings = {"model": model, "weights": str(arguments.weights), "as_published": run.as_published}
     written: list[dict[str, object]] = []
     console = Console() if Console().is_terminal else Console(width=LEAST_WIDTH)

@@ -107,7 +107,7 @@ def folder_config(path: Path) -> EvaluationConfig:
     files = [path] if path.is_file() else sorted(file for file in path.glob("*") if file.suffix in SUFFIXES)
     if not files:
         raise UsageError(f"{path} has no recordings ({', '.join(SUFFIXES)}); convert raw ones with v2v-convert")
-    return EvaluationConfig((DataSet(path.stem, ".", dict.fromkeys(file.stem for file in files)),))
+    return EvaluationConfig((DataSet(path.resolve().stem, ".", dict.fromkeys(file.stem for file in files)),))
 
 
 def _data_set(entry: Any, where: str) -> DataSet:
@@ -162,7 +162,8 @@ def _list(value: Any, where: str) -> list[Any]:
 
 
 def _known(value: Any, names: tuple[str, ...], where: str) -> tuple[str, ...]:
-    unknown = [entry for entry in (value if isinstance(value, list) else [value]) if entry not in names]
+    entries = value if isinstance(value, list) else [value]
+    unknown = [entry for entry in entries if entry not in names]
     if unknown:
         raise UsageError(f"{where}: {unknown[0]!r} is none of {', '.join(names)}")
-    return tuple(value)
+    return tuple(entries)

@@ -92,6 +92,7 @@ class FlowRun:
         device: PyTorch device.
         as_published: see the module.
         out: folder for a picture of each sequence; None draws none.
+        size: height and width of the sensor, for recordings that do not state it.
     """
 
     network: VoxelNetwork
@@ -99,6 +100,7 @@ class FlowRun:
     device: str = "cpu"
     as_published: bool = False
     out: Path | None = None
+    size: tuple[int, int] | None = None
 
 
 def evaluate_flow(
@@ -113,7 +115,7 @@ def evaluate_flow(
         UsageError: see :class:`Recording`; or the recording has no flow; or the network's output is not finite.
     """
     scores = {name: FlowScore(run.as_published) for name in ("network", "zeros")}
-    with Recording(path, as_published=run.as_published) as recording, ieee_products():
+    with Recording(path, as_published=run.as_published, size=run.size) as recording, ieee_products():
         windows = flow_windows(recording, time_range, one_later=run.as_published)
         hood = recording.name.startswith("outdoor") and not run.as_published
         rows = HOOD_ROW if hood else recording.size[0]
@@ -168,7 +170,7 @@ def flow_table(name: str, scores: Mapping[str, Mapping[str, FlowScore]], compare
             label = escape(sequence) if predictor == "network" else f"  {predictor}"
             rows.add_row(label, str(score.windows), *_numbers(score.means))
         for method in compared:
-            stated = paper.FLOW[method].get(sequence)
+            stated = paper.FLOW.get(method, {}).get(sequence)
             if stated is not None:
                 rows.add_row(f"  paper: {method}", "", *_numbers(stated), style="dim")
     return rows

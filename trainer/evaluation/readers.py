@@ -210,9 +210,14 @@ class Recording:
                 continue
             after = fixed[index + 1] if index + 1 < len(fixed) else 2 * fixed[index - 1] - fixed[max(0, index - 2)]
             if after <= fixed[index - 1]:
+                late = (
+                    f"pictures {index} and {index + 1} are"
+                    if index + 1 < len(fixed)
+                    else f"picture {index}, the last, is"
+                )
                 raise UsageError(
-                    f"{self.path}: the times of pictures {index} and {index + 1} are not later than that of picture "
-                    f"{index - 1}, {fixed[index - 1]:.6f} s; only single times can be repaired"
+                    f"{self.path}: the time of {late} not later than that of picture {index - 1}, "
+                    f"{fixed[index - 1]:.6f} s; only single times between others can be repaired"
                 )
             fixed[index] = (fixed[index - 1] + after) / 2
             self.repaired_images += 1

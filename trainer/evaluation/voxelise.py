@@ -94,7 +94,8 @@ def voxel_grid(
     height, width = size
     if not len(events):
         return np.zeros((settings.bins, height, width), np.float32)
-    outside = (events.x < 0) | (events.x >= width) | (events.y < 0) | (events.y >= height)
+    x, y = events.x.astype(np.int64), events.y.astype(np.int64)  # uint64 does not mix with signed numbers
+    outside = (x < 0) | (x >= width) | (y < 0) | (y >= height)
     if outside.any():
         first = int(np.flatnonzero(outside)[0])
         raise UsageError(
@@ -102,7 +103,7 @@ def voxel_grid(
             f"first at x = {events.x[first]}, y = {events.y[first]}"
         )
     place = _place(events.t, settings, window)
-    pixel = events.y.astype(np.int64) * width + events.x
+    pixel = y * width + x
     if settings.kind == "discrete":
         grid = _sum(np.floor(settings.bins * place).astype(np.int64), pixel, events.p, settings.bins, size)
     else:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import bisect
 import dataclasses
 import itertools
+import math
 from collections.abc import Sequence
 
 from trainer.evaluation.data_sets import TimeRange
@@ -99,8 +100,8 @@ def regular_windows(recording: Recording, fps: float) -> list[EventWindow]:
     Raises:
         UsageError: ``fps`` is not above 0, or the recording is shorter than one window.
     """
-    if not fps > 0:
-        raise UsageError(f"{fps:g} windows per second: give more than 0")
+    if not 0 < fps < math.inf:
+        raise UsageError(f"{fps:g} windows per second: give a number above 0")
     first, last = recording.span
     count = int((last - first) * fps + 1e-9)
     if count < 1:

@@ -132,7 +132,8 @@ def epoch_name(epoch: int) -> str:
 
 def prune_epochs(out: Path, keep: int) -> None:
     """Remove the oldest checkpoints of epochs in the folder of a run, except the last ``keep``."""
-    for path in sorted(out.glob("epoch-*.pt"))[:-keep]:
+    # By number: from 10,000 on, names have more than four digits.
+    for path in sorted(out.glob("epoch-*.pt"), key=lambda path: (len(path.name), path.name))[:-keep]:
         path.unlink(missing_ok=True)
 
 

@@ -320,7 +320,7 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         V2VError: wrong usage, or no server.
     """
-    if arguments.seconds <= 0 or arguments.warmup_batches < 0 or arguments.trainer_ms < 0:
+    if not (arguments.seconds > 0 and arguments.warmup_batches >= 0 and 0 <= arguments.trainer_ms < math.inf):
         raise UsageError(
             f"--seconds {arguments.seconds:g}, --warmup-batches {arguments.warmup_batches}, --trainer-ms "
             f"{arguments.trainer_ms:g}: give --seconds above 0, and 0 or more of the others"

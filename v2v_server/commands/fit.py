@@ -13,6 +13,7 @@ from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.progress import Progress
 from v2v_recordings.forms import FORMS
 from v2v_recordings.items import ConvertOptions, SensorSize
+from v2v_recordings.text_events import NS_PER_UNIT
 from v2v_server.config import read_yaml_mapping, recipe_setting
 from v2v_server.fit.fit import FittedCamera, fit
 from v2v_server.fit.lab import camera_of, measure, table
@@ -35,6 +36,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     recording.add_argument("recording", nargs="?", metavar="RECORDING", help="file or folder with events; frames help")
     recording.add_argument("--static", action="store_true", help="nothing moved: all events are noise")
     recording.add_argument("--size", metavar="WxH", help="size of the sensor in px, if the recording does not state it")
+    recording.add_argument(
+        "--time-unit",
+        choices=tuple(NS_PER_UNIT),
+        help="unit of times in text files (default: s if they have a decimal point, else us)",
+    )
     recording.add_argument("--camera", choices=("left", "right"), default="left", help="camera of a stereo recording")
     recording.add_argument("--events-topic", metavar="TOPIC", help="topic of events, for a bag with several")
     recording.add_argument("--images-topic", metavar="TOPIC", help="topic of pictures, for a bag with several")
@@ -65,6 +71,7 @@ def _run(arguments: argparse.Namespace) -> None:
 def _fit(arguments: argparse.Namespace) -> FittedCamera:
     options = ConvertOptions(
         size=None if arguments.size is None else SensorSize.parse(arguments.size),
+        time_unit=arguments.time_unit,
         camera=arguments.camera,
         events_topic=arguments.events_topic,
         images_topic=arguments.images_topic,

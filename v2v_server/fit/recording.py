@@ -191,7 +191,7 @@ class _Kept:
             UsageError: one lies outside the sensor.
         """
         width, height = self._size.width, self._size.height
-        if int(chunk.x.max()) >= width or int(chunk.y.max()) >= height:
+        if not (0 <= chunk.x.min() <= chunk.x.max() < width and 0 <= chunk.y.min() <= chunk.y.max() < height):
             raise UsageError(f"{path}: an event lies outside {width}x{height} px: correct --size")
         place = chunk.y.astype(np.int64) * width + chunk.x
         self._counts += np.bincount(place + chunk.p * (width * height), minlength=len(self._counts))

@@ -80,6 +80,7 @@ def test_an_interrupt_ends_the_measurement_and_keeps_its_results(server, tmp_pat
         (["--set", "gamma"], "KEY=VALUE"),
         (["--arrays", "pixels"], "pixels"),
         (["--seconds", "0"], "--seconds"),
+        (["--trainer-ms", "nan"], "--trainer-ms nan"),
         (["--workers", "2"], "--workers"),
         (["--json", "/nowhere/out.json"], "/nowhere/out.json"),
     ],

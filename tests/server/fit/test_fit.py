@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from tests.oracles.cameras import Film, TrueCamera, record, rendered_film
 from v2v_protocol.errors import UsageError
+from v2v_recordings.items import ConvertOptions, SensorSize
 from v2v_server.config import recipe_setting
 from v2v_server.fit import estimators
 from v2v_server.fit import recording as recording_module
@@ -178,6 +179,13 @@ def test_a_recording_in_files_is_the_recording_in_memory(tmp_path: Path) -> None
     np.testing.assert_array_equal(read.first, direct.first)
     np.testing.assert_array_equal(read.counts, direct.counts)
     assert len(read.frames) in (len(direct.frames) - 1, len(direct.frames))
+
+
+@pytest.mark.parametrize("line", ["0.1 -1 5 1", "0.1 5 -1 0", "0.1 24 5 1"])
+def test_events_outside_the_sensor_are_refused(tmp_path: Path, line: str) -> None:
+    (tmp_path / "a.txt").write_text(f"24 20\n0.0 1 1 1\n{line}\n")
+    with pytest.raises(UsageError, match="an event lies outside 24x20 px"):
+        read_recording(tmp_path / "a.txt", ConvertOptions(size=SensorSize(24, 20)))
 
 
 def write_ijrr(folder: Path, made: Mapping[str, npt.NDArray[Any]]) -> None:

@@ -267,6 +267,27 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert (tmp_path / "one.h5").is_file()
 
 
+def test_the_folder_here_gives_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    raw_forms.write_folder(tmp_path / "slow", raw_forms.ijrr_members(scene()))
+    monkeypatch.chdir(tmp_path / "slow")
+    assert cli.main([".", "--out", str(tmp_path / "h5")]) == 0
+    assert [path.name for path in (tmp_path / "h5").iterdir()] == ["slow.h5"]
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.txt"])
+def test_a_file_that_cannot_be_read_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    (tmp_path / name).touch()
+
+    def denied(path: Path, *_: object) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "open", denied)
+    assert cli.main([str(tmp_path / name), "--out", str(tmp_path / "a.h5")]) == 2
+    assert capsys.readouterr().err.endswith(f"{name} cannot be read: Permission denied\n")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

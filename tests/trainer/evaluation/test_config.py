@@ -74,15 +74,22 @@ def test_own_data_sets(tmp_path: Path) -> None:
     assert config.metrics == ("mse",)
 
 
-def test_folders_and_files(tmp_path: Path) -> None:
+def test_folders_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("b.h5", "a.hdf5", "notes.txt"):
         (tmp_path / name).touch()
     (data_set,) = folder_config(tmp_path).data_sets
     assert (data_set.name, dict(data_set.time_ranges)) == (tmp_path.stem, {"a": None, "b": None})
     assert dict(folder_config(tmp_path / "b.h5").data_sets[0].time_ranges) == {"b": None}
+    monkeypatch.chdir(tmp_path)
+    assert folder_config(Path(".")).data_sets[0].name == tmp_path.stem
     (tmp_path / "empty").mkdir()
     with pytest.raises(UsageError, match=r"no recordings.*v2v-convert"):
         folder_config(tmp_path / "empty")
+
+
+def test_one_entry_needs_no_list() -> None:
+    found = parse_config({"data": ["HQF"], "metrics": "mse", "paper": "E2VID+"}, "x")
+    assert (found.metrics, found.paper) == (("mse",), ("E2VID+",))
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from tests.trainer.evaluation.h5_file import write_h5
 from trainer.convert.cli import main as convert
 from trainer.evaluation import paper
 from trainer.evaluation.cli import main
-from trainer.evaluation.flow import HOOD_ROW, FlowRun, evaluate_flow
+from trainer.evaluation.flow import HOOD_ROW, FlowRun, FlowScore, evaluate_flow, flow_table
 from trainer.evaluation.voxelise import VoxelSettings
 from trainer.models import ERAFT, EVFlowNet
 from v2v_protocol.errors import UsageError
@@ -126,6 +126,25 @@ def test_the_command_shows_the_papers_values(tmp_path: Path, capsys: pytest.Capt
     assert [record["predictor"] for record in records] == ["network", "zeros"]
     assert records[0]["aee_dense"] == records[1]["aee_dense"]
     assert (tmp_path / "out" / "indoor_flying1.png").is_file()
+    assert main([*arguments[:3], str(tmp_path / "data" / "mvsec"), "--window-events", "9", "--stretch", "robust"]) == 2
+    assert "--stretch, --window-events: for networks that reconstruct pictures" in capsys.readouterr().err
+
+
+def test_a_recording_that_states_no_size_takes_a_given_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with h5py.File(recording(tmp_path / "a.h5"), "a") as file:
+        del file.attrs["sensor_resolution"]
+    torch.save(constant(0, 0).state_dict(), tmp_path / "a.pth")
+    arguments = ["--weights", str(tmp_path / "a.pth"), "--data", str(tmp_path / "a.h5")]
+    assert main(arguments) == 2
+    assert "--size WxH" in capsys.readouterr().err
+    assert main([*arguments, "--size", f"{WIDTH}x{HEIGHT}"]) == 0
+
+
+def test_rows_of_the_paper_that_have_no_flow_are_left_out() -> None:
+    score = FlowScore(as_published=False)
+    score.add(np.zeros((2, 1, 1), np.float32), np.ones((2, 1, 1), np.float32), np.ones((1, 1), bool), 1)
+    table = flow_table("a", {"indoor_flying1": {"network": score}}, ["Zeros", next(iter(paper.RESULTS))])
+    assert table.row_count == 2
 
 
 def test_flow_of_mvsec_is_converted_with_its_recording(tmp_path: Path) -> None:

@@ -268,9 +268,11 @@ def test_regular_windows(tmp_path: Path) -> None:
         windows = regular_windows(opened, 5)
         assert [opened.events(window).t.tolist() for window in windows] == [[1.0, 1.1], [1.2, 1.3]]
         assert all(window.target is None for window in windows)
-        for fps, message in ((0, "more than 0"), (float("nan"), "more than 0"), (1.9, "less than one window")):
-            with pytest.raises(UsageError, match=message):
+        for fps in (0, float("nan"), float("inf")):
+            with pytest.raises(UsageError, match="give a number above 0"):
                 regular_windows(opened, fps)
+        with pytest.raises(UsageError, match="less than one window"):
+            regular_windows(opened, 1.9)
 
 
 def broken(path: Path, kind: str) -> Path:
@@ -292,6 +294,8 @@ def broken(path: Path, kind: str) -> Path:
         write_h5(file, T, T, T, T, [(PIXELS, {"timestamp": 1.0})])
     elif kind == "colour":
         write_h5(file, T, T, T, T, [(np.zeros((3, 4, 3), np.uint8), {"timestamp": 1.0, "event_idx": 0})])
+    elif kind == "equal":
+        recording(path, stamped(1.2, 1.2))
     elif kind == "twice back":
         recording(path, stamped(1.3, 1.2, 1.1))
     elif kind == "raw":
@@ -315,7 +319,8 @@ def broken(path: Path, kind: str) -> Path:
         ("no images or size", "give the sensor.s size with --size WxH"),
         ("no index", "without the attribute event_idx"),
         ("colour", r"is \[3, 4, 3\], not \[H, W\]"),
-        ("twice back", "only single times can be repaired"),
+        ("twice back", "pictures 1 and 2 are not later than that of picture 0.*only single times"),
+        ("equal", "picture 1, the last, is not later than that of picture 0"),
     ],
 )
 def test_unreadable_recordings_are_refused(tmp_path: Path, kind: str, message: str) -> None:

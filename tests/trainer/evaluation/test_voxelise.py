@@ -6,6 +6,7 @@ from fractions import Fraction
 from math import floor
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -122,6 +123,14 @@ def test_no_events_and_simultaneous_events_are_valid(kind: str, span: str) -> No
     together = grid([(0, 1, 1, 1), (0, 1, 1, 1), (0, 2, 1, -1)], kind, span=span)
     assert (together[0, 1, 1], together[0, 1, 2]) == (2, -1)
     assert not together[1:].any()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.uint64])
+def test_coordinates_of_any_integer_type_give_the_same_grid(dtype: npt.DTypeLike) -> None:
+    rows = [(0, 3, 2, 1), (7, 0, 1, -1), (9, 3, 0, 1)]
+    found = events(rows)
+    typed = Events(found.t, found.x.astype(dtype), found.y.astype(dtype), found.p)
+    np.testing.assert_array_equal(voxel_grid(typed, SIZE, VoxelSettings(), (100.0, 100.04)), grid(rows, "discrete"))
 
 
 @pytest.mark.parametrize(("x", "y"), [(4, 0), (-1, 0), (0, 3), (0, -1)])

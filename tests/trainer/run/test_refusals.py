@@ -12,7 +12,7 @@ import torch
 
 from tests.client.fake_server import FakeServer
 from tests.trainer.training import arguments, losses, refused, same, trained
-from trainer.run.checkpoint import LAST, load_checkpoint, require_fresh, save_checkpoint
+from trainer.run.checkpoint import LAST, epoch_name, load_checkpoint, prune_epochs, require_fresh, save_checkpoint
 from trainer.run.reporting import METRICS
 from trainer.train import main
 from v2v_protocol.errors import UsageError
@@ -54,6 +54,25 @@ def test_a_run_resumes_in_its_own_folder(server: FakeServer, tmp_path: Path, mon
     assert main([*without_out, "--set", "run.steps=2", "--resume", f"elsewhere/{LAST}"]) == 0
     assert load_checkpoint(tmp_path / "elsewhere" / LAST).step == 2
     assert (tmp_path / "runs" / "small" / LAST).read_bytes() == first
+
+
+def test_a_resumed_run_does_not_overwrite_another(
+    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trained(tmp_path, server.address, "one", run__steps=1)
+    other = trained(tmp_path, server.address, "other", run__steps=1)
+    before = {path.name: path.read_bytes() for path in other.iterdir() if path.is_file()}
+    resuming = [*arguments(tmp_path, server.address, "other", run__steps=2), "--resume", str(tmp_path / "one" / LAST)]
+    assert main(resuming) == 2
+    assert "other holds a run" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in other.iterdir() if path.is_file()} == before
+
+
+def test_the_newest_epochs_are_kept_by_number(tmp_path: Path) -> None:
+    for epoch in range(9990, 10003):
+        (tmp_path / epoch_name(epoch)).touch()
+    prune_epochs(tmp_path, 3)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"epoch-{epoch}.pt" for epoch in (10000, 10001, 10002)]
 
 
 def test_another_run_is_not_resumed(server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -132,8 +151,10 @@ def test_a_diverged_run_keeps_the_checkpoint_before(
     run = trained(tmp_path, server.address, "run", run__steps=1)
     good = load_checkpoint(run / LAST)
     spoilt = {name: tensor * torch.nan for name, tensor in good.model.items()}
-    save_checkpoint(tmp_path / "spoilt.pt", dataclasses.replace(good, model=spoilt))
-    assert main(arguments(tmp_path, server.address, "run", resume="spoilt.pt", run__steps=3, run__save_every=1)) == 1
+    save_checkpoint(run / "spoilt.pt", dataclasses.replace(good, model=spoilt))
+    assert (
+        main(arguments(tmp_path, server.address, "run", resume="run/spoilt.pt", run__steps=3, run__save_every=1)) == 1
+    )
     message = capsys.readouterr().err
     assert "step 2: loss nan" in message
     assert "nothing was saved since this start" in message
