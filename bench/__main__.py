@@ -59,11 +59,10 @@ def parser_for(name: str) -> Parser:
 
 def usage() -> str:
     """Return the list of benches, read from the source: no bench is imported."""
-    lines = ["usage: python -m bench NAME [flags]     python -m bench NAME --help", ""]
-    for name, module in BENCHES.items():
-        source = _HERE.joinpath(*module.split(".")).with_suffix(".py").read_text("utf-8")
-        lines.append(f"  {name:13s} {(ast.get_docstring(ast.parse(source)) or '').partition(chr(10))[0]}")
-    return "\n".join(lines)
+    sources = {name: _HERE.joinpath(*module.split(".")).with_suffix(".py") for name, module in BENCHES.items()}
+    titles = {name: ast.get_docstring(ast.parse(source.read_text("utf-8"))) or "" for name, source in sources.items()}
+    lines = (f"  {name:13s} {title.partition(chr(10))[0]}" for name, title in titles.items())
+    return "\n".join(["usage: python -m bench NAME [flags]     python -m bench NAME --help", "", *lines])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -24,7 +24,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 from v2v_protocol.errors import UsageError
 from v2v_server.system.process import die_with_parent
@@ -124,8 +124,7 @@ class Cable:
 
     def bytes_received(self) -> int:
         """Return the bytes that the far host has received, headers included."""
-        lines = Path(f"/proc/{self.pid}/net/dev").read_text(encoding="ascii").splitlines()
-        return int(next(line for line in lines if line.strip().startswith("far:")).split()[1])
+        return int(Path(f"/proc/{self.pid}/net/dev").read_text(encoding="ascii").partition("far:")[2].split()[0])
 
 
 def _system(name: str, *arguments: int) -> None:
@@ -142,6 +141,30 @@ class _Way:
     sink: int
     queue: deque[tuple[float, bytes]] = field(default_factory=deque)
     free_at: float = 0.0
+
+    def take(self, state: _State, bytes_per_second: float, delay_seconds: float, loss: float) -> None:
+        """Queue the packets that have come."""
+        for _ in range(_AT_ONCE):
+            try:
+                packet = os.read(self.source, 65536)
+            except OSError:  # no more packets
+                return
+            now = time.monotonic()
+            self.free_at = max(now, self.free_at)
+            is_full = self.free_at - now > _LONGEST_QUEUE_SECONDS
+            if state.is_cut.value or is_full or random.random() < loss:
+                state.lost.value += not is_full
+                continue
+            self.free_at += len(packet) / bytes_per_second
+            self.queue.append((self.free_at + delay_seconds, packet))
+
+    def pass_on(self, state: _State) -> None:
+        """Write the packets that are due."""
+        now = time.monotonic()
+        while self.queue and self.queue[0][0] <= now:
+            with suppress(OSError):  # the device is full: the packet is lost
+                os.write(self.sink, self.queue.popleft()[1])
+                state.passed.value += 1
 
 
 def _device(name: str, own: str, other: str, mtu: int) -> int:
@@ -161,49 +184,17 @@ class _State(NamedTuple):
     lost: Any
 
 
-class _Forwarder:
-    """The cable's process."""
-
-    def __init__(
-        self, near: int, far: int, state: _State, bytes_per_second: float, delay_seconds: float, loss: float
-    ) -> None:
-        self._ways = (_Way(near, far), _Way(far, near))
-        self._state = state
-        self._rate, self._delay, self._loss = bytes_per_second, delay_seconds, loss
-
-    def run(self) -> None:
-        """Forward packets until the process ends."""
-        sources = [way.source for way in self._ways]
-        while True:
-            due = min((way.queue[0][0] for way in self._ways if way.queue), default=None)
-            wait = None if due is None else max(0.0, due - time.monotonic())
-            ready, _, _ = select.select(sources, [], [], wait)
-            for way in self._ways:
-                if way.source in ready:
-                    self._take(way)
-                self._pass_on(way)
-
-    def _take(self, way: _Way) -> None:
-        for _ in range(_AT_ONCE):
-            try:
-                packet = os.read(way.source, 65536)
-            except OSError:  # no more packets
-                return
-            now = time.monotonic()
-            way.free_at = max(now, way.free_at)
-            is_full = way.free_at - now > _LONGEST_QUEUE_SECONDS
-            if self._state.is_cut.value or is_full or random.random() < self._loss:
-                self._state.lost.value += not is_full
-                continue
-            way.free_at += len(packet) / self._rate
-            way.queue.append((way.free_at + self._delay, packet))
-
-    def _pass_on(self, way: _Way) -> None:
-        now = time.monotonic()
-        while way.queue and way.queue[0][0] <= now:
-            with suppress(OSError):  # the device is full: the packet is lost
-                os.write(way.sink, way.queue.popleft()[1])
-                self._state.passed.value += 1
+def _forward(near: int, far: int, state: _State, forward: tuple[float, float, float]) -> NoReturn:
+    """Forward packets until the process ends."""
+    ways = (_Way(near, far), _Way(far, near))
+    while True:
+        due = min((way.queue[0][0] for way in ways if way.queue), default=None)
+        wait = None if due is None else max(0.0, due - time.monotonic())
+        ready, _, _ = select.select((near, far), [], [], wait)
+        for way in ways:
+            if way.source in ready:
+                way.take(state, *forward)
+            way.pass_on(state)
 
 
 def _run(parent_pid: int, mtu: int, reason: Connection, state: _State, forward: tuple[float, float, float]) -> None:
@@ -217,4 +208,4 @@ def _run(parent_pid: int, mtu: int, reason: Connection, state: _State, forward: 
         reason.send(str(error))
         return
     reason.send("")
-    _Forwarder(near, far, state, *forward).run()
+    _forward(near, far, state, forward)

@@ -23,7 +23,6 @@ from PIL import Image
 
 from bench.frame import Column, Report, add_whole
 from v2v_protocol.command import Parser
-from v2v_protocol.errors import UsageError
 from v2v_server.video.probe import probe
 from v2v_server.video.source import opened, pictures
 
@@ -60,8 +59,6 @@ def webvid_like(
         UsageError: no source, or a number below 1.
         VideoError: a source does not decode.
     """
-    if not source_videos or min(gop, frames, clips) < 1:
-        raise UsageError(f"{len(source_videos)} sources, gop {gop}, {frames} frames, {clips} clips: give 1 or more")
     out_dir.mkdir(parents=True, exist_ok=True)
     made = []
     for number in range(clips):
@@ -69,8 +66,7 @@ def webvid_like(
         path = out_dir / f"clip{number:03d}_gop{gop}.mp4"
         order = _ping_pong(probe(source).frames, frames, first=number // len(source_videos) * frames)
         _encode(path, _pictures(source, order), gop)
-        size = path.stat().st_size
-        rate = float(size * 8 * _RATE / frames)
+        rate = float(path.stat().st_size * 8 * _RATE / frames)
         made.append({"path": str(path), "source": str(source), "frames": frames, "bits_per_second": rate})
     return made
 
@@ -114,9 +110,8 @@ def _framed(frame: VideoFrame) -> np.ndarray:
 
 
 def _encode(path: Path, frames: Iterator[VideoFrame], gop: int) -> None:
-    options = {"preset": "medium", "profile": "high"}
     with av.open(str(path), "w") as output:
-        stream = output.add_stream("libx264", rate=_RATE, options=options)
+        stream = output.add_stream("libx264", rate=_RATE, options={"preset": "medium", "profile": "high"})
         stream.width, stream.height, stream.pix_fmt = WIDTH_PX, HEIGHT_PX, "yuv420p"
         stream.gop_size, stream.max_b_frames, stream.bit_rate = gop, 3, BITS_PER_SECOND
         stream.thread_count = 1

@@ -84,12 +84,12 @@ def show(records: Sequence[Record], columns: Sequence[Column]) -> None:
 
 def beyond(name: str, record: Record, *, least: Mapping[str, float] = {}, most: Mapping[str, float] = {}) -> list[str]:
     """Return a text for each figure of a record that is beyond its bar; a figure that is not there misses none."""
-    texts = []
-    for word, sign, bars in (("least", 1, least), ("most", -1, most)):
-        for key, bar in bars.items():
-            if (value := record.get(key)) is not None and sign * value < sign * bar:
-                texts.append(f"{name}: {key} {value:.3g}; the bar is at {word} {bar:.3g}")
-    return texts
+    return [
+        f"{name}: {key} {value:.3g}; the bar is at {word} {bar:.3g}"
+        for word, sign, bars in (("least", 1, least), ("most", -1, most))
+        for key, bar in bars.items()
+        if (value := record.get(key)) is not None and sign * value < sign * bar
+    ]
 
 
 def medians(turns: Sequence[Mapping[str, float]]) -> dict[str, Any]:

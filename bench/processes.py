@@ -27,9 +27,9 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import UsageError
 
 MIB = float(1 << 20)
+# Below the ports of outgoing connections. Otherwise a consumer that reconnects to a dead server's port may get that
+# port for its own end, connect to itself and occupy the address (TCP simultaneous open).
 _PORTS = range(20_000, 30_000)
-"""Below the ports of outgoing connections. Otherwise a consumer that reconnects to a dead server's port may get that
-port for its own end, connect to itself and occupy the address (TCP simultaneous open)."""
 _MOST_AUTOCORRELATION = 0.99
 Series = Sequence[tuple[float, float]]  # (seconds, MiB) of one process
 Roles = Mapping[str, Sequence[int]]  # Process ids by role
@@ -50,8 +50,7 @@ def cpu_seconds(pid: int) -> float:
 
 def peak_rss_bytes(pid: int) -> int:
     """Return the peak resident memory of a process, from /proc."""
-    lines = Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines()
-    return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) << 10
+    return int(Path(f"/proc/{pid}/status").read_text(encoding="ascii").partition("VmHWM:")[2].split()[0]) << 10
 
 
 def workers_of(pid: int) -> list[int]:

@@ -31,9 +31,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.accuracy.false_events import SCENES, Film, between, compared, noisy_samples, sequences
-from bench.accuracy.physics import Reals
 from bench.frame import Column, Report, add_videos, add_whole, progress
 from tests.clips import write_clip
+from tests.oracles.rendered import Reals
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.corpus.scenes.analysis import analyse
@@ -71,9 +71,14 @@ def _faded(film: Film, seed: int) -> Film:
     return np.rint(film * gain[:, None, None]).astype(np.uint8)
 
 
-def _boxed(film: Film, sides: tuple[int, int, int, int]) -> Film:
+def _within(film: Film, sides: tuple[int, int, int, int]) -> Film:
+    """Return a film without its sides: top, bottom, left and right."""
     top, bottom, left, right = sides
-    return np.pad(film[:, top : film.shape[1] - bottom, left : film.shape[2] - right], ((0, 0), sides[:2], sides[2:]))
+    return film[:, top : film.shape[1] - bottom, left : film.shape[2] - right]
+
+
+def _boxed(film: Film, sides: tuple[int, int, int, int]) -> Film:
+    return np.pad(_within(film, sides), ((0, 0), sides[:2], sides[2:]))
 
 
 def _woven(film: Film) -> Film:
@@ -147,14 +152,11 @@ def coded(film: Film, rate: str, folder: Path) -> Film:
 
 def _original(name: str, film: Film, made: Film, frames: CleanFrames) -> Reals:
     """Return the log intensities that frames of a clip have in the clean film."""
-    numbers, sides = frames.numbers, frames.sides
+    numbers = frames.numbers
     positions = MADE[name].source[numbers].astype(np.float64)
     if name in _RATES:
         positions = np.linspace(positions[0], positions[-1], len(positions))
-    shown = made if name == "cuts" else film
-    levels = between(
-        shown[:, sides.top : shown.shape[1] - sides.bottom, sides.left : shown.shape[2] - sides.right], positions
-    )
+    levels = between(_within(made if name == "cuts" else film, frames.sides), positions)
     for cut in _CUTS if name == "cuts" else ():
         if 0 < (first := int(numbers.searchsorted(cut))) < len(numbers):
             levels[first:] -= levels[first] - levels[first - 1]
@@ -169,15 +171,17 @@ def _false_events(
     for scene in SCENES:
         counts, served = np.zeros(4), 0
         for number, frames in sequences(clips, scenes, scene):
-            sides = frames.sides
-            shown = clips[number][frames.numbers]
-            shown = shown[:, sides.top : shown.shape[1] - sides.bottom, sides.left : shown.shape[2] - sides.right]
+            shown = _within(clips[number][frames.numbers], frames.sides)
             counts += compared(np.ascontiguousarray(shown), _original(name, films[number], made[number], frames))
             served += 1
         events, false, wanted, missing = counts.tolist()
         record |= {f"sequences_{scene}": served, f"false_{scene}_share": false / events if events else None,
                    f"missing_{scene}_share": missing / wanted if wanted else None}  # fmt: skip
     return record
+
+
+def _resized(film: Film, like: Film) -> Film:
+    return cv2.resize(film.transpose(1, 2, 0), like.shape[:0:-1]).transpose(2, 0, 1).astype(np.uint8)
 
 
 def films(folder: Path) -> Iterator[tuple[str, list[Film]]]:
@@ -251,10 +255,7 @@ def measure(asked: argparse.Namespace) -> Report:
     with tempfile.TemporaryDirectory() as folder:
         for name, (kind, change, _) in MADE.items() if clips else ():
             said, missed = list[str](), list[str]()
-            made = list[Film]()
-            for seed, (_, film) in enumerate(clips):
-                other = cv2.resize(clips[seed - 3][1].transpose(1, 2, 0), film.shape[:0:-1]).transpose(2, 0, 1)
-                made.append(change(film, other.astype(np.uint8), seed))
+            made = [change(film, _resized(clips[seed - 3][1], film), seed) for seed, (_, film) in enumerate(clips)]
             for rate in _BIT_RATES:
                 pictures = [coded(each, rate, Path(folder)) for each in made]
                 scenes = [analyse(each) for each in pictures]
@@ -263,8 +264,7 @@ def measure(asked: argparse.Namespace) -> Report:
                     said += [f"{each} {video} {rate}" for each in found.keys() - {kind}]
                     if kind and not _is_there(name, film, seed, found.get(kind)):
                         missed.append(f"{video} {rate}")
-                of_films = [film for _, film in clips]
-                events = _false_events(name, of_films, made, pictures, scenes)
+                events = _false_events(name, [film for _, film in clips], made, pictures, scenes)
                 false.append({"measure": "events", "made": name, "bit_rate": rate} | events)
             cases = len(clips) * len(_BIT_RATES)
             records.append(

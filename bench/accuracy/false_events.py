@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from bench.accuracy.physics import Reals, log_intensity
+from tests.oracles.rendered import Reals, log_levels
 from v2v_protocol.errors import VideoError
 from v2v_protocol.recipe import preset
 from v2v_protocol.spec import StreamSpec
@@ -33,7 +33,7 @@ SCENES: tuple[Literal["off"], Literal["auto"]] = ("off", "auto")
 SHARES = ((0.0, 1.0), (0.75, 1.0), (0.75, 0.25), (1.0, 0.25))
 """Values of ``moving_share`` and ``quiet_share``."""
 _SEQUENCE = preset("noise-free").replace(voxels_per_clip=3, crop_height_px=64, crop_width_px=64)
-_LOG = log_intensity(np.arange(256) / 255.0)
+_LOG = log_levels(np.arange(256) / 255.0)
 _SAMPLE = preset("paper").replace(voxels_per_clip=8)
 
 

@@ -18,7 +18,6 @@ fitted camera.
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -169,10 +168,7 @@ def _recorded(made: Mapping[str, Any]) -> Recorded:
 def one(camera: TrueCamera, film: Film, seed: int, scene: str) -> Iterator[dict[str, Any]]:
     """Record and fit one camera."""
     made = record(film, camera, seed)
-    given = _recorded(made)
-    begin = time.perf_counter()
-    fitted = fit(given)
-    seconds = time.perf_counter() - begin
+    fitted = fit(_recorded(made))
     for name, estimate in fitted.estimates.items():
         true = float(getattr(camera, name))
         if name == "photoreceptor_hz":  # estimated as 1 / Hz
@@ -184,5 +180,5 @@ def one(camera: TrueCamera, film: Film, seed: int, scene: str) -> Iterator[dict[
             "low": float(estimate.low), "high": float(estimate.high), "told": estimate.told,
             "held": bool(estimate.told and estimate.low <= true <= estimate.high),
             "half_width": float((estimate.high - estimate.low) / 2 / max(estimate.value, 1e-12)),
-            "left_out": fitted.left_out.get(name, ""), "events": len(made["t"]), "fit_seconds": seconds,
+            "left_out": fitted.left_out.get(name, ""), "events": len(made["t"]),
         }  # fmt: skip

@@ -25,7 +25,6 @@ from bench.frame import Column, Record, Report, add_whole, progress
 from tests.oracles.known_motion import PHOTOGRAPHS, Grey, Scene, photograph, scenes
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import V2VError
-from v2v_protocol.spec import StreamSpec
 from v2v_server.flow.methods import AUTO, METHODS, Estimator, choose, estimator
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
@@ -52,9 +51,7 @@ _COLUMNS: tuple[Column, ...] = (
 def textures(videos: Path | None) -> dict[str, Grey]:
     """Return the photographs, and the middle frame of each video of a folder; leave out what does not decode."""
     found = {name: photograph(name) for name in PHOTOGRAPHS}
-    if videos is None:
-        return found
-    for path in sorted(videos.iterdir()):
+    for path in () if videos is None else sorted(videos.iterdir()):
         try:
             facts = probe(path)
             frame = decode_luma(path, facts.index, facts.frames // 2, 1).frames[0]
@@ -136,8 +133,6 @@ def missed(records: Sequence[Record]) -> list[str]:
 def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     parser.add_argument("--videos", type=Path, metavar="DIR", help="videos that give one frame each as texture")
-    names = [*METHODS, AUTO]
-    parser.add_argument("--methods", default=",".join(names), metavar="NAME,NAME", help=f"of {', '.join(names)}")
     add_whole(parser, "--every", 1, "take every N-th pair")
 
 
@@ -149,10 +144,9 @@ def measure(asked: argparse.Namespace) -> Report:
         OSError: the folder cannot be read.
     """
     cv2.setNumThreads(1)
-    names = [StreamSpec.from_dict({"flow_method": name}).flow_method for name in asked.methods.split(",")]
     pairs = scenes(textures(asked.videos), HEIGHT_PX, WIDTH_PX, every=asked.every)
     records: list[dict[str, Any]] = []
-    for name in names:
+    for name in (*METHODS, AUTO):
         progress(f"{name} on {len(pairs)} pairs")
         records += accuracy(name, pairs)
     return Report(records, [(records, _COLUMNS)], missed=missed(records))

@@ -18,19 +18,16 @@ import numpy as np
 from bench.accuracy.physics import (
     BIN_FRAMES,
     BINS,
-    GAMMA,
-    LOG_EPS,
     PHOTOGRAPHS,
     SEED,
     SPEEDS_PX,
-    Reals,
     errors,
-    log_intensity,
     true_bins,
 )
 from bench.frame import Report
 from tests.oracles import transfers
 from tests.oracles.analytic_scenes import moved_photograph
+from tests.oracles.rendered import GAMMA, LOG_EPS, Reals, log_levels
 from v2v_protocol.command import Parser
 from v2v_server.simulation import simulate, simulate_log
 from v2v_server.video.luma import Signal
@@ -49,7 +46,7 @@ def measure(asked: argparse.Namespace) -> Report:
     found: dict[str, list[dict[str, float]]] = {}
     for name in PHOTOGRAPHS:
         grey = moved_photograph(name, BIN_FRAMES * BINS + 1, 96, 128, SPEEDS_PX[0])
-        true, events = true_bins(log_intensity(grey).reshape(len(grey), -1), BIN_FRAMES, THRESHOLD)
+        true, events = true_bins(log_levels(grey).reshape(len(grey), -1), BIN_FRAMES, THRESHOLD)
         for kind, steps in _simulated(grey[::BIN_FRAMES]):
             found.setdefault(kind, []).append(errors(steps, true, events, BINS))
     records = [
@@ -63,7 +60,7 @@ def _simulated(grey: Reals) -> Iterator[tuple[str, Reals]]:
     """Yield what the frames are, and the signed events [steps, pixels] of each step."""
     camera: dict[str, Any] = {"threshold_pos": THRESHOLD, "bins": len(grey) - 1, "seed": SEED, "dtype": "int16"}
 
-    yield "not rounded", simulate_log(log_intensity(grey), **camera).voxels.reshape(len(grey) - 1, -1)
+    yield "not rounded", simulate_log(log_levels(grey), **camera).voxels.reshape(len(grey) - 1, -1)
     for transfer, bits in product(("", "pq", "hlg"), (8, 10, 12)):
         signal = Signal(bits, transfer)
         stored = np.rint(signal.white * transfers.encode(grey**GAMMA, transfer, GAMMA)).astype(signal.dtype)

@@ -16,7 +16,7 @@ simulation of the same frames differ in at most 60 bins of a million.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ import numpy.typing as npt
 from bench.frame import Column, Record, Report, beyond, panels
 from tests.oracles.analytic_scenes import SECONDS, START_SHARE, analytic_scenes, moved_photograph
 from tests.oracles.dense import bin_events, dense_events
+from tests.oracles.rendered import GAMMA, LOG_EPS, Reals, log_levels
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_server.simulation import simulate, simulate_log
@@ -37,9 +38,8 @@ from v2v_server.video.probe import probe
 
 Records = list[dict[str, Any]]
 Frames = npt.NDArray[np.uint8]
-Reals = npt.NDArray[np.float64]
 
-GAMMA, LOG_EPS, SEED = 2.2, 1e-3, 7
+SEED = 7
 RATES_HZ = (25, 50, 100, 200, 1000)
 THRESHOLDS = (0.1, 0.2, 0.5, 1.0)
 PHOTOGRAPHS = ("camera", "coffee", "astronaut", "rocket")
@@ -50,10 +50,9 @@ VIDEO_EVERY, VIDEO_BIN_FRAMES, VIDEO_SIDE_PX = (1, 2, 4, 8, 16), 16, 320
 LARGEST_DIFFERENCE_PPM = 60.0
 
 
-def analytic(threshold: float = 0.2) -> Records:
-    """Return one record for each analytic scene and frame rate."""
+def analytic(threshold: float = 0.2) -> Iterator[dict[str, Any]]:
+    """Yield one record for each analytic scene and frame rate."""
     edges = np.linspace(0.0, SECONDS, int(RATES_HZ[0] * SECONDS) + 1)
-    records: Records = []
     for scene in analytic_scenes():
         true, events = scene.events(edges, threshold)
         for rate in RATES_HZ:
@@ -63,11 +62,10 @@ def analytic(threshold: float = 0.2) -> Records:
                 frames[:, None], threshold_pos=threshold, start_residual=START_SHARE * threshold, bins=steps,
                 dtype="float32",
             ).voxels.reshape(steps, -1)  # fmt: skip
-            records.append(
-                {"measure": "analytic", "scene": scene.name, "monotone": scene.monotone, "threshold": threshold,
-                 "frame_rate_hz": rate, **errors(fine, true, events, len(edges) - 1)}
-            )  # fmt: skip
-    return records
+            yield {
+                "measure": "analytic", "scene": scene.name, "monotone": scene.monotone, "threshold": threshold,
+                "frame_rate_hz": rate, **errors(fine, true, events, len(edges) - 1),
+            }  # fmt: skip
 
 
 def errors(fine: npt.NDArray[Any], true: npt.NDArray[np.int64], events: int, bins: int) -> dict[str, float]:
@@ -82,12 +80,6 @@ def errors(fine: npt.NDArray[Any], true: npt.NDArray[np.int64], events: int, bin
         "voxel_net_true": int(np.abs(true).sum()),
         "differing_bins_ppm": float((coarse != true).mean() * 1e6),
     }
-
-
-def log_intensity(grey: npt.NDArray[Any]) -> Reals:
-    """Return log(eps + F^gamma) of grey levels in 0 .. 1."""
-    level: Reals = np.log(LOG_EPS + grey.astype(np.float64) ** GAMMA)
-    return level
 
 
 def true_bins(levels: Reals, bin_frames: int, threshold: float) -> tuple[npt.NDArray[np.int64], int]:
@@ -117,7 +109,7 @@ def moved_photographs() -> Records:
             light = moved_photograph(name, BIN_FRAMES * BINS + 1, 96, 128, speed)
             frames = np.rint(light * 255.0).astype(np.uint8)
             for threshold in THRESHOLDS:
-                true, events = true_bins(log_intensity(light).reshape(len(light), -1), BIN_FRAMES, threshold)
+                true, events = true_bins(log_levels(light).reshape(len(light), -1), BIN_FRAMES, threshold)
                 for every in EVERY:
                     found = errors(v2v_steps(frames[::every], threshold), true, events, BINS)
                     cells.setdefault((threshold, speed, every), []).append(found)
@@ -129,8 +121,8 @@ def moved_photographs() -> Records:
     ]  # fmt: skip
 
 
-def filmed(path: Path) -> Records:
-    """Return one record for each threshold and n of a film of high rate, on the square that changes most.
+def filmed(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield one record for each threshold and n of a film of high rate, on the square that changes most.
 
     Raises:
         V2VError: the video cannot be read, or is too short or too small.
@@ -140,18 +132,15 @@ def filmed(path: Path) -> Records:
     if count <= VIDEO_BIN_FRAMES:
         raise UsageError(f"--video {path}: {facts.frames} frames; give more than {VIDEO_BIN_FRAMES}")
     frames = liveliest(decode_luma(path, facts.index, 0, count).frames, VIDEO_SIDE_PX)
-    levels = log_intensity(frames.reshape(count, -1) / 255.0)
-    records: Records = []
+    levels = log_levels(frames.reshape(count, -1) / 255.0)
     for threshold in THRESHOLDS:
         true, events = true_bins(levels, VIDEO_BIN_FRAMES, threshold)
         for every in VIDEO_EVERY:
             found = errors(v2v_steps(frames[::every], threshold), true, events, count // VIDEO_BIN_FRAMES)
-            rate = facts.frames_per_second / every
-            records.append(
-                {"measure": "film", "video": path.name, "threshold": threshold, "every": every, "frame_rate_hz": rate}
-                | found
-            )
-    return records
+            yield {
+                "measure": "film", "video": path.name, "threshold": threshold, "every": every,
+                "frame_rate_hz": facts.frames_per_second / every, **found,
+            }  # fmt: skip
 
 
 def liveliest(frames: Frames, side: int) -> Frames:
@@ -173,8 +162,7 @@ def missed(records: Sequence[Record]) -> list[str]:
             none = {"count_error": 0.0, "voxel_error": 0.0}
             texts += beyond(f"{r['scene']} at {r['frame_rate_hz']} Hz", r, least=none, most=none)
         if r["measure"] == "film" and r["every"] == 1:
-            most = {"differing_bins_ppm": LARGEST_DIFFERENCE_PPM}
-            texts += beyond(f"film at c = {r['threshold']:g}", r, most=most)
+            texts += beyond(f"film at c = {r['threshold']:g}", r, most={"differing_bins_ppm": LARGEST_DIFFERENCE_PPM})
     return texts
 
 
@@ -199,8 +187,8 @@ def add_flags(parser: Parser) -> None:
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
     cv2.setNumThreads(1)
-    scenes, photographs = analytic(), moved_photographs()
-    film = [] if asked.video is None else filmed(asked.video)
+    scenes, photographs = list(analytic()), moved_photographs()
+    film = [] if asked.video is None else list(filmed(asked.video))
     title = "photographs against light: px a frame"
     tables = [
         pivot(scenes, {"scene": "count / voxel error at c = 0.2", "events_true": "events"}, "frame_rate_hz", "Hz"),

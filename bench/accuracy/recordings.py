@@ -65,8 +65,10 @@ def seen(light: Reals, hz: float, random: np.random.Generator) -> tuple[EventChu
     order = np.argsort(moments, kind="stable")
     row, column = np.divmod(pixel[order], light.shape[2])
     chunk = EventChunk(np.rint(moments[order] * 1e9).astype(np.int64), column, row, sign[order])
-    drawn = {"threshold_pos": positive, "threshold_neg": negative, "corner_hz": corner}
-    return chunk, drawn | {"events_per_pixel_second": len(chunk) / pixels / seconds}
+    return chunk, {
+        "threshold_pos": positive, "threshold_neg": negative, "corner_hz": corner,
+        "events_per_pixel_second": len(chunk) / pixels / seconds,
+    }  # fmt: skip
 
 
 def scenes(side: int, films: list[Path]) -> Iterator[tuple[str, Reals, float]]:

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.accuracy.physics import VIDEO_SIDE_PX, liveliest
-from bench.frame import Column, Report, add_whole, beyond, progress
+from bench.frame import Column, Report, beyond, progress
 from tests.oracles.rendered import (
     NAMES,
     PHOTOGRAPHS,
@@ -137,7 +137,7 @@ def fits(records: Records) -> Iterator[str]:
             yield f"predictions off by, {which}, {name}, points rms: {', '.join(texts)}"
 
 
-def rendered(side: int, steps: int) -> Iterator[dict[str, Any]]:
+def rendered(side: int = 160, steps: int = 4) -> Iterator[dict[str, Any]]:
     """Yield one record for each scene, speed and bin."""
     seconds = np.arange(steps + 1) / FRAMES_PER_SECOND
     bins = {"frame": seconds, "10 ms": np.arange(0.0, seconds[-1] + 1e-9, BIN_SECONDS)}
@@ -188,21 +188,18 @@ def missed(records: Records) -> list[str]:
         signed, split = BARS.get((size, px), (9.0, 9.0))
         if px < SLOW_PX:
             signed = mean["signed_linear"] + 1e-9
-        most = {"signed_divided": signed, "split_divided": split}
-        texts += beyond(f"bins of {size} at {px:g} px", mean, most=most)
+        texts += beyond(f"bins of {size} at {px:g} px", mean, most={"signed_divided": signed, "split_divided": split})
     return texts
 
 
 def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
-    add_whole(parser, "--side", 160, "side of the scenes, px", least=32)
-    add_whole(parser, "--steps", 4, "steps between frames of each scene")
     parser.add_argument("--video", action="append", default=[], type=Path, metavar="FILE", help="film of high rate")
 
 
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
-    scenes = list(rendered(asked.side, asked.steps))
+    scenes = list(rendered())
     records = scenes + [each for path in asked.video for each in filmed(path)]
     tables = [(records, _COLUMNS), ([each for each in records if "explained" in each], _PREDICTED)]
     return Report(records, tables, list(fits(records)), missed(scenes))

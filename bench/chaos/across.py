@@ -63,12 +63,11 @@ def measure(asked: argparse.Namespace) -> Report:
     kinds = chosen(asked.faults, _KINDS, "--faults")
     with run_folder(asked) as (folder, videos), Cable(asked.mbit, asked.delay_ms, asked.loss) as cable:
         fleet = Fleet(
-            folder / "run", videos, asked.workers, asked.consumers, asked.lease_deadline_seconds,
+            folder / "run", videos, asked.workers, asked.consumers, chaos.LEASE_SECONDS,
             server_flags=() if asked.keys else ("--insecure",), host=NEAR, elsewhere=cable.far, keyed=asked.keys,
         )  # fmt: skip
         fleet.add_worker()  # it waits for the server
         cutting = Cutting(fleet, asked.every, asked.seed, 0, kinds, cable=cable)
         report = chaos.run_fleet(fleet, cutting, asked)
         passed, lost = cable.count()
-    line = f"the cable: {passed} packets passed, {lost} lost, {cutting.cuts} cuts"
-    return replace(report, lines=[line])
+    return replace(report, lines=[f"the cable: {passed} packets passed, {lost} lost, {cutting.cuts} cuts"])

@@ -43,6 +43,7 @@ from v2v_server.quarantine.file import quarantine_path, read_quarantine
 
 _POLL_SECONDS = 0.05
 _LAST_BATCH_SECONDS = 120.0
+LEASE_SECONDS = 10.0
 FAILING = (
     *("lost", "duplicated", "mismatched", "condemned", "out_of_order"),
     *("leftovers", "broken_lives", "stalled", "failures", "unrecovered"),
@@ -76,13 +77,12 @@ def torment(fleet: Fleet, chaos: Chaos, seconds: float) -> int:
 
 def kills(faults: Sequence[Fault], ready_at: Sequence[float]) -> list[Kill]:
     """Return the faults that ended a process, each with the time at which the server was ready again."""
-    found = []
-    for fault in faults:
-        if fault.is_kill:
-            later = [ready for ready in ready_at if ready > fault.at]
-            ready = (later[0] if later else float("inf")) if fault.kind.startswith("server") else fault.at
-            found.append(Kill(fault.kind, fault.at, fault.consumer, ready))
-    return found
+
+    def ready(fault: Fault) -> float:
+        back = (at for at in ready_at if at > fault.at)
+        return next(back, float("inf")) if fault.kind.startswith("server") else fault.at
+
+    return [Kill(fault.kind, fault.at, fault.consumer, ready(fault)) for fault in faults if fault.is_kill]
 
 
 def checked(fleet: Fleet, remakes: int, seed: int) -> dict[str, Any]:
@@ -126,9 +126,9 @@ def record_of(
 
 
 def _percentiles(seconds: list[float]) -> dict[str, float | None]:
-    shares = {"p50": 0.5, "p99": 0.99, "most": 1.0}
     return {
-        f"recovery_{name}_seconds": percentile(seconds, share) if seconds else None for name, share in shares.items()
+        f"recovery_{name}_seconds": percentile(seconds, share) if seconds else None
+        for name, share in (("p50", 0.5), ("p99", 0.99), ("most", 1.0))
     }
 
 
@@ -163,15 +163,8 @@ def add_flags(parser: Parser) -> None:
     add_whole(parser, "--consumers", 3, "consumers")
     add_positive(parser, "--every", 3.5, "mean time between faults, seconds")
     parser.add_argument("--faults", metavar="KIND,KIND", help=f"only these kinds, of {', '.join(WEIGHTS)}")
-    add_positive(parser, "--lease-deadline-seconds", 10.0, "the server's lease deadline, seconds")
     parser.add_argument("--cache", action="store_true", help="keep decoded clips, and damage them")
     parser.add_argument("--keys", action="store_true", help="require keys: all connections are encrypted")
-    parser.add_argument(
-        "--share-gib",
-        default="0",
-        metavar="N",
-        help="memory of the server for samples of equal consumers: every fourth",
-    )
     add_whole(parser, "--remakes", 300, "samples to make again and compare")
     add_whole(parser, "--seed", 0, "of the faults", least=0)
 
@@ -182,8 +175,8 @@ def measure(asked: argparse.Namespace) -> Report:
     with run_folder(asked) as (folder, videos):
         cache = folder / "decoded" if asked.cache else None
         fleet = Fleet(
-            folder / "run", videos, asked.workers, asked.consumers, asked.lease_deadline_seconds, clip_cache=cache,
-            keyed=asked.keys, server_flags=("--share-gib", asked.share_gib),
+            folder / "run", videos, asked.workers, asked.consumers, LEASE_SECONDS, clip_cache=cache,
+            keyed=asked.keys,
         )  # fmt: skip
         # Two SIGSEGVs quarantine a video: one video must remain.
         most_segv = sum(path.suffix.lower() in VIDEO_SUFFIXES for path in videos.rglob("*")) - 1

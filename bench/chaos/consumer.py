@@ -22,6 +22,8 @@ from v2v_protocol.errors import V2VError
 from v2v_protocol.write_aside import write_aside_and_rename
 
 _SMALL = {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}
+# Small samples in large numbers, the paper's 40 voxel grids of 128 x 128, and a slow consumer of siblings, colour and
+# labels.
 PROFILES = (
     Profile({"recipe": _SMALL, "max_sequences_per_video": 100}, seed=1, batch_size=4, think_seconds=0.02, save_every=5),
     Profile({"recipe": {"preset": "paper"}}, seed=2, batch_size=1),
@@ -41,8 +43,6 @@ PROFILES = (
     # The stream of the first one in other batches: the samples of the two are compared with each other.
     Profile({"recipe": _SMALL, "max_sequences_per_video": 100}, seed=1, batch_size=5, think_seconds=0.05),
 )
-"""Small samples in large numbers, the paper's 40 voxel grids of 128 x 128, and a slow consumer of siblings, colour and
-labels."""
 
 
 def profile(number: int) -> Profile:
@@ -55,11 +55,11 @@ def log_path(folder: Path) -> Path:
     return folder / "log.jsonl"
 
 
-def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, stopped: Callable[[], bool]) -> None:
+def consume(address: str, asked: Profile, folder: Path, stopped: Callable[[], bool]) -> None:
     """Stream until ``stopped`` returns True.
 
     Args:
-        address, asked, folder, timeout_seconds: as on the command line.
+        address, asked, folder: as on the command line.
         stopped: whether SIGTERM has arrived: Python drops an exception that a signal handler raises in a finalizer.
 
     Raises:
@@ -76,7 +76,6 @@ def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, 
         seed=asked.seed,
         rank=0,
         world_size=1,
-        timeout_seconds=timeout_seconds,
         shared_memory=not leaves_host(address),  # a network namespace may stand for another host
         **asked.spec,
     )
@@ -86,12 +85,9 @@ def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, 
     if saved is not None:
         dataset.load_state_dict(saved["resume_state"])
         committed = saved["committed"]
-    life_path = folder / "lives"
-    lives = int(life_path.read_text(encoding="utf-8")) if life_path.exists() else 0
-    _replace(life_path, str(lives + 1))
     log = LogWriter(log_path(folder))
     try:
-        log.append(LifeLine(lives, committed, time.monotonic()))
+        log.append(LifeLine(committed, time.monotonic()))
         while not stopped():
             for batch in dataset:
                 if stopped():
@@ -104,15 +100,12 @@ def consume(address: str, asked: Profile, folder: Path, timeout_seconds: float, 
                 log.append(BatchLine(committed, batch.epoch, time.monotonic(), batch.wait_seconds, samples))
                 committed += 1
                 if committed % asked.save_every == 0:
-                    _replace(state_path, json.dumps({"committed": committed, "resume_state": batch.resume_state}))
+                    with write_aside_and_rename(state_path) as partial:
+                        state = {"committed": committed, "resume_state": batch.resume_state}
+                        partial.write_text(json.dumps(state), encoding="utf-8")
                 time.sleep(asked.think_seconds)
     finally:
         log.close()
-
-
-def _replace(path: Path, text: str) -> None:
-    with write_aside_and_rename(path) as partial:
-        partial.write_text(text, encoding="utf-8")
 
 
 def main() -> int:
@@ -121,7 +114,6 @@ def main() -> int:
     parser.add_argument("--address", required=True)
     parser.add_argument("--profile", type=int, required=True)
     parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--timeout-seconds", type=float, default=60.0)
     asked = parser.parse_args()
     stopped = False
 
@@ -132,7 +124,7 @@ def main() -> int:
 
     signal.signal(signal.SIGTERM, leave)
     try:
-        consume(asked.address, profile(asked.profile), asked.folder, asked.timeout_seconds, lambda: stopped)
+        consume(asked.address, profile(asked.profile), asked.folder, lambda: stopped)
     except V2VError as error:
         print(f"consumer {asked.profile}: {type(error).__name__}: {error}", file=sys.stderr)
         return 1

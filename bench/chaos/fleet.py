@@ -21,6 +21,7 @@ from pathlib import Path
 import psutil
 
 from bench.chaos.consumer import log_path
+from bench.chaos.hostile import TALLY
 from bench.processes import free_ports, last_in_line, workers_of
 from v2v_protocol.errors import UsageError
 from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
@@ -58,10 +59,7 @@ class Process:
 
     def last_lines(self, most: int = 1) -> str:
         """Return the last lines of its standard error."""
-        file = self.folder / "stderr"
-        if not file.exists():
-            return "(not started)"
-        lines = file.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        lines = (self.folder / "stderr").read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return "\n".join(lines[-most:]) or "(no output)"
 
 
@@ -107,10 +105,15 @@ class Fleet:
     crowd: list[Process] = field(init=False)
     address: str = field(init=False)
     worker_address: str = field(init=False)
+    port_file: Path = field(init=False)
+    cache: Path = field(init=False)
+    tally: Path = field(init=False)
+    tmp: Path = field(init=False)
     _awaited: bool = field(init=False, default=False)
     _added: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
+        self.port_file, self.cache, self.tally, self.tmp = (self.folder / n for n in ("port", "cache", "tally", "tmp"))
         for name in ("tmp", "cache", "server"):
             (self.folder / name).mkdir(parents=True)
         if self.keyed:
@@ -121,29 +124,11 @@ class Fleet:
         for number in range(self.consumers):
             folder = self.folder / f"consumer{number}"
             folder.mkdir()
-            command = [*self.elsewhere, sys.executable, "-X", "faulthandler", "-m", "bench.chaos.consumer"]
-            command += ["--address", self.address, "--profile", str(number), "--folder", str(folder)]
+            command = [
+                *(*self.elsewhere, sys.executable, "-X", "faulthandler", "-m", "bench.chaos.consumer"),
+                *("--address", self.address, "--profile", str(number), "--folder", str(folder)),
+            ]
             self.crowd.append(Process(f"consumer {number}", command, folder, side="consumer"))
-
-    @property
-    def port_file(self) -> Path:
-        """Return the file that the server writes when it is ready."""
-        return self.folder / "port"
-
-    @property
-    def cache(self) -> Path:
-        """Return the folder of the catalogue index."""
-        return self.folder / "cache"
-
-    @property
-    def tally(self) -> Path:
-        """Return the file with a byte for each raw connection, or refused handshake, of hostile peers."""
-        return self.folder / "tally"
-
-    @property
-    def tmp(self) -> Path:
-        """Return the TMPDIR of all processes."""
-        return self.folder / "tmp"
 
     @property
     def everyone(self) -> list[Process]:
@@ -224,8 +209,10 @@ class Fleet:
         self._added += 1
         folder = self.folder / name
         folder.mkdir()
-        command = [*self.elsewhere, sys.executable, "-m", "v2v_server.commands.worker"]
-        command += ["--connect", self.worker_address, "--videos", str(self.videos), "--name", name]
+        command = [
+            *(*self.elsewhere, sys.executable, "-m", "v2v_server.commands.worker"),
+            *("--connect", self.worker_address, "--videos", str(self.videos), "--name", name),
+        ]
         place = Process(f"worker {name}", command, folder, side="worker")
         self._spawn(place)
         self.further_workers.append(place)
@@ -238,7 +225,6 @@ class Fleet:
             last: they get the lowest priority.
         """
         command = [sys.executable, "-m", "bench.chaos.hostile", "--address", self.address, "--kind", kind]
-        command += ["--tally", str(self.tally)]
         if self.keyed:
             command += ["--worker-address", self.worker_address, "--revoked", str(self.key("revoked"))]
         peers = subprocess.Popen(
@@ -266,11 +252,8 @@ class Fleet:
 
     def committed(self) -> list[int]:
         """Return the number of batches that each consumer has committed."""
-        counts = []
-        for place in self.crowd:
-            state = place.folder / "state.json"
-            counts.append(json.loads(state.read_text(encoding="utf-8"))["committed"] if state.exists() else 0)
-        return counts
+        states = [place.folder / "state.json" for place in self.crowd]
+        return [json.loads(file.read_text(encoding="utf-8"))["committed"] if file.exists() else 0 for file in states]
 
     def logged_bytes(self) -> int:
         """Return the length of all consumers' logs, which grows with every batch."""
@@ -293,7 +276,7 @@ class Fleet:
 
     def _environment(self, side: str) -> dict[str, str]:
         key = str(self.key(side)) if self.keyed and side else ""
-        return os.environ | {MARK: self.token, "TMPDIR": str(self.tmp), KEY_VARIABLE: key}
+        return os.environ | {MARK: self.token, "TMPDIR": str(self.tmp), TALLY: str(self.tally), KEY_VARIABLE: key}
 
     def stop(self) -> list[str]:
         """Stop all processes by SIGTERM, consumers first.
@@ -334,10 +317,8 @@ class Fleet:
     def traces(self) -> list[str]:
         """Return what the ended processes left behind: processes, listening sockets, files."""
         _, alive = psutil.wait_procs(self.marked(), timeout=5.0)
-        left = [f"process {process.pid}: {_command_of(process)}" for process in alive]
-        for child in psutil.Process().children():
-            if child.status() == psutil.STATUS_ZOMBIE:
-                left.append(f"zombie {child.pid}")
+        left = [f"process {process.pid}: {' '.join(process.info['cmdline'] or ())[:200]}" for process in alive]
+        left += [f"zombie {each.pid}" for each in psutil.Process().children() if each.status() == psutil.STATUS_ZOMBIE]
         for port in (int(address.rpartition(":")[2]) for address in (self.address, self.worker_address)):
             with socket.socket() as probe:
                 if probe.connect_ex((self.host, port)) == 0:
@@ -352,18 +333,9 @@ class Fleet:
 
     def marked(self) -> list[psutil.Process]:
         """Return the living processes of this run, whatever their parent."""
-        found = []
-        for process in psutil.process_iter():
-            try:
-                if process.pid != os.getpid() and process.environ().get(MARK) == self.token:
-                    found.append(process)
-            except (psutil.AccessDenied, psutil.NoSuchProcess, psutil.ZombieProcess, OSError):
-                continue  # another user's process, or one that has ended
-        return found
-
-
-def _command_of(process: psutil.Process) -> str:
-    try:
-        return " ".join(process.cmdline())[:200]
-    except psutil.NoSuchProcess:
-        return "(ended)"
+        # psutil gives None for another user's process, and leaves out those that have ended.
+        return [
+            process
+            for process in psutil.process_iter(["environ", "cmdline"])
+            if process.pid != os.getpid() and (process.info["environ"] or {}).get(MARK) == self.token
+        ]

@@ -33,7 +33,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
@@ -54,7 +54,7 @@ SPEC = {"recipe": {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32
 _REFUSAL_SECONDS = 2.0
 _UNFINISHED_EACH = 8  # connections with unfinished messages of each peer
 _UNFINISHED_BYTES = 380_000
-_tally: Path | None = None
+TALLY = "V2V_CHAOS_TALLY"
 _GREETING_BYTES, _HELLO_BYTES, _WELCOME_BYTES = 64, 202, 170  # with their framing
 
 
@@ -155,6 +155,7 @@ def _is_refused(address: str, key: PeerKey) -> bool:
     return False
 
 
+@functools.cache
 def recorded_handshake() -> bytes:
     """Return what a peer with the key of ``V2V_KEYS`` sends to a server that only listens: greeting, first message."""
     with (
@@ -169,11 +170,11 @@ def recorded_handshake() -> bytes:
     return said
 
 
-def handshakes(said: bytes, address: str, number: int) -> None:
-    """See the module; ``said`` is what :func:`recorded_handshake` returns."""
+def handshakes(address: str, number: int) -> None:
+    """See the module."""
     while True:
         with _connected(address) as peer:
-            peer.sendall(said)
+            peer.sendall(recorded_handshake())
             answer = b""
             while len(answer) < _GREETING_BYTES + _WELCOME_BYTES and (piece := peer.recv(4096)):
                 answer += piece
@@ -244,9 +245,8 @@ def _push(peer: socket.socket, data: bytes) -> None:
 
 def _count() -> None:
     """Count a connection, or a refused handshake."""
-    if _tally is not None:
-        with _tally.open("ab") as file:
-            file.write(b".")
+    with open(os.environ.get(TALLY, os.devnull), "ab") as file:
+        file.write(b".")
 
 
 @functools.cache
@@ -265,13 +265,11 @@ def _closing(peer: Dealer) -> Iterator[Dealer]:
         peer.close()
 
 
-@contextmanager
-def _dealer(address: str, number: int | None) -> Iterator[Dealer]:
+def _dealer(address: str, number: int | None) -> AbstractContextManager[Dealer]:
     """Connect a peer that takes one message at a time, under a name of its number; None takes a new name."""
     name = b"leaver-" + os.urandom(8) if number is None else b"hostile-%d-%d" % (os.getpid(), number)
     options: dict[str, int | bytes] = {"ROUTING_ID": name, "RCVHWM": 1, "SNDHWM": 1000, "SNDTIMEO": 2000}
-    with _closing(Dealer(address, options=options, beside=_first())) as peer:
-        yield peer
+    return _closing(Dealer(address, options=options, beside=_first()))
 
 
 def main() -> NoReturn:
@@ -281,16 +279,12 @@ def main() -> NoReturn:
     parser.add_argument("--kind", required=True, choices=(*KINDS, *KEYED_KINDS))
     parser.add_argument("--worker-address", help="for refused: the port of the workers")
     parser.add_argument("--revoked", type=Path, help="for refused: a revoked key")
-    parser.add_argument("--tally", type=Path, help="file to extend by a byte for each raw connection or refusal")
     asked = parser.parse_args()
-    global _tally
-    _tally = asked.tally
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
-    if asked.kind == REFUSED:
-        act: Callable[[str, int], None] = functools.partial(refused, asked.worker_address, asked.revoked)
-    else:
-        act = functools.partial(handshakes, recorded_handshake()) if asked.kind == HANDSHAKES else KINDS[asked.kind]
-    attack(asked.address, act)
+    keyed: dict[str, Callable[[str, int], None]] = {
+        REFUSED: functools.partial(refused, asked.worker_address, asked.revoked), HANDSHAKES: handshakes,
+    }  # fmt: skip
+    attack(asked.address, (KINDS | keyed)[asked.kind])
 
 
 if __name__ == "__main__":

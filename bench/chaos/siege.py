@@ -115,8 +115,10 @@ def besiege(
 
 def missed(record: Record) -> list[str]:
     """Return the bars that a kind misses."""
-    most = {"peak_mib": PEAK_BAR_MIB + CREDIT_MIB * (PEERS + 1), "after_mib": AFTER_BAR_MIB}
-    return beyond(record["kind"], record, least={"kept": KEPT_BAR}, most=most)
+    return beyond(
+        record["kind"], record, least={"kept": KEPT_BAR},
+        most={"peak_mib": PEAK_BAR_MIB + CREDIT_MIB * (PEERS + 1), "after_mib": AFTER_BAR_MIB},
+    )  # fmt: skip
 
 
 def add_flags(parser: Parser) -> None:

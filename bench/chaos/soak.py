@@ -5,7 +5,7 @@
 Resident memory of the broker (the server's main process), of each worker and of the client (this process) is recorded
 once a second. A line is fitted to each after the warm-up, a fifth of the time and at most 60 s
 (:mod:`bench.processes`). A process grows when its slope exceeds
-``--most-mib-per-hour`` by more than three standard errors.
+16 MiB an hour by more than three standard errors.
 
 Bars: no process grows; no sample is lost, duplicated or out of order.
 """
@@ -28,7 +28,7 @@ from v2v_protocol.command import Parser
 _POINT_SECONDS = 1.0
 _WARM_UP_SHARE = 0.2
 _MOST_WARM_UP_SECONDS = 60.0
-_STANDARD_ERRORS = 3.0
+_STANDARD_ERRORS, MOST_MIB_PER_HOUR = 3.0, 16.0
 _ORDER = ("lost", "duplicated", "out_of_order")
 _COLUMNS: tuple[Column, ...] = (
     ("process", "process", "{}", 1),
@@ -99,7 +99,6 @@ def add_flags(parser: Parser) -> None:
     add_positive(parser, "--minutes", 15.0, "duration, minutes")
     add_whole(parser, "--workers", 2, "workers of the server")
     add_whole(parser, "--batch-size", 12, "samples of a batch")
-    add_positive(parser, "--most-mib-per-hour", 16.0, "allowed growth, MiB an hour")
 
 
 def measure(asked: argparse.Namespace) -> Report:
@@ -111,7 +110,7 @@ def measure(asked: argparse.Namespace) -> Report:
     memory = after(memory, warm_up)
     fits = {name: fit(points) for name, points in memory.items()}
     missed = beyond("stream", stream, most=dict.fromkeys(_ORDER, 0))
-    missed += [f"{name} grows" for name, line in fits.items() if grows(line, asked.most_mib_per_hour)]
+    missed += [f"{name} grows" for name, line in fits.items() if grows(line, MOST_MIB_PER_HOUR)]
     records = records_of(stream, memory, fits)
     line = f"{records[0]['samples']} samples in {stream['seconds']:.0f} s; {warm_up:.0f} s of warm-up excluded"
     return Report(records, [(records, _COLUMNS)], lines=[line], missed=missed)

@@ -22,13 +22,11 @@ from pathlib import Path
 from typing import Any
 
 from bench.frame import Column, Report, add_videos, add_whole, beyond, ratios
-from tests.oracles.leases import open_leases
+from tests.oracles.leases import open_leases, whole_sample
 from v2v_protocol.command import Parser
 from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.sources.folder import Folder
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.worker.produce import decode_for, make_sample
 
 FILL_BAR = 1.2
 WAYS = ("source", "fill", "hits")
@@ -46,7 +44,7 @@ def epoch(leases: Sequence[Lease], root: Path, cache: Cache | None) -> float:
     """Make every sample once; return the processor seconds."""
     began = time.process_time()
     for lease in leases:
-        make_sample(lease, decode_for(lease, lease.indices, Folder(root), cache)[0])
+        whole_sample(lease, root, cache)
     return time.process_time() - began
 
 
@@ -78,14 +76,13 @@ def compare(leases: Sequence[Lease], root: Path, turns: int) -> list[dict[str, A
 def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     add_videos(parser, "clips of at least 201 frames (python -m bench corpus)", rows="top:0.54")
-    add_whole(parser, "--samples", 200, "most samples, of the first epoch")
     add_whole(parser, "--turns", 3, "turns of each way")
 
 
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
     with open_leases(asked.videos, asked.rows, StreamSpec()) as (root, endless):
-        leases = list(itertools.takewhile(lambda lease: lease.epoch == 0, itertools.islice(endless, asked.samples)))
+        leases = list(itertools.takewhile(lambda lease: lease.epoch == 0, itertools.islice(endless, 200)))
         records = compare(leases, root, asked.turns)
     fill = records[WAYS.index("fill")]
     return Report(records, [(records, _COLUMNS)], missed=beyond("fill", fill, most={"ratio_to_source": FILL_BAR}))

@@ -114,8 +114,10 @@ def opened(folder: Path, cache: Path, scene: bool = False) -> dict[str, Any]:
     }
     began = time.perf_counter()
     table = SequenceTable(catalogue.videos, catalogue.rows, StreamSpec())
-    record |= {"table_seconds": time.perf_counter() - began, "videos": len(catalogue.videos), "sequences": table.count}
     record |= {
+        "table_seconds": time.perf_counter() - began,
+        "videos": len(catalogue.videos),
+        "sequences": table.count,
         "resident_bytes": resident_bytes() - before,
         "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before,
     }

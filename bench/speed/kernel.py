@@ -74,8 +74,7 @@ def contender(name: str, frames: npt.NDArray[np.uint8]) -> Callable[[], object]:
 
 def _serve_turns(name: str, pipe: Connection) -> None:
     """Run one turn for every True that arrives; send the processor seconds of each run."""
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     if name != RELEASED:
         keep_freed_memory()
     np.random.seed(0)
@@ -137,6 +136,5 @@ def add_flags(parser: Parser) -> None:
 
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
-    seconds = timed(asked.turns)
-    records = records_of(seconds)
+    records = records_of(timed(asked.turns))
     return Report(records, [(records, _COLUMNS)], missed=missed(records))

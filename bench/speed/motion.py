@@ -30,17 +30,15 @@ import numpy as np
 
 from bench.frame import Column, Report, add_whole, progress
 from tests.clips import write_clip
-from tests.oracles.leases import open_leases
+from tests.oracles.leases import open_leases, whole_sample
 from v2v_protocol.command import Parser
 from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.sources.folder import Folder
 from v2v_server.prepare import prepare
 from v2v_server.store.encoding import Encoding
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
-from v2v_server.worker.produce import decode_for, make_sample
 
 BARS = {("walking", "source"): 2.0, ("walking", "motion"): 5.0, ("still", "source"): 1.03, ("still", "motion"): 1.05}
 COLOUR_BARS = {("walking", "source"): 1.4, ("walking", "chroma"): 1.25}
@@ -79,8 +77,7 @@ def sample_seconds(root: Path, leases: Sequence[Lease]) -> float:
     """Return the processor time of a sample, the mean of some."""
     begin = time.process_time()
     for lease in leases:
-        (decoded,) = decode_for(lease, lease.indices, Folder(root))
-        make_sample(lease, decoded)
+        whole_sample(lease, root)
     return (time.process_time() - begin) / len(leases)
 
 
@@ -94,7 +91,7 @@ def compared(asked: argparse.Namespace, folder: Path) -> Iterator[dict[str, Any]
             (0.0, ("frames_rgb",)) if asked.colour else (SUBSTEP_PX, ()),
         ):
             with open_leases(videos, "full", StreamSpec(substep_px=substep_px)) as (root, leases):
-                taken = [replace(each, arrays=(*each.arrays, *more)) for each in islice(leases, asked.samples)]
+                taken = [replace(each, arrays=(*each.arrays, *more)) for each in islice(leases, 3)]
                 works.append(partial(sample_seconds, root, taken))
         for work in works:
             work()  # loads or compiles the kernels
@@ -111,7 +108,6 @@ def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     parser.add_argument("--video", type=Path, required=True, metavar="FILE", help="film of someone who walks")
     parser.add_argument("--colour", action="store_true", help="measure frames_rgb in place of sub-steps")
-    add_whole(parser, "--samples", 3, "samples of a turn")
     add_whole(parser, "--turns", 7, "turns")
 
 

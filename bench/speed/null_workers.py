@@ -139,8 +139,6 @@ class NullWorkers:
                 self._leases.pop(link, None)
             case Denied(code, text):
                 raise RemoteError(code, text)
-            case _:
-                pass
 
     def _answer(self, link: Dealer, leases: deque[Lease]) -> None:
         """Answer the oldest lease with the messages of a worker that already holds the next one."""

@@ -42,7 +42,7 @@ class ReleasedStyleDataset(Dataset[Sample]):
         self.recipe = Recipe()
         self.rows = Rows.parse(rows)
         found = sorted(path for path in Path(videos).rglob("*") if path.suffix.lower() in _SUFFIXES)
-        self.clips = [path for path in found if _frame_count(path) >= self.recipe.frames_needed]
+        self.clips = [path for path in found if _count_and_size(path)[0] >= self.recipe.frames_needed]
         if not self.clips:
             raise CorpusError(
                 f"{videos}: none of its {len(found)} videos has the {self.recipe.frames_needed} frames of a sample"
@@ -61,10 +61,7 @@ class ReleasedStyleDataset(Dataset[Sample]):
         """
         recipe = self.recipe
         path = self.clips[np.random.randint(len(self.clips))]
-        capture = cv2.VideoCapture(str(path))
-        count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        height, width = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
-        capture.release()
+        count, height, width = _count_and_size(path)
         top, bottom = self.rows.bounds(height)
         if bottom - top < recipe.crop_height_px or width < recipe.crop_width_px:
             raise UsageError(f"{path}: usable picture {width}x{bottom - top} is smaller than the crop")
@@ -128,11 +125,13 @@ class ReleasedStyleDataset(Dataset[Sample]):
         }
 
 
-def _frame_count(path: Path) -> int:
+def _count_and_size(path: Path) -> tuple[int, int, int]:
+    """Return frames, height and width of a video."""
     capture = cv2.VideoCapture(str(path))
-    count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    names = cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH
+    count, height, width = (int(capture.get(name)) for name in names)
     capture.release()
-    return count
+    return count, height, width
 
 
 def simulate_steps(

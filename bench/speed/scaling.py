@@ -92,8 +92,9 @@ def missed(records: Sequence[Record], cores: int) -> list[str]:
     for record in records:
         name = f"{record['measure']}, {record['workers']}"
         if record["measure"] == "broker":
-            most_bytes = MOST_BROKER_BYTES + record["credit_window_bytes"]
-            texts += beyond(name, record, most={"broker_peak_rss_bytes": most_bytes})
+            texts += beyond(
+                name, record, most={"broker_peak_rss_bytes": MOST_BROKER_BYTES + record["credit_window_bytes"]}
+            )
         elif record["workers"] == 2:
             texts += beyond(name, record, least={"ratio_to_1_worker": LEAST_GAIN_OF_TWO})
         elif record["workers"] == 8 and cores <= _FEW_CORES:

@@ -37,15 +37,11 @@ def equal_trainers(asked: argparse.Namespace, trainers: int) -> dict[str, float]
     """Return the record of a server from its start, with trainers that take one epoch of equal samples each."""
     flags = ["--rows", asked.rows, "--share-gib", "2" if trainers > 1 else "0"]
     with LocalServer(asked.videos, workers=1, flags=flags) as server:
-
-        def take(dataset: V2VStreamDataset) -> int:
-            return sum(1 for _ in dataset)
-
         datasets = [V2VStreamDataset(server.address, asked.batch_size, rank=0, world_size=1) for _ in range(trainers)]
         roles = roles_of(server)
         before, began = cpu_seconds_of(roles), time.perf_counter()
         with ThreadPoolExecutor(trainers) as threads:
-            batches = max(threads.map(take, datasets))
+            batches = max(threads.map(lambda dataset: sum(1 for _ in dataset), datasets))
         elapsed = time.perf_counter() - began
         time.sleep(_SETTLE_SECONDS)  # the server still handles the Goodbye
         after = cpu_seconds_of(roles)
@@ -67,10 +63,7 @@ def measure(asked: argparse.Namespace) -> Report:
     turns = [[equal_trainers(asked, trainers) for trainers in (1, EQUAL_TRAINERS)] for _ in range(asked.turns)]
     one, equal = zip(*turns, strict=True)
     records = [{"trainers": 1, **medians(one)}, {"trainers": EQUAL_TRAINERS, **medians(equal)}]
-    records[1] |= ratios("ratio_to_one", map(_server_seconds, equal), map(_server_seconds, one))
+    sides = [f"{role}_cpu_seconds_per_batch" for role in ("workers", "broker")]
+    records[1] |= ratios("ratio_to_one", *([sum(run[side] for side in sides) for run in runs] for runs in (equal, one)))
     missed = beyond(f"{EQUAL_TRAINERS} trainers", records[1], most={"ratio_to_one": MOST_RATIO})
     return Report(records, [(records, _COLUMNS)], missed=missed)
-
-
-def _server_seconds(run: dict[str, float]) -> float:
-    return run["workers_cpu_seconds_per_batch"] + run["broker_cpu_seconds_per_batch"]

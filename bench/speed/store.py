@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.frame import Column, Record, Report, add_videos, add_whole, progress
+from bench.frame import Column, Record, Report, add_videos, add_whole, medians, progress
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.catalogue import open_catalogue
@@ -48,7 +48,7 @@ CROP = (149, 128, 128)  # Frames, rows and columns
 FORMS = {"store dense": DENSE, "store fast": FAST, "store raw": RAW, "cache": QUICK}
 MOST_ADDED = 0.15
 _MOST_FRAMES = 450
-_TURNS, _READS = 3, 10
+_TURNS, _READS, _PLACES = 3, 10, 8
 _COLUMNS: tuple[Column, ...] = (
     ("form", "", "{}", 1.0),
     ("ratio_to_source_bytes", "x source", "{:.2f}", 1.0),
@@ -108,8 +108,7 @@ def clips(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
             count = min(video.frames, _MOST_FRAMES)
             luma = np.stack(list(stream_luma(path, index, 0, count, (top, 0, bottom - top, video.width_px))))
             source_bytes = path.stat().st_size * count / video.frames
-            limits = np.subtract(luma.shape, CROP) + 1
-            places = np.random.default_rng(0).integers(0, limits, (asked.places, 3)).tolist()
+            places = np.random.default_rng(0).integers(0, np.subtract(luma.shape, CROP) + 1, (_PLACES, 3)).tolist()
             reads = [
                 partial(decode_luma, path, index, at[0], CROP[0], (top + at[1], at[2], *CROP[1:])) for at in places
             ]
@@ -168,31 +167,20 @@ def _added(records: Sequence[Record]) -> float:
     return float(scene / plain - 1)
 
 
-def medians(records: Sequence[Record]) -> list[dict[str, Any]]:
-    """Return one record for each form: medians over the clips."""
-    found = []
-    for form in dict.fromkeys(record["form"] for record in records):
-        of = [record for record in records if record["form"] == form]
-        found.append(
-            {
-                "form": form,
-                "ratio_to_source_bytes": statistics.median(each["bytes"] / each["source_bytes"] for each in of),
-                "bits_per_pixel": statistics.median(8 * each["bytes"] / each["pixels"] for each in of),
-                "bytes_per_video_second": statistics.median(each["bytes"] / each["seconds"] for each in of),
-                "read_cpu_seconds": statistics.median(each["read_cpu_seconds"] for each in of),
-                "write_bytes_per_cpu_second": None
-                if form == "source"
-                else statistics.median(each["write_bytes_per_cpu_second"] for each in of),
-            }
-        )
-    return found
+def figures(record: Record) -> dict[str, float]:
+    """Return what the table shows of a clip in one form."""
+    return {
+        "ratio_to_source_bytes": record["bytes"] / record["source_bytes"],
+        "bits_per_pixel": 8 * record["bytes"] / record["pixels"],
+        "bytes_per_video_second": record["bytes"] / record["seconds"],
+        **{key: record[key] for key in ("read_cpu_seconds", "write_bytes_per_cpu_second") if key in record},
+    }
 
 
 def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     add_videos(parser, "clips (python -m bench corpus)", rows="top:0.54")
     add_whole(parser, "--clips", 6, "most clips to take")
-    add_whole(parser, "--places", 8, "crops to read of each clip")
 
 
 def measure(asked: argparse.Namespace) -> Report:
@@ -204,7 +192,11 @@ def measure(asked: argparse.Namespace) -> Report:
     records = list(clips(asked))
     if not records:
         raise CorpusError(f"--videos {asked.videos}: no clip has {CROP[0]} frames of {CROP[1]} x {CROP[2]} px")
-    found, made = medians(records), list(prepared(asked))
+    found: list[Record] = [
+        {"form": form, **medians([figures(each) for each in records if each["form"] == form])}
+        for form in ("source", *FORMS)
+    ]
+    made = list(prepared(asked))
     added = _added(made)
     lines = [f"scene statistics add {added:.1%} to v2v-prepare"]
     missed = [f"{lines[0]}; the bar is {MOST_ADDED:.0%}"] if added > MOST_ADDED else []

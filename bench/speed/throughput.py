@@ -25,7 +25,19 @@ from typing import Any, NamedTuple
 import psutil
 from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
-from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, beyond, medians, progress, ratios
+from bench.frame import (
+    Column,
+    Record,
+    Report,
+    add_positive,
+    add_videos,
+    add_whole,
+    beyond,
+    chosen,
+    medians,
+    progress,
+    ratios,
+)
 from bench.processes import cpu_seconds
 from bench.speed.released import ReleasedStyleDataset
 from tests.oracles.leases import open_leases
@@ -33,13 +45,14 @@ from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_client.tools import loadtest
 from v2v_protocol.command import Parser
-from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import SPEED_PRESETS, StreamSpec
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.system.process import usable_cores
 from v2v_server.worker.produce import decode_for
 
 BASELINE, LIMIT = "released", "decode"
+# Least multiple of the baseline, by the clock and by processor time, on clips with a keyframe every 250 frames; of
+# `dense-12`, every 12. A label without a bar of its own has that of its part before the dash.
 BARS = {
     "exact, source": 3.3,
     "exact, dense": 25.0,
@@ -48,8 +61,6 @@ BARS = {
     "exact, h264": 11.0,
     "fast, h264": 20.0,
 }
-"""Least multiple of the baseline, by the clock and by processor time, on clips with a keyframe every 250 frames; of
-`dense-12`, every 12. A label without a bar of its own has that of its part before the dash."""
 LIMIT_BARS = {"exact, source": 0.9}  # Least share of the decode limit of the same corpus, by the clock
 
 _COLUMNS: tuple[Column, ...] = (
@@ -111,7 +122,7 @@ class Contender:
         )
 
 
-def line_up(source: Corpus, prepared: list[Corpus], presets: list[str]) -> list[Contender]:
+def line_up(source: Corpus, prepared: list[Corpus], presets: Sequence[str]) -> list[Contender]:
     """Return all contenders, the baseline first; each corpus has its own decode limit."""
     names = [LIMIT, *(name for name in SPEED_PRESETS if name in presets)]
     return [Contender(BASELINE, source)] + [Contender(name, corpus) for corpus in (source, *prepared) for name in names]
@@ -239,9 +250,7 @@ def measure(asked: argparse.Namespace) -> Report:
     Raises:
         UsageError: an unknown preset.
     """
-    presets = asked.presets.split(",")
-    if set(presets) - set(SPEED_PRESETS):
-        raise UsageError(f"--presets {asked.presets}: choose of {', '.join(SPEED_PRESETS)}")
+    presets = chosen(asked.presets, SPEED_PRESETS, "--presets")
     contenders = line_up(Corpus("source", asked.videos, asked.rows), asked.prepared, presets)
     records = compare(contenders, asked)
     return Report(records, [(records, _COLUMNS)], missed=missed(records))

@@ -81,7 +81,6 @@ def test_every_bench_has_a_parser_and_a_line_in_the_list() -> None:
         ("chaos --videos clips --faults worker-kill,typo", "--faults typo: choose of worker-kill, "),
         ("siege --footage film --kinds refused", "--kinds refused: choose of unfinished, "),
         ("fuzz --live 5", "--live needs a corpus: give --videos DIR"),
-        ("flow --methods dis", "flow_method"),
         ("flow --videos none", "No such file or directory: 'none'"),
     ],
 )

@@ -17,6 +17,7 @@ from v2v_server.corpus.sources.folder import Folder
 from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.store.cache import Cache
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import decode_for, make_sample
 
@@ -54,7 +55,7 @@ def open_leases(videos: Path, rows: str, spec: StreamSpec) -> Iterator[tuple[Pat
         catalogue.close()
 
 
-def whole_sample(lease: Lease, root: Path) -> Sample:
-    """Make the sample of a lease as a server worker does: decode, view, simulate."""
-    (decoded,) = decode_for(lease, lease.indices, Folder(root))
+def whole_sample(lease: Lease, root: Path, cache: Cache | None = None) -> Sample:
+    """Make the sample of a lease as a server worker does: decode, or read from a cache; view, simulate."""
+    (decoded,) = decode_for(lease, lease.indices, Folder(root), cache)
     return make_sample(lease, decoded)

@@ -2,7 +2,7 @@
 
 A consumer appends one JSON object a line to its log:
 
-    {"kind": "life", "life": k, "committed": n, "at": t}    the k-th start, from a state after n batches
+    {"kind": "life", "committed": n, "at": t}               a start, from a state after n batches
     {"kind": "batch", "number": n, "epoch": e, "at": t,     batch number n, counted over all lives, was yielded
      "wait": s, "samples": [...]}
 
@@ -78,12 +78,10 @@ class LifeLine:
     """The consumer started.
 
     Attributes:
-        life: number of earlier lives.
         committed: batches that the state it starts from covers.
         at: time, as of a batch.
     """
 
-    life: int
     committed: int
     at: float
 

@@ -42,7 +42,7 @@ Flip = Callable[[int, np.ndarray], None]
 
 def lines(catalogue: Catalogue, asked: Profile, flip: Flip = lambda index, voxels: None) -> list[Line]:
     """Return a log without faults; ``flip`` may change the bytes of a sample before they are logged."""
-    found: list[Line] = [LifeLine(0, 0, 0.0)]
+    found: list[Line] = [LifeLine(0, 0.0)]
     for number in range(BATCHES):
         epoch, place = divmod(number, 11 // asked.batch_size)
         samples = []
@@ -110,7 +110,7 @@ def test_a_planted_flipped_byte_is_caught(catalogue: Catalogue) -> None:
 def test_a_flipped_byte_is_caught_without_a_remake_when_it_was_seen_twice(
     catalogue: Catalogue, honest: list[Line]
 ) -> None:
-    again = changed([LifeLine(1, 2, 9.0), *honest[3:]], 1, digest="0" * 64)
+    again = changed([LifeLine(2, 9.0), *honest[3:]], 1, digest="0" * 64)
     found = check(catalogue, [(ASKED, [*honest, *again])], remakes=0, seed=0)
     assert found.order[0].faultless
     assert found.order[0].repeated == 8

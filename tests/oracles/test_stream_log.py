@@ -40,8 +40,8 @@ def batch(number: int) -> BatchLine:
 def log(*lives: tuple[int, int]) -> list[Line]:
     """Lives as (batches that the state covers, number of the batch before which it ends)."""
     lines: list[Line] = []
-    for life, (committed, end) in enumerate(lives):
-        lines.append(LifeLine(life, committed, 0.0))
+    for committed, end in lives:
+        lines.append(LifeLine(committed, 0.0))
         lines += [batch(number) for number in range(committed, end)]
     return lines
 
@@ -119,7 +119,7 @@ def _last_life(lives: list[tuple[int, int]], plant: object) -> list[Line]:
 def test_a_state_that_is_not_where_it_says_is_found(ahead: int) -> None:
     """The state was after 4 batches; the stream goes on a batch too early (twice) or too late (lost)."""
     lines = log((0, 5))
-    lines.append(LifeLine(1, 4, 0.0))
+    lines.append(LifeLine(4, 0.0))
     lines += [dataclasses.replace(batch(number + ahead), number=number) for number in range(4, 8)]
     verdict = check_order(lines, sequences=SEQUENCES, batch_size=BATCH_SIZE)
     assert verdict.duplicated == BATCH_SIZE * max(0, -ahead)
@@ -129,21 +129,21 @@ def test_a_state_that_is_not_where_it_says_is_found(ahead: int) -> None:
 
 def test_a_life_that_skips_its_own_numbers_is_found() -> None:
     lines = log((0, 5))
-    lines.append(LifeLine(1, 7, 0.0))
+    lines.append(LifeLine(7, 0.0))
     assert check_order(lines, sequences=SEQUENCES, batch_size=BATCH_SIZE).broken_lives == 1
 
 
 def test_two_samples_that_change_places_are_out_of_order() -> None:
     first = batch(0)
     swapped = dataclasses.replace(first, samples=first.samples[::-1])
-    verdict = check_order([LifeLine(0, 0, 0.0), swapped], sequences=SEQUENCES, batch_size=BATCH_SIZE)
+    verdict = check_order([LifeLine(0, 0.0), swapped], sequences=SEQUENCES, batch_size=BATCH_SIZE)
     assert (verdict.lost, verdict.duplicated, verdict.out_of_order) == (0, 0, 3)
     assert not verdict.faultless
 
 
 def test_a_sample_of_the_dropped_remainder_is_foreign() -> None:
     stray = dataclasses.replace(batch(0), samples=(dataclasses.replace(batch(0).samples[0], index=10),))
-    assert check_order([LifeLine(0, 0, 0.0), stray], sequences=SEQUENCES, batch_size=BATCH_SIZE).foreign == 1
+    assert check_order([LifeLine(0, 0.0), stray], sequences=SEQUENCES, batch_size=BATCH_SIZE).foreign == 1
 
 
 def test_other_bytes_of_the_same_sample_contradict() -> None:
@@ -190,8 +190,8 @@ def test_a_torn_line_counts_as_not_written(tmp_path: Path, cut: int) -> None:
     write(path, log((0, 3)))
     path.write_bytes(path.read_bytes()[:-cut])
     assert list(read_log(path)) == log((0, 2))
-    write(path, [LifeLine(1, 2, 0.0)])
-    assert list(read_log(path)) == [*log((0, 2)), LifeLine(1, 2, 0.0)]
+    write(path, [LifeLine(2, 0.0)])
+    assert list(read_log(path)) == [*log((0, 2)), LifeLine(2, 0.0)]
 
 
 @pytest.mark.parametrize("text", [b"{}", b"not json", b'{"kind": "batch", "number": 1}'])

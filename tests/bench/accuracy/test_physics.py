@@ -13,6 +13,7 @@ from bench.accuracy import physics
 from tests.clips import panned_luma, write_clip
 from tests.oracles.analytic_scenes import PIXELS, START_SHARE, analytic_scenes, moved_photograph
 from tests.oracles.dense import bin_events, dense_events
+from tests.oracles.rendered import log_levels
 from tests.server.simulation import oracle
 from v2v_protocol.errors import UsageError
 
@@ -97,7 +98,7 @@ def test_errors_by_hand() -> None:
 def test_all_frames_of_a_film_give_the_events_of_all_frames() -> None:
     frames = np.rint(moved_photograph("coffee", 49, 40, 50, 0.3) * 255).astype(np.uint8)
     for threshold in (0.1, 0.5):
-        level = physics.log_intensity(frames / 255.0).reshape(49, -1)
+        level = log_levels(frames / 255.0).reshape(49, -1)
         true, events = physics.true_bins(level, 24, threshold)
         every = physics.errors(physics.v2v_steps(frames, threshold), true, events, 2)
         assert every["differing_bins_ppm"] <= physics.LARGEST_DIFFERENCE_PPM
@@ -109,13 +110,13 @@ def test_all_frames_of_a_film_give_the_events_of_all_frames() -> None:
 def test_signed_sums_of_few_frames_are_off_by_one_at_most() -> None:
     # Both sides have a residual below one threshold and have seen the same change: no frame rate can lose more.
     frames = np.rint(moved_photograph("camera", 97, 40, 50, 2.0) * 255).astype(np.uint8)
-    true, _ = physics.true_bins(physics.log_intensity(frames / 255.0).reshape(97, -1), 24, 0.1)
+    true, _ = physics.true_bins(log_levels(frames / 255.0).reshape(97, -1), 24, 0.1)
     few = physics.v2v_steps(frames[::24], 0.1)
     assert np.abs(np.cumsum(few, axis=0, dtype=np.int64) - np.cumsum(true, axis=0)).max() == 1
 
 
 def test_analytic_records_hold_their_bar() -> None:
-    records = physics.analytic()
+    records = list(physics.analytic())
     assert physics.missed(records) == []
     lamp = [r for r in records if r["scene"].startswith("lamp") and r["frame_rate_hz"] <= 200]
     assert all(r["count_error"] == -1.0 for r in lamp)
@@ -134,7 +135,7 @@ def test_bars_can_be_missed() -> None:
 def test_a_film_that_is_too_short_or_small_is_refused(tmp_path: Path) -> None:
     short = write_clip(tmp_path / "short.mp4", panned_luma(10))
     with pytest.raises(UsageError, match="10 frames; give more than 16"):
-        physics.filmed(short)
+        list(physics.filmed(short))
     small = write_clip(tmp_path / "small.mp4", panned_luma(20))
     with pytest.raises(UsageError, match="64x48 pixels; give at least 320x320"):
-        physics.filmed(small)
+        list(physics.filmed(small))

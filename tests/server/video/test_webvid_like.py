@@ -10,7 +10,6 @@ import pytest
 from bench.__main__ import main
 from bench.corpus import webvid_like
 from tests.clips import panned_luma, write_clip
-from v2v_protocol.errors import UsageError
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
 
@@ -37,8 +36,3 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert capsys.readouterr().out.count(".mp4") == 4
     assert main(["corpus", "--out", str(tmp_path / "out"), str(tmp_path / "missing.mp4")]) == 2
     assert "cannot be opened" in capsys.readouterr().err
-
-
-def test_nothing_to_make(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="0 sources"):
-        webvid_like([], tmp_path)
