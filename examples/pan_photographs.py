@@ -5,9 +5,9 @@
 A few dozen photographs give a network more scenes than a handful of films do. Motion is smooth and random, like that of
 a hand-held camera. A patch is an ellipse of another photograph with its own motion, so that edges occlude each other.
 PNG files with transparent parts are objects without background: they become patches of their own shape. Networks for
-real windows, which are short, need many frames a second and large plain areas:
+real windows, which are short, need many frames a second and large plain areas, most of them bright:
 
-    python examples/pan_photographs.py PHOTOGRAPHS OUT --frames 401 --rate 240 --plain 0.4
+    python examples/pan_photographs.py PHOTOGRAPHS OUT --frames 601 --rate 240 --plain 0.3 --walls 0.5
 """
 
 import argparse
@@ -54,6 +54,13 @@ def flat(picture: np.ndarray) -> np.ndarray:
     return cv2.resize(cv2.resize(picture, (2, 2), interpolation=cv2.INTER_AREA), picture.shape[1::-1])
 
 
+def wall(picture: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Return a picture as a bright wall: mean level 170 to 250, at most 0.8 of the contrast, a weak gradient."""
+    gradient = flat(picture).astype(np.float32)
+    light = random.uniform(170, 250) + random.uniform(0, 0.4) * (gradient - gradient.mean())
+    return np.rint((light + random.uniform(0, 0.8) * (picture - gradient)).clip(0, 255)).astype(np.uint8)
+
+
 def ellipse(photographs: list[np.ndarray], random: np.random.Generator) -> np.ndarray:
     """Return a patch (HEIGHT, WIDTH, 4) uint8: an ellipse of a photograph at a random place, transparent elsewhere."""
     picture = downscale(photographs[random.integers(len(photographs))], random)
@@ -76,18 +83,24 @@ def cut_out(objects: list[np.ndarray], random: np.random.Generator) -> np.ndarra
 
 
 def clip(
-    photographs: list[np.ndarray], objects: list[np.ndarray], random: np.random.Generator, count: int, plain: float
+    photographs: list[np.ndarray],
+    objects: list[np.ndarray],
+    random: np.random.Generator,
+    count: int,
+    plain: float,
+    walls: float = 0.0,
 ) -> np.ndarray:
-    """Return frames (count, HEIGHT, WIDTH, 3) uint8 of a background and up to three patches."""
+    """Return frames (count, HEIGHT, WIDTH, 3) uint8 of a background and up to six patches."""
     frames = np.zeros((count, HEIGHT, WIDTH, 3), np.uint8)
+    is_wall = walls > 0 and random.random() < walls
     is_plain = plain > 0 and random.random() < plain
     background = downscale(photographs[random.integers(len(photographs))], random)
-    background = flat(background) if is_plain else background
+    background = wall(background, random) if is_wall else flat(background) if is_plain else background
     start = np.eye(3)
     start[:2, 2] = -random.integers(0, np.maximum(np.array(background.shape[1::-1]) - (WIDTH, HEIGHT), 1))
     for t, step in enumerate(motion(random, pace(random), count)):
         frames[t] = cv2.warpPerspective(background, step @ start, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT_101)
-    for _ in range(random.integers(3, 7) if is_plain else random.integers(0, 4)):
+    for _ in range(random.integers(*((1, 5) if is_wall else (3, 7) if is_plain else (0, 4)))):
         patch = cut_out(objects, random) if objects and random.random() < 0.5 else ellipse(photographs, random)
         if plain > 0 and random.random() < plain:
             patch[..., :3] = flat(patch[..., :3])
@@ -97,7 +110,7 @@ def clip(
             moved, under = moved[y : y + height, x : x + width], frames[t, y : y + height, x : x + width]
             inside = moved[..., 3:] / np.float32(255)
             under[:] = np.rint(inside * moved[..., :3] + (1 - inside) * under)
-    return tone(random)[frames]
+    return frames if is_wall else tone(random)[frames]
 
 
 def pace(random: np.random.Generator) -> float:
@@ -132,6 +145,12 @@ def main() -> None:
     parser.add_argument(
         "--plain", type=float, default=0.0, help="share of backgrounds, and of patches, that are a smooth gradient"
     )
+    parser.add_argument(
+        "--walls",
+        type=float,
+        default=0.0,
+        help="share of backgrounds that are bright walls, in front of which most is dark",
+    )
     args = parser.parse_args()
     files = sorted(p for p in args.photographs.rglob("*") if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
     pictures = [picture for p in files if (picture := cv2.imread(str(p), cv2.IMREAD_UNCHANGED)) is not None]
@@ -143,7 +162,7 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     for index in range(args.clips):
         random = np.random.default_rng((args.seed, index))
-        frames = clip(photographs, objects, random, args.frames, args.plain)
+        frames = clip(photographs, objects, random, args.frames, args.plain, args.walls)
         write(args.out / f"pan_{index:04d}.mp4", frames, args.rate)
         print(f"\r{index + 1}/{args.clips}", end="", flush=True)
     print()

@@ -26,8 +26,8 @@ def test_motion_begins_at_rest_position_and_never_jumps():
     assert jumps.max() < 15
 
 
-def clip(photographs, objects, seed, count, plain=0.0):
-    return pan_photographs.clip(photographs, objects, np.random.default_rng(seed), count, plain)
+def clip(photographs, objects, seed, count, plain=0.0, walls=0.0):
+    return pan_photographs.clip(photographs, objects, np.random.default_rng(seed), count, plain, walls)
 
 
 def test_the_same_seed_gives_the_same_frames():
@@ -57,6 +57,18 @@ def test_a_plain_clip_has_plain_patches_before_a_smooth_gradient():
     shares = [np.mean(step > 8) for step in steps]
     assert shares[0] > 0.2
     assert 0 < shares[1] < shares[0]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_wall_is_bright_with_the_texture_of_its_photograph(seed):
+    rng = np.random.default_rng(seed)
+    stripes = np.resize(np.uint8([[[20]], [[120]]]), (600, 800, 3))
+    wall = pan_photographs.wall(stripes, rng)
+    assert 160 < wall.mean() <= 250
+    assert wall.std() <= 0.8 * stripes.std()
+    assert np.corrcoef(wall.ravel(), stripes.ravel())[0, 1] > 0.9
+    dark = clip([stripes // 8], [], seed, 1, walls=1.0)
+    assert np.quantile(dark, 0.95) > 150 > dark.min()
 
 
 def test_an_object_cut_out_moves_over_a_photograph():
