@@ -164,9 +164,11 @@ class Grants:
     # --- sharing ------------------------------------------------------------------------------------------------------
 
     def as_leased(self, request: Request, lease: int) -> Request:
-        """Return a request with the slot that its lease names: its own, or memory of the ring."""
-        slot = None if self._ring is None else self._ring.lent(lease)
-        return request if slot is None else replace(request, slot=slot)
+        """Return a request with the slot that its lease names.
+
+        That is its own, or with a ring memory of that; without such memory none, because the ring needs the arrays.
+        """
+        return request if self._ring is None else replace(request, slot=self._ring.lent(lease))
 
     def answer_shared(self, session: Session, want: Want) -> list[Action]:
         """Answer the new requests whose samples are in the ring, and let those that are being made follow."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
+import pytest
 from hypothesis import settings
 
 from tests.server.broker.test_interleaving import WithSlots, walk
@@ -15,6 +16,7 @@ from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.messages import Hello, Lease, SampleHeader, Want
 from v2v_protocol.sample import Form, array_layout
 from v2v_protocol.wire import encode
+from v2v_server.sharing.ring import SampleRing
 from v2v_server.worker.output_buffer import slot_arrays
 
 ARENA = f"17:9:12:{'0123456789abcdef' * 2}"
@@ -100,6 +102,37 @@ def test_a_worker_gets_memory_of_the_server_and_consumers_their_own_slot_back() 
         assert isinstance(answer, SampleHeader)
         assert (answer.arena, answer.slot, len(at.frames[identity][-1])) == (lease.arena, number, 1)
     assert at.dispatcher.counters.in_slots == 2
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_without_memory_of_the_server_shared_samples_are_messages(
+    packed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are never only in the arena of the consumer that came first."""
+    monkeypatch.setattr(SampleRing, "lend", lambda *_: None)
+    at = peers(share_bytes=1 << 20)
+    for identity in (b"c", b"d", b"e"):
+        at.consumer_says(identity, Hello({}, ("voxels",), 4, 0, packed=packed))
+    at.join()
+    at.want(0, identity=b"c", arena=ARENA, slots=[5])
+    at.want(0, identity=b"d", arena=ARENA, slots=[7])
+    lease = at.begin()
+    assert (lease.arena, lease.slot) == ("", NO_SLOT)
+    at.finish()
+    at.want(0, identity=b"e")
+    for identity, number in ((b"c", 5), (b"d", 7), (b"e", NO_SLOT)):
+        answer = at.heard[identity][-1]
+        assert isinstance(answer, SampleHeader)
+        assert (answer.arena, answer.slot, len(at.frames[identity][-1])) == ("", number, 2)
+
+
+def test_the_server_lends_no_memory_to_a_sample_that_is_packed() -> None:
+    at = peers(share_bytes=1 << 20)
+    at.consumer_says(b"c", Hello({}, ("voxels",), 4, 0, packed=True))
+    at.join()
+    at.want(0, identity=b"c", arena=ARENA, slots=[5])
+    lease = at.begin()
+    assert (lease.packed, lease.arena, lease.slot) == (True, "", NO_SLOT)
 
 
 class Sharing(WithSlots):
