@@ -58,7 +58,8 @@ def wall(picture: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Return a picture as a bright wall: mean level 170 to 250, at most 0.8 of the contrast, a weak gradient."""
     gradient = flat(picture).astype(np.float32)
     light = random.uniform(170, 250) + random.uniform(0, 0.4) * (gradient - gradient.mean())
-    return np.rint((light + random.uniform(0, 0.8) * (picture - gradient)).clip(0, 255)).astype(np.uint8)
+    bright = light + random.uniform(0, 0.8) * (picture - gradient)
+    return np.asarray(np.rint(bright.clip(0, 255)), np.uint8)
 
 
 def ellipse(photographs: list[np.ndarray], random: np.random.Generator) -> np.ndarray:

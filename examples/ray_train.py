@@ -37,17 +37,16 @@ def train_rank(settings: dict[str, Any]) -> None:
     torch.manual_seed(0)
     network = prepare_model(nn.Conv2d(BINS, 1, 5, padding=2))
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
-    epoch = step = 0
+    step = 0
     if checkpoint := train.get_checkpoint():
         with checkpoint.as_directory() as folder:
             state = torch.load(Path(folder, STATE), weights_only=True)
         network.load_state_dict(state["network"])
         optimizer.load_state_dict(state["optimizer"])
         dataset.load_state_dict(json.loads(state["stream"]))
-        epoch, step = state["epoch"], state["step"]
-    while epoch < settings["epochs"]:
+        step = state["step"]
+    while dataset.epoch < settings["epochs"]:
         for batch in dataset:
-            epoch = batch.epoch
             voxels, frames = batch["voxels"].flatten(0, 1).float(), batch["frames"].flatten(0, 1) / 255.0
             loss = nn.functional.l1_loss(network(voxels), frames)
             optimizer.zero_grad()
@@ -55,19 +54,18 @@ def train_rank(settings: dict[str, Any]) -> None:
             optimizer.step()
             step += 1
             if settings["seen"]:
-                note = {"epoch": epoch, "step": step, "indices": batch.indices, "process": os.getpid()}
+                note = {"epoch": batch.epoch, "step": step, "indices": batch.indices, "process": os.getpid()}
                 with Path(settings["seen"], f"{rank}.jsonl").open("a", encoding="utf-8") as file:
                     print(json.dumps(note), file=file)
             with tempfile.TemporaryDirectory() as folder:
                 if rank == 0:
                     state = {
-                        "network": network.state_dict(), "optimizer": optimizer.state_dict(), "epoch": epoch,
-                        "step": step, "stream": json.dumps(batch.resume_state),
+                        "network": network.state_dict(), "optimizer": optimizer.state_dict(), "step": step,
+                        "stream": json.dumps(batch.resume_state),
                     }  # fmt: skip
                     torch.save(state, Path(folder, STATE))
                 saved = train.Checkpoint.from_directory(folder) if rank == 0 else None
-                train.report({"loss": loss.item(), "epoch": epoch, "step": step}, checkpoint=saved)
-        epoch += 1
+                train.report({"loss": loss.item(), "epoch": batch.epoch, "step": step}, checkpoint=saved)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

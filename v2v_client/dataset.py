@@ -195,7 +195,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         require_arguments(cls.local, options)
         resolved = recipe if isinstance(recipe, Recipe) else StreamSpec.from_dict({"recipe": recipe}).recipe
         scene = StreamSpec.from_dict({key: options.get(key) for key in ("preset", "scene")}).scene
-        asked = [*recipe_flags(resolved), "--scene", scene, *flags]
+        asked = [*recipe_flags(resolved), *(() if scene == "off" else ("--scene", scene)), *flags]
         server = LocalServer(videos, workers=workers, flags=asked).__enter__()
         try:
             # V2V_KEYS may name a key for other servers.

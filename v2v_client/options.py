@@ -16,7 +16,7 @@ from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, SpecOptions, StreamSpec
 
 Labels = Literal["required", "optional"]
 # Fields left to the server may have any value, so an option that fits at least one of them is accepted here.
-_ANY = StreamSpec(samples_per_decode=MOST_SAMPLES_PER_DECODE)
+_ANY = StreamSpec(samples_per_decode=MOST_SAMPLES_PER_DECODE, scene="auto")
 _LONGEST = Recipe(voxels_per_clip=1_000_000, bins=1)
 
 

@@ -55,4 +55,4 @@ def recognise(path: Path) -> str:
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror or error}") from error
     forms = "; ".join(form.title for form in FORMS.values())
-    raise UsageError(f"{path} is not a known recording. Known forms: {forms}. Give the form with --form")
+    raise UsageError(f"{path} is not a known recording. Known forms: {forms}. v2v-convert takes one with --form")

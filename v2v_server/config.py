@@ -14,7 +14,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.safe_yaml import YamlError, parse_yaml, read_yaml
 from v2v_protocol.settings import bounds, check_settings, number, require_known, settings_of, switch, text, whole, word
-from v2v_protocol.spec import SPEC_KEYS, StreamSpec
+from v2v_protocol.spec import SPEC_KEYS, SPEED_PRESETS, StreamSpec
 from v2v_server.system.log import LOG_FORMATS
 from v2v_server.video.rows import Rows
 
@@ -189,13 +189,19 @@ class ServeConfig:
                 raise UsageError(f"--config {file}: {name} appears twice, with dashes and with underscores; keep one")
             values[name] = value
         require_known(values, SERVE_KEYS, f"key in --config {file}:")
+        for name in SPEED_PRESETS.get(flags.get("preset") or "", ()):
+            values.pop(name, None)  # a flag wins: the file's fields that the preset sets do not count
         values |= {name: value for name, value in flags.items() if value is not None}
+        recipe = values.get("recipe")
+        if isinstance(recipe, str) and recipe.endswith(_RECIPE_FILES):
+            values["recipe"] = read_yaml_mapping("recipe:", recipe)
         if settings:
             values["recipe"] = recipe_setting(None, settings, values.get("recipe"))
         asked = {name: values.pop(name) for name in SPEC_KEYS if name in values}
         return cls(**values, spec=StreamSpec.from_dict(asked))
 
 
+_RECIPE_FILES = (".yaml", ".yml")
 SERVE_KEYS = (*settings_of(ServeConfig), *SPEC_KEYS)
 """Keys of a YAML file for ``v2v-serve --config``."""
 
@@ -218,7 +224,7 @@ def recipe_setting(recipe: str | None, settings: Sequence[str], configured: Any 
         return None
     fields: dict[str, Any] = {}
     if recipe is not None:
-        is_file = recipe.endswith((".yaml", ".yml"))
+        is_file = recipe.endswith(_RECIPE_FILES)
         fields = read_yaml_mapping("--recipe", recipe) if is_file else {"preset": recipe}
     elif configured is not None:
         fields = dict(configured) if isinstance(configured, Mapping) else {"preset": configured}

@@ -235,6 +235,9 @@ def test_options_that_depend_on_the_servers_spec_are_checked_by_the_server():
     """The server's own spec may have clips of 80 voxels, and four samples per decode."""
     for recipe in (None, {"bins": 3}):
         V2VStreamDataset("tcp://127.0.0.1:1", recipe=recipe, flow_from=60, sibling_spacing=48)
+    V2VStreamDataset("tcp://127.0.0.1:1", moving_share=0.5, quiet_share=0.5)  # with scene auto
+    with pytest.raises(UsageError, match="moving_share"):
+        V2VStreamDataset("tcp://127.0.0.1:1", moving_share=0.5, scene="off")
 
 
 def test_a_malformed_address_says_what_to_give():

@@ -18,7 +18,7 @@ from tests.clips import panned_luma, write_clip
 from tests.leftovers import abandoned_memory, shared_memory
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.spec import SpecOptions
 from v2v_server.keys.folder import KeyFolder
 
@@ -105,6 +105,23 @@ def test_a_key_for_other_servers_is_not_used(
         servers.update(started)
         assert next(iter(dataset)).voxels is not None
     assert not any(process.is_running() for process in started if "v2v_server" in " ".join(command(process)))
+
+
+@pytest.mark.parametrize(("options", "told"), [({}, ()), ({"preset": "natural"}, ("--scene", "auto"))])
+def test_scenes_are_the_servers_choice_unless_an_option_names_them(
+    monkeypatch: pytest.MonkeyPatch, options: dict[str, str], told: tuple[str, ...]
+) -> None:
+    started: list[list[str]] = []
+
+    def local(_: object, *, workers: int, flags: list[str]) -> None:
+        started.append(flags)
+        raise ServerLost(f"{workers} workers are not started")
+
+    monkeypatch.setattr("v2v_client.dataset.LocalServer", local)
+    with pytest.raises(ServerLost):
+        V2VStreamDataset.local("clips", recipe=RECIPE, flags=["--preset", "natural"], **options)
+    assert started[0][-2 - len(told) :] == [*told, "--preset", "natural"]
+    assert ("--scene" in started[0]) == bool(told)
 
 
 def test_an_error_is_the_servers_own_message(tmp_path: Path, servers: set[psutil.Process]) -> None:

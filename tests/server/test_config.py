@@ -43,6 +43,19 @@ def test_a_flag_wins_over_the_file_and_the_file_over_the_default(tmp_path: Path)
     assert config.max_credit_bytes == ServeConfig(videos="a").max_credit_bytes
 
 
+def test_a_preset_as_flag_wins_over_what_the_file_says_of_its_fields(tmp_path: Path) -> None:
+    text = "videos: a\nsamples_per_decode: 1\nmax_sequences_per_video: 3\n"
+    spec = load(tmp_path, text, preset="fast").spec
+    assert (spec.samples_per_decode, spec.max_sequences_per_video) == (4, 3)
+    assert load(tmp_path, text, preset="fast", samples_per_decode=2).spec.samples_per_decode == 2
+
+
+def test_the_recipe_of_the_file_may_be_a_file(tmp_path: Path) -> None:
+    (tmp_path / "camera.yaml").write_text("preset: paper\nbins: 3\n")
+    assert load(tmp_path, f"videos: a\nrecipe: {tmp_path}/camera.yaml\n").spec.recipe == Recipe(bins=3)
+    assert load(tmp_path, "videos: a\nrecipe: clean\n").spec.recipe == preset("clean")
+
+
 def test_the_spec_is_made_of_the_spec_settings(tmp_path: Path) -> None:
     text = """
 videos: a

@@ -28,7 +28,7 @@ from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
 from v2v_protocol.safe_yaml import YamlError, parse_yaml
 from v2v_protocol.sample import DEFAULT_ARRAYS
-from v2v_protocol.spec import SPEED_PRESETS
+from v2v_protocol.spec import SPEED_PRESETS, StreamSpec
 
 _RSS_EVERY_SECONDS = 0.5
 _LEAST_WIDTH = 110
@@ -309,7 +309,8 @@ def _dataset(arguments: argparse.Namespace, address: str) -> V2VStreamDataset:
 
 def _server_flags(arguments: argparse.Namespace) -> list[str]:
     # The server checks with its own recipe which videos are long enough, so it gets the stream's.
-    settings = {"--rows": arguments.rows, "--recipe": arguments.recipe}
+    scene = StreamSpec.from_dict({"preset": arguments.preset}).scene
+    settings = {"--rows": arguments.rows, "--recipe": arguments.recipe, "--scene": "" if scene == "off" else scene}
     flags = [part for flag, value in settings.items() if value for part in (flag, value)]
     return [*flags, *(part for change in arguments.changes for part in ("--set", change))]
 

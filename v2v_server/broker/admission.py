@@ -16,7 +16,7 @@ from v2v_server.broker.worker_registry import clean_name
 from v2v_server.corpus.videos import CorpusFacts
 from v2v_server.quarantine.snapshots import Quarantine
 from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.sequences import Columns, SequenceTable
+from v2v_server.schedule.sequences import MOST_CLIP_BYTES, Columns, SequenceTable
 
 MOST_BATCH_SIZE = 65_536
 MOST_CREDIT = 400
@@ -85,7 +85,7 @@ class Admission:
         spec = StreamSpec.from_dict(hello.spec, self._default_spec)
         spec = spec.spaced(hello.stride or hello.batch_size)
         layout = array_layout(spec.recipe, spec.voxel_dtype, hello.arrays)
-        self._check_sizes(layout)
+        self._check_sizes(spec, layout)
         self._facts.require_arrays(hello.arrays)
         newest = self._quarantine.latest
         quarantine = newest if hello.quarantine is None else hello.quarantine
@@ -131,7 +131,7 @@ class Admission:
             sidecars=self._facts.sidecars_digest(hello.arrays),
         )
 
-    def _check_sizes(self, layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:
+    def _check_sizes(self, spec: StreamSpec, layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:
         remedy = "ask for fewer voxels_per_clip or a smaller crop"
         for name, (dtype, shape) in layout.items():
             size = layout_bytes({name: (dtype, shape)})
@@ -140,6 +140,13 @@ class Admission:
                     f"array {name} {dtype}{list(shape)} of one sample is {size} bytes; the limit is "
                     f"{LARGEST_ARRAY_BYTES}: {remedy}"
                 )
+        recipe = spec.recipe
+        view = recipe.frames_needed * recipe.crop_height_px * recipe.crop_width_px
+        if view > MOST_CLIP_BYTES and not recipe.is_timed:
+            raise UsageError(
+                f"the {recipe.frames_needed} frames of {recipe.crop_width_px}x{recipe.crop_height_px} px of one sample "
+                f"are {view >> 20} MiB; the limit is {MOST_CLIP_BYTES >> 20} MiB: {remedy}"
+            )
         if layout_bytes(layout) > self._max_credit_bytes:
             raise UsageError(
                 f"one sample is {layout_bytes(layout)} bytes; the server's --max-credit-bytes is "

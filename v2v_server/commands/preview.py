@@ -28,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cameras = parser.group("Virtual cameras")
     cameras.add_argument("--recipe", metavar="NAME", help="preset or YAML file of recipe fields (default paper)")
     cameras.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field")
-    cameras.add_argument("--seeds", type=int, default=4, metavar="N", help="virtual cameras to draw (default 4)")
+    cameras.add_argument("--seeds", type=int, metavar="N", help="virtual cameras to draw (default 4)")
     cameras.add_argument(
         "--seed", type=int, metavar="S",
         help="seed of the first camera; the others have the next seeds (default: seeds whose crops show motion)",
@@ -51,18 +51,21 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    for flag, value in (("--seeds", arguments.seeds), ("--moments", arguments.moments)):
+    count = 4 if arguments.seeds is None else arguments.seeds
+    for flag, value in (("--seeds", count), ("--moments", arguments.moments)):
         if not 1 <= value <= _MOST_CAMERAS:
             raise UsageError(f"{flag} {value}: give 1 to {_MOST_CAMERAS}")
     first = arguments.seed or 0
     if arguments.compare:
         if arguments.recipe is not None:
             raise UsageError("--compare names the recipes: leave --recipe out")
+        if arguments.seeds is not None:
+            raise UsageError("--compare shows each recipe with one seed: leave --seeds out")
         looks = [Shot(Path(name).stem, recipe_setting(name, arguments.set), first) for name in arguments.compare]
         what = "the same clip under " + ", ".join(look.title for look in looks)
     else:
         recipe = recipe_setting(arguments.recipe or "paper", arguments.set)
-        looks = [Shot("", recipe, seed) for seed in range(first, first + arguments.seeds)]
+        looks = [Shot("", recipe, seed) for seed in range(first, first + count)]
         what = f'virtual cameras drawn from the recipe "{Path(arguments.recipe or "paper").stem}"'
     if arguments.seed is None:
         what += ", chosen where something moves"

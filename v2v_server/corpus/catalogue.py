@@ -197,7 +197,8 @@ class Catalogue:
     @property
     def facts(self) -> CorpusFacts:
         """What is known in memory: all that a server's dispatcher needs."""
-        has_colour = self.prepared is None or has_chroma(self.source, self.videos.ids)
+        ids = self.videos.ids if not self._absent else [id for id in self.videos.ids if id not in self._absent]
+        has_colour = self.prepared is None or has_chroma(self.source, ids)
         return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars, has_colour)
 
     def part(self) -> CorpusPart:

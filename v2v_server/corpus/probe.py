@@ -43,6 +43,8 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
         with source.open_local(id, "") as path:
             mark = fingerprint(path)
             facts = _facts(path)
+        name = f"{mark}-{facts.content}" if facts.content else mark
+        source.keep_as(id, mark, name)
         if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
     except OSError as error:
@@ -57,7 +59,7 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
     return IndexRow(
         id,
         *before,
-        fingerprint=f"{mark}-{facts.content}" if facts.content else mark,
+        fingerprint=name,
         frames=facts.frames,
         width_px=facts.width_px,
         height_px=facts.height_px,

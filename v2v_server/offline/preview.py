@@ -113,6 +113,13 @@ def preview(
         whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
     finally:
         catalogue.close()
+    sizes = {(*camera.voxels.shape[:2], len(camera.frames)): camera.title or "it" for camera in cameras}
+    if len(sizes) > 1:
+        found = ", ".join(
+            f"{title} has {grids} voxel grids of {bins} bins and {frames} frames"
+            for (grids, bins, frames), title in sizes.items()
+        )
+        raise UsageError(f"{found}: compare recipes of equal voxels_per_clip, bins and grids_per_frame (see --set)")
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
     say(describe_loss(loss))

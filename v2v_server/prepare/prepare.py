@@ -19,6 +19,7 @@ from base64 import b64encode
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
@@ -264,11 +265,17 @@ def _outcomes(
         except UsageError as error:
             yield video, _record(video, 0, 0, str(error), encoding)
 
+    changed: list[tuple[_ToPrepare, str]] = []
+
     def transcodings() -> Iterator[tuple[_ToPrepare, Transcoding]]:
         for job in jobs:
             id = job.video.id
             keeps_scene = job.standing is not None and job.standing.scene != ""
-            index = catalogue.frame_index(id).to_bytes()
+            try:
+                index = catalogue.frame_index(id).to_bytes()
+            except VideoError as error:
+                changed.append((job, error.reason))
+                continue
             yield job, Transcoding(
                 id, catalogue.path(id), job.video.fingerprint, job.video.codec, index, job.video.frames_per_second,
                 job.window, encoding, target, target / id, scene or keeps_scene, planes,
@@ -281,7 +288,8 @@ def _outcomes(
         lambda job: _deadline_seconds(job[0]),
         writable=(target, *compile_cache()),
     )
-    for (job, _), result in isolated:
+    found: Iterator[tuple[_ToPrepare, Made | Scene | str | Died]] = ((job, result) for (job, _), result in isolated)
+    for job, result in chain(found, changed):
         if isinstance(result, Died):
             if result.overdue_seconds:
                 result = f"hangs the transcoder: {result.how}"

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -73,8 +74,17 @@ def arguments(address: str, root: str, name: str, flags: Sequence[str], logbook:
     ]
 
 
-def post_mortem(returncode: int, *, short_of_memory: bool) -> Loss:
-    """Return the cause of a worker's unexpected end."""
+def post_mortem(returncode: int, logbook: Logbook | None, *, short_of_memory: bool) -> Loss:
+    """Return the cause of a worker's unexpected end, and what it worked on.
+
+    Only the death of a worker that decoded speaks against the video; otherwise the spec may be to blame.
+    """
+    at = None if logbook is None else logbook.lease()
+    decoded = at is None or logbook is None or logbook.decodes()
+    return replace(_cause(returncode, short_of_memory=short_of_memory), lease=at, for_all=decoded)
+
+
+def _cause(returncode: int, *, short_of_memory: bool) -> Loss:
     if returncode >= 0:
         # An unhandled exception or a broken installation. The trace is on stderr; the cause is not known.
         return Loss(Cause.UNEXPLAINED, f"exited with status {returncode}")

@@ -12,7 +12,6 @@ import os
 import subprocess
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 
 from v2v_protocol.keys import PeerKey
 from v2v_server.broker.blame import Cause, Loss
@@ -143,10 +142,9 @@ class LocalPlace:
         if returncode is None:
             return None
         # The kernel counts a kill before its victim is gone, so it is included.
-        loss = post_mortem(returncode, short_of_memory=self._host.is_short_of_memory())
-        lease = None if self.logbook is None else self.logbook.lease()
+        loss = post_mortem(returncode, self.logbook, short_of_memory=self._host.is_short_of_memory())
         self._forget()
-        return Exit(replace(loss, lease=lease), returncode)
+        return Exit(loss, returncode)
 
     def status(self, now: float) -> ProcessStatus | None:
         """Observe the worker's process; None without one."""

@@ -10,7 +10,7 @@ import socket
 import subprocess
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import ray
 
@@ -73,8 +73,8 @@ class RayWorker:
         returncode = process.wait()
         with self._lock:
             short = out_of_memory_kills() > self._memory_kills
-            loss = post_mortem(returncode, short_of_memory=short)
-            loss = Loss(loss.cause, f"{loss.text} on {node()}", logbook.lease())
+            loss = post_mortem(returncode, logbook, short_of_memory=short)
+            loss = replace(loss, text=f"{loss.text} on {node()}")
             logbook.close()
             if self._child is not None and self._child[1] is process:
                 self._child = None

@@ -14,7 +14,7 @@ from av.video.frame import VideoFrame
 from v2v_protocol.errors import VideoError
 from v2v_server.video.colour.chroma import Chroma, ChromaCut, ChromaStack
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import MIXED, SDR, TRANSFERS, LumaFormat, Signal, copy_luma, luma_plane, stretch
+from v2v_server.video.luma import MIXED, SDR, TRANSFERS, BeyondBits, LumaFormat, Signal, copy_luma, luma_plane, stretch
 from v2v_server.video.orientation import Orientation, Window
 
 
@@ -129,8 +129,11 @@ class Stack:
             return False
         if self._damaged:
             self.refuse("is damaged, or refers to a damaged or lost frame")
-        self._copy(frame)
-        self._collect_colour(frame)
+        try:
+            self._copy(frame)
+            self._collect_colour(frame)
+        except BeyondBits as error:
+            self.refuse(str(error))
         self.taken += 1
         return self.taken == len(self._expected)
 

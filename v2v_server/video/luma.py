@@ -141,6 +141,10 @@ def range_table(bits: int, full_range: bool, kept: Signal = SDR) -> npt.NDArray[
     return table
 
 
+class BeyondBits(ValueError):
+    """A picture has a sample that its pixel format cannot hold."""
+
+
 def luma_plane(frame: VideoFrame, luma: LumaFormat) -> npt.NDArray[np.unsignedinteger]:
     """Return the samples of a frame's luma, [H, W] uint8 or uint16 as stored: the decoder's memory, read-only."""
     if not luma.has_plane:
@@ -162,13 +166,20 @@ def copy_luma(
 
     8-bit samples are copied as they are (:func:`stretch` maps a whole stack at once); deeper ones are mapped to the
     grey levels of ``kept``.
+
+    Raises:
+        BeyondBits: a sample is larger than its bits can hold.
     """
     top, left, height, width = window
     view = samples[top : top + height, left : left + width]
     if luma.bits == 8:
         out[...] = view
     else:
-        np.take(range_table(luma.bits, luma.full_range, kept), view, out=out)
+        table = range_table(luma.bits, luma.full_range, kept)
+        try:
+            np.take(table, view, out=out)
+        except IndexError as error:  # raw video may hold any number
+            raise BeyondBits(f"has a sample of {view.max()}, beyond its {luma.bits} bits") from error
 
 
 def stretch(frames: npt.NDArray[Any], luma: LumaFormat) -> None:

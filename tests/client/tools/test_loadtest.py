@@ -119,6 +119,8 @@ def test_a_local_server_gets_the_requested_recipe(server, monkeypatch):
     # With its own, the paper's 201 frames, it would refuse clips that are long enough for this.
     assert loadtest.main([*flags, "--recipe", "clean", "--set", "bins=3", "--set", "gamma=2"]) == 0
     assert started == [("clips", 3, ["--rows", "top:0.5", "--recipe", "clean", "--set", "bins=3", "--set", "gamma=2"])]
+    loadtest.main([*flags, "--preset", "natural"])
+    assert started[1] == ("clips", 3, ["--rows", "top:0.5", "--scene", "auto"])
 
 
 def test_no_server_is_status_2(capsys):

@@ -123,6 +123,7 @@ def test_the_command_compares_recipes_on_one_clip(
         (["--out", "p.png", "--moments", "99"], "--moments 99: give 1 to 32"),
         (["--out", "nowhere/p.png"], "--out nowhere/p.png: there is no folder nowhere"),
         (["--out", "p.png", "--recipe", "paper", "--compare", "paper"], "leave --recipe out"),
+        (["--out", "p.png", "--seeds", "2", "--compare", "paper"], "leave --seeds out"),
         (["--out", "p.png", "--recipe", "papr"], "paper"),
     ],
 )
@@ -138,6 +139,13 @@ def test_what_is_wrong_is_one_line_and_leaves_no_file(
     assert command.main([str(clip), *flags]) == 2
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_recipes_of_other_sizes_are_not_compared(clip: Path, tmp_path: Path) -> None:
+    shots = [Shot(str(bins), {**TINY, "preset": "paper", "bins": bins}, 0) for bins in (2, 3)]
+    with pytest.raises(UsageError, match=r"2 has \d+ voxel grids of 2 bins .*, 3 has .*: compare recipes of equal"):
+        preview(str(clip), tmp_path / "p.png", shots, {}, title="t", with_flow=False, cache_dir=str(tmp_path / "cache"))
+    assert not (tmp_path / "p.png").exists()
 
 
 def test_the_error_of_the_library_is_typed(clip: Path, tmp_path: Path) -> None:

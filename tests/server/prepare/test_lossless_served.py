@@ -110,11 +110,13 @@ def test_the_scenes_in_the_manifest_are_those_of_the_source(pair: tuple[Path, Pa
 
 
 def test_a_store_of_whole_pictures_takes_any_rows(pair: tuple[Path, Path], tmp_path: Path) -> None:
-    run(pair[0], tmp_path / "store", LOSSLESS)
+    """The scenes in its manifest are those of whole pictures: of other rows they are found again."""
+    run(pair[0], tmp_path / "store", LOSSLESS, scene=True)
     for rows in ("full", "top:0.5", "0.2:0.8"):
-        opened = [open_catalogue(at, rows=Rows.parse(rows), cache_dir=tmp_path, processes=0)
+        opened = [open_catalogue(at, rows=Rows.parse(rows), cache_dir=tmp_path, processes=0, scene=True)
                   for at in (pair[0], tmp_path / "store")]  # fmt: skip
         assert opened[0].digest == opened[1].digest
+        assert opened[0].scene_digest == opened[1].scene_digest
         for catalogue in opened:
             catalogue.close()
     with pytest.raises(CorpusError, match=r"rows top:0.5 asked for, but this prepared folder holds rows top:0.9"):

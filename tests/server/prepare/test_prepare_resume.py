@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +23,9 @@ from tests.server.prepare.test_prepare_isolate import children
 from tests.waiting import until
 from v2v_protocol.errors import CorpusError, VideoError
 from v2v_server.commands.prepare import main, summary
+from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.manifest import MANIFEST_NAME, read_manifest
+from v2v_server.prepare.prepare import prepare
 from v2v_server.prepare.resume import refuse_overlap
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX, Transcoding
 from v2v_server.store.encoding import Encoding
@@ -274,6 +277,15 @@ def test_only_what_changed_is_done_again(source: Path, tmp_path: Path) -> None:
     assert [video.id for video in report.prepared] == ["0.mp4", "1.mp4", "2.mp4", "new.mp4", "sub/4.mp4"]
     assert inodes(out)["sub/4.mp4"] == before["sub/4.mp4"]
     assert [video.frames for video in opened(out).videos] == [18, 24, 24, 20, 30]  # and 3.mp4 is none of it
+
+
+def test_a_video_that_changes_after_the_start_fails_alone(source: Path, tmp_path: Path) -> None:
+    with closing(open_catalogue(source, cache_dir=tmp_path / "cache", processes=0)) as catalogue:
+        (source / "0.mp4").unlink()
+        open_catalogue(source, cache_dir=tmp_path / "cache", processes=0).close()  # as another command does meanwhile
+        report = prepare(catalogue, tmp_path / "out", H264, processes=0)
+    assert [(video.id, "has changed" in str(video.problem)) for video in report.failed] == [("0.mp4", True)]
+    assert len(report.prepared) == 4
 
 
 def test_a_failed_one_is_tried_again(source: Path, tmp_path: Path) -> None:

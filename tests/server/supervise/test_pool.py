@@ -474,6 +474,15 @@ def test_stop_after_a_crash_leaves_no_zombie_and_may_come_twice(start: Callable[
     assert all(is_gone(pid) for pid in pids)
 
 
+@pytest.mark.parametrize("decodes", [True, False])
+def test_only_a_death_while_decoding_speaks_against_the_video(decodes: bool) -> None:
+    logbook = Logbook()
+    note(logbook.descriptor, 7, decodes=decodes)
+    loss = child_module.post_mortem(-signal.SIGSEGV, logbook, short_of_memory=False)
+    assert loss == Loss(Cause.CRASHED, "was ended by SIGSEGV", 7, for_all=decodes)
+    logbook.close()
+
+
 def test_the_programs_of_real_workers() -> None:
     logbook = Logbook()
     arguments = child_module.arguments("tcp://127.0.0.1:5556", "/a folder", "w-0.1", ["--debug"], logbook)

@@ -17,6 +17,9 @@ from v2v_server.corpus.probe import probe_files
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.video import probe as probing
 from v2v_server.video import source
+from v2v_server.video.collect import Cut
+from v2v_server.video.colour.chroma import ChromaCut
+from v2v_server.video.decode import decode_cuts
 from v2v_server.video.probe import probe
 from v2v_server.video.source import CODECS, FORMATS
 
@@ -142,6 +145,21 @@ def test_a_list_of_frames_that_never_ends_is_given_up(tmp_path: Path, monkeypatc
     monkeypatch.setattr(probing, "LONGEST_CPU_SECONDS", -1.0)
     with pytest.raises(VideoError, match="of processor time to list its frames"):
         probe(clip)
+
+
+@pytest.mark.parametrize(("plane", "colour"), [(0, ""), (1, "colour ")])
+def test_a_raw_sample_beyond_its_bits_is_a_damaged_frame(tmp_path: Path, plane: int, colour: str) -> None:
+    """FFmpeg passes on the numbers of a raw video as they are."""
+    header = b"YUV4MPEG2 W32 H32 F25:1 Ip A1:1 C420p10 XYSCSS=420P10\n"
+    frames = np.full((24, 32 * 32 * 3 // 2), 512, "<u2")
+    frames[20, (0, 32 * 32)[plane] + 77] = 5000
+    path = tmp_path / "raw.y4m"
+    path.write_bytes(header + b"".join(b"FRAME\n" + frame.tobytes() for frame in frames))
+    facts = probe(path)
+    wanted = Cut(24, chroma=ChromaCut(tuple(range(24)), (0, 0, 32, 32), (0, 32)))
+    with pytest.raises(VideoError, match=f"at frame 20: has a {colour}sample of 5000, beyond its 10 bits"):
+        decode_cuts(path, facts.index, 0, [wanted])
+    assert len(decode_cuts(path, facts.index, 0, [Cut(20)])[0].frames) == 20
 
 
 def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:

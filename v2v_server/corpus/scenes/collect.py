@@ -54,9 +54,19 @@ class SceneCollection:
     @property
     def kind(self) -> FigureKind:
         """Distinguish analyses of one file."""
-        is_source = self.manifest is None or self.manifest.lossless
-        made = "" if self.manifest is None or is_source else f"prepared {self.manifest.header.rows}, "
+        made = ""
+        if self.manifest is not None and not self.manifest.lossless:
+            made = f"prepared {self.manifest.header.rows}, "
+        elif self.manifest is not None and not self._is_stated:
+            made = "part of prepared, "
         return FigureKind("scene", f"{made}{self.rows}{_ENDING}")
+
+    @property
+    def _is_stated(self) -> bool:
+        """Whether the manifest's scenes are of the rows of the corpus."""
+        return self.manifest is not None and (
+            not self.manifest.lossless or Rows.parse(self.manifest.header.rows) == self.rows
+        )
 
     def collect(
         self,
@@ -161,7 +171,9 @@ class SceneCollection:
 
     def _prepared(self, record: IndexRow) -> bytes | None:
         """Return the encoded scene that the manifest states."""
-        if self.manifest is None or not self.manifest.videos[record.id].scene or not self.manifest.describes(record):
+        if self.manifest is None or not self._is_stated or not self.manifest.videos[record.id].scene:
+            return None
+        if not self.manifest.describes(record):
             return None
         return b64decode(self.manifest.videos[record.id].scene)
 

@@ -220,14 +220,21 @@ class Copies(VideoSource):
         with held:
             yield Path(held.name)
 
+    def keep_as(self, id: str, found: str, fingerprint: str) -> None:
+        """See :meth:`VideoSource.keep_as`."""
+        kept = self._path(id, fingerprint)
+        with contextlib.suppress(OSError):  # evicted just now: it is fetched again
+            kept.parent.mkdir(exist_ok=True)
+            self._path(id, found).replace(kept)
+
     def release(self) -> None:
         """Allow eviction of the copies that :meth:`has` or :meth:`fetch` keeps."""
         _close(self._at_hand)
         self._at_hand = {}
 
     def _path(self, id: str, fingerprint: str) -> Path:
-        mark = "-".join(fingerprint.split("-")[:2])  # what a file's head and tail tell
-        key = hashlib.sha256(repr((self.bucket.url, id, mark)).encode()).hexdigest()[:32]
+        # All of the fingerprint: the copy of an object that changed in the middle only has another name.
+        key = hashlib.sha256(repr((self.bucket.url, id, fingerprint)).encode()).hexdigest()[:32]
         return self.copies / key[:2] / f"{key}{PurePosixPath(id).suffix}"
 
     def _hold(self, path: Path) -> IO[bytes] | None:
@@ -283,7 +290,7 @@ class Copies(VideoSource):
             if fingerprint and not is_same_file(found, fingerprint):
                 why = f"changed in {self} since it was catalogued: {found} instead of {fingerprint}"
                 raise VideoChanged(id, None, why)
-            path = self._path(id, found)
+            path = self._path(id, fingerprint or found)
             with slot.open("rb") as file:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # the lock outlives renaming: no eviction in between
                 self._place(id, slot, path)

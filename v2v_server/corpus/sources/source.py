@@ -160,6 +160,14 @@ class VideoSource(ABC):
                 reading it reports the same errors.
         """
 
+    def keep_as(self, id: str, found: str, fingerprint: str) -> None:  # noqa: B027 - a local source has no copies
+        """Keep the copy of a video that was just probed for those who ask for it by its fingerprint.
+
+        Args:
+            found: fingerprint of its file.
+            fingerprint: that with what probing found.
+        """
+
     @abstractmethod
     def verify(self, id: str, fingerprint: str, state: State | None) -> None:
         """Check that a video or sidecar is as catalogued. A remote source that gives no answer now raises no error.

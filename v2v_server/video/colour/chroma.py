@@ -22,7 +22,7 @@ import numpy.typing as npt
 from av.video.frame import VideoFrame
 from av.video.reformatter import ColorRange, Colorspace
 
-from v2v_server.video.luma import LumaFormat
+from v2v_server.video.luma import BeyondBits, LumaFormat
 from v2v_server.video.orientation import Orientation, Window
 
 CELL_PX = 2
@@ -122,7 +122,12 @@ class ChromaStack:
         cells = np.zeros(self._cells.shape[1:], np.int8)
         for plane, (samples, down, across) in enumerate(planes):
             rows, columns = self._stored[0] // down, self._stored[1] // across
-            values = table[samples[rows][:, columns]]
+            stored = samples[rows][:, columns]
+            if stored.max(initial=0) >= len(table):
+                raise BeyondBits(
+                    f"has a colour sample of {stored.max()}, beyond its {len(table).bit_length() - 1} bits"
+                )
+            values = table[stored]
             cells[plane] = values.T if self._transpose else values
         return cells, matrix
 

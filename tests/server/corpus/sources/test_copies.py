@@ -102,10 +102,33 @@ def test_a_video_is_fetched_once(store: Path) -> None:
         assert path.read_bytes() == (store / "a.mp4").read_bytes()
         assert path.suffix == ".mp4"
     (store / "a.mp4").unlink()
-    assert made.has({"a.mp4": mark})
-    with made.open_local("a.mp4", mark) as path:
+    assert made.has({"a.mp4": f"{mark}-content"})
+    with made.open_local("a.mp4", f"{mark}-content") as path:
         assert path.stat().st_size == SIZE
     assert [each.name for each in (made.copies / PARTIAL).iterdir() if each.suffix != ".lock"] == []
+
+
+def test_an_object_that_changed_in_the_middle_only_is_fetched_again(store: Path) -> None:
+    """Another host knows it by the fingerprint alone, and must not make samples of its old copy."""
+    content = bytes(100_000) + b"old" + bytes(100_000)
+    (store / "a.mp4").write_bytes(content)
+    made, mark = copies(store, 10 * len(content)), fingerprint(store / "a.mp4")
+    made.fetch({"a.mp4": f"{mark}-old"})
+    (store / "a.mp4").write_bytes(content.replace(b"old", b"new"))
+    assert fingerprint(store / "a.mp4") == mark
+    with made.open_local("a.mp4", f"{mark}-new") as path:
+        assert b"new" in path.read_bytes()
+    assert made.has({"a.mp4": f"{mark}-new"})
+
+
+def test_what_was_fetched_to_be_probed_is_not_fetched_again(store: Path) -> None:
+    made, mark = copies(store), fingerprint(store / "a.mp4")
+    with made.open_local("a.mp4", ""):
+        pass
+    made.keep_as("a.mp4", mark, f"{mark}-content")
+    (store / "a.mp4").unlink()
+    assert made.has({"a.mp4": f"{mark}-content"})
+    made.keep_as("b.mp4", "absent", "absent-content")
 
 
 def test_a_slot_that_another_process_keeps_is_not_waited_for(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
