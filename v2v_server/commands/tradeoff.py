@@ -86,6 +86,8 @@ def _check(asked: argparse.Namespace) -> None:
     wishes = [wish for wish in (asked.target_rate, asked.max_error) if wish is not None]
     if asked.preset_out is not None and not wishes:
         raise UsageError("--preset-out without a wish: give --target-rate or --max-error too")
+    if asked.preset_out is not None and not asked.preset_out.parent.is_dir():
+        raise UsageError(f"--preset-out {asked.preset_out}: there is no folder {asked.preset_out.parent}")
     if not 0 < asked.budget_minutes < math.inf:
         raise UsageError(f"--budget-minutes {asked.budget_minutes:g}: give a finite number above 0")
     for flag, value in (("--places", asked.places), ("--clips", asked.clips)):

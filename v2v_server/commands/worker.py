@@ -13,6 +13,7 @@ from v2v_protocol.errors import UsageError, V2VError
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_source
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.packing import QUICK, RAW
+from v2v_server.store.quota import MOST_GIB
 from v2v_server.system.log import LOG_FORMATS, Log, report_errors
 from v2v_server.system.process import die_with_parent
 from v2v_server.system.start_times import StartTimes
@@ -87,8 +88,8 @@ def _work(times: StartTimes, arguments: argparse.Namespace) -> None:
     source.make()
     cache = None
     if arguments.cache is not None:
-        if not arguments.cache_gib >= 0:
-            raise UsageError(f"--cache-gib {arguments.cache_gib:g}: give 0 or more")
+        if not 0 <= arguments.cache_gib <= MOST_GIB:
+            raise UsageError(f"--cache-gib {arguments.cache_gib:g}: give 0 to {MOST_GIB:g}")
         folder = Path(arguments.cache)
         if arguments.logbook_fd is None:  # a server has already made the name of its own workers unique
             make_cache(folder)

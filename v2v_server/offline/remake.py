@@ -240,6 +240,8 @@ def simulate_to_file(
             print(f"{len(made)} events written to {events}")
     except OSError as error:
         raise UsageError(f"{error.filename or out}: {error.strerror}") from error
+    for name, why in sample.provenance.unlabelled.items():
+        print(f"no {name}: {why}")
     params = sample.provenance.params
     print(
         f"{sample.provenance.video} from frame {sample.provenance.start_frame}: "

@@ -32,7 +32,9 @@ from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.report import Report
 from v2v_server.prepare.resume import has_failed, known_records, locked, refuse_overlap, standing_files
 from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode
+from v2v_server.store.chroma import CHROMA
 from v2v_server.store.encoding import Encoding
+from v2v_server.store.motion import MADE_PLANES
 from v2v_server.store.reader import has_planes
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
@@ -271,6 +273,8 @@ def _outcomes(
         for job in jobs:
             id = job.video.id
             keeps_scene = job.standing is not None and job.standing.scene != ""
+            # A file that is made again for one plane keeps its others.
+            more = [name for name in (*MADE_PLANES, CHROMA) if job.lacks_planes and has_planes(target / id, (name,))]
             try:
                 index = catalogue.frame_index(id).to_bytes()
             except VideoError as error:
@@ -278,7 +282,8 @@ def _outcomes(
                 continue
             yield job, Transcoding(
                 id, catalogue.path(id), job.video.fingerprint, job.video.codec, index, job.video.frames_per_second,
-                job.window, encoding, target, target / id, scene or keeps_scene, planes,
+                job.window, encoding, target, target / id, scene or keeps_scene,
+                tuple(dict.fromkeys((*planes, *more))),
             )  # fmt: skip
 
     isolated = run_isolated(

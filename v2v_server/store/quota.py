@@ -38,6 +38,10 @@ class CachePart:
     trouble: str = text("Why a cache stores nothing more, as last reported; empty if it does.", default="")
 
 
+MOST_GIB = 1e6
+"""Largest limit of a folder that a flag may give."""
+
+
 @dataclass(slots=True)
 class Used:
     """Count the folder's bytes. Only the holder of the lock may use it."""

@@ -80,7 +80,7 @@ def axes(texts: Iterable[str]) -> Axes:
         key, equals, values = text.partition("=")
         if not equals:
             raise UsageError(f"--vary {text}: write KEY=VALUE,VALUE, for instance --vary voxel_seconds=0.02,0.1")
-        found[key] = [value.strip() for value in values.split(",")]
+        found[key] = list(dict.fromkeys(value.strip() for value in values.split(",")))
     return found
 
 

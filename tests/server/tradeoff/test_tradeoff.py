@@ -151,6 +151,10 @@ def test_the_choice_is_written_and_a_wish_that_nothing_fulfils_is_status_1(
     assert ServeConfig.load(str(out), {"videos": "clips"}).spec == compared[2].spec
 
 
+def test_a_value_given_twice_is_compared_once() -> None:
+    assert axes(["tolerance=0, 0.01,0"])["tolerance"] == ["0", "0.01"]
+
+
 AXES = ["tolerance=0,0.01", "voxel_seconds=0.1,0.2"]
 CAMERA_OF_A_USER = StreamSpec(recipe=Recipe(leak_hz=(0.1, 0.2)))
 EVERY = settings(list(ENCODINGS), CAMERA_OF_A_USER, axes(AXES))
@@ -229,7 +233,7 @@ def test_works_of_different_places_are_refused() -> None:
         ["--target-rate", "-1"], ["--max-error", "nan"], ["--forms", "h265 1"], ["--preset-out", "x.yaml"],
         ["--set", "gama=1"], ["--rows", "upper"], ["--vary", "tolerance"], ["--vary", "tolerance=2"],
         ["--vary", "samples_per_decode=3"],
-        ["--vary", "voxel_seconds=0.1,101"],
+        ["--vary", "voxel_seconds=0.1,101"], ["--preset-out", "nowhere/x.yaml", "--max-error", "1"],
     ],
 )  # fmt: skip
 def test_wrong_usage_is_status_2(tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,6 +30,7 @@ from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.encoding import Encoding
+from v2v_server.store.reader import has_planes
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import decode_for, make_sample
 
@@ -117,6 +118,21 @@ def samples_of(folder: Path, recipe: Recipe = RECIPE) -> list[bytes]:
     with closing(open_catalogue(folder, processes=0, rows=Rows.parse("0.1:0.9"))) as catalogue:
         samples = [made(catalogue, recipe, ("frames", "frames_rgb"), seed) for seed in range(4)]
     return [sample.arrays["frames_rgb"].tobytes() for sample in samples]
+
+
+def test_colour_stays_with_another_plane_and_without_some_files(tmp_path: Path) -> None:
+    source, prepared = tmp_path / "source", tmp_path / "prepared"
+    source.mkdir()
+    for name in "ab":
+        write_coloured(source / f"{name}.mp4", coloured(12))
+    for planes in (("chroma",), ("motion",)):
+        with closing(open_catalogue(source, processes=0)) as catalogue:
+            prepare(catalogue, prepared, Encoding(size="fast"), processes=0, planes=planes)
+    assert has_planes(prepared / "a.mp4", ("chroma", "motion"))
+    (prepared / "b.mp4").unlink()
+    with closing(open_catalogue(prepared, processes=0)) as catalogue:
+        assert catalogue.notes
+        catalogue.facts.require_arrays(("frames_rgb",))
 
 
 @pytest.mark.parametrize("recipe", [RECIPE, RECIPE.replace(frame_stride=2, resize_scale=(0.7, 1.6))])

@@ -33,7 +33,7 @@ from v2v_server.corpus.sources.names import UNPRINTABLE, count_left_out, is_vide
 from v2v_server.corpus.sources.sidecar import fingerprint_of as sidecar_fingerprint
 from v2v_server.corpus.sources.sidecar import is_sidecar, state_text
 from v2v_server.corpus.sources.source import GONE, SourceOptions, State, VideoSource
-from v2v_server.store.quota import PARTIAL, QuotaFolder
+from v2v_server.store.quota import MOST_GIB, PARTIAL, QuotaFolder
 from v2v_server.system.locks import lock
 from v2v_server.system.private import make_private, open_private
 from v2v_server.system.process import cache_folder
@@ -344,8 +344,8 @@ def open_source(name: str, options: SourceOptions) -> Copies | None:
     """
     if not is_url(name):
         return None
-    if not options.copies_gib > 0:
-        raise UsageError(f"--copies-gib {options.copies_gib:g}: give more than 0")
+    if not 0 < options.copies_gib <= MOST_GIB:
+        raise UsageError(f"--copies-gib {options.copies_gib:g}: give more than 0, at most {MOST_GIB:g}")
     folder = Path(options.copies or cache_folder(options.cache_dir) / "copies").absolute()
     return Copies(Bucket(name), folder, int(options.copies_gib * (1 << 30)), options.listed)
 

@@ -285,8 +285,9 @@ def test_addresses_that_cannot_be(store: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(CorpusError, match="cannot be written to"):
         Copies(Bucket("file:///x"), tmp_path / "file", 1).make()
-    with pytest.raises(UsageError, match="--copies-gib 0"):
-        open_source("file:///x", SourceOptions(copies=tmp_path, copies_gib=0.0))
+    for limit in (0.0, float("inf")):
+        with pytest.raises(UsageError, match=f"--copies-gib {limit:g}"):
+            open_source("file:///x", SourceOptions(copies=tmp_path, copies_gib=limit))
 
 
 def test_it_travels_to_processes(store: Path) -> None:
