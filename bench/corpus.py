@@ -56,7 +56,6 @@ def webvid_like(
         one record for each clip.
 
     Raises:
-        UsageError: no source, or a number below 1.
         VideoError: a source does not decode.
     """
     out_dir.mkdir(parents=True, exist_ok=True)

@@ -150,7 +150,7 @@ def main() -> None:
         "--walls",
         type=float,
         default=0.0,
-        help="share of backgrounds that are bright walls, in front of which most is dark",
+        help="share of backgrounds that are bright walls",
     )
     args = parser.parse_args()
     files = sorted(p for p in args.photographs.rglob("*") if p.suffix.lower() in (".jpg", ".jpeg", ".png"))

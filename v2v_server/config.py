@@ -189,16 +189,16 @@ class ServeConfig:
                 raise UsageError(f"--config {file}: {name} appears twice, with dashes and with underscores; keep one")
             values[name] = value
         require_known(values, SERVE_KEYS, f"key in --config {file}:")
-        for name in SPEED_PRESETS.get(flags.get("preset") or "", ()):
-            values.pop(name, None)  # a flag wins: the file's fields that the preset sets do not count
+        if asked := SPEED_PRESETS.get(flags.get("preset") or ""):  # a flag wins over the fields that it sets
+            values = {name: value for name, value in values.items() if name not in {*asked, "sibling_spacing"}}
         values |= {name: value for name, value in flags.items() if value is not None}
         recipe = values.get("recipe")
         if isinstance(recipe, str) and recipe.endswith(_RECIPE_FILES):
             values["recipe"] = read_yaml_mapping("recipe:", recipe)
         if settings:
             values["recipe"] = recipe_setting(None, settings, values.get("recipe"))
-        asked = {name: values.pop(name) for name in SPEC_KEYS if name in values}
-        return cls(**values, spec=StreamSpec.from_dict(asked))
+        fields = {name: values.pop(name) for name in SPEC_KEYS if name in values}
+        return cls(**values, spec=StreamSpec.from_dict(fields))
 
 
 _RECIPE_FILES = (".yaml", ".yml")

@@ -48,6 +48,8 @@ def test_a_preset_as_flag_wins_over_what_the_file_says_of_its_fields(tmp_path: P
     spec = load(tmp_path, text, preset="fast").spec
     assert (spec.samples_per_decode, spec.max_sequences_per_video) == (4, 3)
     assert load(tmp_path, text, preset="fast", samples_per_decode=2).spec.samples_per_decode == 2
+    spaced = "videos: a\nsamples_per_decode: 2\nsibling_spacing: 48\n"
+    assert load(tmp_path, spaced, preset="natural").spec == StreamSpec.from_dict({"preset": "natural"})
 
 
 def test_the_recipe_of_the_file_may_be_a_file(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +31,7 @@ class Converted:
 
 def default_name(source: Path) -> str:
     """Return the name of the new file: the sequence's name in data sets, with the ending .h5."""
-    stem = source.resolve().name if source.is_dir() else source.stem  # "." has no name
+    stem = Path(os.path.abspath(source)).name if source.is_dir() else source.stem  # "." has no name
     return stem.removesuffix("_data") + layout.SUFFIXES[0]
 
 

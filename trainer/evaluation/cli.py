@@ -184,7 +184,7 @@ def _run_flow(arguments: argparse.Namespace, config: EvaluationConfig, run: Run,
     given = [name for name in OF_PICTURES if getattr(arguments, name) != parser.get_default(name)]
     if given:
         flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-        raise UsageError(f"{flags}: for networks that reconstruct pictures, and {model} estimates flow; leave it out")
+        raise UsageError(f"{flags}: for networks that reconstruct pictures, and {model} estimates flow; leave them out")
     data = Path(arguments.data)
     flow_run = FlowRun(run.network, run.voxels, run.device, run.as_published, run.drawing.folder, run.size)
     settings = {"model": model, "weights": str(arguments.weights), "as_published": run.as_published}

@@ -13,6 +13,7 @@ Its keys:
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
@@ -107,7 +108,9 @@ def folder_config(path: Path) -> EvaluationConfig:
     files = [path] if path.is_file() else sorted(file for file in path.glob("*") if file.suffix in SUFFIXES)
     if not files:
         raise UsageError(f"{path} has no recordings ({', '.join(SUFFIXES)}); convert raw ones with v2v-convert")
-    return EvaluationConfig((DataSet(path.resolve().stem, ".", dict.fromkeys(file.stem for file in files)),))
+    return EvaluationConfig(
+        (DataSet(Path(os.path.abspath(path)).stem, ".", dict.fromkeys(file.stem for file in files)),)
+    )
 
 
 def _data_set(entry: Any, where: str) -> DataSet:

@@ -8,6 +8,7 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import Hello, Welcome
+from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES
@@ -85,7 +86,7 @@ class Admission:
         spec = StreamSpec.from_dict(hello.spec, self._default_spec)
         spec = spec.spaced(hello.stride or hello.batch_size)
         layout = array_layout(spec.recipe, spec.voxel_dtype, hello.arrays)
-        self._check_sizes(spec, layout)
+        self._check_sizes(spec.recipe, layout)
         self._facts.require_arrays(hello.arrays)
         newest = self._quarantine.latest
         quarantine = newest if hello.quarantine is None else hello.quarantine
@@ -131,7 +132,7 @@ class Admission:
             sidecars=self._facts.sidecars_digest(hello.arrays),
         )
 
-    def _check_sizes(self, spec: StreamSpec, layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:
+    def _check_sizes(self, recipe: Recipe, layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:
         remedy = "ask for fewer voxels_per_clip or a smaller crop"
         for name, (dtype, shape) in layout.items():
             size = layout_bytes({name: (dtype, shape)})
@@ -140,11 +141,10 @@ class Admission:
                     f"array {name} {dtype}{list(shape)} of one sample is {size} bytes; the limit is "
                     f"{LARGEST_ARRAY_BYTES}: {remedy}"
                 )
-        recipe = spec.recipe
-        view = recipe.frames_needed * recipe.crop_height_px * recipe.crop_width_px
+        view = (recipe.steps + 1) * recipe.crop_height_px * recipe.crop_width_px
         if view > MOST_CLIP_BYTES and not recipe.is_timed:
             raise UsageError(
-                f"the {recipe.frames_needed} frames of {recipe.crop_width_px}x{recipe.crop_height_px} px of one sample "
+                f"the {recipe.steps + 1} frames of {recipe.crop_width_px}x{recipe.crop_height_px} px of one sample "
                 f"are {view >> 20} MiB; the limit is {MOST_CLIP_BYTES >> 20} MiB: {remedy}"
             )
         if layout_bytes(layout) > self._max_credit_bytes:

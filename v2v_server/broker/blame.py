@@ -38,8 +38,8 @@ class Loss:
         text: what happened, in words: "was ended by SIGSEGV".
         lease: the lease in work by the worker's own record, 0 for no lease; None without a record. Then the last lease
             that the worker announced counts.
-        for_all: whether the video is refused under every spec. A sample that took too long refuses its video for all
-            only if the video was being decoded; otherwise the cause is what its spec asks for.
+        for_all: whether the video is refused under every spec: only if it was being decoded, or nothing is known.
+            Otherwise the cause may be what its spec asks for.
     """
 
     cause: Cause

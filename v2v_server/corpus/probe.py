@@ -44,9 +44,9 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
             mark = fingerprint(path)
             facts = _facts(path)
         name = f"{mark}-{facts.content}" if facts.content else mark
-        source.keep_as(id, mark, name)
         if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
+        source.keep_as(id, mark, name)
     except OSError as error:
         return IndexRow(id, -1, problem=f"cannot be read: {error.strerror or error}")
     except VideoUnreadable as error:

@@ -113,18 +113,31 @@ def preview(
         whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
     finally:
         catalogue.close()
-    sizes = {(*camera.voxels.shape[:2], len(camera.frames)): camera.title or "it" for camera in cameras}
-    if len(sizes) > 1:
-        found = ", ".join(
-            f"{title} has {grids} voxel grids of {bins} bins and {frames} frames"
-            for (grids, bins, frames), title in sizes.items()
-        )
-        raise UsageError(f"{found}: compare recipes of equal voxels_per_clip, bins and grids_per_frame (see --set)")
+    _check_sizes(cameras, out.suffix)
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
     say(describe_loss(loss))
     write(out, _content(out.suffix, whole, cameras, title, moments))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
+
+
+def _check_sizes(cameras: Sequence[Camera], kind: str) -> None:
+    """Check that the cameras can be drawn side by side: a sheet has a column per bin, a film the moments of all.
+
+    Raises:
+        UsageError: they have other sizes.
+    """
+    wanted = 1 if kind == ".png" else 2
+    sizes = {camera.voxels.shape[1::-1][:wanted]: camera for camera in cameras}
+    if len(sizes) > 1:
+        found = ", ".join(
+            f"{each.title or each.provenance.id} {each.voxels.shape[0]} of {each.voxels.shape[1]} bins"
+            for each in sizes.values()
+        )
+        raise UsageError(
+            f"frames with their bins, as shown: {found}. Compare recipes of equal bins and grids_per_frame, and in a "
+            "film of equal voxels_per_clip (see --set)"
+        )
 
 
 def _moving(shots: Sequence[Shot], remaker: Remaker, wholes: WholePictures) -> tuple[list[Shot], str]:

@@ -83,7 +83,7 @@ def prepare(
         scene: also compute the scene statistics; for a video prepared without them they are computed from its source,
             and its file stays.
         planes: names of the planes to store (:data:`v2v_server.store.motion.MADE_PLANES`); a video prepared without one
-            of them is prepared again.
+            of them is prepared again, and keeps its others.
         single: the source is one video, so the destination may lie in its folder.
         progress: called at the start, after each video whose file was checked, and after each that was done.
 

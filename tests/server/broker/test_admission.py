@@ -64,14 +64,14 @@ def test_a_sample_that_the_credit_cannot_hold_is_refused() -> None:
         admission(SAMPLE_BYTES - 1).admit(b"c", hello(), 1, 0.0)
 
 
-def test_a_clip_that_no_worker_could_hold_is_refused() -> None:
-    """A small picture may be enlarged: the source's size does not bound what a camera sees of it."""
-    large = {"recipe": {"voxels_per_clip": 400, "bins": 5, "crop_height_px": 1100, "crop_width_px": 1000,
-                        "resize_scale": [64, 64]}}  # fmt: skip
-    with pytest.raises(
-        UsageError, match=r"the 2001 frames of 1000x1100 px of one sample are 2099 MiB; the limit is 2048"
-    ):
-        admission(2**40).admit(b"c", Hello(large, ("frames",), 1, 0), 1, 0.0)
+@pytest.mark.parametrize(("stride", "height"), [(1, 1100), (4, 1100), (4, 1000)])
+def test_the_frames_that_a_camera_sees_are_limited(stride: int, height: int) -> None:
+    """A small picture may be enlarged. What the stride leaves out is not held."""
+    recipe = {"voxels_per_clip": 400, "bins": 5, "frame_stride": stride, "resize_scale": [64, 64],
+              "crop_height_px": height, "crop_width_px": 1000}  # fmt: skip
+    said = "the 2001 frames of 1000x1100 px .* are 2099 MiB; the limit is 2048" if height > 1000 else "none of the 5"
+    with pytest.raises(UsageError, match=said):
+        admission(2**40).admit(b"c", Hello({"recipe": recipe}, ("frames",), 1, 0), 1, 0.0)
 
 
 def test_the_quarantine_is_the_newest_unless_an_older_one_is_asked_for() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -142,10 +143,17 @@ def test_what_is_wrong_is_one_line_and_leaves_no_file(
 
 
 def test_recipes_of_other_sizes_are_not_compared(clip: Path, tmp_path: Path) -> None:
-    shots = [Shot(str(bins), {**TINY, "preset": "paper", "bins": bins}, 0) for bins in (2, 3)]
-    with pytest.raises(UsageError, match=r"2 has \d+ voxel grids of 2 bins .*, 3 has .*: compare recipes of equal"):
-        preview(str(clip), tmp_path / "p.png", shots, {}, title="t", with_flow=False, cache_dir=str(tmp_path / "cache"))
-    assert not (tmp_path / "p.png").exists()
+    """A sheet needs equal bins, a film also equal clips."""
+    more: dict[str, Any] = {"title": "t", "with_flow": False, "cache_dir": str(tmp_path / "cache")}
+    bins = [Shot(f"b{number}", {**TINY, "bins": number}, 0) for number in (2, 3)]
+    clips = [Shot(f"c{number}", {**TINY, "voxels_per_clip": number}, 0) for number in (2, 3)]
+    with pytest.raises(UsageError, match=r"b2 3 of 2 bins, b3 3 of 3 bins\. Compare recipes of equal bins"):
+        preview(str(clip), tmp_path / "p.png", bins, {}, **more)
+    with pytest.raises(UsageError, match=r"c2 2 of 5 bins, c3 3 of 5 bins\."):
+        preview(str(clip), tmp_path / "p.gif", clips, {}, **more)
+    assert not list(tmp_path.glob("p.*"))
+    preview(str(clip), tmp_path / "p.png", clips, {}, **more)
+    assert (tmp_path / "p.png").exists()
 
 
 def test_the_error_of_the_library_is_typed(clip: Path, tmp_path: Path) -> None:

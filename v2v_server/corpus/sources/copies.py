@@ -222,10 +222,14 @@ class Copies(VideoSource):
 
     def keep_as(self, id: str, found: str, fingerprint: str) -> None:
         """See :meth:`VideoSource.keep_as`."""
-        kept = self._path(id, fingerprint)
-        with contextlib.suppress(OSError):  # evicted just now: it is fetched again
-            kept.parent.mkdir(exist_ok=True)
-            self._path(id, found).replace(kept)
+        # Another process may be reading the copy under its first name, so it gets a second one.
+        with contextlib.suppress(OSError), self._locked_slot(_slot_number(id)) as slot:
+            slot.unlink(missing_ok=True)
+            try:
+                slot.hardlink_to(self._path(id, found))
+                self._quota.add(slot, self._path(id, fingerprint), evicts=True)
+            finally:
+                slot.unlink(missing_ok=True)
 
     def release(self) -> None:
         """Allow eviction of the copies that :meth:`has` or :meth:`fetch` keeps."""
@@ -251,7 +255,7 @@ class Copies(VideoSource):
     def _get(self, id: str, fingerprint: str) -> IO[bytes]:
         """Fetch a video, and return its copy, locked against eviction."""
         try:
-            with self._locked_slot(int(hashlib.sha256(id.encode()).hexdigest(), 16)) as slot:
+            with self._locked_slot(_slot_number(id)) as slot:
                 held = self._hold(self._path(id, fingerprint)) if fingerprint else None  # another process was faster
                 return held or self._fetch(id, fingerprint, slot)
         except OSError as error:
@@ -348,6 +352,10 @@ def open_source(name: str, options: SourceOptions) -> Copies | None:
         raise UsageError(f"--copies-gib {options.copies_gib:g}: give more than 0, at most {MOST_GIB:g}")
     folder = Path(options.copies or cache_folder(options.cache_dir) / "copies").absolute()
     return Copies(Bucket(name), folder, int(options.copies_gib * (1 << 30)), options.listed)
+
+
+def _slot_number(id: str) -> int:
+    return int(hashlib.sha256(id.encode()).hexdigest(), 16)
 
 
 def _close(held: Mapping[tuple[str, str], IO[bytes]]) -> None:

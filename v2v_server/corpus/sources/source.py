@@ -161,11 +161,11 @@ class VideoSource(ABC):
         """
 
     def keep_as(self, id: str, found: str, fingerprint: str) -> None:  # noqa: B027 - a local source has no copies
-        """Keep the copy of a video that was just probed for those who ask for it by its fingerprint.
+        """Let the copy that was made for probing be found under the video's full fingerprint.
 
         Args:
-            found: fingerprint of its file.
-            fingerprint: that with what probing found.
+            found: fingerprint of the file, its size, head and tail.
+            fingerprint: the full one.
         """
 
     @abstractmethod

@@ -125,10 +125,15 @@ def test_what_was_fetched_to_be_probed_is_not_fetched_again(store: Path) -> None
     made, mark = copies(store), fingerprint(store / "a.mp4")
     with made.open_local("a.mp4", ""):
         pass
-    made.keep_as("a.mp4", mark, f"{mark}-content")
+    with made.open_local("a.mp4", "") as reading:
+        for _ in range(3):  # as several processes do
+            made.keep_as("a.mp4", mark, f"{mark}-content")
+        assert reading.read_bytes() == (store / "a.mp4").read_bytes()
     (store / "a.mp4").unlink()
     assert made.has({"a.mp4": f"{mark}-content"})
+    assert used_bytes(made.copies) == 2 * SIZE  # under two names
     made.keep_as("b.mp4", "absent", "absent-content")
+    assert [each.name for each in (made.copies / PARTIAL).iterdir() if each.suffix != ".lock"] == []
 
 
 def test_a_slot_that_another_process_keeps_is_not_waited_for(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
