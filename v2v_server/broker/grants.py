@@ -166,7 +166,7 @@ class Grants:
     def as_leased(self, request: Request, lease: int) -> Request:
         """Return a request with the slot that its lease names.
 
-        Without a ring that is its own. With one it is the memory lent for this lease, or none, because the ring needs the
+        Without a ring that is its own. With one it is the memory lent for this lease, or none: the ring needs the
         arrays.
         """
         return request if self._ring is None else replace(request, slot=self._ring.lent(lease))
