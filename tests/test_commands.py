@@ -43,6 +43,7 @@ _LAUNCHED = {
     "examples/pan_photographs.py": "examples.pan_photographs",
     "examples/draw_curve.py": "examples.draw_curve",
     "examples.ray_train": "examples.ray_train",
+    "trainer.run.export": "trainer.run.export",
 }
 """What `python` and `torchrun` start beside benches."""
 _STANDS_FOR_ANY = {"train.py": "the reader's own script"}
