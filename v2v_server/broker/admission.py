@@ -141,6 +141,8 @@ class Admission:
                     f"array {name} {dtype}{list(shape)} of one sample is {size} bytes; the limit is "
                     f"{LARGEST_ARRAY_BYTES}: {remedy}"
                 )
+        # The view of an enlarged picture may be larger than the picture, which the sequences are bounded by. How many
+        # frames a duration has depends on the video.
         view = (recipe.steps + 1) * recipe.crop_height_px * recipe.crop_width_px
         if view > MOST_CLIP_BYTES and not recipe.is_timed:
             raise UsageError(

@@ -57,10 +57,11 @@ def _run(arguments: argparse.Namespace) -> None:
         raise UsageError("nothing to do: give a RECORDING and --out, or --check RECIPE")
     if (arguments.recording is None) != (arguments.out is None):
         raise UsageError("a RECORDING and --out belong together: give both, or neither with --check")
-    lacking = {"picture": arguments.recording, "static": arguments.recording, "size": arguments.recording}
-    for name, needed in (lacking | {"sheet": arguments.check}).items():
-        if getattr(arguments, name) and needed is None:
-            raise UsageError(f"--{name} needs {'--check' if name == 'sheet' else 'a RECORDING'}")
+    if arguments.sheet is not None and arguments.check is None:
+        raise UsageError("--sheet needs --check")
+    for flag in ("--static", "--size", "--time-unit", "--picture"):
+        if arguments.recording is None and getattr(arguments, flag[2:].replace("-", "_")):
+            raise UsageError(f"{flag} needs a RECORDING")
     fitted = None if arguments.recording is None else _fit(arguments)
     if arguments.check is None:
         return

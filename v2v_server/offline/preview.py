@@ -131,12 +131,12 @@ def _check_sizes(cameras: Sequence[Camera], kind: str) -> None:
     sizes = {camera.voxels.shape[1::-1][:wanted]: camera for camera in cameras}
     if len(sizes) > 1:
         found = ", ".join(
-            f"{each.title or each.provenance.id} {each.voxels.shape[0]} of {each.voxels.shape[1]} bins"
+            f"{each.title} has {each.voxels.shape[0]} frames of {each.voxels.shape[1]} bins here"
             for each in sizes.values()
         )
         raise UsageError(
-            f"frames with their bins, as shown: {found}. Compare recipes of equal bins and grids_per_frame, and in a "
-            "film of equal voxels_per_clip (see --set)"
+            f"{found}: give recipes of equal bins and grids_per_frame, and for a film of equal voxels_per_clip (--set "
+            "changes all of them)"
         )
 
 

@@ -149,6 +149,15 @@ class QuotaFolder:
             path.unlink()
             used.add(-size)
 
+    def discard(self, path: Path) -> None:
+        """Remove a file unless it has a reader.
+
+        Raises:
+            OSError: see :meth:`locked`.
+        """
+        with self.locked() as used:
+            used.add(-_evicted(path))
+
     def _evict(self, used: Used, size: int) -> None:
         enough = max(0, int(self.most_bytes * _KEPT_SHARE) - size)
         for oldest in _oldest_first(self.folder):

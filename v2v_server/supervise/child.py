@@ -79,9 +79,10 @@ def post_mortem(returncode: int, logbook: Logbook | None, *, short_of_memory: bo
 
     Only the death of a worker that decoded speaks against the video; otherwise the spec may be to blame.
     """
-    at = None if logbook is None else logbook.lease()
-    decoded = at is None or logbook is None or logbook.decodes()
-    return replace(_cause(returncode, short_of_memory=short_of_memory), lease=at, for_all=decoded)
+    loss = _cause(returncode, short_of_memory=short_of_memory)
+    if logbook is None or (at := logbook.lease()) is None:
+        return loss
+    return replace(loss, lease=at, for_all=logbook.decodes())
 
 
 def _cause(returncode: int, *, short_of_memory: bool) -> Loss:

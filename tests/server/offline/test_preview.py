@@ -147,9 +147,9 @@ def test_recipes_of_other_sizes_are_not_compared(clip: Path, tmp_path: Path) -> 
     more: dict[str, Any] = {"title": "t", "with_flow": False, "cache_dir": str(tmp_path / "cache")}
     bins = [Shot(f"b{number}", {**TINY, "bins": number}, 0) for number in (2, 3)]
     clips = [Shot(f"c{number}", {**TINY, "voxels_per_clip": number}, 0) for number in (2, 3)]
-    with pytest.raises(UsageError, match=r"b2 3 of 2 bins, b3 3 of 3 bins\. Compare recipes of equal bins"):
+    with pytest.raises(UsageError, match=r"b2 has 3 frames of 2 bins here, b3 has 3 .*: give recipes of equal bins"):
         preview(str(clip), tmp_path / "p.png", bins, {}, **more)
-    with pytest.raises(UsageError, match=r"c2 2 of 5 bins, c3 3 of 5 bins\."):
+    with pytest.raises(UsageError, match=r"c2 has 2 frames of 5 bins here, c3 has 3 "):
         preview(str(clip), tmp_path / "p.gif", clips, {}, **more)
     assert not list(tmp_path.glob("p.*"))
     preview(str(clip), tmp_path / "p.png", clips, {}, **more)

@@ -222,11 +222,12 @@ class Copies(VideoSource):
 
     def keep_as(self, id: str, found: str, fingerprint: str) -> None:
         """See :meth:`VideoSource.keep_as`."""
-        # Another process may be reading the copy under its first name, so it gets a second one.
+        # A link, because another process may be reading the copy under its first name, which then stays.
         with contextlib.suppress(OSError), self._locked_slot(_slot_number(id)) as slot:
             slot.unlink(missing_ok=True)
             try:
                 slot.hardlink_to(self._path(id, found))
+                self._quota.discard(self._path(id, found))
                 self._quota.add(slot, self._path(id, fingerprint), evicts=True)
             finally:
                 slot.unlink(missing_ok=True)

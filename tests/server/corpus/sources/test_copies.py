@@ -129,9 +129,11 @@ def test_what_was_fetched_to_be_probed_is_not_fetched_again(store: Path) -> None
         for _ in range(3):  # as several processes do
             made.keep_as("a.mp4", mark, f"{mark}-content")
         assert reading.read_bytes() == (store / "a.mp4").read_bytes()
+    assert used_bytes(made.copies) == 2 * SIZE  # under two names while it was read
+    made.keep_as("a.mp4", mark, f"{mark}-content")
+    assert used_bytes(made.copies) == SIZE
     (store / "a.mp4").unlink()
     assert made.has({"a.mp4": f"{mark}-content"})
-    assert used_bytes(made.copies) == 2 * SIZE  # under two names
     made.keep_as("b.mp4", "absent", "absent-content")
     assert [each.name for each in (made.copies / PARTIAL).iterdir() if each.suffix != ".lock"] == []
 
