@@ -215,5 +215,6 @@ def _with_unit(name: str, value: float) -> str:
     """Write ``shot_noise_hz`` 1.26 as "shot noise 1.26 Hz"."""
     for ending, (factor, unit) in _UNITS.items():
         if name.endswith(ending):
-            return f"{name.removesuffix(ending).replace('_', ' ')} {factor * value:.2g}{unit}"
+            shown = f"{factor * value:.0f}" if factor * value >= 100 else f"{factor * value:.2g}"
+            return f"{name.removesuffix(ending).replace('_', ' ')} {shown}{unit}"
     return f"{name.replace('_', ' ')} {value:.3g}"

@@ -131,6 +131,15 @@ def shortened(text: str, width_px: float, size: int = TEXT_PT) -> str:
     return "..." + text
 
 
+def beginning(text: str, width_px: float, size: int = TEXT_PT) -> str:
+    """Return the text, or as much of its beginning as fits before three dots."""
+    if text_width(text, size) <= width_px:
+        return text
+    while text and text_width(text + "...", size) > width_px:
+        text = text[:-1]
+    return text + "..."
+
+
 def label(page: Canvas, x: int, y: int, text: str, colour: Colour = INK) -> None:
     """Write text on a ground of its own, so that the panel below does not hide it."""
     page.box(x, y, x + text_width(text) + 10, y + 24, PAPER)

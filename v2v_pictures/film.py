@@ -77,7 +77,7 @@ def _draw_camera(page: Canvas, camera: Camera, place: int, top: int, number: int
     x = float(MARGIN_PX)
     if warning := camera.warning(range(len(camera.voxels))):
         x = page.text(x, top + 27, warning) + 18
-    page.text(x, top + 27, canvas.shortened(camera.describe(), width + MARGIN_PX - x), colour=canvas.SOFT)
+    page.text(x, top + 27, canvas.beginning(camera.describe(), width + MARGIN_PX - x), colour=canvas.SOFT)
     left = [MARGIN_PX + column * (tile_px + GAP_PX) for column in range(3)]
     top += _CAMERA_PX
     page.text(left[0], top, "video frame", size=canvas.HEADING_PT)

@@ -170,8 +170,8 @@ def _camera_line(page: Canvas, camera: Camera, number: int, picks: Sequence[int]
         x = page.text(x + 10, top, camera.title, size=canvas.HEADING_PT, colour=canvas.MARK)
     if warning := camera.warning(picks):
         x = page.text(x + 18, top + 4, warning)
-    x = page.text(x + 18, top + 4, camera.describe(), colour=canvas.SOFT)
     right = page.width_px - MARGIN_PX
+    x = page.text(x + 18, top + 4, canvas.beginning(camera.describe(), right - x - 18), colour=canvas.SOFT)
     if right - x > _LEAST_SOURCE_PX:
         page.text(right, top + 4, canvas.shortened(camera.source, right - x - 24), colour=canvas.SOFT, anchor="ra")
 

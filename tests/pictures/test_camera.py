@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tests.pictures.cameras import camera, without_noise
 from tests.protocol.test_sample import PARAMS, PROVENANCE
-from v2v_pictures.camera import Camera
+from v2v_pictures.camera import Camera, _with_unit
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 
@@ -104,6 +104,11 @@ def test_lead_frames_and_voxels_stand_in_front() -> None:
 def test_both_arrays_are_needed(name: str) -> None:
     with pytest.raises(UsageError, match="voxels,frames"):
         Camera.of({name: np.zeros((2, 1, 8, 8), np.uint8)}, PROVENANCE, "")
+
+
+@pytest.mark.parametrize(("value", "shown"), [(1.26, "1.3"), (99.4, "99"), (257.6, "258")])
+def test_effects_are_described_without_exponents(value: float, shown: str) -> None:
+    assert _with_unit("photoreceptor_hz", value) == f"photoreceptor {shown} Hz"
 
 
 def test_a_drawn_dark_floor_is_described() -> None:

@@ -18,7 +18,7 @@ from PIL import Image as Pictures
 from tests.pictures.cameras import camera, has, record_texts, without_noise
 from tests.protocol.test_sample import PARAMS, PROVENANCE
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import INK, MARGIN_PX, MARK, PAUSED, Canvas, shortened, text_width
+from v2v_pictures.canvas import INK, MARGIN_PX, MARK, PAUSED, Canvas, beginning, shortened, text_width
 from v2v_pictures.colours import BRIGHTER, DARKER, draw_events, draw_grey, full_colour
 from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write_png
 from v2v_pictures.film import draw_film
@@ -294,6 +294,14 @@ def test_a_long_name_keeps_its_end() -> None:
     assert short.endswith("clip.mp4")
     assert text_width(short) <= 200
     assert shortened("clip.mp4", 200) == "clip.mp4"
+
+
+def test_a_long_description_keeps_its_beginning() -> None:
+    short = beginning("threshold +0.20 / -0.17   " + "shot noise 2.4 Hz   " * 20, 300)
+    assert short.startswith("threshold +0.20")
+    assert short.endswith("...")
+    assert text_width(short) <= 300
+    assert beginning("mirrored", 300) == "mirrored"
 
 
 def test_png_of_a_view_that_is_not_contiguous() -> None:
