@@ -46,10 +46,11 @@ def check_event_file(path: Path) -> None:
 
 
 def _npz(path: Path, events: EventList) -> None:
-    np.savez_compressed(
-        path, x=events.x, y=events.y, t=events.t, p=events.p,
-        width=np.int64(events.width_px), height=np.int64(events.height_px), note=np.array(_NOTE),
-    )  # fmt: skip
+    with path.open("wb") as file:  # to a path that ends in .NPZ, NumPy adds a second ending
+        np.savez_compressed(
+            file, x=events.x, y=events.y, t=events.t, p=events.p,
+            width=np.int64(events.width_px), height=np.int64(events.height_px), note=np.array(_NOTE),
+        )  # fmt: skip
 
 
 def _hdf5(path: Path, events: EventList) -> None:
