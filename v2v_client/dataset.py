@@ -16,7 +16,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from v2v_client.batch import Batch
 from v2v_client.delivery import deliver
-from v2v_client.loaders import end_with_parent, report_unsent, send_before_exit
+from v2v_client.loaders import end_with_parent, send_before_exit
 from v2v_client.local_server import LocalServer, recipe_flags
 from v2v_client.memory.buffers import BatchBuffers
 from v2v_client.options import Labels, Options, check_labels, require_arguments, require_labels

@@ -36,7 +36,7 @@ def recognises(path: Path) -> bool:
     """Return whether the path is an HDF5 file with ``events/t``, or a folder with ``events.h5`` in it."""
     if path.is_dir():
         with Archive(path) as archive:
-            return bool(archive.named(EVENTS))
+            return any(hdf5.holds(path / member, "events/t") for member in archive.named(EVENTS))
     return hdf5.holds(path, "events/t")
 
 
@@ -100,20 +100,16 @@ def _frames(archive: Archive, camera: str, size: SensorSize | None, reach: Senso
         return
     if len(times) != 1 or len(folders) != 1:
         raise UsageError(
-            f"{archive.path} holds {len(folders)} folders of frames and {len(times)} files *{TIMES}: give a folder with "
-            "one of each"
+            f"{archive.path} holds {len(folders)} folders of frames and {len(times)} files *{TIMES}: give a folder "
+            "with one of each"
         )
     frames = sorted(member for member in frames if posixpath.dirname(member) == folders[0])
     stamps = archive.integers(times[0])
     if len(stamps) != len(frames):
         raise UsageError(f"{archive.path}: {len(frames)} frames in {folders[0]}, but {len(stamps)} times in {times[0]}")
-    shown = archive.size(frames[0])
-    if (
-        (size or shown) != shown
-        or shown.width > LARGEST_RATIO * reach.width
-        or shown.height > LARGEST_RATIO * reach.height
-    ):
-        sensor = size or reach
+    shown, sensor = archive.size(frames[0]), size or reach
+    ratio = max(shown.width / sensor.width, shown.height / sensor.height)
+    if shown != sensor if size else ratio > LARGEST_RATIO:
         yield Note(
             f"{len(frames)} frames of {shown.width} x {shown.height} px are of another camera than the events, of "
             f"{sensor.width} x {sensor.height} px: left out"

@@ -119,8 +119,8 @@ def _metadata_size(stream: IO[bytes], where: str) -> Any:
 def _pictures(pictures: _Column, times: _Column, path: Path) -> Iterator[Item]:
     if len(pictures.row_shape) != 2 or pictures.count != times.count or pictures.dtype != np.uint8:
         raise UsageError(
-            f"{path}: {pictures.count} pictures of {pictures.dtype} {list(pictures.row_shape)} in {IMAGES}, and {times.count} times in "
-            f"{IMAGE_TIMES}; pictures must be uint8 [H, W]"
+            f"{path}: {IMAGES} has {pictures.count} pictures, {pictures.dtype} {list(pictures.row_shape)}, and "
+            f"{IMAGE_TIMES} {times.count} times; they must be as many, and uint8 [H, W]"
         )
     SensorSize(*pictures.row_shape[::-1]).require_usable(f"{path}: {IMAGES}")
     for number, t_ns in enumerate(to_ns(times.take(times.count), f"{path}: {IMAGE_TIMES}")):
