@@ -21,7 +21,7 @@ def recognises(path: Path) -> bool:
     if not (path.is_dir() or path.suffix.lower() == ".zip"):
         return False
     with Archive(path) as archive:
-        return archive.find(TIMES) is not None and bool(_members(archive, "event", (".txt",)))
+        return bool(_members(archive, "event", (".txt",))) and archive.find(TIMES) is not None
 
 
 def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:

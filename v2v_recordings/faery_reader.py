@@ -134,6 +134,7 @@ def read_es(path: Path, _options: ConvertOptions, progress: Progress) -> Iterato
             raise UsageError(f"{path} holds {decoder.event_type} events; only dvs can be read")
         yield SensorSize(*decoder.dimensions)
         for events in decoder:
+            events["y"] = decoder.dimensions[1] - 1 - events["y"]  # rows are counted from below
             yield _events(events)
             steps = np.diff(events["t"].astype(np.int64), prepend=last_us)
             end += ES_EVENT_BYTES * len(events) + int((steps // ES_LONGEST_STEP_US).sum())

@@ -70,7 +70,8 @@ def _faery(path: Path, events: EventList) -> None:
     table = np.empty(len(events), faery.EVENTS_DTYPE)
     table["t"], table["x"], table["y"], table["on"] = events.t, events.x, events.y, events.p
     stream = faery.events_stream_from_array(table, (events.width_px, events.height_px))
-    stream.to_file(path, zero_t0=False)
+    kind = {".raw": "evt", ".aedat4": "aedat"}.get(path.suffix.lower(), path.suffix.lower().lstrip("."))
+    stream.to_file(path, zero_t0=False, file_type=kind)  # faery does not know endings in capitals
 
 
 FORMS: dict[str, Callable[[Path, EventList], None]] = {
