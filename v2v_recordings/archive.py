@@ -38,7 +38,9 @@ class Archive:
         try:
             self._zip = zipfile.ZipFile(path)
         except (OSError, zipfile.BadZipFile) as error:
-            raise UsageError(f"{path} is neither a folder nor a complete zip file: {error}") from error
+            raise UsageError(
+                f"{path} is neither a folder nor a complete zip file: {error}; if it was cut, load it again"
+            ) from error
         self.bytes_of = _without_hidden(
             {entry.filename: entry.file_size for entry in self._zip.infolist() if not entry.is_dir()}
         )

@@ -62,7 +62,9 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
             else:
                 yield from _read_arrays(bag, events, images, path, progress)
     except (ReaderError, struct.error, OSError) as error:
-        raise UsageError(f"{path}: the bag cannot be read: {error}") from error
+        raise UsageError(
+            f"{path}: the bag cannot be read: {error}; if it was cut, `rosbag reindex` repairs it"
+        ) from error
     except DAMAGE as error:
         raise UsageError(f"{path}: the bag is damaged and cannot be read: {error!r}") from error
 

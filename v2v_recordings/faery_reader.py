@@ -24,7 +24,8 @@ ES_HEAD_BYTES, ES_EVENT_BYTES, ES_LONGEST_STEP_US = 20, 5, 127
 """Bytes before the first event and of an event; a longer time between two events is bytes of 0xff of this length."""
 CUT_PACKET = "failed to fill whole buffer"
 """Error of faery where a packet of aedat4 is longer than the file."""
-DAT_BYTES = 8
+DAT_WORD = np.dtype("<u8")
+"""An event of DAT; the lower half is its time, us."""
 EVT_WORDS: dict[str, np.dtype[Any]] = {
     **dict.fromkeys(("2.0", "EVT2"), np.dtype("<u4")),
     **dict.fromkeys(("3.0", "EVT3"), np.dtype("<u2")),
@@ -34,7 +35,12 @@ NOT_DECODED = "2.1"
 """A version that faery up to 0.7.1 recognises but does not implement: it panics. It does not recognise "EVT21"."""
 TIME_HIGH = 0x8
 """Value of the four upper bits of a word whose other bits are the upper bits of a time."""
+TIME_HIGH_US = {8: 1, 4: 64, 2: 4096}
+"""Unit of the upper bits, by the bytes of a word; DAT's words hold a whole time."""
+LATEST_US = 10_000
+"""The upper bits may step back by at most this without a reset."""
 LOOKED_THROUGH_WORDS = 1 << 20
+COPIED_BYTES = 1 << 22
 LONGEST_LINE_BYTES = 1 << 12
 GREY = {"RGB": cv2.COLOR_RGB2GRAY, "RGBA": cv2.COLOR_RGBA2GRAY}
 
@@ -104,22 +110,24 @@ def read_prophesee(path: Path, options: ConvertOptions, progress: Progress) -> I
     fallback = None if options.size is None else (options.size.width, options.size.height)
     version, head = _header(path)
     is_evt = bool(version) or path.suffix.lower() != ".dat"
-    word = EVT_WORDS.get(version)
-    module = faery.evt if is_evt else faery.dat
-    with _errors_of_faery(path), module.Decoder(path, fallback, None) as decoder:
-        if version == NOT_DECODED:
-            raise UsageError(f"{path} is in EVT 2.1, which is not supported; EVT 2, EVT 3 and DAT are")
-        if decoder.dimensions is None:
-            raise UsageError(f"{path}: its header states no size of the sensor; give --size")
-        yield SensorSize(*decoder.dimensions)
-        timeless = _events_without_time(path, module, fallback, word, head) if is_evt else 0
-        for events in _event_packets(decoder):
-            progress(0, None)
-            left_out = min(timeless, len(events))
-            timeless -= left_out
-            yield _events(events[left_out:])
     # DAT's header ends with two bytes of its own.
-    yield from _cut_note(path, head if is_evt else head + 2, word.itemsize if word is not None else DAT_BYTES)
+    word, head = (EVT_WORDS.get(version), head) if is_evt else (DAT_WORD, head + 2)
+    module = faery.evt if is_evt else faery.dat
+    with tempfile.TemporaryDirectory() as folder:
+        for number, part in enumerate(_parts(path, word, head, Path(folder))):
+            with _errors_of_faery(path), module.Decoder(part, fallback, None) as decoder:
+                if version == NOT_DECODED:
+                    raise UsageError(f"{path} is in EVT 2.1, which is not supported; EVT 2, EVT 3 and DAT are")
+                if decoder.dimensions is None:
+                    raise UsageError(f"{path}: its header states no size of the sensor; give --size")
+                yield SensorSize(*decoder.dimensions)
+                timeless = _events_without_time(path, module, fallback, word, head) if is_evt and not number else 0
+                for events in _event_packets(decoder):
+                    progress(0, None)
+                    left_out = min(timeless, len(events))
+                    timeless -= left_out
+                    yield _events(events[left_out:])
+    yield from _cut_note(path, head, word.itemsize if word is not None else 1)
 
 
 def read_es(path: Path, _options: ConvertOptions, progress: Progress) -> Iterator[Item]:
@@ -148,6 +156,43 @@ def _cut_note(path: Path, begin: int, item_bytes: int) -> Iterator[Item]:
     over = (path.stat().st_size - begin) % item_bytes
     if over:
         yield Note(f"cut: the last {over} bytes are an incomplete event and left out")
+
+
+def _parts(path: Path, word: np.dtype[Any] | None, head: int, folder: Path) -> Iterator[Path]:
+    """Yield the file; or, if the sensor's clock is reset in it, a file in ``folder`` for each stretch of one clock.
+
+    faery takes a clock that steps back for one that went round.
+    """
+    edges, whole_bytes = [head, *_resets(path, word, head)], path.stat().st_size
+    if len(edges) == 1:
+        yield path
+        return
+    with path.open("rb") as file:
+        header = file.read(head)
+        for begin, end in zip(edges, [*edges[1:], whole_bytes], strict=True):
+            part = folder / "part.raw"
+            with part.open("wb") as copy:
+                copy.write(header)
+                for start in range(begin, end, COPIED_BYTES):
+                    copy.write(file.read(min(COPIED_BYTES, end - start)))
+            yield part
+
+
+def _resets(path: Path, word: np.dtype[Any] | None, head: int) -> list[int]:
+    """Return the bytes at which the (upper bits of the) time step back, and do not go round."""
+    found: list[int] = []
+    if word is None:
+        return found
+    bits, last = 32 if word == DAT_WORD else 8 * word.itemsize - 4, None
+    for begin in range(head, path.stat().st_size, LOOKED_THROUGH_WORDS * word.itemsize):
+        words = np.fromfile(path, word, LOOKED_THROUGH_WORDS, offset=begin)
+        times = np.flatnonzero((words >> bits == TIME_HIGH) | (word == DAT_WORD))
+        highs = (words[times] & ((1 << bits) - 1)).astype(np.int64)
+        steps = np.diff(highs, prepend=highs[:1] if last is None else last)
+        is_back = (-steps * TIME_HIGH_US[word.itemsize] > LATEST_US) & (steps % (1 << bits) > 1 << (bits - 2))
+        found += (begin + word.itemsize * times[is_back]).tolist()
+        last = highs[-1:] if len(highs) else last
+    return found
 
 
 def _event_packets(decoder: Any) -> Iterator[npt.NDArray[Any]]:

@@ -239,6 +239,41 @@ def test_a_reset_clock_is_a_gap_in_fit_and_convert(tmp_path: Path) -> None:
     assert read_recording(tmp_path / "a.zip", size).seconds == pytest.approx(1.099, abs=1e-5)
 
 
+def written_with_reset(path: Path, form: str) -> None:
+    """Write a stream of words whose clock goes from 1.5 back to 0.2 s."""
+    t = np.concatenate([np.arange(1_000_000, 1_500_000, 500), np.arange(200_000, 900_000, 500)])
+    x, y, p = t // 500 % WIDTH, t // 500 % HEIGHT, t // 500 % 2
+    if form == "dat":
+        words = np.stack([t, p << 28 | y << 14 | x], axis=1).astype("<u4").tobytes()
+        path.write_bytes(f"% Version 2\n% Width {WIDTH}\n% Height {HEIGHT}\n".encode() + b"\x0c\x08" + words)
+    elif form == "evt3":
+        header = f"% evt 3.0\n% geometry {WIDTH}x{HEIGHT}\n% end\n".encode()
+        path.write_bytes(header + raw_forms.evt3_words(t, x, y, p))
+    else:
+        raw_forms.write_evt2(path, Scene(t, x, y, p > 0, np.zeros(0, np.uint8), t))
+
+
+@pytest.mark.parametrize("form", ["evt2", "evt3", "dat"])
+def test_a_reset_clock_in_words_is_seen(tmp_path: Path, form: str) -> None:
+    """The package that decodes them takes a time that steps back for one that went round."""
+    path = tmp_path / f"a.{'dat' if form == 'dat' else 'raw'}"
+    written_with_reset(path, form)
+    done = convert(path, tmp_path / "a.h5")
+    assert done.written.events == 2400
+    assert done.written.seconds == pytest.approx(0.4995 + 0.6995, abs=1e-5)
+    assert "at event 1000 the times step back by 1.2995 s" in done.written.notes[0]
+
+
+def test_a_clock_that_goes_round_is_no_reset(tmp_path: Path) -> None:
+    t = np.arange((1 << 24) - 500_000, (1 << 24) + 500_000, 500)
+    zeros = np.zeros(len(t), np.int64)
+    header = f"% evt 3.0\n% geometry {WIDTH}x{HEIGHT}\n% end\n".encode()
+    (tmp_path / "a.raw").write_bytes(header + raw_forms.evt3_words(t, zeros, zeros, zeros))
+    done = convert(tmp_path / "a.raw", tmp_path / "a.h5")
+    assert done.written.notes == ()
+    assert done.written.seconds == pytest.approx(0.9995, abs=1e-6)
+
+
 def test_pictures_beside_a_reset_clock_are_refused(tmp_path: Path) -> None:
     picture = raw_forms.png(np.zeros((HEIGHT, WIDTH), np.uint8))
     reset_text(tmp_path / "a.zip", **{"images.txt": b"0.1 a.png\n", "a.png": picture})
