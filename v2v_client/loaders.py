@@ -57,7 +57,7 @@ def _send_error(queue: Any, error: Exception, unsent: Any) -> None:
         f"a loader worker cannot send a batch to the trainer: {error}. If /dev/shm is full (64 MB in Docker), "
         "enlarge it (docker run --shm-size 2g), use fewer num_workers, or num_workers=0"
     )
-    failed = ExceptionWrapper((type(refusal), refusal, None), "in a loader worker")
+    failed = ExceptionWrapper((type(refusal), refusal, None), "in a loader worker")  # type: ignore[no-untyped-call]
     # torchdata sends the batch, the number of the worker and its state.
     is_stateful = isinstance(batch, tuple) and len(batch) == 3 and type(batch[1]) is int
     with queue._notempty:

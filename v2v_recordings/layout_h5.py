@@ -49,7 +49,7 @@ def read(path: Path, _options: ConvertOptions, progress: Progress) -> Iterator[I
                 t_ns = int(to_ns(np.array([seconds], np.float64), f"{path}: {kind}/{key}")[0]) + origin_ns
                 if kind == "flow":
                     yield FlowField(t_ns, item[:].astype(np.float32))
-                elif item.ndim != 2 or item.dtype != np.uint8:
-                    raise UsageError(f"{path}: images/{key} is {item.dtype} {list(item.shape)}, not uint8 [H, W]")
+                elif len(getattr(item, "shape", ())) != 2 or item.dtype != np.uint8:
+                    raise UsageError(f"{path}: images/{key} is {item}, not uint8 [H, W]")
                 else:
                     yield Picture(t_ns, item[:])

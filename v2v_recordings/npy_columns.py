@@ -65,7 +65,7 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
                 yield _metadata_size(stream, f"{path}: {member}")
         t, p = column(NPZ[0] if is_npz else FOLDER[0]), column(NPZ[3] if is_npz else FOLDER[2])
         x, y = (column("x.npy"), column("y.npy")) if is_npz else (column(FOLDER[1]), column(FOLDER[1], 1))
-        if len({each.count for each in (t, x, y, p)}) > 1:
+        if len({each.count for each in (t, x, y, p)}) > 1 or {t.row_shape, x.row_shape, p.row_shape} - {(), (2,)}:
             raise UsageError(f"{path}: columns of t, x, y, p have {t.count}, {x.count}, {y.count}, {p.count} entries")
         unit = NS_PER_UNIT[options.time_unit or ("s" if t.is_float else "us")]
         for start in range(0, t.count, hdf5.READ_EVENTS):
@@ -117,15 +117,15 @@ def _metadata_size(stream: IO[bytes], where: str) -> Any:
 
 
 def _pictures(pictures: _Column, times: _Column, path: Path) -> Iterator[Item]:
-    if len(pictures.row_shape) != 2 or pictures.count != times.count or pictures.dtype != np.uint8:
+    if len(pictures.row_shape) != 2 or times.row_shape or pictures.count != times.count or pictures.dtype != np.uint8:
         raise UsageError(
             f"{path}: {IMAGES} has {pictures.count} pictures, {pictures.dtype} {list(pictures.row_shape)}, and "
             f"{IMAGE_TIMES} {times.count} times; they must be as many, and uint8 [H, W]"
         )
     SensorSize(*pictures.row_shape[::-1]).require_usable(f"{path}: {IMAGES}")
-    for number, t_ns in enumerate(to_ns(times.take(times.count), f"{path}: {IMAGE_TIMES}")):
-        picture = pictures.take(1)
-        if not len(picture):
+    for number in range(pictures.count):
+        time, picture = times.take(1), pictures.take(1)
+        if not (len(time) and len(picture)):
             yield Note(f"cut: {number} of {pictures.count} pictures are there")
             return
-        yield Picture(int(t_ns), picture[0])
+        yield Picture(int(to_ns(time, f"{path}: {IMAGE_TIMES}")[0]), picture[0])

@@ -20,6 +20,7 @@ from tests.trainer.convert.aedat4_file import write_aedat4
 from tests.trainer.convert.scene import HEIGHT, WIDTH, Scene, scene
 from trainer.convert import convert
 from trainer.convert.conversion import in_layout
+from trainer.evaluation.readers import Recording
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
 from v2v_recordings.forms import recognise
@@ -325,6 +326,12 @@ def test_sensors_of_impossible_size_are_refused(
     with pytest.raises(UsageError, match=r"at most 16,777,216|cannot be decoded"):
         use(stated(tmp_path, form, width, height))
     assert not (tmp_path / "out.h5").exists()
+
+
+@pytest.mark.parametrize("side", [0, -40, 65_535])
+def test_an_evaluation_refuses_a_sensor_of_impossible_size(tmp_path: Path, side: int) -> None:
+    with pytest.raises(UsageError, match=r"at most 16,777,216"):
+        Recording(stated(tmp_path, "h5", side, side))
 
 
 @pytest.mark.parametrize("text", ["0x0", "0x5", "65535x65535", "-40x-30", "99999999999999999999x1"])
