@@ -114,12 +114,12 @@ def _read_packets(bag: Any, events: str, images: str | None, path: Path, progres
                 stream.write(message.array(np.dtype("u1"), count).tobytes())
         offset_ns: int | None = None
         for item in read_prophesee(raw_file, ConvertOptions(), lambda _done, _total: None):
-            if isinstance(item, EventChunk) and len(item):
+            if not isinstance(item, EventChunk):
+                yield item
+            elif len(item):
                 if offset_ns is None:
                     offset_ns = (first_stamp_ns or 0) - int(item.t_ns[0])
                 yield EventChunk(item.t_ns + offset_ns, item.x, item.y, item.p)
-            elif isinstance(item, SensorSize):
-                yield item
     if images is not None:
         for _, _, raw in _messages(bag, (images,), progress):
             yield _picture(raw, path)
