@@ -54,13 +54,21 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
         if len(found) != 1:
             raise UsageError(f"{path} holds {len(found)} recordings ({', '.join(found[:3])}): convert each separately")
         events = path / found[0]
-        size = options.size or _stated_size(events)
-        reach = SensorSize(1, 1)
-        for item in _events(events, size, progress):
-            if isinstance(item, EventChunk) and len(item):
-                reach = SensorSize(max(reach.width, int(item.x.max()) + 1), max(reach.height, int(item.y.max()) + 1))
-            yield item
-        yield from _frames(archive, options.camera, size, reach)
+        size, frames = options.size or _stated_size(events), _frames(archive, options.camera)
+        if frames:
+            shown, sensor = archive.size(frames[0][1]), size or _reach(events)
+            ratios = shown.width / sensor.width, shown.height / sensor.height
+            if shown != sensor if size else not 1 <= min(ratios) <= max(ratios) <= LARGEST_RATIO:
+                yield Note(
+                    f"{len(frames)} frames of {shown.width} x {shown.height} px are of another camera than the events, "
+                    f"of {sensor.width} x {sensor.height} px: left out"
+                )
+                frames = []
+            else:
+                size = shown
+        yield from _events(events, size, progress)
+        for t_us, member in frames:
+            yield Picture(t_us * 1000, archive.picture(member))
 
 
 def _of_camera(members: list[str], camera: str) -> list[str]:
@@ -88,8 +96,17 @@ def _events(path: Path, size: SensorSize | None, progress: Progress) -> Iterator
             yield EventChunk(to_ns(t, str(path), 1e3) + 1000 * offset_us, x, y, p > 0)
 
 
-def _frames(archive: Archive, camera: str, size: SensorSize | None, reach: SensorSize) -> Iterator[Item]:
-    """Yield the frames. ``reach`` is the area with events, for a sensor whose size is not known."""
+def _reach(path: Path) -> SensorSize:
+    """Return the area with events, of a sensor whose size is not stated."""
+    width = height = 1
+    with hdf5.open_hdf5(path) as file:
+        for x, y in hdf5.columns(file["events"], COLUMNS[:2], path, lambda _done, _total: None):
+            width, height = max(width, int(x.max()) + 1), max(height, int(y.max()) + 1)
+    return SensorSize(width, height)
+
+
+def _frames(archive: Archive, camera: str) -> list[tuple[int, str]]:
+    """Return the times of the frames, us, and their members."""
     times = [member for member in archive.bytes_of if posixpath.basename(member).lower().endswith(TIMES)]
     times = _of_images([member for member in times if "exposure" not in member.lower()])
     frames = _of_images(_of_camera([member for member in archive.bytes_of if member.lower().endswith(".png")], camera))
@@ -97,7 +114,7 @@ def _frames(archive: Archive, camera: str, size: SensorSize | None, reach: Senso
     # DSEC-Detection has the frames twice: as seen by the event camera ("distorted"), and rectified.
     folders = [folder for folder in folders if "distorted" in folder.lower()] or folders
     if not frames:
-        return
+        return []
     if len(times) != 1 or len(folders) != 1:
         raise UsageError(
             f"{archive.path} holds {len(folders)} folders of frames and {len(times)} files *{TIMES}: give a folder "
@@ -107,16 +124,7 @@ def _frames(archive: Archive, camera: str, size: SensorSize | None, reach: Senso
     stamps = archive.integers(times[0])
     if len(stamps) != len(frames):
         raise UsageError(f"{archive.path}: {len(frames)} frames in {folders[0]}, but {len(stamps)} times in {times[0]}")
-    shown, sensor = archive.size(frames[0]), size or reach
-    ratio = max(shown.width / sensor.width, shown.height / sensor.height)
-    if shown != sensor if size else ratio > LARGEST_RATIO:
-        yield Note(
-            f"{len(frames)} frames of {shown.width} x {shown.height} px are of another camera than the events, of "
-            f"{sensor.width} x {sensor.height} px: left out"
-        )
-        return
-    for t_us, member in zip(stamps, frames, strict=True):
-        yield Picture(t_us * 1000, archive.picture(member))
+    return list(zip(stamps, frames, strict=True))
 
 
 def _of_images(members: list[str]) -> list[str]:

@@ -286,7 +286,8 @@ def test_a_fit_takes_the_size_of_the_pictures(tmp_path: Path) -> None:
     raw_forms.write_zip(tmp_path / "a.zip", raw_forms.ijrr_members(scene()))
     members = {name: content for name, content in raw_forms.evaid_members(scene()).items() if name != "shape.txt"}
     raw_forms.write_zip(tmp_path / "b.zip", members)
-    for name in ("a.zip", "b.zip"):
+    raw_forms.write_dsec(tmp_path / "c", scene())
+    for name in ("a.zip", "b.zip", "c"):
         recorded = read_recording(tmp_path / name)
         assert (recorded.width_px, recorded.height_px, len(recorded.frames)) == (WIDTH, HEIGHT, 4)
 
