@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
+from v2v_recordings.items import SensorSize
 
 
 class Archive:
@@ -37,7 +38,9 @@ class Archive:
         try:
             self._zip = zipfile.ZipFile(path)
         except (OSError, zipfile.BadZipFile) as error:
-            raise UsageError(f"{path} is neither a folder nor a complete zip file: {error}") from error
+            raise UsageError(
+                f"{path} is neither a folder nor a complete zip file: {error}; if it was cut, load it again"
+            ) from error
         self.bytes_of = _without_hidden(
             {entry.filename: entry.file_size for entry in self._zip.infolist() if not entry.is_dir()}
         )
@@ -52,16 +55,35 @@ class Archive:
     def find(self, name: str) -> str | None:
         """Return the member of this name in the outermost folder that has one; None if there is no such member.
 
+        The name is in small letters; a member in capitals is found too.
+
         Raises:
             UsageError: several folders of that depth have one, so the archive holds several recordings.
         """
-        found = [member for member in self.bytes_of if member == name or member.endswith(f"/{name}")]
+        found = self.named(name)
         depth = min((member.count("/") for member in found), default=0)
         outermost = sorted(member for member in found if member.count("/") == depth)
         if len(outermost) > 1:
-            folders = ", ".join(member.removesuffix(f"/{name}") for member in outermost[:3])
+            folders = ", ".join(posixpath.dirname(member) for member in outermost[:3])
             raise UsageError(f"{self.path} holds {len(outermost)} recordings ({folders}): convert each separately")
         return outermost[0] if outermost else None
+
+    def named(self, name: str) -> list[str]:
+        """Return all members of this name, which is in small letters."""
+        return [member for member in self.bytes_of if posixpath.basename(member).lower() == name]
+
+    def integers(self, member: str) -> list[int]:
+        """Read the numbers of a text, rounded.
+
+        Raises:
+            UsageError: as :meth:`open`, or it holds something else.
+        """
+        with self.open(member) as stream:
+            words = stream.read().decode("utf-8-sig", "replace").split()
+        try:
+            return [round(float(word)) for word in words]
+        except (ValueError, OverflowError) as error:
+            raise UsageError(f"{self.path}: {member} holds text that is not a number: {error}") from None
 
     @contextlib.contextmanager
     def open(self, member: str) -> Iterator[IO[bytes]]:
@@ -101,6 +123,11 @@ class Archive:
         if pixels is None:
             raise UsageError(f"{self.path}: {member} is not a readable picture")
         return np.asarray(pixels, np.uint8)
+
+    def size(self, member: str) -> SensorSize:
+        """Return the size of a picture; raises as :meth:`picture`."""
+        height, width = self.picture(member).shape
+        return SensorSize(width, height)
 
 
 def _without_hidden(bytes_of: dict[str, int]) -> dict[str, int]:

@@ -62,7 +62,9 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
             else:
                 yield from _read_arrays(bag, events, images, path, progress)
     except (ReaderError, struct.error, OSError) as error:
-        raise UsageError(f"{path}: the bag cannot be read: {error}") from error
+        raise UsageError(
+            f"{path}: the bag cannot be read: {error}; if it was cut, `rosbag reindex` repairs it"
+        ) from error
     except DAMAGE as error:
         raise UsageError(f"{path}: the bag is damaged and cannot be read: {error!r}") from error
 
@@ -112,12 +114,12 @@ def _read_packets(bag: Any, events: str, images: str | None, path: Path, progres
                 stream.write(message.array(np.dtype("u1"), count).tobytes())
         offset_ns: int | None = None
         for item in read_prophesee(raw_file, ConvertOptions(), lambda _done, _total: None):
-            if isinstance(item, EventChunk) and len(item):
+            if not isinstance(item, EventChunk):
+                yield item
+            elif len(item):
                 if offset_ns is None:
                     offset_ns = (first_stamp_ns or 0) - int(item.t_ns[0])
                 yield EventChunk(item.t_ns + offset_ns, item.x, item.y, item.p)
-            elif isinstance(item, SensorSize):
-                yield item
     if images is not None:
         for _, _, raw in _messages(bag, (images,), progress):
             yield _picture(raw, path)

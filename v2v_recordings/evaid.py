@@ -18,10 +18,10 @@ PICTURES = (".png", ".jpg", ".jpeg")
 
 def recognises(path: Path) -> bool:
     """Return whether the path is an archive with ``timestamps.txt`` and a folder ``event``."""
-    if not (path.is_dir() or path.suffix == ".zip"):
+    if not (path.is_dir() or path.suffix.lower() == ".zip"):
         return False
     with Archive(path) as archive:
-        return archive.find(TIMES) is not None and bool(_members(archive, "event", (".txt",)))
+        return bool(_members(archive, "event", (".txt",))) and archive.find(TIMES) is not None
 
 
 def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
@@ -32,14 +32,16 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
     """
     with Archive(path) as archive:
         events, pictures = _members(archive, "event", (".txt",)), _members(archive, "gt", PICTURES)
-        times_us = _integers(archive, TIMES)
+        times_us = archive.integers(archive.find(TIMES) or TIMES)
         if len(times_us) != len(pictures):
             raise UsageError(f"{path}: {len(pictures)} pictures in gt/, but {len(times_us)} times in {TIMES}")
-        if archive.find(SHAPE) is not None:
-            shape = _integers(archive, SHAPE)
+        if (stated := archive.find(SHAPE)) is not None:
+            shape = archive.integers(stated)
             if len(shape) != 2:
                 raise UsageError(f"{path}: {SHAPE} holds {shape}, not `width height`")
             yield SensorSize(*shape)
+        elif pictures:
+            yield archive.size(pictures[0])
         total = sum(archive.bytes_of[member] for member in events + pictures)
         done = 0
 
@@ -63,18 +65,6 @@ def _members(archive: Archive, folder: str, suffixes: tuple[str, ...]) -> list[s
     found = [
         member
         for member in archive.bytes_of
-        if posixpath.basename(posixpath.dirname(member)) == folder and member.lower().endswith(suffixes)
+        if posixpath.basename(posixpath.dirname(member)).lower() == folder and member.lower().endswith(suffixes)
     ]
     return sorted(found, key=lambda member: (len(member), member))
-
-
-def _integers(archive: Archive, name: str) -> list[int]:
-    member = archive.find(name)
-    if member is None:
-        raise UsageError(f"{archive.path} has no {name}")
-    with archive.open(member) as stream:
-        words = stream.read().decode("utf-8", "replace").split()
-    try:
-        return [round(float(word)) for word in words]
-    except ValueError as error:
-        raise UsageError(f"{archive.path}: {member} holds text that is not a number: {error}") from None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings import bag, evaid, faery_reader, ijrr, mvsec
+from v2v_recordings import bag, dsec, evaid, faery_reader, ijrr, layout_h5, mvsec, npy_columns
 from v2v_recordings.items import ConvertOptions, Item, Progress
 
 
@@ -33,9 +33,21 @@ FORMS = {
         "IJRR: events.txt, images.txt, PNGs in a zip or folder; or one .txt or .csv", ijrr.recognises, ijrr.read
     ),
     "evaid": RawForm("EVAID-R: event/*.txt, gt/, timestamps.txt in a zip or folder", evaid.recognises, evaid.read),
+    "dsec": RawForm(
+        "DSEC: events.h5, PNGs and *timestamps.txt in a folder; or one .h5, as of v2v-simulate",
+        dsec.recognises,
+        dsec.read,
+    ),
+    "columns": RawForm(
+        "EVREAL: events_ts.npy ... in a folder or zip; or .npz with x, y, t, p",
+        npy_columns.recognises,
+        npy_columns.read,
+    ),
+    "h5": RawForm("the layout that v2v-convert writes", layout_h5.recognises, layout_h5.read),
     "mvsec": RawForm("MVSEC: *_data.hdf5", mvsec.recognises, mvsec.read),
     "bag": RawForm("ROS 1 bag (HQF, IJRR, MVSEC)", bag.recognises, bag.read, published_shift=1),
     "aedat4": RawForm("aedat4 of a DAVIS", faery_reader.recognises_aedat4, faery_reader.read_aedat4),
+    "es": RawForm("Event Stream (.es)", faery_reader.recognises_es, faery_reader.read_es),
     "prophesee": RawForm("EVT 2, 3 (.raw), DAT", faery_reader.recognises_prophesee, faery_reader.read_prophesee),
 }
 

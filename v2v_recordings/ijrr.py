@@ -22,9 +22,9 @@ TEXT_SUFFIXES = (".txt", ".csv")
 
 def recognises(path: Path) -> bool:
     """Return whether the path is a text file, or an archive with ``events.txt``."""
-    if path.is_file() and path.suffix in TEXT_SUFFIXES:
+    if path.is_file() and path.suffix.lower() in TEXT_SUFFIXES:
         return True
-    if not (path.is_dir() or path.suffix == ".zip"):
+    if not (path.is_dir() or path.suffix.lower() == ".zip"):
         return False
     with Archive(path) as archive:
         return archive.find(EVENTS) is not None
@@ -36,7 +36,7 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
     Raises:
         UsageError: a part is missing or malformed.
     """
-    if path.is_file() and path.suffix in TEXT_SUFFIXES:
+    if path.is_file() and path.suffix.lower() in TEXT_SUFFIXES:
         total, done = path.stat().st_size, 0
 
         def advance(count: int) -> None:
@@ -67,6 +67,8 @@ def _read_archive(archive: Archive, options: ConvertOptions, progress: Progress)
         done += count
         progress(done, total)
 
+    if pictures:
+        yield archive.size(pictures[0][1])
     with archive.open(events) as stream:
         yield from read_text_events(stream, f"{archive.path}: {events}", time_unit=options.time_unit, advance=advance)
     for t_ns, member in pictures:
@@ -81,7 +83,7 @@ def _listed_pictures(archive: Archive) -> list[tuple[int, str]]:
         return []
     with archive.open(listing) as stream:
         lines = stream.read().decode("utf-8", "replace").splitlines()
-    folder = listing.removesuffix(IMAGES)
+    folder = listing[: -len(IMAGES)]
     pictures = []
     for number, line in enumerate(lines, start=1):
         if not line.strip():

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 
+MOST_SENSOR_PIXELS = 1 << 24
+"""Limit of a stated sensor's size: 4096 x 4096. Some arrays have an entry for each pixel."""
 Progress = Callable[[int, int | None], None]
 """Progress callback: called with the amount read so far (bytes or messages), and the total if it is known."""
 
@@ -37,9 +40,16 @@ class EventChunk:
         lengths = {len(self.t_ns), len(self.x), len(self.y), len(self.p)}
         if len(lengths) > 1:
             raise UsageError(f"the columns of events have different lengths: {sorted(lengths)}")
+        if {self.x.dtype.kind, self.y.dtype.kind} - {"i", "u"}:
+            raise UsageError(f"coordinates of events are {self.x.dtype} and {self.y.dtype}: they must be integers")
 
     def __len__(self) -> int:
         return len(self.t_ns)
+
+    def part(self, first: int, last: int | None = None) -> EventChunk:
+        """Return the events ``first:last``."""
+        chosen = slice(first, last)
+        return EventChunk(self.t_ns[chosen], self.x[chosen], self.y[chosen], self.p[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +80,25 @@ class SensorSize:
         """Parse WIDTHxHEIGHT, such as ``346x260``.
 
         Raises:
-            UsageError: the text has another form, or a size is 0.
+            UsageError: the text has another form, or :meth:`require_usable`.
         """
         width, _, height = text.lower().partition("x")
-        if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        if not (width.isdecimal() and height.isdecimal()):
             raise UsageError(f"size {text!r}: give WIDTHxHEIGHT in pixels, as in 346x260")
-        return cls(int(width), int(height))
+        return cls(int(width), int(height)).require_usable("--size")
+
+    def require_usable(self, where: str) -> SensorSize:
+        """Return this size if memory for such a sensor may be taken; ``where`` begins the error message.
+
+        Raises:
+            UsageError: a side is below 1, or there are more than MOST_SENSOR_PIXELS.
+        """
+        if min(self.width, self.height) < 1 or self.width * self.height > MOST_SENSOR_PIXELS:
+            raise UsageError(
+                f"{where}: a sensor of {self.width} x {self.height} px; sides must be at least 1, and width x height "
+                f"at most {MOST_SENSOR_PIXELS:,} px: correct the size"
+            )
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +114,14 @@ class FlowField:
     flow: npt.NDArray[np.float32]
 
 
-Item = EventChunk | Picture | SensorSize | FlowField
+@dataclass(frozen=True)
+class Note:
+    """Hold a sentence for the user about the recording, such as where it was cut."""
+
+    text: str
+
+
+Item = EventChunk | Picture | SensorSize | FlowField | Note
 
 
 @dataclass(frozen=True)
@@ -116,8 +146,8 @@ class ConvertOptions:
 LARGEST_NS = 2.0**63
 
 
-def to_ns(times: npt.NDArray[np.float64], where: str, ns_per_unit: float = 1e9) -> npt.NDArray[np.int64]:
-    """Convert float64 times to int64 nanoseconds, rounded to the nearest.
+def to_ns(times: npt.NDArray[Any], where: str, ns_per_unit: float = 1e9) -> npt.NDArray[np.int64]:
+    """Convert times to int64 nanoseconds: integers exactly, others as float64, rounded to the nearest.
 
     Args:
         where: beginning of the error message.
@@ -126,7 +156,7 @@ def to_ns(times: npt.NDArray[np.float64], where: str, ns_per_unit: float = 1e9) 
     Raises:
         UsageError: a time is NaN or does not fit int64, so its unit is probably wrong.
     """
-    ns = np.rint(times * ns_per_unit)
+    ns = np.rint(times.astype(np.float64) * ns_per_unit)
     held = np.abs(ns) < LARGEST_NS
     if not held.all():
         # A cast would turn all of them into the same number.
@@ -134,4 +164,4 @@ def to_ns(times: npt.NDArray[np.float64], where: str, ns_per_unit: float = 1e9) 
             f"{where}: a time is {ns[~held][0] * 1e-9:.10g} s, which is out of range; give the unit of text files with "
             "--time-unit"
         )
-    return ns.astype(np.int64)
+    return times.astype(np.int64) * int(ns_per_unit) if times.dtype.kind in "iu" else ns.astype(np.int64)

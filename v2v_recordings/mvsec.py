@@ -18,20 +18,18 @@ If ``*_gt.hdf5`` is in the same folder, its flow is read too:
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from v2v_protocol.errors import UsageError
+from v2v_recordings import hdf5
 from v2v_recordings.items import ConvertOptions, EventChunk, FlowField, Item, Picture, Progress, SensorSize, to_ns
 
 if TYPE_CHECKING:
     import h5py
-
-READ_EVENTS = 1 << 18
 
 
 def recognises(path: Path) -> bool:
@@ -40,10 +38,7 @@ def recognises(path: Path) -> bool:
     Raises:
         UsageError: it is an HDF5 file, but damaged.
     """
-    if path.suffix not in (".hdf5", ".h5") or not _h5py(path).is_hdf5(path):
-        return False
-    with _open(path) as file:
-        return "davis" in file
+    return hdf5.holds(path, "davis")
 
 
 def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
@@ -52,32 +47,12 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
     Raises:
         UsageError: a part is missing, damaged or has another shape.
     """
-    with _open(path) as file:
+    with hdf5.open_hdf5(path) as file:
         yield from _read(file, path, options.camera, progress)
     truth = path.with_name(path.name.replace("_data", "_gt"))
     if truth != path and truth.is_file():
-        with _open(truth) as file:
+        with hdf5.open_hdf5(truth) as file:
             yield from _flow(file, truth, options.camera)
-
-
-def _h5py(path: Path) -> Any:
-    try:
-        import h5py
-    except ModuleNotFoundError as error:
-        raise UsageError(f"{path}: needs the package {error.name}: pip install h5py") from error
-    return h5py
-
-
-@contextlib.contextmanager
-def _open(path: Path) -> Iterator[h5py.File]:
-    try:
-        with _h5py(path).File(path, "r") as file:
-            from v2v_recordings.hdf5 import require_self_contained
-
-            require_self_contained(file, path)
-            yield file
-    except (OSError, RuntimeError, KeyError, ValueError) as error:  # h5py's errors, for truncated or damaged files
-        raise UsageError(f"{path} cannot be read as HDF5: {error}") from error
 
 
 def _read(file: h5py.File, path: Path, camera: str, progress: Progress) -> Iterator[Item]:
@@ -93,8 +68,8 @@ def _read(file: h5py.File, path: Path, camera: str, progress: Progress) -> Itera
             raise UsageError(f"{path}: image_raw is {pictures.dtype} {list(pictures.shape)}, not uint8 [M, H, W]")
         yield SensorSize(pictures.shape[2], pictures.shape[1])
     done = 0
-    for start in range(0, len(events), READ_EVENTS):
-        rows = events[start : start + READ_EVENTS]
+    for start in range(0, len(events), hdf5.READ_EVENTS):
+        rows = events[start : start + hdf5.READ_EVENTS]
         yield EventChunk(
             to_ns(rows[:, 2], str(path)), rows[:, 0].astype(np.int32), rows[:, 1].astype(np.int32), rows[:, 3] > 0
         )

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.items import EventChunk, SensorSize, to_ns
+from v2v_recordings.items import EventChunk, Note, SensorSize, to_ns
 
 BLOCK_BYTES = 1 << 22
 COMMENT = re.compile(rb"^[ \t]*#[^\r\n]*", re.MULTILINE)
@@ -31,8 +31,8 @@ def read_text_events(
     *,
     time_unit: str | None = None,
     advance: Callable[[int], None] = lambda _bytes: None,
-) -> Iterator[SensorSize | EventChunk]:
-    """Yield the sensor's size, if the file states it, and chunks of events.
+) -> Iterator[SensorSize | EventChunk | Note]:
+    """Yield the sensor's size, if the file states it, and chunks of events. A last line that was cut is left out.
 
     Args:
         stream: the file's bytes; read in blocks of 4 MiB.
@@ -65,6 +65,9 @@ def read_text_events(
         yield from _chunk(block, name, lines_before, time_unit)
         lines_before += block.count(b"\n")
     rest = _plain(rest)
+    if lines_before and rest.strip() and _numbers(rest) is None:
+        yield Note(f"cut: line {lines_before + 1}, the last, is incomplete ({_shown(rest)}) and left out")
+        return
     yield from _chunk(rest, name, lines_before, time_unit or _time_unit(rest) or "us")
 
 
@@ -127,9 +130,12 @@ def _numbers(block: bytes) -> npt.NDArray[np.float64] | None:
     return table
 
 
+def _shown(line: bytes) -> str:
+    return repr(line[:60].decode("ascii", "replace"))
+
+
 def _first_bad_line(block: bytes, name: str, lines_before: int) -> str:
     for number, line in enumerate(block.splitlines(), start=lines_before + 1):
         if line.strip() and (len(line.split()) != 4 or _numbers(line) is None):
-            shown = line[:60].decode("ascii", "replace")
-            return f"{name}, line {number}: {shown!r} is not `t x y p` with whole x and y and p of -1, 0 or 1"
+            return f"{name}, line {number}: {_shown(line)} is not `t x y p` with whole x and y and p of -1, 0 or 1"
     return f"{name}: the lines after {lines_before} are not `t x y p`"

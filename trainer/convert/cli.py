@@ -61,7 +61,7 @@ def _run(arguments: argparse.Namespace) -> int:
         images_topic=arguments.images_topic,
     )
     out = Path(arguments.out)
-    to_file = out.suffix in layout.SUFFIXES
+    to_file = out.suffix.lower() in layout.SUFFIXES
     if to_file and len(arguments.sources) > 1:
         raise UsageError(f"--out {out} is one file, and there are {len(arguments.sources)} recordings: give a folder")
     sources = [Path(source) for source in arguments.sources]
@@ -97,6 +97,7 @@ def summary(done: Converted) -> str:
         f"{done.destination}: {written.events} events in {written.seconds:.3f} s, {written.images} images, "
         f"{written.size.width} x {written.size.height} ({done.form})"
     )
+    text += "".join(f"\n  {note}" for note in written.notes)
     if written.size_is_guessed:
         text += "\n  the recording does not state the sensor's size; the events' area is used: give --size WxH"
     if written.reordered_events:
@@ -123,6 +124,7 @@ def _record(done: Converted) -> dict[str, str | int | float]:
         "backward_images": written.backward_images,
         "width_px": written.size.width,
         "height_px": written.size.height,
+        "notes": "; ".join(written.notes),
     }
 
 

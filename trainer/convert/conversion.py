@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +14,10 @@ from trainer.evaluation import layout
 from v2v_protocol.errors import UsageError
 from v2v_recordings.forms import FORMS, recognise
 from v2v_recordings.items import ConvertOptions, Progress
+from v2v_recordings.reading import read_items
+
+EVENT_SUFFIXES = (*layout.SUFFIXES, ".npz", ".raw", ".aedat4", ".es", ".dat", ".bag")
+"""Suffixes of files that hold events and nothing else; a text may be anything."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +84,7 @@ def convert(
         with RecordingWriter(
             destination, source=source.name, size=options.size, published_shift=chosen.published_shift
         ) as writer:
-            for item in chosen.read(source, options, progress):
+            for item in read_items(source, form, options, progress):
                 writer.add(item)
     except OSError as error:
         # Readers convert their own errors, so this one comes from writing the destination.
@@ -85,3 +92,44 @@ def convert(
     if writer.written is None:
         raise RuntimeError("the writer was left without finishing")
     return Converted(source, destination, form, writer.written)
+
+
+@contextlib.contextmanager
+def in_layout(data: Path, options: ConvertOptions, progress: Progress) -> Iterator[Path]:
+    """Yield a path whose recordings are in the layout, for ``v2v-eval``: ``data``, or a folder for as long as needed.
+
+    Args:
+        data: a recording of any form, or a folder of files. Of a folder's files, those with the suffixes of event files
+            are converted, unless one in the layout has the same name.
+
+    Raises:
+        UsageError: a recording is damaged.
+    """
+    raw = [path for path in _recordings(data) if _form(path) not in (None, "h5")]
+    if not raw:
+        yield data
+        return
+    with tempfile.TemporaryDirectory(prefix="v2v-") as scratch:
+        folder = Path(scratch) / Path(os.path.abspath(data)).stem
+        folder.mkdir()
+        for path in _recordings(data):
+            if path not in raw:
+                (folder / path.name).symlink_to(path.resolve())
+        for path in raw:
+            if not (folder / default_name(path)).exists():
+                convert(path, folder / default_name(path), options=options, progress=progress)
+        yield folder
+
+
+def _recordings(data: Path) -> list[Path]:
+    if data.is_file() or _form(data) is not None:
+        return [data]
+    return sorted(path for path in data.iterdir() if path.is_file() and path.suffix.lower() in EVENT_SUFFIXES)
+
+
+def _form(path: Path) -> str | None:
+    """Return the form of a recording; None if it is not known, or damaged."""
+    try:
+        return recognise(path)
+    except UsageError:
+        return None

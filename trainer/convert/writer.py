@@ -24,7 +24,7 @@ import numpy.typing as npt
 from trainer.evaluation import layout
 from v2v_protocol.errors import UsageError
 from v2v_protocol.write_aside import write_aside_and_rename
-from v2v_recordings.items import EventChunk, FlowField, Item, Picture, SensorSize
+from v2v_recordings.items import EventChunk, FlowField, Item, Note, Picture, SensorSize
 
 FLUSH_EVENTS = 1 << 19
 REORDER_EVENTS = 1 << 17
@@ -44,6 +44,7 @@ class Written:
         size: size of the sensor.
         size_is_guessed: True if the recording does not state the size, so that it is the smallest one that holds all
             events.
+        notes: sentences of the reader for the user.
     """
 
     events: int
@@ -53,6 +54,7 @@ class Written:
     backward_images: int
     size: SensorSize
     size_is_guessed: bool
+    notes: tuple[str, ...]
 
 
 class RecordingWriter:
@@ -78,6 +80,7 @@ class RecordingWriter:
         self._origin_ns: int | None = None
         self._last_ns: int | None = None
         self._largest = SensorSize(0, 0)
+        self._notes: list[str] = []
         self._picture_size: SensorSize | None = None
         self._picture_times: list[int] = []
         self._events = self._reordered = self._flow_fields = 0
@@ -121,6 +124,8 @@ class RecordingWriter:
                     f"{self._size.width} x {self._size.height}"
                 )
             self._size = item
+        elif isinstance(item, Note):
+            self._notes.append(item.text)
         elif isinstance(item, Picture):
             self._add_picture(item)
         elif isinstance(item, FlowField):
@@ -208,7 +213,7 @@ class RecordingWriter:
             self._flush(keep=0)
         if not self._events or self._origin_ns is None or self._last_ns is None:
             raise UsageError(f"{self._source} has no events")
-        size = self._size or self._picture_size or self._largest
+        size = self._size or self._picture_size or self._largest.require_usable(self._source)
         if self._picture_size not in (None, size):
             raise UsageError(f"{self._source}: pictures are {self._picture_size}, the sensor is {size}")
         if self._largest.width > size.width or self._largest.height > size.height:
@@ -234,6 +239,7 @@ class RecordingWriter:
             backward_images=int(np.count_nonzero(np.diff(self._picture_times) <= 0)),
             size=size,
             size_is_guessed=self._size is None and self._picture_size is None,
+            notes=tuple(self._notes),
         )
 
     def _pair_pictures(self) -> None:

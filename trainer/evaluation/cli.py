@@ -6,6 +6,7 @@ Exit status: 0 all existing recordings were evaluated, 2 wrong usage or input, 1
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import sys
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from typing import Any, get_args
 import torch
 from rich.console import Console
 
+from trainer.convert.conversion import in_layout
 from trainer.evaluation.config import EvaluationConfig, folder_config, read_config, shipped
 from trainer.evaluation.evaluate import Advance, Drawing, Run, check_data_set, evaluate_data_set, find_recordings
 from trainer.evaluation.flow import FlowRun, evaluate_flow, flow_records, flow_table
@@ -29,7 +31,7 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
-from v2v_recordings.items import SensorSize
+from v2v_recordings.items import ConvertOptions, SensorSize
 
 OF_PICTURES = (
     "metrics",
@@ -74,7 +76,8 @@ def _parser() -> Parser:
     )  # fmt: skip
     what.add_argument(
         "--data", required=True, metavar="DIR",
-        help="with CONFIG: folder with one folder per data set; without: folder of .h5 files, or a single one",
+        help="with CONFIG: folder with one folder per data set; without: folder of event files, or a single recording "
+        "of any form that v2v-convert reads",
     )  # fmt: skip
     what.add_argument("--ema", action="store_true", help="take the averaged weights of a checkpoint of v2v-train")
     what.add_argument("--model", choices=tuple(NETWORKS), help="network of the weights (default: recognised)")
@@ -138,10 +141,19 @@ def _run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--per-frame {arguments.per_frame}: no folder {Path(arguments.per_frame).parent}")
     if arguments.json is not None and not Path(arguments.json).parent.is_dir():
         raise UsageError(f"--json {arguments.json}: cannot be written: no folder {Path(arguments.json).parent}")
-    config = folder_config(data) if arguments.config is None else read_config(arguments.config)
+    if arguments.config is not None:
+        return _evaluate(arguments, data, read_config(arguments.config))
+    size = None if arguments.size is None else SensorSize.parse(arguments.size)
+    with contextlib.ExitStack() as files:
+        with Progress("converting", "%") as progress:
+            data = files.enter_context(in_layout(data, ConvertOptions(size=size), progress))
+        return _evaluate(arguments, data, folder_config(data))
+
+
+def _evaluate(arguments: argparse.Namespace, data: Path, config: EvaluationConfig) -> int:
     run, model = _prepare(arguments, config)
     if run.network.task == "flow":
-        return _run_flow(arguments, config, run, model)
+        return _run_flow(arguments, data, config, run, model)
     for data_set in config.data_sets:
         check_data_set(run, data, data_set)
     scores: dict[str, list[SequenceScore]] = {}
@@ -179,13 +191,12 @@ def _run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _run_flow(arguments: argparse.Namespace, config: EvaluationConfig, run: Run, model: str) -> int:
+def _run_flow(arguments: argparse.Namespace, data: Path, config: EvaluationConfig, run: Run, model: str) -> int:
     parser = _parser()
     given = [name for name in OF_PICTURES if getattr(arguments, name) != parser.get_default(name)]
     if given:
         flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)
         raise UsageError(f"{flags}: for networks that reconstruct pictures, and {model} estimates flow; leave them out")
-    data = Path(arguments.data)
     flow_run = FlowRun(run.network, run.voxels, run.device, run.as_published, run.drawing.folder, run.size)
     settings = {"model": model, "weights": str(arguments.weights), "as_published": run.as_published}
     written: list[dict[str, object]] = []

@@ -105,7 +105,7 @@ def parse_config(content: Any, where: str) -> EvaluationConfig:
 
 def folder_config(path: Path) -> EvaluationConfig:
     """Return a configuration for all recordings of a folder, or a single file, as one data set without time ranges."""
-    files = [path] if path.is_file() else sorted(file for file in path.glob("*") if file.suffix in SUFFIXES)
+    files = [path] if path.is_file() else sorted(file for file in path.glob("*") if file.suffix.lower() in SUFFIXES)
     if not files:
         raise UsageError(f"{path} has no recordings ({', '.join(SUFFIXES)}); convert raw ones with v2v-convert")
     return EvaluationConfig(

@@ -90,7 +90,8 @@ def find_recordings(data: Path, data_set: DataSet) -> dict[str, Path]:
     folder = data if data.is_dir() else data.parent
     found = {}
     for sequence in data_set.time_ranges:
-        candidates = [folder / data_set.folder / f"{sequence}{suffix}" for suffix in layout.SUFFIXES]
+        endings = [ending for suffix in layout.SUFFIXES for ending in (suffix, suffix.upper())]
+        candidates = [folder / data_set.folder / f"{sequence}{ending}" for ending in endings]
         if data.is_file() and (data_set.folder, sequence) == (".", data.stem):
             candidates = [data]  # with any ending, even if a file with another one exists
         existing = next((path for path in candidates if path.is_file()), None)

@@ -23,6 +23,7 @@ from trainer.evaluation import layout
 from trainer.evaluation.voxelise import Events
 from v2v_protocol.errors import UsageError
 from v2v_recordings.hdf5 import require_self_contained
+from v2v_recordings.items import SensorSize
 
 BLOCK_EVENTS = 1 << 16
 CACHED_BLOCKS = 64
@@ -236,6 +237,7 @@ class Recording:
             raise UsageError(
                 f"{self.path} has neither pictures nor sensor_resolution: give the sensor's size with --size WxH"
             )
+        SensorSize(int(stated[1]), int(stated[0])).require_usable(str(self.path))
         return int(stated[0]), int(stated[1])
 
     def flow_fields(self) -> list[Image]:

@@ -82,7 +82,7 @@ def _fit(arguments: argparse.Namespace) -> FittedCamera:
         images_topic=arguments.images_topic,
     )
     source, out = Path(arguments.recording), Path(arguments.out)
-    if out.suffix not in (".yaml", ".yml"):
+    if out.suffix.lower() not in (".yaml", ".yml"):
         raise UsageError(f"--out {out}: give a name that ends in .yaml, as --recipe expects")
     with Progress(source.name, "%") as progress:
         fitted = fit(source, static=arguments.static, options=options, progress=progress)

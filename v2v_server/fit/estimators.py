@@ -70,12 +70,13 @@ def mismatch(fitted: Regression, given: Increments, blocks: npt.NDArray[np.int64
 
 
 def noise_rates(
-    still: Still, blocks: npt.NDArray[np.int64], is_hot: npt.NDArray[np.bool_]
+    still: Still, blocks: npt.NDArray[np.int64], is_hot: npt.NDArray[np.bool_], static: bool = False
 ) -> tuple[Estimate, Estimate]:
     """Estimate shot noise (of a black pixel, both polarities) and the surplus of brighter events, Hz."""
     seconds = float(still.seconds[~is_hot].sum())
     if seconds < LEAST_SECONDS:
-        note = f"{seconds:.0f} pixel-seconds without a change; needs {LEAST_SECONDS:.0f}: hold the camera still"
+        remedy = "record for longer" if static else "hold the camera still"
+        note = f"{seconds:.0f} pixel-seconds without a change; needs {LEAST_SECONDS:.0f}: {remedy}"
         return unknown(note), unknown(note)
     block = (blocks[:, None] * 4 + np.arange(4)).ravel()
     columns = [part * ~is_hot[:, None] for part in (still.on, still.off, still.seconds, still.light)]

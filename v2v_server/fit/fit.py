@@ -45,6 +45,7 @@ class FittedCamera:
         left_out: why an effect is not in the recipe, by name.
         measured, simulated: statistics of the recording and of its simulation; None without frames.
         facts: what was read: events, pixels, seconds, frames, and the shares of brighter events.
+        notes: what the reader says about the recording.
     """
 
     estimates: Mapping[str, Estimate]
@@ -52,6 +53,7 @@ class FittedCamera:
     measured: Panels
     simulated: Panels | None
     facts: Mapping[str, float]
+    notes: tuple[str, ...] = ()
 
     @property
     def camera(self) -> dict[str, float]:
@@ -80,7 +82,7 @@ def fit(
     has_frames = len(given.frames) >= LEAST_FRAMES
     if static and not has_frames:
         given = _with_constant_frames(given)
-    estimates = _estimates(given, static and not has_frames)
+    estimates = _estimates(given, static and not has_frames, static)
     light = regression.light_of(np.arange(256.0))
     begin, end = _span(given)
     measured = panels_of(given, light, begin, end)
@@ -100,11 +102,11 @@ def fit(
         "frames": float(len(given.frames) if has_frames else 0),
         "on_share": float(given.counts[1].sum() / max(given.counts.sum(), 1)),
     }  # fmt: skip
-    return FittedCamera(estimates, left_out, measured, simulated, facts)
+    return FittedCamera(estimates, left_out, measured, simulated, facts, given.notes)
 
 
-def _estimates(given: Recorded, is_blank: bool) -> dict[str, Estimate]:
-    """Estimate all parameters. ``is_blank``: the frames are made up, of one grey level."""
+def _estimates(given: Recorded, is_blank: bool, static: bool = False) -> dict[str, Estimate]:
+    """Estimate all parameters. ``is_blank``: the frames are made up, of one grey level. ``static``: see :func:`fit`."""
     blocks, light = given.blocks(_BLOCKS_SIDE), regression.light_of(np.arange(256.0))
     period = estimators.refractory(intervals_us(given))
     has_frames = len(given.frames) >= LEAST_FRAMES
@@ -130,7 +132,7 @@ def _estimates(given: Recorded, is_blank: bool) -> dict[str, Estimate]:
     made["log_eps"] = fitted.log_eps
     made["threshold_mismatch_sigma"] = estimators.mismatch(fitted, increments, blocks)
     made["photoreceptor_hz"] = fitted.corner if made["threshold_pos"].told else unknown("needs the thresholds")
-    shot, surplus = estimators.noise_rates(still, blocks, is_hot)
+    shot, surplus = estimators.noise_rates(still, blocks, is_hot, static)
     if is_blank and shot.told:
         shot = dataclasses.replace(
             shot.moved(shot.value, _STATIC_LIGHT_DOUBT * shot.value),

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.forms import FORMS, recognise
-from v2v_recordings.items import ConvertOptions, EventChunk, Picture, Progress, SensorSize
+from v2v_recordings.items import ConvertOptions, EventChunk, Note, Picture, Progress, SensorSize
+from v2v_recordings.reading import read_items
 
 MOST_PIXELS = 1 << 15
 """Pixels whose events and frames are kept at first."""
@@ -36,6 +36,7 @@ class Recorded:
         frame_us: [n] int64, time of each frame, ascending.
         counts: [2, H, W] int64, darker and brighter events of the whole sensor.
         seconds: time from the first to the last event or frame.
+        notes: sentences of the reader for the user.
     """
 
     height_px: int
@@ -48,6 +49,7 @@ class Recorded:
     frame_us: Longs
     counts: Longs
     seconds: float
+    notes: tuple[str, ...] = ()
 
     @property
     def begin_us(self) -> int:
@@ -137,8 +139,11 @@ def read_recording(
     """
     path, options = Path(path), options or ConvertOptions()
     size, kept = options.size, None if options.size is None else _Kept(options.size)
-    for item in FORMS[recognise(path)].read(path, options, progress):
-        if isinstance(item, SensorSize):
+    notes = []
+    for item in read_items(path, None, options, progress):
+        if isinstance(item, Note):
+            notes.append(item.text)
+        elif isinstance(item, SensorSize):
             size = size or item
         elif isinstance(item, Picture):
             size = size or SensorSize(item.pixels.shape[1], item.pixels.shape[0])
@@ -152,7 +157,7 @@ def read_recording(
             kept.add_events(item, path)
     if kept is None or not kept.event_count:
         raise UsageError(f"{path} has no events")
-    return kept.recorded()
+    return dataclasses.replace(kept.recorded(), notes=tuple(notes))
 
 
 class _Kept:

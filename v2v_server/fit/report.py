@@ -69,6 +69,7 @@ def report_lines(fitted: FittedCamera, source: str) -> list[str]:
         f"Camera of {source}, fitted by v2v-fit: {facts['events']:.0f} events "
         f"({100 * facts['on_share']:.0f} % brighter), {facts['frames']:.0f} frames, {facts['seconds']:.1f} s; "
         f"{facts['pixels']:.0f} pixels in use",
+        *fitted.notes,
         "Fitted (90 % intervals; thresholds are for frames of gamma 2.2):",
     ]
     for name, made in fitted.estimates.items():

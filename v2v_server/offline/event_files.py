@@ -46,10 +46,11 @@ def check_event_file(path: Path) -> None:
 
 
 def _npz(path: Path, events: EventList) -> None:
-    np.savez_compressed(
-        path, x=events.x, y=events.y, t=events.t, p=events.p,
-        width=np.int64(events.width_px), height=np.int64(events.height_px), note=np.array(_NOTE),
-    )  # fmt: skip
+    with path.open("wb") as file:  # to a path that ends in .NPZ, NumPy adds a second ending
+        np.savez_compressed(
+            file, x=events.x, y=events.y, t=events.t, p=events.p,
+            width=np.int64(events.width_px), height=np.int64(events.height_px), note=np.array(_NOTE),
+        )  # fmt: skip
 
 
 def _hdf5(path: Path, events: EventList) -> None:
@@ -69,7 +70,8 @@ def _faery(path: Path, events: EventList) -> None:
     table = np.empty(len(events), faery.EVENTS_DTYPE)
     table["t"], table["x"], table["y"], table["on"] = events.t, events.x, events.y, events.p
     stream = faery.events_stream_from_array(table, (events.width_px, events.height_px))
-    stream.to_file(path, zero_t0=False)
+    kind = {".raw": "evt", ".aedat4": "aedat"}.get(path.suffix.lower(), path.suffix.lower().lstrip("."))
+    stream.to_file(path, zero_t0=False, file_type=kind)  # faery does not know endings in capitals
 
 
 FORMS: dict[str, Callable[[Path, EventList], None]] = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 import struct
 import zipfile
 from pathlib import Path
@@ -70,6 +72,61 @@ def write_mvsec(path: Path, scene: Scene) -> None:
             group["image_raw_ts"] = scene.picture_us / 1e6
             # "Nearest": here the last event before.
             group["image_raw_event_inds"] = np.searchsorted(scene.t_us, scene.picture_us) - 1
+
+
+DSEC_OFFSET_US = 4_000_000
+
+
+def write_dsec(path: Path, scene: Scene, camera: str = "left", **stated: int) -> None:
+    """Write a sequence as unpacked by DSEC's instructions. ``stated``: attributes, which DSEC itself does not have."""
+    folder = path / "events" / camera
+    folder.mkdir(parents=True)
+    with h5py.File(folder / "events.h5", "w") as file:
+        t_us = (scene.t_us - DSEC_OFFSET_US).astype(np.uint32)
+        for name, values, dtype in (
+            ("x", scene.x, "u2"),
+            ("y", scene.y, "u2"),
+            ("t", t_us, "u4"),
+            ("p", scene.p, "u1"),
+        ):
+            file.create_dataset(f"events/{name}", data=values.astype(dtype))
+        file["ms_to_idx"] = np.searchsorted(t_us, 1000 * np.arange(int(t_us[-1]) // 1000 + 1)).astype(np.uint64)
+        file["t_offset"] = np.int64(DSEC_OFFSET_US)
+        file.attrs.update(stated)
+    frames = path / "images" / camera / "rectified"
+    frames.mkdir(parents=True)
+    for number, pixels in enumerate(scene.pictures):
+        (frames / f"{number:06d}.png").write_bytes(png(np.repeat(pixels[..., None], 3, axis=2)))
+    (path / "images" / "timestamps.txt").write_text("".join(f"{t}\n" for t in scene.picture_us))
+    exposures = "".join(f"{t - 50},{t + 50}\n" for t in scene.picture_us)
+    header = "# exposure_start_timestamp_us, exposure_end_timestamp_us\n"
+    (path / "images" / camera / "exposure_timestamps.txt").write_text(header + exposures)
+    (path / "disparity").mkdir(exist_ok=True)
+    (path / "disparity" / "timestamps.txt").write_text("0\n")
+    (path / "disparity" / "000000.png").write_bytes(png(scene.pictures[0]))
+
+
+def evreal_members(scene: Scene) -> dict[str, bytes]:
+    """Return the files that EVREAL's tools save: xy as the transpose of two rows, and so in Fortran's order."""
+    columns = {
+        "events_ts": scene.t_us / 1e6,
+        "events_xy": np.array([scene.x, scene.y]).transpose(),
+        "events_p": scene.p.astype(np.int64),
+        "images": scene.pictures[..., None],
+        "images_ts": (scene.picture_us / 1e6)[:, None],
+        "image_event_indices": np.searchsorted(scene.t_us, scene.picture_us, "right")[:, None] - 1,
+    }
+    members = {}
+    for name, values in columns.items():
+        stream = io.BytesIO()
+        np.save(stream, values, allow_pickle=False)
+        members[f"{name}.npy"] = stream.getvalue()
+    return members | {"metadata.json": json.dumps({"sensor_resolution": [HEIGHT, WIDTH]}).encode()}
+
+
+def write_npz(path: Path, scene: Scene) -> None:
+    with path.open("wb") as file:
+        np.savez_compressed(file, t=scene.t_us, x=scene.x, y=scene.y, p=scene.p, width=WIDTH, height=HEIGHT)
 
 
 def write_bag(

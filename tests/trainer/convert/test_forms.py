@@ -24,6 +24,17 @@ Write = Callable[[Path, Scene], None]
 
 WITH_PICTURES: dict[str, tuple[str, str, Write]] = {
     "ijrr zip": ("ijrr", "slow.zip", lambda path, s: raw_forms.write_zip(path, raw_forms.ijrr_members(s))),
+    "ijrr in capitals": (
+        "ijrr",
+        "SLOW.ZIP",
+        lambda path, s: raw_forms.write_zip(
+            path,
+            {
+                name.upper().replace("IMAGES/FRAME", "images/frame").replace("PNG", "png"): content
+                for name, content in raw_forms.ijrr_members(s).items()
+            },
+        ),
+    ),
     "ijrr folder": ("ijrr", "slow", lambda path, s: raw_forms.write_folder(path, raw_forms.ijrr_members(s))),
     "evaid zip": ("evaid", "ball.zip", lambda path, s: raw_forms.write_zip(path, raw_forms.evaid_members(s))),
     "evaid zip of macOS": (
@@ -33,6 +44,14 @@ WITH_PICTURES: dict[str, tuple[str, str, Write]] = {
     ),
     "evaid folder": ("evaid", "ball", lambda path, s: raw_forms.write_folder(path, raw_forms.evaid_members(s))),
     "mvsec": ("mvsec", "indoor_flying1_data.hdf5", raw_forms.write_mvsec),
+    "dsec": ("dsec", "zurich_city_00_a", raw_forms.write_dsec),
+    "dsec with a stated size": (
+        "dsec",
+        "zurich_city_00_a",
+        lambda path, s: raw_forms.write_dsec(path, s, width=WIDTH, height=HEIGHT),
+    ),
+    "evreal": ("columns", "boxes", lambda path, s: raw_forms.write_folder(path, raw_forms.evreal_members(s))),
+    "evreal zip": ("columns", "BOXES.ZIP", lambda path, s: raw_forms.write_zip(path, raw_forms.evreal_members(s))),
     "bag": ("bag", "desk.bag", raw_forms.write_bag),
     "bag of colour": ("bag", "desk.bag", lambda path, s: raw_forms.write_bag(path, s, image_encoding="bgr8")),
     "bag of packets": ("bag", "desk.bag", lambda path, s: raw_forms.write_bag(path, s, packets=True)),
@@ -56,6 +75,10 @@ WITHOUT: dict[str, tuple[str, str, Write]] = {
         "own.raw",
         lambda path, s: raw_forms.write_evt3(path, s, front=raw_forms.EVT3_MIDDLE),
     ),
+    "evt2 in capitals": ("prophesee", "OWN.RAW", raw_forms.write_evt2),
+    "evt2 called dat": ("prophesee", "OWN.DAT", raw_forms.write_evt2),
+    "npz": ("columns", "own.npz", raw_forms.write_npz),
+    "npz in capitals": ("columns", "OWN.NPZ", raw_forms.write_npz),
     "text": ("ijrr", "own.txt", lambda path, s: path.write_bytes(raw_forms.ijrr_members(s)["slow/events.txt"])),
 }
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from trainer.convert import convert, writer
-from v2v_recordings import mvsec, text_events
+from v2v_recordings import hdf5, text_events
 
 
 def write_mvsec(path: Path, events: int) -> Path:
@@ -36,7 +36,7 @@ def test_peak_memory_is_that_of_the_buffers(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(writer, "FLUSH_EVENTS", 4096)
     monkeypatch.setattr(writer, "REORDER_EVENTS", 1024)
     monkeypatch.setattr(writer, "H5_CHUNK", 1024)
-    monkeypatch.setattr(mvsec, "READ_EVENTS", 1024)
+    monkeypatch.setattr(hdf5, "READ_EVENTS", 1024)
     monkeypatch.setattr(text_events, "BLOCK_BYTES", 1 << 14)
     peaks = []
     # The first one also pays for imports and caches.
