@@ -17,7 +17,7 @@ from v2v_protocol.sample import FromSidecar
 from v2v_server.corpus import sidecars as collecting
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources import asking
-from v2v_server.corpus.sources.sidecar import fingerprint_of, open_sidecar, sidecar_id
+from v2v_server.corpus.sources.sidecar import open_sidecar, read_files, sidecar_id
 from v2v_server.corpus.sources.source import SourceOptions, open_source
 
 JSON, MASKS = ".boxes.json", ".masks/"
@@ -82,7 +82,7 @@ def test_a_catalogue_knows_them_and_its_digest_does_not(
         assert "1 of 2 videos have a sidecar .masks/" in catalogue.notes
 
     read: list[object] = []
-    monkeypatch.setattr(collecting, "fingerprint_of", lambda opened: read.append(opened) or fingerprint_of(opened))
+    monkeypatch.setattr(collecting, "read_files", lambda opened: read.append(opened) or read_files(opened))
     with opened(corpus, kind) as again:
         assert {again.facts.sidecars_digest(arrays) for arrays in (("boxes",), ("masks",), ARRAYS)} == digests
     assert not read, "what is unchanged is not read again"
@@ -100,16 +100,16 @@ def test_an_interrupted_start_keeps_what_it_has_read(corpus: Path, monkeypatch: 
     monkeypatch.setattr(asking, "_TOGETHER", 1)
     read: list[str] = []
 
-    def interrupted(opened: Path) -> str:
+    def interrupted(opened: Path) -> tuple[str, bytes]:
         if read:
             raise KeyboardInterrupt
         read.append(opened.name)
-        return fingerprint_of(opened)
+        return read_files(opened)
 
-    monkeypatch.setattr(collecting, "fingerprint_of", interrupted)
+    monkeypatch.setattr(collecting, "read_files", interrupted)
     with pytest.raises(KeyboardInterrupt), opened(corpus, "folder"):
         pass
-    monkeypatch.setattr(collecting, "fingerprint_of", lambda opened: read.append(opened.name) or fingerprint_of(opened))
+    monkeypatch.setattr(collecting, "read_files", lambda opened: read.append(opened.name) or read_files(opened))
     with opened(corpus, "folder"):
         assert read == ["a.boxes.json", "b.x.boxes.json", "b.x.masks"]
 
@@ -119,12 +119,12 @@ def test_a_fifo_is_not_opened(corpus: Path, name: str, monkeypatch: pytest.Monke
     (corpus / name).unlink()
     os.mkfifo(corpus / name)
 
-    def read(opened: Path) -> str:
+    def read(opened: Path) -> tuple[str, bytes]:
         """Fail before opening it, which would wait for a writer."""
         assert not any(map(Path.is_fifo, (opened, *opened.glob("*"))))
-        return fingerprint_of(opened)
+        return read_files(opened)
 
-    monkeypatch.setattr(collecting, "fingerprint_of", read)
+    monkeypatch.setattr(collecting, "read_files", read)
     with opened(corpus, "folder") as catalogue:
         notes = [note for note in catalogue.notes if "not a regular file" in note]
     assert len(notes) == 1
@@ -157,7 +157,8 @@ def test_it_is_opened_like_the_video(corpus: Path, kind: str) -> None:
     assert source.has(files)
     with open_sidecar(source, "a.boxes.json", boxes) as file:
         assert file.read_text() == "[1]"
-    with open_sidecar(source, "deep/b.x.masks/", masks) as folder:
+    table = read_files(corpus / "deep" / "b.x.masks")[1]
+    with open_sidecar(source, "deep/b.x.masks/", masks, table) as folder:
         assert (folder / "2.png").read_bytes() == b"2.png"
         assert (folder / "more" / "3.png").read_bytes() == b"more/3.png"
     source.release()
@@ -168,6 +169,7 @@ def test_a_changed_and_a_missing_one_are_told_apart(corpus: Path, kind: str) -> 
     with opened(corpus, kind) as catalogue:
         boxes = catalogue.facts.sidecars_of("a.mp4", ARRAYS)[JSON]
         masks = catalogue.facts.sidecars_of("deep/b.x.mp4", ARRAYS)[MASKS]
+        table = read_files(corpus / "deep/b.x.masks")[1]
         catalogue.check("a.mp4", boxes, JSON)
         catalogue.check("deep/b.x.mp4", masks, MASKS)
         (corpus / "a.boxes.json").write_text("[2]")
@@ -186,7 +188,7 @@ def test_a_changed_and_a_missing_one_are_told_apart(corpus: Path, kind: str) -> 
     fresh.make()
     with pytest.raises(VideoGone), open_sidecar(fresh, "a.boxes.json", boxes):
         pass
-    with pytest.raises(VideoError), open_sidecar(fresh, "deep/b.x.masks/", masks):
+    with pytest.raises(VideoError), open_sidecar(fresh, "deep/b.x.masks/", masks, table):
         pass
 
 
