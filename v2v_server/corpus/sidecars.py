@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import sqlite3
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -67,15 +67,12 @@ def files_for_lease(data: bytes | None, fingerprint: str, start: int, count: int
         start, count: the frames.
     """
     mark, _, table = (data or b"").partition(b"\n")
-    if mark != fingerprint.encode():
-        return "has changed since this catalogue was opened; start again to serve it as it is now"
-    try:
-        part = files_between(table, start, start + count)
-    except ValueError:
-        return "has a damaged entry in the index: delete the index and start again"
-    if len(part) > _LARGEST_PART_BYTES:
-        return f"has too many files for {count} frames: their names take {len(part)} of {_LARGEST_PART_BYTES} bytes"
-    return part
+    with suppress(ValueError):  # damaged
+        if mark == fingerprint.encode():
+            part = files_between(table, start, start + count)
+            too_long = f"has too many files for a clip of {count} frames: the list of them has {len(part)} bytes"
+            return part if len(part) <= _LARGEST_PART_BYTES else f"{too_long}; the limit is {_LARGEST_PART_BYTES}"
+    return "is not as in the index, which another program changed: start again to serve it as it is now"
 
 
 def collect_sidecars(
@@ -98,119 +95,118 @@ def collect_sidecars(
         processes: number of processes that read; 0 reads in this one.
         notice: progress callback.
     """
-    sidecars, notes, tell = dict[str, Sidecars](), list[str](), notice or (lambda text: None)
+    sidecars, notes = dict[str, Sidecars](), list[str]()
     for ending, ids in source.with_sidecars(sorted(videos), endings).items():
-        collection = _Collection(source, store, ending)
-        changed = collection.compare(ids, tell) if ids else []
-        jobs = [(video, sidecar_id(video, ending), ending, *shape(video)) for video in changed]
-        collection.read(jobs, videos, processes, tell)
-        sidecars[ending] = collection.sidecars()
-        notes += collection.notes(len(videos))
-    return sidecars, notes
-
-
-class _Collection:
-    """The sidecars of one ending while they are collected."""
-
-    def __init__(self, source: VideoSource, store: Store, ending: str) -> None:
-        self._source, self._store, self._ending, self._kind = (
-            source,
-            store,
-            ending,
-            FigureKind(f"sidecar {ending}", "2"),
-        )
-        self._found, self._states, self._problems = (
-            dict[str, tuple[str, str, str]](),
-            dict[str, str](),
-            dict[str, str](),
-        )
-
-    def compare(self, ids: Sequence[str], tell: Notice) -> list[str]:
-        """Take over what the index knows, and return the videos whose sidecars are to be read."""
-        known, changed, done = dict[str, str](), list[str](), 0
-        with suppress(sqlite3.Error):  # an index that cannot be read costs time only
-            self._store.make_figures()
-            known = {id: data.decode("utf-8", "replace") for id, _, data in self._store.all_figures(self._kind)}
-        with closing(by_parts(lambda part: [self._state(video) for video in part], ids)) as answered:
-            for part, states in answered:
-                done += len(part)
-                for video, state in zip(part, states, strict=True):
-                    before, *found = known.get(video, "").split("\n")
-                    if isinstance(state, OSError):
-                        self._problems[video] = _line(state)
-                    elif state:
-                        self._states[video] = state
-                        if state == before and len(found) == 3:
-                            self._found[video] = found[0], found[1], found[2]
-                        else:
-                            changed.append(video)
-                tell(f"looking for sidecars {self._ending} in {self._source}: {done} of {len(ids)} videos")
-        return changed
-
-    def _state(self, video: str) -> str | OSError:
-        try:
-            return self._source.sidecar_state(sidecar_id(video, self._ending))
-        except OSError as error:
-            return error
-
-    def read(self, jobs: Sequence[_Job], videos: Mapping[str, str], processes: int, tell: Notice) -> None:
-        """Read new and changed sidecars, and put what was found into the index."""
-        isolated = run_isolated(
-            partial(read_sidecar, self._source),
-            jobs,
-            processes,
-            deadline_seconds=lambda job: LONGEST_SECONDS,
-            memory_bytes=LARGEST_MEMORY_BYTES,
-            writable=() if self._source.is_local else None,  # copies are fetched: from a network, into a folder
-        )
-        facts, files = list[Figures](), list[Figures]()
-        try:
-            for done, ((video, id, *_), result) in enumerate(isolated, 1):
-                tell(f"read {id}, {done} of {len(jobs)} new or changed sidecars {self._ending}")
-                if isinstance(result, Died):
-                    self._problems[video] = f"reading it took too much time or memory, or crashed ({result.how})"
-                    continue
-                *found, table = result
-                if not found[0]:
-                    self._problems[video] = found[1]
-                    continue
-                self._found[video] = found[0], found[1], found[2]
-                text = "\n".join((self._states[video], *found))
-                facts.append(Figures(video, videos[video], b"", text.encode()))
-                files.append(Figures(video, videos[video], b"", found[0].encode() + b"\n" + table))
-                if len(facts) == _TOGETHER:
-                    self._save(facts, files)
-        finally:
-            self._save(facts, files)  # also of an interrupted start
-
-    def _save(self, facts: list[Figures], files: list[Figures]) -> None:
-        self._store.put_figures(files_kind(self._ending), files)
-        self._store.put_figures(self._kind, facts)
-        facts.clear()
-        files.clear()
-
-    def sidecars(self) -> Sidecars:
-        fingerprints = {id: self._found[id][0] for id in sorted(self._found)}
-        sha = hashlib.sha256(f"v2v sidecars 1\n{self._ending}\n".encode())
-        for id, fingerprint in fingerprints.items():
-            sha.update(f"{id}\0{fingerprint}\n".encode())
-        refused = {id: problem for id, (_, problem, _) in self._found.items() if problem}
-        return Sidecars(fingerprints, sha.hexdigest()[:32], self._states, self._problems | refused)
-
-    def notes(self, videos: int) -> list[str]:
-        refused = [f"{id}: {problem}" for id, (_, problem, _) in self._found.items() if problem]
-        not_read = [f"{id}: {files}" for id, (*_, files) in self._found.items() if files]
-        unreadable = [f"{sidecar_id(id, self._ending)}: {reason}" for id, reason in self._problems.items()]
-        found = [f"{len(self._found)} of {videos} videos have a sidecar {self._ending}"] if self._found else []
-        return found + [
+        states = _states(source, ending, ids, notice) if ids else {}
+        problems = {video: _line(state) for video, state in states.items() if isinstance(state, OSError)}
+        present = {video: state for video, state in states.items() if isinstance(state, str) and state}
+        found = _known(store, ending, present)
+        jobs = [(video, sidecar_id(video, ending), ending, *shape(video)) for video in present if video not in found]
+        for video, facts in _read(source, store, jobs, present, videos, processes, notice):
+            found[video] = facts
+        problems |= {video: facts[1] for video, facts in found.items() if facts[1]}
+        fingerprints = {video: found[video][0] for video in sorted(found) if found[video][0]}
+        sidecars[ending] = Sidecars(fingerprints, _digest(ending, fingerprints), present, problems)
+        missing = [
+            f"{sidecar_id(video, ending)}: {why}" for video, why in problems.items() if video not in fingerprints
+        ]
+        refused = [f"{video}: {why}" for video, why in problems.items() if video in fingerprints]
+        not_read = [f"{sidecar_id(video, ending)}: {facts[2]}" for video, facts in found.items() if facts[2]]
+        notes += [f"{len(fingerprints)} of {len(videos)} videos have a sidecar {ending}"] if fingerprints else []
+        notes += [
             f"{len(those)} sidecars {text} ({those[0]})"
             for those, text in (
-                (unreadable, "cannot be read and count as missing"),
-                (refused, f"{self._ending} are refused, and their videos are served without these labels"),
-                (not_read, f"{self._ending} have files that are no labels"),
+                (missing, "cannot be read and count as missing"),
+                (refused, f"{ending} are refused, and their videos are served without these labels"),
+                (not_read, f"{ending} have files that are no labels"),
             )
             if those
         ]
+    return sidecars, notes
+
+
+def _states(source: VideoSource, ending: str, ids: Sequence[str], notice: Notice | None) -> dict[str, str | OSError]:
+    """Return the state of each video's sidecar, or why it cannot be told."""
+
+    def states(part: Sequence[str]) -> list[str | OSError]:
+        return [source.sidecar_state(sidecar_id(video, ending)) for video in part]
+
+    found = dict[str, str | OSError]()
+    with closing(by_parts(states, ids)) as answered:
+        for part, those in answered:
+            found.update(zip(part, those, strict=True))
+            if notice is not None:
+                notice(f"looking for sidecars {ending} in {source}: {len(found)} of {len(ids)} videos")
+    return found
+
+
+def _known(store: Store, ending: str, states: Mapping[str, str]) -> dict[str, list[str]]:
+    """Return the facts of unchanged sidecars from the index."""
+    with suppress(sqlite3.Error):  # an index that cannot be read costs time only
+        store.make_figures()
+        entries = (
+            (id, data.decode("utf-8", "replace").split("\n")) for id, _, data in store.all_figures(_kind(ending))
+        )
+        return {id: entry[1:] for id, entry in entries if entry[0] == states.get(id) and len(entry) == 4}
+    return {}
+
+
+def _read(
+    source: VideoSource,
+    store: Store,
+    jobs: Sequence[_Job],
+    states: Mapping[str, str],
+    videos: Mapping[str, str],
+    processes: int,
+    notice: Notice | None,
+) -> Iterator[tuple[str, list[str]]]:
+    """Read new and changed sidecars, put what is found into the index, and yield it: (video, facts)."""
+    isolated = run_isolated(
+        partial(read_sidecar, source),
+        jobs,
+        processes,
+        deadline_seconds=lambda job: LONGEST_SECONDS,
+        memory_bytes=LARGEST_MEMORY_BYTES,
+        writable=() if source.is_local else None,  # copies are fetched: from a network, into a folder
+    )
+    fresh = list[tuple[FigureKind, Figures]]()
+    try:
+        for done, ((video, id, ending, *_), result) in enumerate(isolated, 1):
+            if notice is not None:
+                notice(f"read {id}, {done} of {len(jobs)} new or changed sidecars {ending}")
+            died = (
+                f"reading it took too much time or memory, or crashed ({result.how})"
+                if isinstance(result, Died)
+                else ""
+            )
+            *facts, table = ("", died, "", b"") if isinstance(result, Died) else result
+            if facts[0]:
+                text, mark = "\n".join((states[video], *facts)), facts[0].encode() + b"\n"
+                fresh.append((files_kind(ending), Figures(video, videos[video], b"", mark + table)))
+                fresh.append((_kind(ending), Figures(video, videos[video], b"", text.encode())))
+            if len(fresh) >= _TOGETHER:
+                _save(store, fresh)
+            yield video, facts
+    finally:
+        _save(store, fresh)  # also of an interrupted start
+
+
+def _save(store: Store, fresh: list[tuple[FigureKind, Figures]]) -> None:
+    with suppress(sqlite3.Error):  # the next start reads them again; until then leases refuse folders, in words
+        for kind in dict.fromkeys(kind for kind, _ in fresh):
+            store.put_figures(kind, [figures for each, figures in fresh if each == kind])
+    fresh.clear()
+
+
+def _kind(ending: str) -> FigureKind:
+    return FigureKind(f"sidecar {ending}", "2")
+
+
+def _digest(ending: str, fingerprints: Mapping[str, str]) -> str:
+    sha = hashlib.sha256(f"v2v sidecars 1\n{ending}\n".encode())
+    for id in sorted(fingerprints):
+        sha.update(f"{id}\0{fingerprints[id]}\n".encode())
+    return sha.hexdigest()[:32]
 
 
 def read_sidecar(source: VideoSource, job: _Job) -> _Found:
@@ -228,9 +224,7 @@ def read_sidecar(source: VideoSource, job: _Job) -> _Found:
 
 def _line(text: Exception | str) -> str:
     """Return a text, or what an error says, for people: one line, not too long."""
-    if isinstance(text, MemoryError):
-        text = "reading it takes too much memory"
-    elif isinstance(text, Exception):
-        plain = getattr(text, "reason", None) or getattr(text, "strerror", None) or str(text)
-        text = plain if isinstance(text, OSError | VideoError | ValueError) else f"{type(text).__name__}: {plain}"
-    return printable(text.replace("\n", " "))[:_LONGEST_REASON]
+    plain = getattr(text, "reason", None) or getattr(text, "strerror", None) or str(text)
+    if isinstance(text, Exception) and not isinstance(text, OSError | VideoError | ValueError):
+        plain = f"reading it failed ({type(text).__name__}: {plain})"
+    return printable(plain.replace("\n", " "))[:_LONGEST_REASON]

@@ -46,6 +46,8 @@ def read_coco(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
         raise ValueError("is not a JSON object with images and annotations")
     if len(videos := _list(content, "videos", optional=True)) > 1:
         raise ValueError(f"describes {len(videos)} videos: write one file for each video")
+    for place, video in enumerate(videos):
+        _Entry(f"videos[{place}]", video).check_size(picture_px)
     frames, numbers, ids = dict[int, int](), set[int](), set[str]()
     for place, image in enumerate(_list(content, "images")):
         with_place = _Entry(f"images[{place}]", image)

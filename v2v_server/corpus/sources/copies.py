@@ -164,9 +164,12 @@ class Copies(VideoSource):
         if changed:
             raise VideoChanged(id, None, f"changed in {self} since it was catalogued")
 
-    def sidecar_state(self, id: str) -> str:
+    def sidecar_state(self, id: str) -> str | OSError:
         """Return a text that stands for the listed objects' states, see :meth:`VideoSource.sidecar_state`."""
-        return state_text((name[len(id) :], self._objects[name]) for name in self._below(id))
+        try:
+            return state_text((name[len(id) :], self._objects[name]) for name in self._below(id))
+        except OSError as error:
+            return error
 
     def _below(self, id: str) -> Iterator[str]:
         """Yield the names of the listed objects of a sidecar, sorted."""

@@ -109,9 +109,12 @@ class Folder(VideoSource):
                     videos.append(id)
         return found
 
-    def sidecar_state(self, id: str) -> str:
+    def sidecar_state(self, id: str) -> str | OSError:
         """Return a text that stands for sizes and times, see :meth:`VideoSource.sidecar_state`."""
-        return local_state(self.folder / id, id)
+        try:
+            return local_state(self.folder / id, id)
+        except OSError as error:
+            return error
 
     def verify(self, id: str, fingerprint: str, state: State | str | None) -> None:
         """Check the file against its fingerprint; of a sidecar, only sizes and times.

@@ -183,13 +183,13 @@ class VideoSource(ABC):
         """Return, by ending, those of these videos that may have such a sidecar, in their order."""
         return dict.fromkeys(endings, ids)
 
-    def sidecar_state(self, id: str) -> str:
+    def sidecar_state(self, id: str) -> str | OSError:
         """Return a text that changes with the content of a sidecar; "" if it is not there. Called in threads. A source
         without sidecars need not implement this.
 
-        Raises:
-            OSError: it cannot be told, or the sidecar is beyond the limits of
-                :func:`v2v_server.corpus.sources.sidecar.state_text`.
+        Returns:
+            the text; or an error, if it cannot be told, or the sidecar is beyond the limits of
+            :func:`v2v_server.corpus.sources.sidecar.state_text`.
         """
         return ""
 
