@@ -25,7 +25,7 @@ from v2v_server.corpus.probe import Progress
 from v2v_server.corpus.refresh import index_path, refresh_index
 from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sidecars import Sidecars, collect_sidecars, files_for_lease, files_kind
+from v2v_server.corpus.sidecars import Sidecars, collect_sidecars, files_for_lease, sidecar_kind
 from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.listfile import ListEntry
 from v2v_server.corpus.sources.sidecar import sidecar_id
@@ -201,7 +201,7 @@ class Catalogue:
             CorpusError, IndexUnreadable: see :meth:`frame_index`.
         """
         try:
-            data = self._store.figures(id, self._files.get(id, self._fingerprint(id)), files_kind(ending))
+            data = self._store.figures(id, self._files.get(id, self._fingerprint(id)), sidecar_kind(ending))
         except sqlite3.Error as error:
             raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
         return files_for_lease(data, fingerprint, start, count)

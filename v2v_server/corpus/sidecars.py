@@ -53,9 +53,9 @@ class Sidecars:
     problems: Mapping[str, str] = field(default_factory=dict)
 
 
-def files_kind(ending: str) -> FigureKind:
-    """Return the kind of figures that holds the files of sidecars, see :func:`files_for_lease`."""
-    return FigureKind(f"files of {ending}", "1")
+def sidecar_kind(ending: str) -> FigureKind:
+    """Return the kind of figures that holds the sidecars of an ending."""
+    return FigureKind(f"sidecar {ending}", "2")
 
 
 def files_for_lease(data: bytes | None, fingerprint: str, start: int, count: int) -> bytes | str:
@@ -100,9 +100,9 @@ def collect_sidecars(
         states = _states(source, ending, ids, notice) if ids else {}
         problems = {video: _line(state) for video, state in states.items() if isinstance(state, OSError)}
         present = {video: state for video, state in states.items() if isinstance(state, str) and state}
-        found = _known(store, ending, present)
+        found = _known(store, ending, present) if present else {}
         jobs = [(video, sidecar_id(video, ending), ending, *shape(video)) for video in present if video not in found]
-        for video, facts in _read(source, store, jobs, present, videos, processes, notice):
+        for video, facts in _read(source, store, ending, jobs, present, videos, processes, notice):
             found[video] = facts
         problems |= {video: facts[1] for video, facts in found.items() if facts[1]}
         fingerprints = {video: found[video][0] for video in sorted(found) if found[video][0]}
@@ -144,16 +144,16 @@ def _known(store: Store, ending: str, states: Mapping[str, str]) -> dict[str, li
     """Return the facts of unchanged sidecars from the index."""
     with suppress(sqlite3.Error):  # an index that cannot be read costs time only
         store.make_figures()
-        entries = (
-            (id, data.decode("utf-8", "replace").split("\n")) for id, _, data in store.all_figures(_kind(ending))
-        )
-        return {id: entry[1:] for id, entry in entries if entry[0] == states.get(id) and len(entry) == 4}
+        rows = ((row[0], row[-1]) for row in store.rows(sidecar_kind(ending)))
+        entries = {id: data.decode("utf-8", "replace").split("\n") for id, data in rows if isinstance(data, bytes)}
+        return {id: entry[1:] for id, entry in entries.items() if entry[0] == states.get(id) and len(entry) == 4}
     return {}
 
 
 def _read(
     source: VideoSource,
     store: Store,
+    ending: str,
     jobs: Sequence[_Job],
     states: Mapping[str, str],
     videos: Mapping[str, str],
@@ -169,9 +169,9 @@ def _read(
         memory_bytes=LARGEST_MEMORY_BYTES,
         writable=() if source.is_local else None,  # copies are fetched: from a network, into a folder
     )
-    fresh = list[tuple[FigureKind, Figures]]()
+    fresh = list[Figures]()
     try:
-        for done, ((video, id, ending, *_), result) in enumerate(isolated, 1):
+        for done, ((video, id, *_), result) in enumerate(isolated, 1):
             if notice is not None:
                 notice(f"read {id}, {done} of {len(jobs)} new or changed sidecars {ending}")
             died = (
@@ -182,24 +182,18 @@ def _read(
             *facts, table = ("", died, "", b"") if isinstance(result, Died) else result
             if facts[0]:
                 text, mark = "\n".join((states[video], *facts)), facts[0].encode() + b"\n"
-                fresh.append((files_kind(ending), Figures(video, videos[video], b"", mark + table)))
-                fresh.append((_kind(ending), Figures(video, videos[video], b"", text.encode())))
-            if len(fresh) >= _TOGETHER:
-                _save(store, fresh)
+                fresh.append(Figures(video, videos[video], text.encode(), mark + table))
+            if len(fresh) == _TOGETHER:
+                _save(store, ending, fresh)
             yield video, facts
     finally:
-        _save(store, fresh)  # also of an interrupted start
+        _save(store, ending, fresh)  # also of an interrupted start
 
 
-def _save(store: Store, fresh: list[tuple[FigureKind, Figures]]) -> None:
+def _save(store: Store, ending: str, fresh: list[Figures]) -> None:
     with suppress(sqlite3.Error):  # the next start reads them again; until then leases refuse folders, in words
-        for kind in dict.fromkeys(kind for kind, _ in fresh):
-            store.put_figures(kind, [figures for each, figures in fresh if each == kind])
+        store.put_figures(sidecar_kind(ending), fresh)
     fresh.clear()
-
-
-def _kind(ending: str) -> FigureKind:
-    return FigureKind(f"sidecar {ending}", "2")
 
 
 def _digest(ending: str, fingerprints: Mapping[str, str]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources.abc import Traversable
 from typing import Any
@@ -26,57 +25,40 @@ _KEPT = 4
 """Sidecars that stay in memory once they are read: siblings use them one after the other."""
 
 
-@dataclass(frozen=True)
-class _LabelFile:
-    """A sidecar of one video. Equal files have equal bytes; of a folder a clip has a part, which equals itself only."""
+def _only_sidecar(array: str, video: str, sidecars: Mapping[str, Traversable | None]) -> tuple[str, Traversable]:
+    """Return the one sidecar that the array is made from, and its ending.
 
-    video: str
-    ending: str
-    fingerprint: str
-    picture_px: tuple[int, int]
-    opened: Traversable
-
-    @classmethod
-    def of(
-        cls,
-        array: str,
-        video: str,
-        picture_px: tuple[int, int],
-        sidecars: Mapping[str, Traversable | None],
-        fingerprints: Mapping[str, str],
-    ) -> _LabelFile:
-        """Return the one sidecar that the array is made from.
-
-        Raises:
-            SidecarError: there is none, or more than one.
-        """
-        endings = sidecar_endings((array,))
-        found = [(ending, opened) for ending in endings if (opened := sidecars.get(ending)) is not None]
-        if len(found) != 1:
-            why = f"there are {len(found)}: keep one" if found else "is missing: add it beside the video"
-            raise SidecarError(video, " or ".join(ending for ending, _ in found) or " or ".join(endings), why)
-        ((ending, opened),) = found
-        return cls(video, ending, fingerprints[ending], picture_px, opened)
+    Raises:
+        SidecarError: there is none, or more than one.
+    """
+    endings = sidecar_endings((array,))
+    found = [(ending, opened) for ending in endings if (opened := sidecars.get(ending)) is not None]
+    if len(found) != 1:
+        why = f"there are {len(found)}: keep one" if found else "is missing: add it beside the video"
+        raise SidecarError(video, " or ".join(ending for ending, _ in found) or " or ".join(endings), why)
+    return found[0]
 
 
 @lru_cache(maxsize=_KEPT)
-def _boxes_of(file: _LabelFile) -> BoxTable:
-    return READERS[file.ending](file.opened, file.picture_px)
+def _boxes_of(ending: str, fingerprint: str, picture_px: tuple[int, int], opened: Traversable) -> BoxTable:
+    """Read boxes. Equal fingerprints mean equal files; of a folder each clip has a part, which equals itself only."""
+    return READERS[ending](opened, picture_px)
 
 
 def read_ahead(lease: Lease, sidecars: Mapping[str, Traversable | None]) -> None:
     """Read the boxes of a lease, so that they are at hand when its sample is made. Errors come again then."""
     if "boxes" in lease.arrays:
-        marks = {ending: mark for ending, (_, mark) in sidecar_files(lease).items()}
         with suppress(Exception):
-            _boxes_of(_LabelFile.of("boxes", lease.video, (lease.height_px, lease.width_px), sidecars, marks))
+            ending, opened = _only_sidecar("boxes", lease.video, sidecars)
+            _boxes_of(ending, sidecar_files(lease)[ending][1], (lease.height_px, lease.width_px), opened)
 
 
 @makes("boxes")
 def boxes(context: SampleContext, out: npt.NDArray[Any]) -> None:
     """Fill in the boxes of each delivered frame, [T, max_boxes, 7], the largest first."""
     clip = context.clip
-    table = _boxes_of(_LabelFile.of("boxes", context.video, clip.picture_px, clip.sidecars, clip.fingerprints))
+    ending, opened = _only_sidecar("boxes", context.video, clip.sidecars)
+    table = _boxes_of(ending, clip.fingerprints[ending], clip.picture_px, opened)
     found = [table.at(frame) for frame in context.target_frames]
     out[...] = -1
     dropped = 0
@@ -92,9 +74,7 @@ def boxes(context: SampleContext, out: npt.NDArray[Any]) -> None:
 @makes("masks")
 def masks(context: SampleContext, out: npt.NDArray[Any]) -> None:
     """Fill in the class mask of each delivered frame, [T, 1, H, W]."""
-    clip = context.clip
-    file = _LabelFile.of("masks", context.video, clip.picture_px, clip.sidecars, clip.fingerprints)
-    files = numbered_files(file.opened, ".png")
+    files = numbered_files(_only_sidecar("masks", context.video, context.clip.sidecars)[1], ".png")
     view: Callable[[int], npt.NDArray[np.uint8]] = lru_cache(maxsize=1)(lambda frame: _mask(context, files, frame))
     for target, frame in zip(out[:, 0], context.target_frames, strict=True):
         target[...] = view(frame)  # a paused camera repeats its frame

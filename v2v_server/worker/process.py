@@ -204,7 +204,8 @@ class Worker:
     def _inspect(self, lease: Lease) -> Readiness:
         """Return what the work on a lease needs."""
         missing, has_video = kernels_of(lease) - self._kernels, self._has_video(lease)
-        is_ready = not missing and has_video and (not sidecar_files(lease) or self._sidecars[0] == _labels(lease))
+        has_sidecars = not sidecar_files(lease) or self._sidecars[0] == (lease.video, lease.arrays, lease.sidecars)
+        is_ready = not missing and has_video and has_sidecars
         is_small = has_video or _size_bytes(lease) <= _SOON_FETCHED_BYTES
         return Readiness(is_ready, is_small and all(map(is_compiled, missing)), self._clips.has(lease))
 
@@ -235,13 +236,14 @@ class Worker:
         """Read the lease's sidecars before the lease is begun, so that their time does not count against the sample.
         Siblings use them too.
         """
-        if self._sidecars[0] != _labels(lease):
+        key = lease.video, lease.arrays, lease.sidecars
+        if self._sidecars[0] != key:
             try:
                 with open_sidecars(lease, self._source) as opened:
                     read_ahead(lease, opened)
-                    self._sidecars = _labels(lease), opened
+                    self._sidecars = key, opened
             except SidecarError as error:
-                self._sidecars = _labels(lease), error
+                self._sidecars = key, error
         return self._sidecars[1]
 
     def _messages(self, wait_seconds: float) -> list[bytes]:
@@ -330,11 +332,6 @@ def _size_bytes(lease: Lease) -> int:
 def _files(lease: Lease) -> dict[str, str]:
     """Return the fingerprints of the files that a lease's sample is made from, by id."""
     return {lease.video: lease.fingerprint, **dict(sidecar_files(lease).values())}
-
-
-def _labels(lease: Lease) -> object:
-    """Return what tells the sidecars of one lease from those of another."""
-    return lease.video, lease.arrays, lease.sidecars
 
 
 def _written(source: VideoSource, address: str, cache: Cache | None) -> list[Path] | None:
