@@ -218,7 +218,7 @@ def read_sidecar(source: VideoSource, job: _Job) -> _Found:
 
 def _line(text: Exception | str) -> str:
     """Return a text, or what an error says, for people: one line, not too long."""
-    plain = getattr(text, "reason", None) or getattr(text, "strerror", None) or str(text)
+    plain = text.reason if isinstance(text, VideoError) else getattr(text, "strerror", None) or str(text)
     if isinstance(text, Exception) and not isinstance(text, OSError | VideoError | ValueError):
         plain = f"reading it failed ({type(text).__name__}: {plain})"
     return printable(plain.replace("\n", " "))[:_LONGEST_REASON]

@@ -40,7 +40,7 @@ def _only_sidecar(array: str, video: str, sidecars: Mapping[str, Traversable | N
 
 
 @lru_cache(maxsize=_KEPT)
-def _boxes_of(ending: str, fingerprint: str, picture_px: tuple[int, int], opened: Traversable) -> BoxTable:
+def _boxes_of(ending: str, fingerprint: str, picture_px: tuple[int, int], opened: Any) -> BoxTable:
     """Read boxes. Equal fingerprints mean equal files; of a folder each clip has a part, which equals itself only."""
     return READERS[ending](opened, picture_px)
 

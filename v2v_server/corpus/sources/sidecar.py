@@ -41,6 +41,7 @@ LARGEST_FILE_BYTES, MOST_BYTES, MOST_FILES, MOST_FOLDERS = 4 << 30, 64 << 30, 1 
 MOST_LENT_BYTES = 256 << 20
 """Limit of the files of a folder that one clip needs: they are held in memory."""
 _BLOCK_BYTES = 1 << 20
+_LARGEST_TABLE_BYTES = 64 << 20
 _EVERY_FRAME = -1
 """Stands for the frame of a file whose name has no number: every clip needs it."""
 _DIGEST = 16
@@ -76,6 +77,8 @@ def read_files(opened: Traversable) -> tuple[str, bytes]:
         rows.append((_EVERY_FRAME if frame is None else frame, os.fsencode(name[1:]), content.digest()[:_DIGEST]))
     longest = max(1, *(len(name) for _, name, _ in rows), 1)
     table = longest.to_bytes(2, "little") + np.array(rows, _row(longest)).tobytes()
+    if len(table) > _LARGEST_TABLE_BYTES:
+        raise OSError(errno.EFBIG, f"has {len(rows)} files, whose names are too long: shorten the paths")
     return f"{total}-{sha.hexdigest()[:32]}", table
 
 
@@ -92,7 +95,8 @@ def files_between(table: bytes, first: int, end: int) -> bytes:
     """
     rows = _rows(table)
     frames = rows["frame"]
-    return table[:2] + rows[(frames == _EVERY_FRAME) | ((frames >= first) & (frames < end))].tobytes()
+    part: bytes = rows[(frames == _EVERY_FRAME) | ((frames >= first) & (frames < end))].tobytes()
+    return table[:2] + part
 
 
 def _rows(table: bytes) -> npt.NDArray[np.void]:
