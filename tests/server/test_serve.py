@@ -175,7 +175,7 @@ def test_the_loop_reads_no_sidecar_for_a_worker_of_this_host(tmp_path: Path) -> 
     missing = CheckVideo("a.mp4", "f", b"toy1", None, "changed", Request(b"c", 0, 0), ".masks/")
     elsewhere = replace(missing, identity=b"elsewhere")
     dispatcher = Scripted([missing, elsewhere], workers=[b"toy1", b"elsewhere"])
-    served(dispatcher, tmp_path, supervisor, check=lambda id, mark, ending: asked.append(ending))  # type: ignore[misc, arg-type]
+    served(dispatcher, tmp_path, supervisor, check=lambda id, mark, ending: asked.append(ending))
     assert dispatcher.told == [("looked for", missing, False), ("looked for", elsewhere, True)]
     assert asked == [".masks/"]
 

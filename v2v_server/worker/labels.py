@@ -25,7 +25,7 @@ _KEPT = 4
 """Sidecars that stay in memory once they are read: siblings use them one after the other."""
 
 
-def _only_sidecar(array: str, video: str, sidecars: Mapping[str, Traversable | None]) -> tuple[str, Traversable]:
+def _only_sidecar(array: str, video: str, sidecars: Mapping[str, Traversable | None]) -> tuple[str, Any]:
     """Return the one sidecar that the array is made from, and its ending.
 
     Raises:
