@@ -204,7 +204,7 @@ class Worker:
     def _inspect(self, lease: Lease) -> Readiness:
         """Return what the work on a lease needs."""
         missing, has_video = kernels_of(lease) - self._kernels, self._has_video(lease)
-        has_sidecars = not sidecar_files(lease) or self._sidecars[0] == (lease.video, lease.arrays, lease.sidecars)
+        has_sidecars = not sidecar_files(lease) or self._sidecars[0] == _clip(lease)
         is_ready = not missing and has_video and has_sidecars
         is_small = has_video or _size_bytes(lease) <= _SOON_FETCHED_BYTES
         return Readiness(is_ready, is_small and all(map(is_compiled, missing)), self._clips.has(lease))
@@ -234,16 +234,15 @@ class Worker:
 
     def _open_sidecars(self, lease: Lease) -> dict[str, Traversable | None] | SidecarError:
         """Read the lease's sidecars before the lease is begun, so that their time does not count against the sample.
-        Siblings use them too.
+        Siblings use them too; the next clip checks them again.
         """
-        key = lease.video, lease.arrays, lease.sidecars
-        if self._sidecars[0] != key:
+        if self._sidecars[0] != _clip(lease):
             try:
                 with open_sidecars(lease, self._source) as opened:
                     read_ahead(lease, opened)
-                    self._sidecars = key, opened
+                    self._sidecars = _clip(lease), opened
             except SidecarError as error:
-                self._sidecars = key, error
+                self._sidecars = _clip(lease), error
         return self._sidecars[1]
 
     def _messages(self, wait_seconds: float) -> list[bytes]:
@@ -279,6 +278,7 @@ class Worker:
         has_clip = time.monotonic()
         sidecars = self._open_sidecars(lease)
         if isinstance(sidecars, SidecarError):
+            self._sidecars = None, {}  # the next lease tries again
             raise sidecars
         sample = make_sample(lease, clip, buffer.arrays, sidecars)
         has_sample = time.monotonic()
@@ -327,6 +327,11 @@ def _size_bytes(lease: Lease) -> int:
     """Return the size of the lease's video, which starts the fingerprint."""
     size = lease.fingerprint.partition("-")[0]
     return int(size) if size.isdecimal() else 0
+
+
+def _clip(lease: Lease) -> object:
+    """Return what a lease's sidecars are read for: equal for siblings."""
+    return lease.video, lease.arrays, lease.sidecars, lease.seed, lease.epoch, lease.start_frame
 
 
 def _files(lease: Lease) -> dict[str, str]:

@@ -128,9 +128,12 @@ def test_sidecars_are_read_before_their_lease_begins(server: Server, monkeypatch
     monkeypatch.setattr(worker_module, "open_sidecars", opened)
     monkeypatch.setattr(worker_module, "kernels_of", lambda lease: frozenset())
     labelled = replace(LEASE, video="a.mp4", arrays=("boxes",))
-    parts = {1: b"a", 2: b"a", 4: b"b", 5: b"c"}
+    starts = {1: 0, 2: 0, 4: 9, 5: 18}
     server.says(
-        *(replace(labelled, lease=number, sidecars={".boxes/": ["3-x", part]}) for number, part in parts.items())
+        *(
+            replace(labelled, lease=number, start_frame=start, sidecars={".boxes/": ["3-x", b"the same files"]})
+            for number, start in starts.items()
+        )
     )
     said = [server.heard()]
     while not isinstance(said[-1], LeaseFailed):
