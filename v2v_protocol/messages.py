@@ -313,7 +313,8 @@ class Lease:
         arena, slot: memory that the sample may be written to, see :mod:`v2v_protocol.arena`; "" and 0: none.
         packed: whether to compress arrays that go into the message.
         sidecars: fingerprints of the video's sidecars that the arrays are made from, by ending; a missing one is left
-            out.
+            out. To workers it may be [fingerprint, part]: bytes, the table of the files of a folder that the clip
+            needs; or a text, why the sidecar is not used, perhaps without a fingerprint.
     """
 
     lease: int

@@ -309,7 +309,11 @@ class Server:
                     # Before anything that follows is sent.
                     todo.extendleft(reversed(self._corpus.record(record)))
                 case CheckVideo() as missing:
-                    todo.extend(dispatcher.video_checked(missing, self._corpus.check_video(missing), now()))
+                    # What a worker of this host cannot read of a sidecar, this host cannot: the loop reads none.
+                    is_here = bool(missing.sidecar) and self._catalogue.source.is_local and self._pool.is_local
+                    is_here = is_here and self._pool.watches(self._name(missing.identity))
+                    found = not is_here and self._corpus.check_video(missing)
+                    todo.extend(dispatcher.video_checked(missing, found, now()))
                 case ReportRefusal(refusal, request):
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
                 case SendStatus() as request:

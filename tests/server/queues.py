@@ -72,6 +72,8 @@ class ToyPool:
         begin: starts a worker.
     """
 
+    is_local = True
+
     def __init__(self, begin: Callable[[bytes, str], None]) -> None:
         self._begin = begin
         self._address = ""

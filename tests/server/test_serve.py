@@ -166,6 +166,20 @@ def test_what_is_looked_for_is_reported(found: bool, tmp_path: Path, capsys: pyt
     assert said.count("worker w failed on a.mp4, which is on this host as catalogued: cannot be read") == found
 
 
+def test_the_loop_reads_no_sidecar_for_a_worker_of_this_host(tmp_path: Path) -> None:
+    """What that worker has read lies here too: a folder of masks would stop the loop for seconds."""
+    supervisor = ToyPool(lambda name, address: None)
+    supervisor.scale(1)
+    supervisor.watch(0.0, 0)
+    asked: list[str] = []
+    missing = CheckVideo("a.mp4", "f", b"toy1", None, "changed", Request(b"c", 0, 0), ".masks/")
+    elsewhere = replace(missing, identity=b"elsewhere")
+    dispatcher = Scripted([missing, elsewhere], workers=[b"toy1", b"elsewhere"])
+    served(dispatcher, tmp_path, supervisor, check=lambda id, mark, ending: asked.append(ending))
+    assert dispatcher.told == [("looked for", missing, False), ("looked for", elsewhere, True)]
+    assert asked == [".masks/"]
+
+
 def test_what_holds_everybody_up_is_said_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     dispatcher = Scripted([])
     now = [0.0]

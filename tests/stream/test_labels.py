@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from tests.clips import write_clip
 from tests.server.worker.test_labels import boxes_text, pictures
@@ -95,3 +96,38 @@ def test_labels_travel_alike_and_resume(corpus: Path, tmp_path: Path) -> None:
 def test_the_option_is_checked() -> None:
     with pytest.raises(UsageError, match='labels = \'never\': choose "required" or "optional"'):
         V2VStreamDataset("tcp://127.0.0.1:1", labels="never")  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_for_labels_no_video_is_refused(corpus: Path, tmp_path: Path) -> None:
+    """Labels beyond the limits, of another size, or changed under the server."""
+    folder = tmp_path / "videos"
+    for name in "abc":
+        (folder / f"{name}.masks").mkdir(parents=True)
+        shutil.copy(corpus / "a.mp4", folder / f"{name}.mp4")
+        for frame, picture in enumerate(pictures(3)):
+            Image.fromarray(picture).save(folder / f"{name}.masks" / f"{frame}.png")
+    with (folder / "a.boxes.json").open("wb") as large:
+        large.truncate(40 << 30)
+    (folder / "b.boxes.txt").write_text("1,1,2,3,4,5,1,1,1\n1000,1,2,3,4,5,1,1,1\n")
+    Image.new("L", (8, 8)).save(folder / "b.masks" / "0.png")
+    with LocalServer(folder, workers=1, flags=FLAGS) as server:
+        stream = V2VStreamDataset(server.address, 2, ("boxes", "masks"), labels="optional")
+        reasons = dict[str, dict[str, str]]()
+        for origin in (origin for batch in stream for origin in batch.provenance):
+            assert not origin.refusals
+            reasons[origin.video] = dict(origin.unlabelled)
+        assert set(reasons) == {"a.mp4", "b.mp4", "c.mp4"}
+        assert "42949672960 bytes or more" in reasons["a.mp4"]["boxes"]
+        assert "frames 1 to 1000: the video has frames 1 to 40" in reasons["b.mp4"]["boxes"]
+        assert "0.png has 8x8 px: the video has 64x48 px" in reasons["b.mp4"]["masks"]
+        assert "is missing" in reasons["c.mp4"]["boxes"]
+        assert "masks" not in reasons["a.mp4"].keys() | reasons["c.mp4"].keys()
+        for name in "abc":
+            for frame in range(40):
+                Image.new("L", (64, 48)).save(folder / f"{name}.masks" / f"{frame}.png")
+        with pytest.raises(SampleUnavailable, match=r"its sidecar \.masks/: changed since it was catalogued: \d+\.png"):
+            list(V2VStreamDataset(server.address, 2, ("masks",), labels="optional", seed=1))
+        assert not any(
+            origin.refusals for batch in V2VStreamDataset(server.address, 2, PLAIN) for origin in batch.provenance
+        )

@@ -128,6 +128,10 @@ def _run(arguments: argparse.Namespace) -> int:
         )
     for line in summary(report, encoding, time.monotonic() - started):
         print(line)
+    for ending, sidecars in catalogue.sidecars.items():
+        if sidecars.states:
+            where = f"copy them to the same places in {arguments.destination} to serve these labels"
+            print(f"{len(sidecars.states)} sidecars {ending} (labels) were left beside their videos: {where}")
     if arguments.json is not None:
         refused = (*report.not_looked_at, *report.unusable)
         records = [asdict(video) for video in report.videos] + [

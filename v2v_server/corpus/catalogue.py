@@ -25,11 +25,11 @@ from v2v_server.corpus.probe import Progress
 from v2v_server.corpus.refresh import index_path, refresh_index
 from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sidecars import Sidecars, collect_sidecars
+from v2v_server.corpus.sidecars import Sidecars, collect_sidecars, files_for_lease, sidecar_kind
 from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.listfile import ListEntry
 from v2v_server.corpus.sources.sidecar import sidecar_id
-from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
+from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, State, VideoSource, open_source
 from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos, has_chroma
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.format import PIECE_FRAMES
@@ -112,9 +112,9 @@ class Catalogue:
             VideoError: the video is gone, another one by now, or (on a disk) cannot be read.
         """
         self._fingerprint(id)
-        state = None
+        state: State | str | None = self.sidecars[sidecar].states.get(id) if sidecar else None
         with suppress(sqlite3.Error):
-            state = self._store.state(id)
+            state = state or self._store.state(id)
         self.source.verify(sidecar_id(id, sidecar) if sidecar else id, fingerprint, state)
 
     def frame_index(self, id: str) -> FrameIndex:
@@ -194,6 +194,18 @@ class Catalogue:
             return Scene.unknown()
         return Scene.from_bytes(self._stored(id, partial(self._store.figures, id, kind=self._scenes.kind)))
 
+    def sidecar_files(self, id: str, ending: str, fingerprint: str, start: int, count: int) -> bytes | str:
+        """Return the second part of a folder in ``lease.sidecars``.
+
+        Raises:
+            CorpusError, IndexUnreadable: see :meth:`frame_index`.
+        """
+        try:
+            data = self._store.figures(id, self._files.get(id, self._fingerprint(id)), sidecar_kind(ending))
+        except sqlite3.Error as error:
+            raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
+        return files_for_lease(data, fingerprint, start, count)
+
     @property
     def facts(self) -> CorpusFacts:
         """What is known in memory: all that a server's dispatcher needs."""
@@ -255,7 +267,15 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
         if "duplicates" not in spec.kept_defects:
             count = int(scene.frames_from(start, count)[-1]) + 1 - start
         part = scene.slice(start, count).to_bytes()
-    return replace(lease, frame_index=catalogue.frame_index_bytes(video, start, count), scene=part)
+    sidecars = dict(lease.sidecars)
+    for ending in sidecar_endings(lease.arrays):
+        mark = lease.sidecars.get(ending, "")
+        if problem := catalogue.sidecars[ending].problems.get(video):
+            sidecars[ending] = [mark, problem]
+        elif mark and ending.endswith("/"):
+            sidecars[ending] = [mark, catalogue.sidecar_files(video, ending, mark, start, count)]
+    frames = catalogue.frame_index_bytes(video, start, count)
+    return replace(lease, frame_index=frames, scene=part, sidecars=sidecars)
 
 
 def open_catalogue(
@@ -299,7 +319,7 @@ def open_catalogue(
     store, table, notes = refresh_index(opened, corpus.ids, path, scenes, processes, progress, notice)
     try:
         with without_collections():
-            return _snapshot(corpus, table, notes, store, scenes, notice)
+            return _snapshot(corpus, table, notes, store, scenes, processes, notice)
     except BaseException as error:
         store.close()
         if isinstance(error, sqlite3.Error):
@@ -313,6 +333,7 @@ def _snapshot(
     notes: list[str],
     store: Store,
     scenes: SceneCollection | None,
+    processes: int,
     notice: Notice | None,
 ) -> Catalogue:
     source, manifest, table = corpus.source, corpus.source.manifest, on_disk
@@ -367,7 +388,8 @@ def _snapshot(
         if died := sorted(unknown - absent.keys()):
             notes = [*notes, f"{len(died)} videos crash the decoder that analyses their scenes: {died[0]}"]
     marks = {id: files.get(id, mark) for id, mark in zip(videos.ids, videos.fingerprints, strict=True)}
-    sidecars, said = collect_sidecars(source, store, marks, sidecar_endings(tuple(ARRAYS)), notice)
+    endings = sidecar_endings(tuple(ARRAYS))
+    sidecars, said = collect_sidecars(source, store, marks, videos.shape, endings, processes, notice)
     notes = [*notes, *said]
     return Catalogue(
         source=source,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import overload
@@ -77,6 +78,11 @@ class Videos(Sequence[VideoEntry]):
     def find(self, id: str) -> int | None:
         """Return the number of the video with an id; None if there is none."""
         return self.ids.find(id)
+
+    def shape(self, id: str) -> tuple[int, int, int]:
+        """Return number of frames, height and width (px) of the video with an id of these."""
+        number = bisect_left(self.ids, id)
+        return int(self.frames[number]), int(self.height_px[number]), int(self.width_px[number])
 
     def digest(self, rows: Rows) -> str:
         """Return 32 hexadecimal digits that name these videos with these rows.

@@ -1,50 +1,77 @@
 """Read boxes from the files of three common formats. All errors are ValueErrors that name the line or entry.
 
-    .boxes.json  COCO-VID, of one video: ``frame_id`` counts from 0; each image is an annotated frame
-    .boxes.txt   MOT Challenge text: frames and coordinates count from 1; with nine columns the eighth is the class
+    .boxes.json  COCO-VID, of one video: ``frame_id`` counts from 0; each image is an annotated frame. Without it the
+                 digits at the end of ``file_name`` are the frame. ``attributes`` may hold the track, as CVAT writes it
+    .boxes.txt   MOT Challenge text: frames and coordinates count from 1; with eight or nine columns the eighth is the
+                 class, with ten columns too if they are VisDrone's
     .boxes/      YOLO text, a file a frame: the digits at the end of the name are the frame, from 0
 
 In MOT and YOLO files a frame without a line has no objects. Entries marked to be ignored (``iscrowd`` or ``ignore`` of
 COCO, seventh column 0 of MOT) are left out.
+
+A reader cannot tell everything from the file: :func:`check_labels` compares all labels of a video with the video.
 """
 
 from __future__ import annotations
 
+import codecs
+import io
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from importlib.resources.abc import Traversable
 from typing import Any
 
+import numpy as np
+
 from v2v_protocol.safe_json import parse_json
 from v2v_server.labels.boxes import NO_TRACK, Box, BoxTable, checked
+from v2v_server.labels.masks import read_mask
 
+_LARGEST_BYTES = 64 << 20
+"""Limit of a file of boxes. Reading one takes up to 15 s and 1 GiB."""
 _MOT_COLUMNS = "frame, track, left, top, width, height, confidence, class, visibility"
 _YOLO_COLUMNS = "class, centre x, centre y, width, height, and optionally the track"
+_NO_COORDINATES = [-1.0, -1.0, -1.0]
 _NUMBER = re.compile(r"(\d{1,12})\.\w+$", re.ASCII)
+_ROBOFLOW = re.compile(r"_(jpe?g|png|bmp|webp)\.rf\.\w+(?=\.\w+$)", re.IGNORECASE)
+"""What Roboflow adds to a name; its hash may end with digits."""
+_NO_FRAME = re.compile(r"(\w*classes|labels|labelmap|\w*names|notes|readme.*|train|val|valid|test)\.txt", re.IGNORECASE)
+"""Texts that label tools write beside those of the frames."""
 
 
 def read_coco(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
     """Read a COCO-VID file."""
-    content = parse_json(file.read_bytes())
+    content = parse_json(_content(file))
     if not isinstance(content, dict):
         raise ValueError("is not a JSON object with images and annotations")
     if len(videos := _list(content, "videos", optional=True)) > 1:
         raise ValueError(f"describes {len(videos)} videos: write one file for each video")
-    frames = {}
+    for place, video in enumerate(videos):
+        _Entry(f"videos[{place}]", video).check_size(picture_px)
+    frames, numbers, ids = dict[int, int](), set[int](), set[str]()
     for place, image in enumerate(_list(content, "images")):
         with_place = _Entry(f"images[{place}]", image)
-        frames[with_place.whole("id")] = with_place.whole("frame_id")
+        with_place.check_size(picture_px)
+        id, number = with_place.whole("id"), frame_of(str(with_place.get("file_name")))
+        if number is None or with_place.get("frame_id") is not None:
+            number = with_place.whole("frame_id")
+        if id in frames or number in numbers:
+            raise ValueError(f"images[{place}]: id {id} or frame {number} is there twice: give each image its own")
+        frames[id] = number
+        numbers.add(number)
     boxes = []
     for place, annotation in enumerate(_list(content, "annotations")):
         entry = _Entry(f"annotations[{place}]", annotation)
+        if entry.get("id") is not None and (name := repr(entry.get("id"))) in ids:
+            raise ValueError(f"annotations[{place}]: id {name:.40} is there twice: give each annotation its own")
+        ids.add(repr(entry.get("id")))
         if entry.get("iscrowd") or entry.get("ignore"):
             continue
         if (image := entry.whole("image_id")) not in frames:
             raise ValueError(f"annotations[{place}]: images has no id {image}")
-        track = next((entry.whole(key) for key in ("instance_id", "track_id") if entry.get(key) is not None), NO_TRACK)
-        box = Box(frames[image], *entry.four("bbox"), entry.whole("category_id"), track)
+        box = Box(frames[image], *entry.four("bbox"), entry.whole("category_id"), entry.track())
         boxes.append(entry.checked(box))
-    return BoxTable.of(boxes, frozenset(frames.values()))
+    return BoxTable.of(boxes, frozenset(numbers))
 
 
 def read_mot(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
@@ -52,16 +79,33 @@ def read_mot(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
     boxes = []
     for where, line in _lines(file):
         values = _numbers(where, line.split(","), _MOT_COLUMNS, 6, 10)
+        category = _whole(where, _mot_class(where, values))
         if len(values) > 6 and values[6] == 0:
             continue
         frame, track, left, top, width, height = values[:6]
         if frame < 1:
             raise ValueError(f"{where}: frame {frame:g}: MOT counts frames from 1")
-        category = _whole(where, values[7]) if len(values) == 9 else 0
         # Tools write -1 for the track of a detection.
         box = Box(_whole(where, frame) - 1, left - 1, top - 1, width, height, category, _whole(where, track))
         boxes.append(_checked(where, box))
     return BoxTable.of(boxes)
+
+
+def _mot_class(where: str, values: list[float]) -> float:
+    """Return the class of a line.
+
+    Raises:
+        ValueError: its columns mean something else than those of MOT or VisDrone.
+    """
+    count, more = len(values), values[6:]
+    is_visdrone = count == 10 and values[7] in range(12) and values[8] in (0, 1) and values[9] in (0, 1, 2)
+    if (
+        (count == 7 and values[6] > 1 and values[6] % 1 == 0)  # a class where MOT has the confidence
+        or (count == 9 and values[8] != -1 and not 0 <= values[8] <= 1)  # a class where MOT has the visibility
+        or (count == 10 and values[7:] != _NO_COORDINATES and not is_visdrone)
+    ):
+        raise ValueError(f"{where} ends with {more}, columns neither of MOT nor of VisDrone: give {_MOT_COLUMNS}")
+    return values[7] if count in (8, 9) or is_visdrone else 0.0
 
 
 def read_yolo(folder: Traversable, picture_px: tuple[int, int]) -> BoxTable:
@@ -77,6 +121,8 @@ def read_yolo(folder: Traversable, picture_px: tuple[int, int]) -> BoxTable:
         for where, line in _lines(file):
             where = f"{file.name} {where}"
             values = _numbers(where, line.split(), _YOLO_COLUMNS, 5, 6)
+            if not all(-1 <= value <= 2 for value in values[1:5]):  # boxes may reach beyond the picture
+                raise ValueError(f"{where}: box {values[1:5]}: give shares of the picture, from 0 to 1, not px")
             x, y, width, height = (
                 value * size for value, size in zip(values[1:5], (width_px, height_px) * 2, strict=True)
             )
@@ -94,6 +140,72 @@ READERS: Mapping[str, Callable[[Traversable, tuple[int, int]], BoxTable]] = {
 """Reader of each ending. Arguments: the opened sidecar, and height and width of the video's upright picture."""
 
 
+_FRAME_FILES = {".boxes/": ".txt", ".masks/": ".png"}
+
+
+def check_labels(ending: str, opened: Traversable, picture_px: tuple[int, int], frames: int) -> str:
+    """Check that labels fit their video, and return which files of a folder are not read; "" if all are.
+
+    Args:
+        ending: of the sidecar; one of another ending is not checked.
+        opened: the sidecar, whole.
+        picture_px: height and width of the video's upright picture.
+        frames: number of frames of the video.
+
+    Raises:
+        ValueError: the labels are malformed, or do not fit.
+    """
+    numbers: Collection[int] = ()
+    first, not_read = int(ending == ".boxes.txt"), ""
+    if suffix := _FRAME_FILES.get(ending):
+        numbers = files = numbered_files(opened, suffix)
+        if not files:
+            raise ValueError(f"has no file named by the number of a frame, like 000012{suffix}")
+        others = {each.name for each in opened.iterdir()} - {file.name for file in files.values()}
+        if others := {name for name in others if not name.startswith(".")}:
+            not_read = f"{len(others)} of its files are not read, such as {min(others)}"
+    if ending == ".masks/":
+        read_mask(files[min(files)], picture_px)
+    elif ending in READERS:
+        table = READERS[ending](opened, picture_px)
+        numbers = numbers or (table.frames.tolist() if table.annotated is None else table.annotated)
+        _check_boxes(table, picture_px)
+    if numbers and (max(numbers) >= frames or (not first and min(numbers) == 1)):
+        raise ValueError(
+            f"has labels of frames {min(numbers) + first} to {max(numbers) + first}: the video has frames {first} to "
+            f"{frames - 1 + first}, so number them from {first}. If frame {first} has no labels, add it without any"
+        )
+    return not_read
+
+
+def _check_boxes(table: BoxTable, picture_px: tuple[int, int]) -> None:
+    """Check the unit of the boxes, and that no object is twice in a frame.
+
+    Raises:
+        ValueError: they are in shares, were drawn at another size, or a track repeats.
+    """
+    (height, width), (left, top, right, bottom) = picture_px, table.corners.T
+    if len(left) and max(right.max(), bottom.max()) <= 1:
+        raise ValueError("all boxes lie in the first pixel: give px, not shares of the picture")
+    is_outside = (right <= 0) | (bottom <= 0) | (left >= width) | (top >= height)
+    if 2 * (count := np.count_nonzero(is_outside)) > len(left):
+        what = f"{count} of {len(left)} boxes lie outside the picture of {width}x{height} px"
+        raise ValueError(f"{what}: draw them at the size of the video")
+    objects = np.column_stack([table.frames, table.numbers])[table.numbers[:, 1] != NO_TRACK]
+    found, counts = np.unique(objects, axis=0, return_counts=True)
+    if len(found) < len(objects):
+        frame, category, track = found[counts.argmax()].tolist()
+        raise ValueError(
+            f"frame {frame} (from 0) has track {track} of class {category} twice: give each object its own"
+        )
+
+
+def frame_of(name: str) -> int | None:
+    """Return the number at the end of a file's name; None if there is none."""
+    match = _NUMBER.search(_ROBOFLOW.sub("", name))
+    return None if match is None else int(match[1])
+
+
 def numbered_files(folder: Traversable, suffix: str) -> dict[int, Traversable]:
     """Return the files of a folder by the number at the end of their names.
 
@@ -102,14 +214,14 @@ def numbered_files(folder: Traversable, suffix: str) -> dict[int, Traversable]:
     """
     found: dict[int, Traversable] = {}
     for file in sorted(folder.iterdir(), key=lambda entry: entry.name):
-        if file.name.startswith(".") or not file.name.lower().endswith(suffix):
+        if file.name.startswith(".") or not file.name.lower().endswith(suffix) or _NO_FRAME.fullmatch(file.name):
             continue
-        match = _NUMBER.search(file.name)
-        if match is None:
+        number = frame_of(file.name)
+        if number is None:
             raise ValueError(f"{file.name}: give it a name that ends with the number of its frame, like 000012{suffix}")
-        if int(match[1]) in found:
-            raise ValueError(f"{found[int(match[1])].name} and {file.name} are both of frame {int(match[1])}: keep one")
-        found[int(match[1])] = file
+        if number in found:
+            raise ValueError(f"{found[number].name} and {file.name} are both of frame {number}: keep one")
+        found[number] = file
     return found
 
 
@@ -138,6 +250,20 @@ class _Entry:
         left, top, width, height = value
         return left, top, width, height
 
+    def track(self) -> int:
+        inner = self.get("attributes")
+        for entry in self, _Entry(f"{self._place}.attributes", inner if isinstance(inner, dict) else {}):
+            for key in ("instance_id", "track_id"):
+                if entry.get(key) is not None:
+                    return entry.whole(key)
+        return NO_TRACK
+
+    def check_size(self, picture_px: tuple[int, int]) -> None:
+        height, width = picture_px
+        if (stated := (self.get("width") or width, self.get("height") or height)) != (width, height):
+            what = f"{self._place} has {stated[0]!r:.20}x{stated[1]!r:.20} px, the video {width}x{height} px"
+            raise ValueError(f"{what}: scale its boxes to the video, and state that size")
+
     def checked(self, box: Box) -> Box:
         return _checked(self._place, box)
 
@@ -149,9 +275,19 @@ def _list(content: Mapping[str, Any], key: str, optional: bool = False) -> list[
     return value
 
 
+def _content(file: Traversable) -> bytes:
+    with file.open("rb") as stream:
+        data: bytes = stream.read(_LARGEST_BYTES + 1)
+    if len(data) > _LARGEST_BYTES:
+        raise ValueError(f"has more than {_LARGEST_BYTES} bytes, the limit of a file of boxes: cut the video")
+    return data
+
+
 def _lines(file: Traversable) -> Iterator[tuple[str, str]]:
     """Yield the lines that are not empty, each with its number for error messages."""
-    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+    data = _content(file)
+    is_wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    for number, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-16" if is_wide else "utf-8-sig"), 1):
         if line.strip():
             yield f"line {number}", line
 

@@ -13,6 +13,7 @@ import secrets
 import signal
 import socket
 import time
+from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from v2v_protocol import NUMERICS_VERSION
@@ -53,6 +54,7 @@ from v2v_server.worker.conversation import (
     WorkerConversation,
 )
 from v2v_server.worker.decode_cache import Clips
+from v2v_server.worker.labels import read_ahead
 from v2v_server.worker.logbook import IDLE, note
 from v2v_server.worker.output_buffer import open_output_buffer, sample_message
 from v2v_server.worker.produce import kernels_of, make_sample, sample_layout
@@ -112,6 +114,7 @@ class Worker:
         if cache is not None:
             cache.on_wait = self._note_wait
         self._source = source
+        self._sidecars: tuple[object, dict[str, Traversable | None] | SidecarError] = None, {}  # of the last lease
         self._unfetched: tuple[dict[str, str], VideoError] | None = None  # the last files that could not be fetched
         self._is_remote = leaves_host(address)
         self._kernels = set(USUAL)  # loaded kernels
@@ -177,6 +180,7 @@ class Worker:
                     load_in_turn(variant)
                     self._kernels.add(variant)
                 self._fetch(lease)
+                self._open_sidecars(lease)
                 return conversation.on_kernels_loaded(time.monotonic())
             case Make(lease):
                 if not self._clips.has(lease):
@@ -200,7 +204,8 @@ class Worker:
     def _inspect(self, lease: Lease) -> Readiness:
         """Return what the work on a lease needs."""
         missing, has_video = kernels_of(lease) - self._kernels, self._has_video(lease)
-        is_ready = not missing and has_video
+        has_sidecars = not sidecar_files(lease) or self._sidecars[0] == _clip(lease)
+        is_ready = not missing and has_video and has_sidecars
         is_small = has_video or _size_bytes(lease) <= _SOON_FETCHED_BYTES
         return Readiness(is_ready, is_small and all(map(is_compiled, missing)), self._clips.has(lease))
 
@@ -226,6 +231,19 @@ class Worker:
             self._source.fetch(files)
         except VideoError as error:
             self._unfetched = files, error
+
+    def _open_sidecars(self, lease: Lease) -> dict[str, Traversable | None] | SidecarError:
+        """Read the lease's sidecars before the lease is begun, so that their time does not count against the sample.
+        Siblings use them too; the next clip checks them again.
+        """
+        if self._sidecars[0] != _clip(lease):
+            try:
+                with open_sidecars(lease, self._source) as opened:
+                    read_ahead(lease, opened)
+                    self._sidecars = _clip(lease), opened
+            except SidecarError as error:
+                self._sidecars = _clip(lease), error
+        return self._sidecars[1]
 
     def _messages(self, wait_seconds: float) -> list[bytes]:
         """Return the first frames of all available messages."""
@@ -258,8 +276,11 @@ class Worker:
             # counts few objects and waits, but each of them holds pictures.
             gc.collect()
         has_clip = time.monotonic()
-        with open_sidecars(lease, self._source) as sidecars:
-            sample = make_sample(lease, clip, buffer.arrays, sidecars)
+        sidecars = self._open_sidecars(lease)
+        if isinstance(sidecars, SidecarError):
+            self._sidecars = None, {}  # the next lease tries again
+            raise sidecars
+        sample = make_sample(lease, clip, buffer.arrays, sidecars)
         has_sample = time.monotonic()
         frames = sample_message(
             lease,
@@ -306,6 +327,11 @@ def _size_bytes(lease: Lease) -> int:
     """Return the size of the lease's video, which starts the fingerprint."""
     size = lease.fingerprint.partition("-")[0]
     return int(size) if size.isdecimal() else 0
+
+
+def _clip(lease: Lease) -> object:
+    """Return what a lease's sidecars are read for: equal for siblings."""
+    return lease.video, lease.arrays, lease.sidecars, lease.seed, lease.epoch, lease.start_frame
 
 
 def _files(lease: Lease) -> dict[str, str]:

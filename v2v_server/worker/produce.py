@@ -55,7 +55,7 @@ from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, 
 from v2v_server.worker.cleaning import CleanFrames, frame_index, frame_times, most_frames, usable_window, within_rows
 from v2v_server.worker.colour import chroma_cut
 from v2v_server.worker.scene_choice import FlowPlan, crop_weight, plan_flow
-from v2v_server.worker.sidecars import errors_of_sidecar, sidecar_files
+from v2v_server.worker.sidecars import errors_of_sidecar, refused_sidecars, sidecar_files
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +231,7 @@ def make_sample(
     unlabelled = dict[str, str]()
     for name, array in context.into.items():
         try:
-            with errors_of_sidecar(lease.video, name, sidecars):
+            with errors_of_sidecar(lease.video, name, sidecars, refused_sidecars(lease)):
                 ARRAY_BUILDERS[name](context, array)
         except SidecarError as error:
             if error.here:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import json
 import os
 import shutil
 from collections.abc import Iterator
@@ -16,8 +18,8 @@ from v2v_protocol.errors import VideoChanged, VideoError, VideoGone
 from v2v_protocol.sample import FromSidecar
 from v2v_server.corpus import sidecars as collecting
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.sources import asking
-from v2v_server.corpus.sources.sidecar import fingerprint_of, open_sidecar, sidecar_id
+from v2v_server.corpus.sources import asking, sidecar
+from v2v_server.corpus.sources.sidecar import open_sidecar, read_files, sidecar_id
 from v2v_server.corpus.sources.source import SourceOptions, open_source
 
 JSON, MASKS = ".boxes.json", ".masks/"
@@ -82,7 +84,7 @@ def test_a_catalogue_knows_them_and_its_digest_does_not(
         assert "1 of 2 videos have a sidecar .masks/" in catalogue.notes
 
     read: list[object] = []
-    monkeypatch.setattr(collecting, "fingerprint_of", lambda opened: read.append(opened) or fingerprint_of(opened))
+    monkeypatch.setattr(collecting, "read_files", lambda opened: read.append(opened) or read_files(opened))
     with opened(corpus, kind) as again:
         assert {again.facts.sidecars_digest(arrays) for arrays in (("boxes",), ("masks",), ARRAYS)} == digests
     assert not read, "what is unchanged is not read again"
@@ -100,16 +102,16 @@ def test_an_interrupted_start_keeps_what_it_has_read(corpus: Path, monkeypatch: 
     monkeypatch.setattr(asking, "_TOGETHER", 1)
     read: list[str] = []
 
-    def interrupted(opened: Path) -> str:
+    def interrupted(opened: Path) -> tuple[str, bytes]:
         if read:
             raise KeyboardInterrupt
         read.append(opened.name)
-        return fingerprint_of(opened)
+        return read_files(opened)
 
-    monkeypatch.setattr(collecting, "fingerprint_of", interrupted)
+    monkeypatch.setattr(collecting, "read_files", interrupted)
     with pytest.raises(KeyboardInterrupt), opened(corpus, "folder"):
         pass
-    monkeypatch.setattr(collecting, "fingerprint_of", lambda opened: read.append(opened.name) or fingerprint_of(opened))
+    monkeypatch.setattr(collecting, "read_files", lambda opened: read.append(opened.name) or read_files(opened))
     with opened(corpus, "folder"):
         assert read == ["a.boxes.json", "b.x.boxes.json", "b.x.masks"]
 
@@ -119,12 +121,12 @@ def test_a_fifo_is_not_opened(corpus: Path, name: str, monkeypatch: pytest.Monke
     (corpus / name).unlink()
     os.mkfifo(corpus / name)
 
-    def read(opened: Path) -> str:
+    def read(opened: Path) -> tuple[str, bytes]:
         """Fail before opening it, which would wait for a writer."""
         assert not any(map(Path.is_fifo, (opened, *opened.glob("*"))))
-        return fingerprint_of(opened)
+        return read_files(opened)
 
-    monkeypatch.setattr(collecting, "fingerprint_of", read)
+    monkeypatch.setattr(collecting, "read_files", read)
     with opened(corpus, "folder") as catalogue:
         notes = [note for note in catalogue.notes if "not a regular file" in note]
     assert len(notes) == 1
@@ -157,7 +159,8 @@ def test_it_is_opened_like_the_video(corpus: Path, kind: str) -> None:
     assert source.has(files)
     with open_sidecar(source, "a.boxes.json", boxes) as file:
         assert file.read_text() == "[1]"
-    with open_sidecar(source, "deep/b.x.masks/", masks) as folder:
+    table = read_files(corpus / "deep" / "b.x.masks")[1]
+    with open_sidecar(source, "deep/b.x.masks/", masks, table) as folder:
         assert (folder / "2.png").read_bytes() == b"2.png"
         assert (folder / "more" / "3.png").read_bytes() == b"more/3.png"
     source.release()
@@ -168,6 +171,7 @@ def test_a_changed_and_a_missing_one_are_told_apart(corpus: Path, kind: str) -> 
     with opened(corpus, kind) as catalogue:
         boxes = catalogue.facts.sidecars_of("a.mp4", ARRAYS)[JSON]
         masks = catalogue.facts.sidecars_of("deep/b.x.mp4", ARRAYS)[MASKS]
+        table = read_files(corpus / "deep/b.x.masks")[1]
         catalogue.check("a.mp4", boxes, JSON)
         catalogue.check("deep/b.x.mp4", masks, MASKS)
         (corpus / "a.boxes.json").write_text("[2]")
@@ -186,7 +190,7 @@ def test_a_changed_and_a_missing_one_are_told_apart(corpus: Path, kind: str) -> 
     fresh.make()
     with pytest.raises(VideoGone), open_sidecar(fresh, "a.boxes.json", boxes):
         pass
-    with pytest.raises(VideoError), open_sidecar(fresh, "deep/b.x.masks/", masks):
+    with pytest.raises(VideoError), open_sidecar(fresh, "deep/b.x.masks/", masks, table):
         pass
 
 
@@ -195,3 +199,101 @@ def test_only_videos_with_such_a_name_beside_them_are_asked_about(corpus: Path) 
     assert source.with_sidecars(ids, (JSON, MASKS)) == {JSON: ["a.mp4"], MASKS: ids}
     shutil.rmtree(corpus / "deep")  # a folder that cannot be listed
     assert source.with_sidecars(ids, (JSON, MASKS)) == {JSON: ids, MASKS: ids}
+
+
+MASKED = "deep/b.x.mp4"
+
+
+@pytest.mark.parametrize("processes", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_sidecar_beyond_the_limits_is_not_read(corpus: Path, processes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not processes:
+        monkeypatch.setattr(collecting, "read_files", lambda opened: pytest.fail(f"reads {opened}"))
+    shutil.rmtree(corpus / "deep/b.x.masks")
+    with (corpus / "a.boxes.json").open("wb") as file:
+        file.truncate(40 << 30)
+    said: list[str] = []
+    with closing(
+        open_catalogue(corpus, cache_dir=corpus.parent / "cache", processes=processes, notice=said.append)
+    ) as catalogue:
+        assert catalogue.facts.sidecars_of("a.mp4", ARRAYS) == {}
+        assert "with 42949672960 bytes or more: at most" in catalogue.sidecars[JSON].problems["a.mp4"]
+        assert any("1 sidecars cannot be read and count as missing (a.boxes.json: " in each for each in catalogue.notes)
+    assert any(f"looking for sidecars {JSON}" in each for each in said)
+
+
+def test_links_that_double_at_each_level_are_bounded(corpus: Path) -> None:
+    shutil.rmtree(corpus / "deep/b.x.masks")
+    folders = [corpus.parent / f"level{number}" for number in range(24)]
+    for folder, below in itertools.pairwise(folders):
+        folder.mkdir()
+        for name in "ab":
+            (folder / name).symlink_to(below)
+    folders[-1].mkdir()
+    (folders[-1] / "1.png").write_bytes(b"1")
+    (corpus / "deep/b.x.masks").symlink_to(folders[0])
+    with opened(corpus, "folder") as catalogue:
+        assert "more than 4096 folders, the limit" in catalogue.sidecars[MASKS].problems[MASKED]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_lease_names_only_the_files_of_its_frames(corpus: Path, kind: str) -> None:
+    with opened(corpus, kind) as catalogue:
+        mark = catalogue.sidecars[MASKS].fingerprints[MASKED]
+        table = catalogue.sidecar_files(MASKED, MASKS, mark, 2, 5)
+        assert isinstance(table, bytes)
+        assert catalogue.sidecar_files(MASKED, MASKS, "20-x", 2, 5) == (
+            "is not as in the index, which another program changed: start again to serve it as it is now"
+        )
+    masks = corpus / "deep/b.x.masks"
+    (masks / "1.png").write_bytes(b"a file of no frame of the lease")
+    source = open_source(str(corpus), SourceOptions())
+    with open_sidecar(source, "deep/b.x.masks/", mark, table) as folder:
+        assert [each.name for each in folder.iterdir()] == ["2.png", "more"]
+        (masks / "2.png").write_bytes(b"another file once it was read")
+        assert (folder / "2.png").read_bytes() == b"2.png"
+    with (
+        pytest.raises(VideoChanged, match=r"changed since it was catalogued: 2\.png"),
+        open_sidecar(source, "deep/b.x.masks/", mark, table),
+    ):
+        pass
+    os.utime(masks / "more/3.png", (1, 1))
+    (masks / "2.png").write_bytes(b"2.png")
+    with open_sidecar(source, "deep/b.x.masks/", mark, table):
+        pass  # times name nothing
+
+
+def test_files_too_large_for_one_clip_are_an_error_of_the_sidecar(
+    corpus: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sidecar, "MOST_LENT_BYTES", 6)
+    fingerprint, table = read_files(corpus / "deep/b.x.masks")
+    source = open_source(str(corpus), SourceOptions())
+    with (
+        pytest.raises(VideoError, match="more than 6 bytes") as raised,
+        open_sidecar(source, "deep/b.x.masks/", fingerprint, table),
+    ):
+        pass
+    assert type(raised.value) is VideoError, "not of this host: no other worker tries"
+
+
+def test_labels_that_do_not_fit_are_said_once_read(corpus: Path) -> None:
+    masks = "deep/b.x.masks/1.png"
+    for _ in range(2):  # the second time from the index
+        with opened(corpus, "folder") as catalogue:
+            assert catalogue.sidecars[MASKS].problems.keys() == {MASKED}
+            assert catalogue.sidecars[MASKS].fingerprints.keys() == {MASKED}
+            (note,) = [each for each in catalogue.notes if f"{MASKS} are refused" in each]
+            assert note.startswith(
+                f"1 sidecars {MASKS} are refused, and their videos are served without these labels ("
+            )
+    assert (corpus / masks).exists()
+
+
+@pytest.mark.slow
+def test_a_sidecar_that_kills_its_reader_costs_itself(corpus: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collecting, "LARGEST_MEMORY_BYTES", 256 << 20)
+    boxes = {"images": [{"id": n, "frame_id": n} for n in range(500_000)], "annotations": []}
+    (corpus / "a.boxes.json").write_text(json.dumps(boxes))
+    with closing(open_catalogue(corpus, cache_dir=corpus.parent / "cache", processes=1)) as catalogue:
+        assert len(catalogue.videos) == 2
+        assert "memory" in catalogue.sidecars[JSON].problems["a.mp4"].lower()

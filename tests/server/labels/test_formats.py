@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
+from v2v_server.labels import formats
 from v2v_server.labels.boxes import Box, BoxTable
-from v2v_server.labels.formats import READERS, numbered_files
+from v2v_server.labels.formats import READERS, check_labels, frame_of, numbered_files
 
 PICTURE_PX = (60, 80)
 Boxes = list[tuple[int, int, int, int, int, int, int]]
@@ -82,6 +84,148 @@ def test_a_frame_that_coco_does_not_list_has_no_labels(tmp_path: Path) -> None:
         table.at(3)
 
 
+def check(ending: str, path: Path, frames: int = 10) -> str:
+    return check_labels(ending, path, PICTURE_PX, frames)
+
+
+def sized(**size: int) -> dict[str, Any]:
+    box = {"id": 1, "image_id": 1, "bbox": [4, 5, 6, 7], "category_id": 2}
+    return {"images": [{"id": 1, "frame_id": 0, **size}], "annotations": [box]}
+
+
+def mot(frame: int, tail: str = "") -> str:
+    return f"{frame},7,11,21,30,20{tail}\n"
+
+
+@pytest.mark.parametrize(
+    ("ending", "content", "message"),
+    [
+        (".boxes.json", sized(width=160, height=120), r"images\[0\] has 160x120 px, the video 80x60 px"),
+        (".boxes.json", sized(width=60, height=80), r"has 60x80 px, the video 80x60 px"),
+        (".boxes.json", sized() | {"videos": [{"width": 81}]}, r"videos\[0\] has 81x60 px"),
+        (".boxes.json", {"images": [{"id": 1, "frame_id": 1}], "annotations": []}, "frames 1 to 1: .* frames 0 to 9"),
+        (
+            ".boxes.json",
+            {"images": [{"id": 1, "frame_id": 10}], "annotations": []},
+            "frames 10 to 10: .* frames 0 to 9",
+        ),
+        (
+            ".boxes.json",
+            {"images": [{"id": 1, "frame_id": 0}] * 2, "annotations": []},
+            "id 1 or frame 0 is there twice",
+        ),
+        (
+            ".boxes.json",
+            {"images": [{"id": 1, "frame_id": 0}, {"id": 2, "frame_id": 0}], "annotations": []},
+            r"images\[1\]: id 2 or frame 0 is there twice",
+        ),
+        (
+            ".boxes.json",
+            sized() | {"annotations": sized()["annotations"] * 2},
+            r"annotations\[1\]: id 1 is there twice",
+        ),
+        (
+            ".boxes.json",
+            sized() | {"annotations": [{"image_id": 1, "bbox": [0.1, 0.2, 0.3, 0.4], "category_id": 1}]},
+            "first pixel: give px, not shares",
+        ),
+        (
+            ".boxes.json",
+            sized() | {"annotations": [{"image_id": 1, "bbox": [400, 200, 30, 40], "category_id": 1}]},
+            "1 of 1 boxes lie outside the picture of 80x60 px",
+        ),
+        (".boxes.txt", mot(11, ",1,2,1"), "frames 11 to 11: the video has frames 1 to 10"),
+        (".boxes.txt", "1,7,0.1,0.2,0.1,0.1\n", "give px, not shares"),
+        (".boxes.txt", mot(1) * 2, r"frame 0 \(from 0\) has track 7 of class 0 twice"),
+        (".boxes.txt", mot(1, ",3"), r"line 1 ends with \[3\.0\], columns neither of MOT nor"),
+        (".boxes.txt", mot(1, ",1,2,3"), r"ends with \[1\.0, 2\.0, 3\.0\]"),
+        (".boxes.txt", mot(1, ",1,0.5,2.5,0.1"), r"ends with \[1\.0, 0\.5, 2\.5, 0\.1\]"),
+        (".boxes.txt", mot(1, ",1,-1"), "line 1: class -1: give a whole number"),
+        (".boxes/", {"1": "2 0.5 0.5 0.1 0.1"}, "frames 1 to 1: .* frames 0 to 9, so number them from 0"),
+        (".boxes/", {"0": "", "10": ""}, "frames 0 to 10: .* frames 0 to 9"),
+        (".boxes/", {"0": "2 41 40 60 40"}, r"0\.txt line 1: box \[41\.0, .*: give shares of the picture"),
+        (".boxes/", {"0": "2 50.5 33.1 18.75 16.7"}, "give shares of the picture"),
+        (".boxes/", {"classes": "person"}, r"has no file named by the number of a frame, like 000012\.txt"),
+        (".boxes/", {"0": "2 0.5 0.5 0.1 0.1 3\n" * 2}, "has track 3 of class 2 twice"),
+    ],
+)
+def test_labels_that_do_not_fit_are_refused_in_words(
+    tmp_path: Path, ending: str, content: str | Mapping[str, Any], message: str
+) -> None:
+    path = tmp_path / f"a{ending}"
+    if isinstance(content, str):
+        path.write_text(content)
+    elif ending.endswith("/"):
+        path.mkdir()
+        for name, text in content.items():
+            (path / f"{name}.txt").write_text(text)
+    else:
+        path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=message):
+        check(ending, path)
+
+
+@pytest.mark.parametrize(
+    ("text", "category"),
+    [
+        (mot(1, ",1,4,0,1"), 4),  # VisDrone
+        (mot(1, ",0.9,-1,-1,-1"), 0),  # detections, trackers, MOT15
+        (mot(1, ",1,5,0.25"), 5),
+        (mot(1, ",1,5"), 5),
+        (mot(1, ",0.93"), 0),
+        (mot(1), 0),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_a_class_is_read_where_the_dialect_has_it(tmp_path: Path, text: str, category: int, encoding: str) -> None:
+    path = tmp_path / "a.boxes.txt"
+    path.write_text(text, encoding=encoding)
+    assert check(".boxes.txt", path) == ""
+    assert read(".boxes.txt", path).at(0)[1].tolist() == [[category, 7]]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_coco_as_cvat_writes_it(tmp_path: Path, encoding: str) -> None:
+    path, labels = tmp_path / "a.boxes.json", sized(width=80, height=60)
+    labels["images"] = [{"id": 1, "file_name": "frame_000003.PNG", "width": 80, "height": 60}]
+    labels["annotations"][0]["attributes"] = {"occluded": False, "track_id": 9}
+    path.write_text(json.dumps(labels), encoding=encoding)
+    assert check(".boxes.json", path) == ""
+    assert read(".boxes.json", path).at(3)[1].tolist() == [[2, 9]]
+
+
+def test_what_tools_write_beside_the_frames_is_not_read_and_said(tmp_path: Path) -> None:
+    for name in ("clip_00_jpg.rf.0a1b2c3d4e5f60718293a4b5c6d7e8f9.txt", "clip_01_png.rf.ab12.txt"):
+        (tmp_path / name).write_bytes(b"\xef\xbb\xbf2 0.5 0.5 0.1 0.1\n")
+    assert check(".boxes/", tmp_path) == ""
+    for name in ("classes.txt", "notes.json", "README.roboflow.txt", ".hidden"):
+        (tmp_path / name).write_text("person\n")
+    assert check(".boxes/", tmp_path) == "3 of its files are not read, such as README.roboflow.txt"
+    assert read(".boxes/", tmp_path).at(1)[1].tolist() == [[2, -1]]
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:
+    Image.new("L", (80, 60)).save(tmp_path / "0.png")
+    assert check(".masks/", tmp_path) == ""
+    Image.new("L", (60, 80)).save(tmp_path / "0.png")
+    with pytest.raises(ValueError, match=r"0\.png has 60x80 px: the video has 80x60 px"):
+        check(".masks/", tmp_path)
+
+
+def test_a_file_beyond_the_limit_is_not_parsed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(formats, "_LARGEST_BYTES", 100)
+    (tmp_path / "a.boxes.txt").write_text(mot(1) * 9)
+    with pytest.raises(ValueError, match="has more than 100 bytes, the limit of a file of boxes"):
+        check(".boxes.txt", tmp_path / "a.boxes.txt")
+
+
+@given(st.integers(0, 10**12 - 1), st.sampled_from(["", "clip_", "a-b.c_"]), st.integers(0, 12))
+def test_the_number_at_the_end_of_a_name_is_the_frame(number: int, before: str, width: int) -> None:
+    assert frame_of(f"{before}{number:0{width}}.png") == number
+    assert frame_of(f"{before}{number:0{width}}_jpg.rf.123456.txt") == number
+    assert frame_of("classes.txt") is None
+
+
 GOOD = {"images": [{"id": 1, "frame_id": 0}], "annotations": []}
 
 
@@ -135,8 +279,8 @@ def test_files_are_numbered_by_the_end_of_their_names(tmp_path: Path) -> None:
     (tmp_path / "a2_07.txt").unlink()
     with pytest.raises(ValueError, match=r"7\.txt line 1 has 2 values: give class, centre x"):
         read(".boxes/", tmp_path)
-    (tmp_path / "classes.txt").write_text("person\n")
-    with pytest.raises(ValueError, match=r"classes\.txt: give it a name that ends with the number"):
+    (tmp_path / "frame.txt").write_text("person\n")
+    with pytest.raises(ValueError, match=r"frame\.txt: give it a name that ends with the number"):
         read(".boxes/", tmp_path)
 
 

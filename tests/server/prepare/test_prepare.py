@@ -323,6 +323,18 @@ def test_one_video_may_be_prepared_in_its_own_folder(
         opened(films)
 
 
+def test_labels_that_are_left_behind_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "films").mkdir()
+    write_clip(tmp_path / "films" / "a.mp4", panned_luma(12))
+    (tmp_path / "films" / "a.boxes.txt").write_text("1,1,2,3,4,5\n")
+    place = tmp_path / "store"
+    more = ["--workers", "1", "--cache-dir", str(tmp_path / "cache")]
+    assert prepare_main([str(tmp_path / "films"), str(place), *more]) == 0
+    said = capsys.readouterr().out
+    assert "1 sidecars .boxes.txt (labels) were left beside their videos: copy them to the same places in" in said
+    assert not (place / "a.boxes.txt").exists()
+
+
 def test_the_table_has_every_flag(capsys: pytest.CaptureFixture[str]) -> None:
     assert prepare_main(["--help"]) == 0
     flags = set(re.findall(r"--[a-z-]+", capsys.readouterr().out.partition("General:")[0]))

@@ -15,8 +15,9 @@ from v2v_protocol.sample import FromSidecar
 from v2v_protocol.wire import decode, encode
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.sidecar import fingerprint_of
+from v2v_server.worker import sidecars as reading
 from v2v_server.worker.conversation import Make, Readiness, Send, WorkerConversation
-from v2v_server.worker.sidecars import errors_of_sidecar, open_sidecars, sidecar_files
+from v2v_server.worker.sidecars import errors_of_sidecar, open_sidecars, refused_sidecars, sidecar_files
 
 ENDING = ".label.json"
 
@@ -76,3 +77,38 @@ def test_the_worker_reports_the_sidecar_and_not_the_video() -> None:
     (said, *_) = talk.on_failure(SidecarError("a.mp4", ENDING, "has no frame 3", here=True), 1.0)
     assert isinstance(said, Send)
     assert decode(said.frames[0]) == LeaseFailed(5, None, "has no frame 3", True, ENDING)
+
+
+def test_a_sidecar_that_the_catalogue_refuses_is_not_opened(tmp_path: Path) -> None:
+    refused = lease(sidecars={ENDING: ["3-abc", "has labels of frame 9"]})
+    assert sidecar_files(refused) == {}
+    assert refused_sidecars(refused) == {ENDING: "has labels of frame 9"}
+    with open_sidecars(refused, Folder(tmp_path)) as opened:
+        assert opened == {ENDING: None}
+    with (
+        pytest.raises(SidecarError, match=r"^a\.mp4: its sidecar \.label\.json: has labels of frame 9$") as raised,
+        errors_of_sidecar("a.mp4", "label", opened, refused_sidecars(refused)),
+    ):
+        pytest.fail("the array is made")
+    assert not raised.value.here
+    assert decode(encode(refused)[0]) == refused
+    for malformed in ([1, b""], ["3-abc", 7], ["3-abc"], {}):
+        with pytest.raises(ProtocolError, match="fingerprint"):
+            sidecar_files(lease(sidecars={ENDING: malformed}))
+
+
+def test_memory_that_labels_take_is_their_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = {ENDING: tmp_path}
+    with pytest.raises(SidecarError, match="MemoryError") as raised, errors_of_sidecar("a.mp4", "label", opened):
+        raise MemoryError
+    assert not raised.value.here
+
+    def short(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(reading, "open_sidecar", short)
+    with (
+        pytest.raises(SidecarError, match="too much memory"),
+        open_sidecars(lease(sidecars={ENDING: "3-abc"}), Folder(tmp_path)),
+    ):
+        pass

@@ -6,6 +6,7 @@ import os
 import socket
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ import pytest
 import zmq
 
 from tests.protocol.wire_messages import example
-from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.errors import SidecarError, UsageError, VideoError
 from v2v_protocol.link.dealer import wait
 from v2v_protocol.messages import Begun, Goodbye, Lease, LeaseFailed, Message, Ping, Pong, Result, Stop, WorkerHello
 from v2v_protocol.sample import Layout, new_arrays
@@ -112,6 +113,38 @@ def test_it_makes_what_it_is_given_and_notes_what_it_is_at(server: Server) -> No
     ]
     server.says(Stop())
     assert server.heard() == Goodbye()
+
+
+def test_sidecars_are_read_before_their_lease_begins(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time and memory that labels take count against no sample: nothing has begun, and the logbook says so."""
+
+    @contextmanager
+    def opened(lease: Lease, source: object) -> Iterator[dict[str, None]]:
+        server.did.append(f"open {lease.lease}")
+        if lease.lease == 5:
+            raise SidecarError("a.mp4", ".boxes/", "is gone", here=True)
+        yield {}
+
+    monkeypatch.setattr(worker_module, "open_sidecars", opened)
+    monkeypatch.setattr(worker_module, "kernels_of", lambda lease: frozenset())
+    labelled = replace(LEASE, video="a.mp4", arrays=("boxes",))
+    starts = {1: 0, 2: 0, 4: 9, 5: 18}
+    server.says(
+        *(
+            replace(labelled, lease=number, start_frame=start, sidecars={".boxes/": ["3-x", b"the same files"]})
+            for number, start in starts.items()
+        )
+    )
+    said = [server.heard()]
+    while not isinstance(said[-1], LeaseFailed):
+        said.append(server.heard())
+    assert said[-1] == LeaseFailed(5, None, "is gone", True, ".boxes/")
+    assert [step for step in server.did if "way" not in step] == [
+        *("open 1", "note 1", "make 1", "note 0"),
+        *("note 2", "make 2", "note 0"),
+        *("open 4", "note 4", "make 4", "note 0"),
+        *("open 5", "note 5", "note 0"),
+    ]
 
 
 def test_a_new_connection_has_a_new_routing_id(tmp_path: Path) -> None:

@@ -142,7 +142,7 @@ class Copies(VideoSource):
         """
         return self.bucket.state(id)
 
-    def verify(self, id: str, fingerprint: str, state: State | None) -> None:
+    def verify(self, id: str, fingerprint: str, state: State | str | None) -> None:
         """Check an object, or a sidecar, against its state, with one question. If the store gives no answer, that is no
         error.
 
@@ -152,19 +152,24 @@ class Copies(VideoSource):
         try:
             if is_sidecar(id):
                 found = self.bucket.find(id, tries=1) if id.endswith("/") else {"": self.bucket.state(id, tries=1)}
-                changed = state_text(sorted(found.items())) != self.sidecar_states([id])[0]
+                changed = state_text(sorted(found.items())) != state and state is not None
             else:
                 changed = self.bucket.state(id, tries=1) != state and state is not None
         except VideoGone:
             raise
         except VideoUnreadable:
             return
+        except OSError:  # beyond the limits of a sidecar
+            changed = True
         if changed:
             raise VideoChanged(id, None, f"changed in {self} since it was catalogued")
 
-    def sidecar_states(self, ids: Sequence[str]) -> list[str]:
-        """Return texts that stand for the listed objects' states, see :meth:`VideoSource.sidecar_states`."""
-        return [state_text([(name[len(id) :], self._objects[name]) for name in self._below(id)]) for id in ids]
+    def sidecar_state(self, id: str) -> str | OSError:
+        """Return a text that stands for the listed objects' states, see :meth:`VideoSource.sidecar_state`."""
+        try:
+            return state_text((name[len(id) :], self._objects[name]) for name in self._below(id))
+        except OSError as error:
+            return error
 
     def _below(self, id: str) -> Iterator[str]:
         """Yield the names of the listed objects of a sidecar, sorted."""

@@ -84,12 +84,12 @@ class Folder(VideoSource):
         return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
-        """Lend the file; only a sidecar is checked.
+        """Lend the file; only a sidecar of one file is checked.
 
         Raises:
             VideoUnreadable, VideoChanged: a sidecar cannot be read, or is another one by now.
         """
-        if is_sidecar(id):
+        if fingerprint and is_sidecar(id) and not id.endswith("/"):
             check_local(self.folder / id, id, fingerprint)
         return nullcontext(self.folder / id)
 
@@ -109,24 +109,21 @@ class Folder(VideoSource):
                     videos.append(id)
         return found
 
-    def sidecar_states(self, ids: Sequence[str]) -> list[str]:
-        """Return texts that stand for sizes and times, see :meth:`VideoSource.sidecar_states`."""
-        found = []
-        for id in ids:
-            try:
-                found.append(local_state(self.folder / id, id))
-            except OSError as error:  # opening it reports the same error
-                found.append(str(error))
-        return found
+    def sidecar_state(self, id: str) -> str | OSError:
+        """Return a text that stands for sizes and times, see :meth:`VideoSource.sidecar_state`."""
+        try:
+            return local_state(self.folder / id, id)
+        except OSError as error:
+            return error
 
-    def verify(self, id: str, fingerprint: str, state: State | None) -> None:
-        """Check the file against its fingerprint.
+    def verify(self, id: str, fingerprint: str, state: State | str | None) -> None:
+        """Check the file against its fingerprint; of a sidecar, only sizes and times.
 
         Raises:
             VideoError: it is gone, another one by now, or cannot be read.
         """
         if is_sidecar(id):
-            check_local(self.folder / id, id, fingerprint)
+            check_local(self.folder / id, id, fingerprint, str(state or ""))
         else:
             check_file(self.folder / id, fingerprint)
 

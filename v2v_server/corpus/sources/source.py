@@ -169,11 +169,11 @@ class VideoSource(ABC):
         """
 
     @abstractmethod
-    def verify(self, id: str, fingerprint: str, state: State | None) -> None:
+    def verify(self, id: str, fingerprint: str, state: State | str | None) -> None:
         """Check that a video or sidecar is as catalogued. A remote source that gives no answer now raises no error.
 
         Args:
-            fingerprint, state: as catalogued; None: unknown.
+            fingerprint, state: as catalogued; None: unknown. That of a sidecar is :meth:`sidecar_state`.
 
         Raises:
             VideoError: it is gone, another one by now, or (on a disk) cannot be read.
@@ -183,11 +183,15 @@ class VideoSource(ABC):
         """Return, by ending, those of these videos that may have such a sidecar, in their order."""
         return dict.fromkeys(endings, ids)
 
-    def sidecar_states(self, ids: Sequence[str]) -> list[str]:
-        """Return texts that change with the content of these sidecars; "" for one that is not there. Called in threads.
-        A source without sidecars need not implement this.
+    def sidecar_state(self, id: str) -> str | OSError:
+        """Return a text that changes with the content of a sidecar; "" if it is not there. Called in threads. A source
+        without sidecars need not implement this.
+
+        Returns:
+            the text; or an error, if it cannot be told, or the sidecar is beyond the limits of
+            :func:`v2v_server.corpus.sources.sidecar.state_text`.
         """
-        return [""] * len(ids)
+        return ""
 
     def has(self, files: Mapping[str, str]) -> bool:
         """Return whether :meth:`open_local` finds these files on this host. If so, they stay until the next call with
