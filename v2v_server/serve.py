@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
 import math
 import os
@@ -17,7 +18,7 @@ from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
 from v2v_protocol.errors import CorpusError
-from v2v_protocol.link.guard import most_connections
+from v2v_protocol.link.user import OwnUser
 from v2v_protocol.progress import Progress
 from v2v_server.broker.actions import (
     Action,
@@ -57,7 +58,7 @@ from v2v_server.supervise.scaling import Scaling, question_workers
 from v2v_server.supervise.standby import Standby
 from v2v_server.system.clock import Clock
 from v2v_server.system.log import Level, Log
-from v2v_server.system.process import keep_freed_memory, open_many_files, usable_cores
+from v2v_server.system.process import keep_freed_memory, most_connections, open_many_files, usable_cores
 from v2v_server.system.service import stop_on_signals, utc_now, write_port_file
 from v2v_server.system.start_times import StartTimes
 from v2v_server.system.status_fields import GIB
@@ -156,9 +157,12 @@ def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None
             config.bind,
             config.worker_bind or _private_address(label),
             most_connections=most_connections(_FILES_A_WORKER * config.workers_in_all),
-            most_queued_bytes=config.max_credit_bytes,
+            has_session=dispatcher.has_session,
             keys=keys,
             local_bind=_private_address(label),
+            admits=None
+            if keys or config.insecure or sys.platform != "linux"
+            else OwnUser(functools.partial(log.say, level="warning")),
         )
         page = PageProcess(config.page_host, config.page, config.page_names) if config.page else None
         server = Server(

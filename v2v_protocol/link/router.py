@@ -1,16 +1,16 @@
 """Listen for peers on a ROUTER socket, and limit what they can cost. I/O.
 
 Memory: ZeroMQ keeps at most MOST_UNREAD whole messages from a peer, and at most MOST_QUEUED messages for one.
-:mod:`v2v_protocol.link.guard` limits bytes, unfinished messages and connections.
+:mod:`v2v_protocol.link.guard` limits connections.
 """
 
 from __future__ import annotations
 
 import os
+import socket
 import sys
 import time
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,12 +42,15 @@ class Limits:
     Attributes:
         frame_bytes: largest frame of a message.
         connections: largest number at a time; None if only our own user can connect, who needs no guard.
-        queued_bytes: largest number of bytes queued for one peer; None limits no bytes in either direction.
+        has_session: returns whether the peer with a routing id has a session, which protects its connection; called by
+            another thread.
+        admits: returns whether a connection that was just accepted may stay; None admits all.
     """
 
     frame_bytes: int
     connections: int | None
-    queued_bytes: int | None = None
+    has_session: Callable[[bytes], bool]
+    admits: Callable[[socket.socket], bool] | None = None
 
 
 class Routers:
@@ -67,7 +70,7 @@ class Routers:
         self._routers: list[Router] = []
         self._poller = zmq.Poller()
         try:
-            self.gate = None if keys is None else Gate(self.context, keys)
+            self.gate = Gate(self.context, keys)
         except BaseException:
             self.context.destroy(linger=0)
             raise
@@ -86,10 +89,7 @@ class Routers:
 
     def close(self) -> None:
         """Close all routers; unsent messages are dropped."""
-        for router in self._routers:
-            router.close()
-        if self.gate is not None:
-            self.gate.close()
+        self.gate.close()
         self.context.destroy(linger=0)
 
 
@@ -111,9 +111,7 @@ class Received:
 class Router:
     """One listening socket. :meth:`Routers.open` creates it."""
 
-    def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], side: str, limits: Limits, gate: Gate | None = None
-    ) -> None:
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], side: str, limits: Limits, gate: Gate) -> None:
         self.socket = router = context.socket(zmq.ROUTER)
         self._side, self._gate = side, gate
         self._users: dict[bytes, str] = {}
@@ -134,11 +132,10 @@ class Router:
         # reveal it. Without TCP keep-alive the connection would stay open for the life of this process.
         router.setsockopt(zmq.TCP_KEEPALIVE, 1)
         router.setsockopt(zmq.TCP_KEEPALIVE_IDLE, _KEEPALIVE_SECONDS)
-        self.guard = (
-            None
-            if limits.connections is None
-            else ConnectionGuard(router, limits.connections, limits.queued_bytes, is_encrypted=gate is not None)
-        )
+        self.guard: ConnectionGuard | None = None
+        if limits.connections is not None:
+            self.guard = ConnectionGuard(router, limits.connections, limits.has_session, limits.admits)
+            gate.watch(side, self.guard)
 
     def bind(self, address: str, flag: str, *, admits_all: bool = False) -> str:
         """Listen at an address; return it with its port.
@@ -152,7 +149,7 @@ class Router:
             UsageError: the address cannot be bound.
         """
         # Only our own user may connect to an ipc:// address.
-        if self._gate is not None and not admits_all and not address.startswith("ipc:"):
+        if not admits_all and not address.startswith("ipc:"):
             self._gate.require(self.socket, self._side)
         # Otherwise IPv4 addresses come back in their IPv6 form, which few readers recognise.
         self.socket.setsockopt(zmq.IPV6, int("[" in address))
@@ -177,13 +174,15 @@ class Router:
             return None  # the connection has just ended, and its message is gone
         sender, user = identity.bytes, ""
         if self.guard is not None:
-            with suppress(zmq.ZMQError):  # ZeroMQ does not know this for messages of connections that have just ended
-                self.guard.heard(sender, int(identity.get(zmq.SRCFD)), frames)
-        if self._gate is not None:
-            with suppress(zmq.ZMQError):  # it came over ipc://, and has no key
-                user = self._users[sender] = str(identity.get("User-Id"))
-                if not self._gate.admits(self._side, user):
-                    return None  # the next review disconnects it
+            # ZeroMQ knows neither for connections over ipc://, which have no handshake of ours.
+            number, _, user = str(_about(identity, "User-Id") or "").partition(" ")
+            descriptor = int(_about(identity, zmq.SRCFD) or -1)
+            if not self.guard.heard(sender, descriptor, int(number) if number else None):
+                return None
+        if user:
+            self._users[sender] = user
+            if not self._gate.admits(self._side, user):
+                return None  # the next review disconnects it
         if len(frames) > MOST_FRAMES:
             self.disconnect(sender)
             return None
@@ -202,8 +201,6 @@ class Router:
             if error.errno == zmq.EHOSTUNREACH:
                 return False
             raise
-        if self.guard is not None:
-            self.guard.sent(identity, sum(map(len, frames)))
         return True
 
     def disconnect(self, identity: bytes) -> None:
@@ -216,20 +213,22 @@ class Router:
         Disconnect peers whose key was revoked.
         """
         ended = [] if self.guard is None else self.guard.take_ended()
-        if self._gate is not None:
-            self._review(self._gate, ended)
+        self._review(ended)
         return ended
 
-    def _review(self, gate: Gate, ended: Iterable[bytes]) -> None:
+    def _review(self, ended: Iterable[bytes]) -> None:
         for identity in ended:
             self._users.pop(identity, None)
         if (now := time.monotonic()) >= self._review_at:
             self._review_at = now + _REVIEW_SECONDS
             for identity, user in self._users.items():
-                if not gate.admits(self._side, user):
+                if not self._gate.admits(self._side, user):
                     self.disconnect(identity)
 
-    def close(self) -> None:
-        """Stop the guard. :meth:`Routers.close` closes the socket."""
-        if self.guard is not None:
-            self.guard.close()
+
+def _about(frame: Any, name: str | int) -> str | int | None:
+    """Return a property of a frame; None if it has none."""
+    try:
+        return frame.get(name)  # type: ignore[no-any-return]
+    except zmq.ZMQError:
+        return None
