@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import gc
 import math
 import os
@@ -71,6 +70,10 @@ _SOON_SECONDS = 5.0
 """Time after which blocked leases are reported."""
 _GIVE_BACK_SECONDS = 12.0
 """Time from the end of a connection until its memory is returned to the kernel; its session is forgotten by then."""
+_OWN_USER_RULE = (
+    "without keys this server serves only root and its own user; make keys with v2v-keys init and give --keys, or give "
+    "--insecure to serve every user of this host"
+)
 
 
 def load_catalogue(config: ServeConfig) -> Catalogue:
@@ -150,6 +153,7 @@ def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None
     worker_flags += catalogue.source.worker_flags()
     label = f"w{secrets.token_hex(4)}"
     keys = KeyFolder(Path(config.keys)) if config.keys else None
+    is_open = bool(keys or config.insecure or sys.platform != "linux")
     stop = threading.Event()
     with stop_on_signals(stop):
         pool = make_pool(config, catalogue.source, label, worker_flags, keys, standbys)
@@ -160,11 +164,13 @@ def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None
             has_session=dispatcher.has_session,
             keys=keys,
             local_bind=_private_address(label),
-            admits=None
-            if keys or config.insecure or sys.platform != "linux"
-            else OwnUser(functools.partial(log.say, level="warning")),
+            admits=None if is_open else OwnUser(_OWN_USER_RULE, log.say).admits,
         )
-        page = PageProcess(config.page_host, config.page, config.page_names) if config.page else None
+        page = None
+        if config.page:
+            page = PageProcess(
+                config.page_host, config.page, config.page_names, config.log_format, is_insecure=config.insecure
+            )
         server = Server(
             config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file, page=page, times=times
         )
@@ -317,7 +323,7 @@ class Server:
                 case ReportRefusal(refusal, request):
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
                 case SendStatus() as request:
-                    todo.extend(self._publisher.ask(request))
+                    self._publisher.ask(request)
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
         """End the process of a hung worker, if it is one of ours."""

@@ -7,12 +7,13 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from tests.clips import panned_luma, write_clip
-from tests.waiting import until
+from tests.server.page.test_child import free_port
 
 pytestmark = [
     pytest.mark.skipif(
@@ -24,9 +25,7 @@ pytestmark = [
 
 SMALL = ("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=40")
 ROOT, NOBODY, ALICE = 0, 65534, 12345
-TAKE_A_BATCH = (
-    "import sys; from v2v_client import V2VStreamDataset as D; print(next(iter(D(sys.argv[1], batch_size=2))).voxels.shape)"
-)
+TAKE_A_BATCH = "import sys; from v2v_client import V2VStreamDataset as D; print(next(iter(D(sys.argv[1], batch_size=2))).voxels.shape)"
 
 
 def acting_as(user: int) -> list[str]:
@@ -53,8 +52,10 @@ def serve(tmp_path: Path) -> Iterator[Callable[..., tuple[str, Path]]]:
             environment = os.environ | {"HOME": str(home), "V2V_CACHE_DIR": str(home), "XDG_CACHE_HOME": str(home)}
             where = ["--port-file", home / port.name]
             running.append(subprocess.Popen([*command, *where, *flags], stderr=errors, env=environment, cwd="/"))
-        until(lambda: (home / port.name).exists() or running[-1].poll() is not None)
-        assert running[-1].poll() is None, log.read_text()
+        while not (home / port.name).exists():  # a worker may have to compile the kernels
+            with suppress(subprocess.TimeoutExpired):
+                running[-1].wait(0.1)
+                pytest.fail(log.read_text())
         return (home / port.name).read_text().strip(), log
 
     yield start
@@ -104,3 +105,27 @@ def test_the_same_user_gets_a_batch_with_nothing_to_configure(serve: Callable[..
     command = [*acting_as(ALICE), "-c", TAKE_A_BATCH, address]
     taken = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False, cwd="/")
     assert taken.stdout.strip() == "torch.Size([2, 4, 5, 32, 40])", taken.stderr + log.read_text()
+
+
+def test_the_page_is_for_the_same_user_unless_it_is_insecure(serve: Callable[..., tuple[str, Path]]) -> None:
+    fetch = (
+        "import sys, http.client; c = http.client.HTTPConnection('127.0.0.1', int(sys.argv[1]), timeout=60); "
+        "c.request('GET', '/healthz'); print(c.getresponse().status)"
+    )
+
+    def got(port: int, user: int) -> str:
+        command = [*acting_as(user), "-c", fetch, str(port)]
+        while True:
+            asked = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, cwd="/")
+            if asked.stdout != "503\n":  # not answered by the server yet
+                return asked.stdout
+
+    closed, opened = free_port(), free_port()
+    _, log = serve(ALICE, "--workers", "0", "--page", str(closed))
+    assert got(closed, ALICE) == "200\n"
+    assert got(closed, ROOT) == "200\n"
+    assert got(closed, NOBODY) == ""
+    assert "refused a connection of user 65534" in log.read_text()
+    assert "the page serves only root and the server's user" in log.read_text()
+    serve(ROOT, "--workers", "0", "--page", str(opened), "--insecure")
+    assert got(opened, NOBODY) == "200\n"

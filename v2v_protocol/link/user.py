@@ -18,7 +18,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from ipaddress import IPv6Address, ip_address
 from pathlib import Path
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 _TABLES = Path("/proc/net")
 _OVERFLOW_USER = Path("/proc/sys/kernel/overflowuid")
@@ -35,34 +35,29 @@ class OwnUser:
     """Admit connections of this process's user and of root.
 
     Args:
-        say: writes a log line about a refused user, at most once a minute for each.
+        rule: who is served and what to do, for the line about a refused user.
+        say: writes that line, at most once a minute for each user.
     """
 
-    def __init__(self, say: Callable[[str], object]) -> None:
-        self._say = say
+    def __init__(self, rule: str, say: Callable[[str, Literal["warning"]], object]) -> None:
+        self._rule, self._say = rule, say
         self._said_at: dict[int | None, float] = {}
         # Users that a user namespace does not map all have this number, so it identifies none.
         self._overflow = int(_OVERFLOW_USER.read_text())
 
-    def __call__(self, link: socket.socket) -> bool:
-        """Return whether a connection may stay.
-
-        Raises:
-            OSError: it has just ended.
-        """
+    def admits(self, link: socket.socket) -> bool:
+        """Return whether a connection may stay."""
         if link.family == socket.AF_UNIX:  # ZeroMQ admits only our own user there
             return True
-        own, user = os.geteuid(), owner(_end(link.getpeername()), _end(link.getsockname()))
-        if user == 0 or (user == own and user != self._overflow):
-            return True
-        is_there = link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] == _ESTABLISHED
-        if is_there and (now := time.monotonic()) >= self._said_at.get(user, now):
-            self._said_at[user] = now + _SAY_SECONDS
-            self._say(
-                f"refused a connection of {'an unknown user' if user is None else f'user {user}'}: without keys this "
-                f"server serves only root and its own user, {own}; make keys with v2v-keys init and give --keys, or "
-                "give --insecure to serve every user of this host"
-            )
+        with suppress(OSError):  # it has just ended
+            own, user = os.geteuid(), owner(_end(link.getpeername()), _end(link.getsockname()))
+            if user == 0 or (user == own and user != self._overflow):
+                return True
+            is_there = link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] == _ESTABLISHED
+            if is_there and (now := time.monotonic()) >= self._said_at.get(user, now):
+                self._said_at[user] = now + _SAY_SECONDS
+                who = "an unknown user" if user is None else f"user {user}"
+                self._say(f"refused a connection of {who} to a process of user {own}: {self._rule}", "warning")
         return False
 
 

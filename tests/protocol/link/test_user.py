@@ -16,6 +16,10 @@ from v2v_protocol.link.user import OwnUser
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux names the user")
 
 
+def fail(text: str, level: str) -> None:
+    pytest.fail(f"{level}: {text}")
+
+
 @pytest.fixture(params=["asked", "looked up"])
 def check(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> OwnUser:
     """Return the check, with the kernel's answer and where it gives none."""
@@ -25,7 +29,7 @@ def check(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ow
 
     if request.param == "looked up":
         monkeypatch.setattr(user, "_ask", deny)
-    return OwnUser(pytest.fail)
+    return OwnUser("", fail)
 
 
 @contextmanager
@@ -52,7 +56,7 @@ def owner(link: socket.socket) -> int | None:
 def test_the_user_is_named_in_both_families(check: OwnUser, server: str, client: str) -> None:
     with connected(server, client) as (ours, _):
         assert owner(ours) == os.geteuid()
-        assert check(ours)
+        assert check.admits(ours)
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="gives a socket to another user: as root")
@@ -69,7 +73,7 @@ def test_a_closed_peer_is_not_root(check: OwnUser) -> None:
     with connected() as (ours, theirs):
         theirs.close()
         assert owner(ours) is None
-        assert not check(ours)  # and says nothing: the peer does not wait for an answer
+        assert not check.admits(ours)  # and says nothing: the peer does not wait for an answer
 
 
 @pytest.mark.usefixtures("check")
@@ -82,21 +86,20 @@ def test_a_socket_that_only_listens_at_the_address_is_not_the_peer() -> None:
 def refuse(monkeypatch: pytest.MonkeyPatch, named: int | None, own: int) -> list[str]:
     """Return what is said if a server of one user gets two connections of another."""
     said: list[str] = []
-    check = OwnUser(said.append)
+    check = OwnUser("the rule", lambda text, level: said.append(text))
     monkeypatch.setattr(user, "owner", lambda local, remote: named)
     monkeypatch.setattr(os, "geteuid", lambda: own)
     with connected() as (ours, _):
-        assert not check(ours)
-        assert not check(ours)
+        assert not check.admits(ours)
+        assert not check.admits(ours)
     return said
 
 
 def test_a_refusal_says_once_which_user_and_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     (said,) = refuse(monkeypatch, 1001, 1000)
     assert "user 1001" in said
-    assert "1000" in said
-    assert "v2v-keys init" in said
-    assert "--insecure" in said
+    assert "user 1000" in said
+    assert said.endswith(": the rule")
 
 
 def test_no_answer_means_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,8 +112,8 @@ def test_the_user_of_all_that_a_namespace_does_not_map_is_never_our_own(monkeypa
 
 @pytest.mark.parametrize("named", [0, 1000])
 def test_root_and_our_own_user_are_admitted(monkeypatch: pytest.MonkeyPatch, named: int) -> None:
-    check = OwnUser(pytest.fail)
+    check = OwnUser("", fail)
     monkeypatch.setattr(user, "owner", lambda local, remote: named)
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     with connected() as (ours, _):
-        assert check(ours)
+        assert check.admits(ours)
