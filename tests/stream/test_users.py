@@ -25,7 +25,11 @@ pytestmark = [
 
 SMALL = ("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=40")
 ROOT, NOBODY, ALICE = 0, 65534, 12345
-TAKE_A_BATCH = "import sys; from v2v_client import V2VStreamDataset as D; print(next(iter(D(sys.argv[1], batch_size=2))).voxels.shape)"
+TAKE_A_BATCH = """
+import sys
+from v2v_client import V2VStreamDataset
+print(next(iter(V2VStreamDataset(sys.argv[1], batch_size=2))).voxels.shape)
+"""
 
 
 def acting_as(user: int) -> list[str]:
