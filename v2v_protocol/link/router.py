@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import zmq
 
@@ -33,24 +33,6 @@ _REVIEW_SECONDS = 0.5
 _ZERO_COPY_RECEIVE = 10  # an option of contexts that pyzmq has no name for
 # Plain numbers: combining two flags of an enumeration takes longer than sending a small frame.
 _NOBLOCK, _NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What peers of a router may cost.
-
-    Attributes:
-        frame_bytes: largest frame of a message.
-        connections: largest number at a time; None if only our own user can connect, who needs no guard.
-        has_session: returns whether the peer with a routing id has a session, which protects its connection; called by
-            another thread.
-        admits: returns whether a connection that was just accepted may stay; None admits all.
-    """
-
-    frame_bytes: int
-    connections: int | None
-    has_session: Callable[[bytes], bool]
-    admits: Callable[[socket.socket], bool] | None = None
 
 
 class Routers:
@@ -75,9 +57,26 @@ class Routers:
             self.context.destroy(linger=0)
             raise
 
-    def open(self, side: str, limits: Limits) -> Router:
-        """Return a new router for peers of a side, "consumer" or "worker"."""
-        router = Router(self.context, side, limits, self.gate)
+    def open(
+        self,
+        side: str,
+        largest_frame_bytes: int,
+        most_connections: int | None,
+        has_session: Callable[[bytes], bool],
+        admits: Callable[[socket.socket], bool] | None = None,
+    ) -> Router:
+        """Return a new router.
+
+        Args:
+            side: of its peers, "consumer" or "worker".
+            largest_frame_bytes: a peer that sends a larger frame is disconnected.
+            most_connections: largest number at a time; None if only our own user can connect, who needs no guard.
+            has_session, admits: see :class:`v2v_protocol.link.guard.ConnectionGuard`.
+        """
+        router = Router(self.context, side, largest_frame_bytes, self.gate)
+        if most_connections is not None:
+            router.guard = ConnectionGuard(router.socket, most_connections, has_session, admits)
+            self.gate.watch(side, router.guard)
         self._routers.append(router)
         self._poller.register(router.socket, zmq.POLLIN)
         return router
@@ -100,18 +99,23 @@ class Received:
     Attributes:
         identity: routing id of its connection.
         frames: the message: the first frame as bytes, the others in ZeroMQ's memory.
-        user: the key of its connection; empty without keys and over ``ipc://``.
+        user: the key of its connection; empty without keys, and for a worker of this host.
     """
 
     identity: bytes
-    frames: list[Any]
-    user: str
+    frames: Sequence[Any]
+    user: str = ""
+
+
+R = TypeVar("R", bound=Received)
 
 
 class Router:
     """One listening socket. :meth:`Routers.open` creates it."""
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], side: str, limits: Limits, gate: Gate) -> None:
+    def __init__(
+        self, context: zmq.Context[zmq.Socket[bytes]], side: str, largest_frame_bytes: int, gate: Gate
+    ) -> None:
         self.socket = router = context.socket(zmq.ROUTER)
         self._side, self._gate = side, gate
         self._users: dict[bytes, str] = {}
@@ -119,7 +123,7 @@ class Router:
         router.setsockopt(zmq.LINGER, 0)
         router.setsockopt(zmq.SNDHWM, MOST_QUEUED)
         router.setsockopt(zmq.RCVHWM, MOST_UNREAD)
-        router.setsockopt(zmq.MAXMSGSIZE, limits.frame_bytes)
+        router.setsockopt(zmq.MAXMSGSIZE, largest_frame_bytes)
         router.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         # Unroutable messages raise instead of vanishing.
         router.setsockopt(zmq.ROUTER_MANDATORY, 1)
@@ -133,9 +137,6 @@ class Router:
         router.setsockopt(zmq.TCP_KEEPALIVE, 1)
         router.setsockopt(zmq.TCP_KEEPALIVE_IDLE, _KEEPALIVE_SECONDS)
         self.guard: ConnectionGuard | None = None
-        if limits.connections is not None:
-            self.guard = ConnectionGuard(router, limits.connections, limits.has_session, limits.admits)
-            gate.watch(side, self.guard)
 
     def bind(self, address: str, flag: str, *, admits_all: bool = False) -> str:
         """Listen at an address; return it with its port.
@@ -159,9 +160,9 @@ class Router:
             raise UsageError(f"{flag} {address}: {error.strerror or error}") from error
         return self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
-    def receive(self) -> Received | None:
-        """Return an available message, if its sender's key has not been revoked since it connected, and it has at most
-        MOST_FRAMES frames.
+    def receive(self, kind: type[R]) -> R | None:
+        """Return an available message as a ``kind`` of :class:`Received`. One of a connection that may not stay, of a
+        revoked key, or with more than MOST_FRAMES frames is dropped.
         """
         frames: list[Any] = []
         try:
@@ -186,7 +187,7 @@ class Router:
         if len(frames) > MOST_FRAMES:
             self.disconnect(sender)
             return None
-        return Received(sender, frames, user)
+        return kind(sender, frames, user)
 
     def send(self, identity: bytes, frames: Sequence[Any]) -> bool:
         """Queue a message; return False if the peer is not connected any more or does not read."""

@@ -14,45 +14,23 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 from v2v_protocol.link.curve import KeyStore
-from v2v_protocol.link.router import Limits, Routers
+from v2v_protocol.link.router import Received, Routers
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_REQUEST_BYTES
 from v2v_server.broker.actions import ToConsumer, ToWorker
 from v2v_server.system.process import MOST_CONNECTIONS
 
 
-@dataclass(frozen=True, slots=True)
-class FromConsumer:
-    """A message that a consumer sent.
-
-    Attributes:
-        identity: routing id of its connection.
-        frames: the message.
-        user: name of the key of its connection; empty without keys.
-    """
-
-    identity: bytes
-    frames: Sequence[Any]
-    user: str = ""
+class FromConsumer(Received):
+    """A message that a consumer sent."""
 
 
-@dataclass(frozen=True, slots=True)
-class FromWorker:
-    """A message that a worker sent.
-
-    Attributes:
-        identity: routing id of its connection.
-        frames: the message.
-        user: name of the key of its connection; empty without keys, and for a worker of this host.
-    """
-
-    identity: bytes
-    frames: Sequence[Any]
-    user: str = ""
+class FromWorker(Received):
+    """A message that a worker sent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,11 +112,11 @@ class Sockets:
         self._routers = Routers(keys)
         try:
             self._consumers = self._routers.open(
-                "consumer", Limits(LARGEST_REQUEST_BYTES, most_connections, has_session, admits)
+                "consumer", LARGEST_REQUEST_BYTES, most_connections, has_session, admits
             )
             is_private = worker_bind.startswith("ipc:")
             self._workers = self._routers.open(
-                "worker", Limits(LARGEST_ARRAY_BYTES, None if is_private else most_connections, has_session, admits)
+                "worker", LARGEST_ARRAY_BYTES, None if is_private else most_connections, has_session, admits
             )
             self.address = self._consumers.bind(bind, "--bind")
             local = ""
@@ -156,10 +134,10 @@ class Sockets:
         ready = self._routers.wait(seconds)
         self.waited_seconds += time.monotonic() - began
         arrivals: list[Arrival] = []
-        if self._workers in ready and (message := self._workers.receive()) is not None:
-            arrivals.append(FromWorker(message.identity, message.frames, message.user))
-        if self._consumers in ready and (message := self._consumers.receive()) is not None:
-            arrivals.append(FromConsumer(message.identity, message.frames, message.user))
+        if self._workers in ready and (sample := self._workers.receive(FromWorker)) is not None:
+            arrivals.append(sample)
+        if self._consumers in ready and (request := self._consumers.receive(FromConsumer)) is not None:
+            arrivals.append(request)
         arrivals += map(ConsumerGone, self._consumers.take_ended())
         self._workers.take_ended()
         return arrivals

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 import zmq
 
+from bench.dealers import wait
 from tests.protocol.wire_messages import example
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_protocol.link.dealer import wait
 from v2v_protocol.messages import Begun, Goodbye, Lease, LeaseFailed, Message, Ping, Pong, Result, Stop, WorkerHello
 from v2v_protocol.sample import Layout, new_arrays
 from v2v_protocol.wire import decode, encode
