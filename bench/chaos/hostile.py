@@ -36,7 +36,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
 
-from bench.dealers import NextDealer, Reader
+from tests.oracles.dealers import NextDealer, Reader
 from v2v_protocol.errors import KeyRefused, V2VError
 from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
 from v2v_protocol.keys import PeerKey, key_for, read_key

@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.dealers import NextDealer, wait
 from bench.processes import Roles
 from tests.clips import write_clip
+from tests.oracles.dealers import NextDealer, wait
 from v2v_client.local_server import LocalServer
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import RemoteError, ServerLost

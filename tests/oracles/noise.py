@@ -38,8 +38,8 @@ def start_uniforms(key: noise.NoiseKey, pixels: int) -> noise.Reals:
 def shot_words(key: noise.NoiseKey, steps: int, pixels: int) -> tuple[noise.Words, noise.Words]:
     """Return independent uniform words that decide the shot events: those of positive and of negative events.
 
-    ``mix`` of the words of pixel and step, as for the normals: with shot_noise.PIXEL_POS and shot_noise.STEP_POS in the place of the two
-    radius words, shot_noise.PIXEL_NEG and shot_noise.STEP_NEG in that of the two angle words.
+    ``mix`` of the words of pixel and step, as for the normals: with PIXEL_POS and STEP_POS in the place of the two
+    radius words, PIXEL_NEG and STEP_NEG in that of the two angle words.
 
     Returns:
         each [steps, pixels] uint32.

@@ -54,10 +54,12 @@ def corpus_summary(
 
 def _span(catalogue: Catalogue, recipe: Recipe) -> tuple[str, list[str]]:
     """Return what a sequence consists of, and a warning if frames are too far apart for the recipe's grids."""
-    rates = catalogue.videos.frames_per_second
-    steps = recipe.frame_stride / rates[rates > 0.0]
-    if not recipe.is_timed or not len(steps):
+    if not recipe.is_timed:
         return f"{recipe.frames_needed} frames", []
+    rates = catalogue.videos.frames_per_second
+    steps = recipe.frame_stride / rates[rates > 0.0]  # of videos without a rate there are no sequences
+    if not len(steps):
+        return f"{recipe.spans} grids", []
     # A grid has the number of steps that comes nearest to its duration, and at least one.
     made = [np.maximum(np.rint(wanted / steps), 1.0) * steps for wanted in recipe.voxel_seconds]
     shortest, longest = f"{made[0].min():.3g}", f"{made[1].max():.3g}"

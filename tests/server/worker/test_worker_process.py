@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import zmq
 
-from bench.dealers import wait
+from tests.oracles.dealers import wait
 from tests.protocol.wire_messages import example
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.messages import Begun, Goodbye, Lease, LeaseFailed, Message, Ping, Pong, Result, Stop, WorkerHello
