@@ -106,7 +106,7 @@ class Remaker:
             VideoUnreadable: this host cannot read a candidate's file, which a server may have read.
         """
         catalogue, spec = self._catalogue, self._spec
-        SampleId(spec.digest, catalogue.digest_under(spec.scene), 0, seed, epoch, index)
+        SampleId(spec.digest, catalogue.facts.digest_under(spec.scene), 0, seed, epoch, index)
         if index >= self.count:
             raise UsageError(f"index {index}: the epoch has {self.count} samples, 0 .. {self.count - 1}")
         request = Request(b"", epoch, index, snapshot=self._snapshot)

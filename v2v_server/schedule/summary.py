@@ -65,12 +65,12 @@ def _span(catalogue: Catalogue, recipe: Recipe) -> tuple[str, list[str]]:
     shortest, longest = f"{made[0].min():.3g}", f"{made[1].max():.3g}"
     span = f"{recipe.spans} grids of {shortest if shortest == longest else f'{shortest} to {longest}'} s"
     coarse = np.count_nonzero(steps > recipe.voxel_seconds[1])
-    wanted = f"voxel_seconds = {recipe.voxel_seconds[1]:g}"
     warning = (
-        f"warning: {wanted} is shorter than the time between frames of {coarse} videos (at most {steps.max():.3g} s), "
-        "and a grid of theirs lasts from frame to frame: raise voxel_seconds, or serve videos with more frames a second"
+        f"warning: voxel_seconds = {recipe.voxel_seconds[1]:g} is shorter than the time between frames of {coarse} "
+        f"videos (at most {steps.max():.3g} s), and a grid of theirs lasts from frame to frame: raise voxel_seconds, or "
+        "serve videos with more frames a second"
     )
-    return span, [warning] * (coarse > 0)
+    return span, [warning] if coarse else []
 
 
 def _listed(refused: Sequence[Refusal], all_of_them: bool) -> list[str]:
