@@ -122,8 +122,8 @@ class ConnectionGuard:
             if not is_admitted:
                 _cut(newcomer)
             elif len(self._connections) > self._most_connections:
-                oldest_first = self._connections.values()
-                _cut(next(x for x in oldest_first if not x.is_cut and not self._has_session(x.identity)))
+                oldest_first = [*self._connections.values(), newcomer]
+                _cut(next(x for x in oldest_first if x is newcomer or not (x.is_cut or self._has_session(x.identity))))
         return self._accepted
 
     def _end(self, descriptor: int) -> None:

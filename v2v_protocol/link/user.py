@@ -1,15 +1,14 @@
 """Find the user at the other end of a connection on loopback. I/O, Linux.
 
 A peer on this host has a socket of its own, whose local end is the address that we see as its peer. The kernel knows
-which user made it. An exact query (``sock_diag(7)``) takes microseconds and needs no rights. Where it is not allowed,
-``/proc/net/tcp`` has the same, in time that grows with the number of connections.
+which user made it. An exact query (``sock_diag(7)``) takes microseconds and needs no rights. Where it finds nothing or
+is not allowed, ``/proc/net/tcp`` is read, in time that grows with the number of connections.
 
 A closed socket has no inode and seems to belong to root, so only an established one with an inode counts.
 """
 
 from __future__ import annotations
 
-import errno
 import os
 import socket
 import struct
@@ -70,7 +69,7 @@ def owner(local: _End, remote: _End) -> int | None:
     for form in forms:
         try:
             found = _ask(*form)
-        except OSError:  # a container may not allow it
+        except OSError:
             found = _look_up(*form)
         if found is not None:
             return found
@@ -87,7 +86,7 @@ def _ask(family: int, local: _End, remote: _End) -> int | None:
     """Ask for one socket (``struct inet_diag_req_v2``).
 
     Raises:
-        OSError: the kernel does not answer such queries.
+        OSError: there is no such socket, or the kernel does not answer such queries.
     """
     query = struct.pack("=BBBxI", family, socket.IPPROTO_TCP, 0, 1 << _ESTABLISHED)
     query += struct.pack("!HH16s16s", local[1], remote[1], local[0], remote[0]) + _ANY_INTERFACE_OR_COOKIE
@@ -95,10 +94,8 @@ def _ask(family: int, local: _End, remote: _End) -> int | None:
         kernel.send(struct.pack("=IHHII", _HEADER_BYTES + len(query), _BY_FAMILY, _REQUEST, 0, 0) + query)
         answer = kernel.recv(4096, socket.MSG_DONTWAIT)
     if struct.unpack_from("=IH", answer)[1] == _ERROR:
-        number = -int(struct.unpack_from("=i", answer, _HEADER_BYTES)[0])
-        if number != errno.ENOENT:
-            raise OSError(number, os.strerror(number))
-        return None
+        # There is no such socket (ENOENT), or the kernel lacks the module that looks (ENOENT too).
+        raise OSError(-int(struct.unpack_from("=i", answer, _HEADER_BYTES)[0]), "no answer")
     user, inode = struct.unpack_from("=II", answer, _OWNER_AT)
     # If nothing has these ends, the answer is the socket that listens at the local one.
     is_it = answer[17] == _ESTABLISHED and struct.unpack_from("!HH", answer, 20) == (local[1], remote[1])
