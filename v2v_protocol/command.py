@@ -16,6 +16,7 @@ from typing import Any, Never
 
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION, __version__
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.programs import open_standard_streams, show
 from v2v_protocol.settings import Setting, nearest, settings_of
 
 FAILED = 1
@@ -121,6 +122,7 @@ def run_command(
     Returns:
         what ``run`` returned, 1 or 2 after an error, or 130 after a Ctrl-C.
     """
+    open_standard_streams()
     try:
         arguments = parser.parse_args(argv)
     except SystemExit as ended:  # argparse's own: help was shown, or a flag not understood
@@ -131,7 +133,7 @@ def run_command(
         if arguments.debug:
             traceback.print_exc()
         if not error.is_reported:
-            print(f"{parser.prog}: {' '.join(str(error).split())}", file=sys.stderr)
+            show(f"{parser.prog}: {' '.join(str(error).split())}", sys.stderr)
         failed = isinstance(error, failures) and not isinstance(error, UsageError)
         return FAILED if failed else WRONG_USAGE
     except KeyboardInterrupt:

@@ -36,8 +36,7 @@ PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
         "hot_pixel_share": (0.0, 0.0),
         "hot_pixel_sigma": (0.0, 0.0),
     },
-    # The paper's pixel with the dark floor of a sensor, drawn: recorded events are followed better from 0.01 to 0.2
-    # than at the paper's 0.001 (docs/effects.md).
+    # The paper's pixel with a higher dark floor, drawn (docs/effects.md).
     "sensor": {"log_eps": (0.01, 0.2)},
     # A DAVIS346 in ordinary light; docs/effects.md gives the source of each value.
     "davis346": {

@@ -1,19 +1,52 @@
-"""Entry points of the installed programs. A program whose packages are missing says so in one line. Programs that one
-starts run from the same installation.
+"""Entry points of the installed programs, and how they print. A program whose packages are missing says so in one line.
+Programs that one starts run from the same installation. Text may come from files: it is printed without characters that
+steer a terminal.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from typing import TextIO
 
 _OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_client", "trainer"})
 
 Program = Callable[[], int | None]
 """A function that returns the exit status; None is success."""
+
+
+# C0 and C1 controls, separators of lines, what changes the direction of text (Unicode 16, UAX 9), and surrogates that
+# stand for no byte.
+_STEERING = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udc7f\udd00-\udfff]"
+)
+
+
+def printable(text: str) -> str:
+    """Return a line that can be shown: bytes that are not UTF-8, and control and bidirectional characters, escaped."""
+    if text.isascii() and text.isprintable():  # as nearly all names are, and there may be a million of them
+        return text
+    text = _STEERING.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+    return os.fsencode(text).decode("utf-8", "backslashreplace")
+
+
+def show(text: str, stream: TextIO | None = None) -> None:
+    """Print lines on standard output, or on another stream, without characters that steer a terminal."""
+    print("\n".join(map(printable, text.split("\n"))), file=stream or sys.stdout, flush=True)
+
+
+def open_standard_streams() -> None:
+    """Open the null device in place of standard streams that are closed (``2>&-``). Otherwise the next file that the
+    process opens takes their number, and gets what others print.
+    """
+    while (null := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(null, True)
+    os.close(null)
+    sys.stdout, sys.stderr = (each or open(os.devnull, "w") for each in (sys.stdout, sys.stderr))  # noqa: SIM115
 
 
 def _program(name: str, module: str, function: str, extra: str) -> Program:

@@ -8,8 +8,11 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from types import TracebackType
 from typing import Any
+
+from v2v_protocol.programs import printable, show
 
 LOG_SECONDS = 10.0
 _FIRST_SECONDS = 1.0
@@ -41,7 +44,7 @@ class Progress:
     ) -> None:
         self._what, self._unit, self._shows_rate = what, unit, shows_rate
         self._clock = clock
-        self._say = say or _print
+        self._say = say or partial(show, stream=sys.stderr)
         has_bar = say is None and (sys.stderr.isatty() if console is None else console.is_terminal)
         self._bar = _make_bar(console) if has_bar else None
         self._task = None if self._bar is None else self._bar.add_task(what, total=None, text="")
@@ -76,9 +79,9 @@ class Progress:
         if now >= self._due or (done == total and self._is_shown):
             self._show(now, what or self._what, self._text(done, total, note, now), done, total)
 
-    def notice(self, text: str) -> None:
-        """Show a step whose total is not known."""
-        if (now := self._clock()) >= self._due:
+    def notice(self, text: str, *, is_urgent: bool = False) -> None:
+        """Show a step whose total is not known, if it is time to or ``is_urgent``."""
+        if (now := self._clock()) >= self._due or is_urgent:
             self._show(now, text, "", 0.0, None)
 
     @property
@@ -91,7 +94,7 @@ class Progress:
             self._say(f"{what}: {text}" if text else what)
             return
         self._due = now + _REFRESH_SECONDS
-        self._bar.update(self._task, description=what, text=text, completed=done, total=total)
+        self._bar.update(self._task, description=printable(what), text=printable(text), completed=done, total=total)
         if not self._is_shown:
             self._bar.start()
 
@@ -117,10 +120,6 @@ def format_duration(seconds: float) -> str:
         return f"{seconds:.1f} s"
     minutes = round(seconds / 60.0)
     return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
-
-
-def _print(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def _make_bar(console: Any) -> Any:

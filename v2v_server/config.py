@@ -101,7 +101,7 @@ class ServeConfig:
         metavar="DIR",
     )
     insecure: bool = switch(
-        False, "allow addresses that other machines can reach, without encryption or authentication"
+        False, "serve every user of this host, and allow addresses that other machines can reach, without keys"
     )
     port_file: str = text("", "file that the bound address is written to once the server is ready", metavar="FILE")
     session_idle_seconds: float = number(

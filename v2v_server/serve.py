@@ -17,7 +17,7 @@ from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
 from v2v_protocol.errors import CorpusError
-from v2v_protocol.link.guard import most_connections
+from v2v_protocol.link.user import OwnUser
 from v2v_protocol.progress import Progress
 from v2v_server.broker.actions import (
     Action,
@@ -57,7 +57,7 @@ from v2v_server.supervise.scaling import Scaling, question_workers
 from v2v_server.supervise.standby import Standby
 from v2v_server.system.clock import Clock
 from v2v_server.system.log import Level, Log
-from v2v_server.system.process import keep_freed_memory, open_many_files, usable_cores
+from v2v_server.system.process import keep_freed_memory, most_connections, open_many_files, usable_cores
 from v2v_server.system.service import stop_on_signals, utc_now, write_port_file
 from v2v_server.system.start_times import StartTimes
 from v2v_server.system.status_fields import GIB
@@ -70,6 +70,10 @@ _SOON_SECONDS = 5.0
 """Time after which blocked leases are reported."""
 _GIVE_BACK_SECONDS = 12.0
 """Time from the end of a connection until its memory is returned to the kernel; its session is forgotten by then."""
+_OWN_USER_RULE = (
+    "without keys this server serves only root and its own user; make keys with v2v-keys init and give --keys, or give "
+    "--insecure to serve every user of this host"
+)
 
 
 def load_catalogue(config: ServeConfig) -> Catalogue:
@@ -149,6 +153,7 @@ def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None
     worker_flags += catalogue.source.worker_flags()
     label = f"w{secrets.token_hex(4)}"
     keys = KeyFolder(Path(config.keys)) if config.keys else None
+    is_open = bool(keys or config.insecure or sys.platform != "linux")
     stop = threading.Event()
     with stop_on_signals(stop):
         pool = make_pool(config, catalogue.source, label, worker_flags, keys, standbys)
@@ -156,11 +161,16 @@ def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None
             config.bind,
             config.worker_bind or _private_address(label),
             most_connections=most_connections(_FILES_A_WORKER * config.workers_in_all),
-            most_queued_bytes=config.max_credit_bytes,
+            has_session=dispatcher.has_session,
             keys=keys,
             local_bind=_private_address(label),
+            admits=None if is_open else OwnUser(_OWN_USER_RULE, log.say).admits,
         )
-        page = PageProcess(config.page_host, config.page, config.page_names) if config.page else None
+        page = None
+        if config.page:
+            page = PageProcess(
+                config.page_host, config.page, config.page_names, config.log_format, is_insecure=config.insecure
+            )
         server = Server(
             config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file, page=page, times=times
         )
@@ -317,7 +327,7 @@ class Server:
                 case ReportRefusal(refusal, request):
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
                 case SendStatus() as request:
-                    todo.extend(self._publisher.ask(request))
+                    self._publisher.ask(request)
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
         """End the process of a hung worker, if it is one of ours."""

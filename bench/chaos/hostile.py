@@ -2,8 +2,6 @@
 
     python -m bench.chaos.hostile --address tcp://127.0.0.1:5555 --kind headers
 
-    unfinished opens connections and sends 380 kB of empty parts on each, just below the limit of one connection
-    segments   the same with parts of 34 bytes, each in a TCP segment of its own
     headers    the largest and most expensive header that is allowed, as fast as possible
     hello      sends Hello ten times a second, requests as much as allowed, and never reads
     leave      sends Hello under a new name and disconnects, repeatedly: its sessions stay
@@ -16,8 +14,8 @@
     handshakes only with keys: sends the recorded first message of a handshake over new connections: cheap for the
                sender, expensive for the server
 
-If `V2V_KEYS` names a consumer's key they use it, except for `unfinished` and `segments`. A disconnected peer
-reconnects. Nothing is checked here: the effect on other peers counts.
+If `V2V_KEYS` names a consumer's key they use it. A disconnected peer reconnects. Nothing is checked here: the effect on
+other peers counts.
 """
 
 from __future__ import annotations
@@ -33,11 +31,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
 
+from tests.oracles.dealers import NextDealer, Reader
 from v2v_protocol.errors import KeyRefused, V2VError
 from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
 from v2v_protocol.keys import PeerKey, key_for, read_key
@@ -49,42 +48,24 @@ from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, encode
 PEERS = 8
 IDLE_EACH = 125  # Connections of each idle peer: a thousand of all eight
 _GREETING = b"\xff\0\0\0\0\0\0\0\0\x7f\x03\0%s" + bytes(1 + 31)
-_READY = b"\x04\x1c\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
 SPEC = {"recipe": {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}}
 _REFUSAL_SECONDS = 2.0
-_UNFINISHED_EACH = 8  # connections with unfinished messages of each peer
-_UNFINISHED_BYTES = 380_000
 TALLY = "V2V_CHAOS_TALLY"
 _GREETING_BYTES, _HELLO_BYTES, _WELCOME_BYTES = 64, 202, 170  # with their framing
-
-
-def _hold(piece: bytes, address: str, number: int) -> None:
-    """Send pieces of a message without end over several connections, and hold these until one is ended."""
-    with ExitStack() as stack:
-        peers = [stack.enter_context(_raw(address)) for _ in range(_UNFINISHED_EACH)]
-        for peer in peers:
-            peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        for _ in range(_UNFINISHED_BYTES // len(piece)):
-            for peer in peers:
-                _push(peer, piece)
-        while True:
-            for peer in select.select(peers, [], [])[0]:
-                if not peer.recv(1 << 16):
-                    return
 
 
 def headers(address: str, number: int) -> None:
     """Act as a peer of this kind until it is disconnected; likewise the functions below."""
     items = LARGEST_REQUEST_BYTES - 5
     costly = b"\xdd" + items.to_bytes(4, "big") + b"\x90" * MOST_CONTAINERS + bytes(items - MOST_CONTAINERS)
-    with _dealer(address, number) as peer:
+    with _reader(address, number) as peer:
         for _ in range(64):  # the server disconnects such a peer
             peer.send([costly])
 
 
 def hello(address: str, number: int) -> None:
     """See the module."""
-    with _dealer(address, number) as peer:
+    with _reader(address, number) as peer:
         for epoch in itertools.count():
             peer.send(encode(Hello(SPEC, ("voxels", "frames"), 2000, number)))
             peer.send(encode(Want(epoch, tuple(range(256)))))
@@ -93,14 +74,14 @@ def hello(address: str, number: int) -> None:
 
 def leave(address: str, number: int) -> None:
     """See the module."""
-    with _dealer(address, None) as peer:
+    with _reader(address, None) as peer:
         peer.send(encode(Hello(SPEC, ("voxels",), 8, number)))
         peer.receive(1.0)
 
 
 def look(address: str, number: int) -> None:
     """See the module."""
-    with _dealer(address, number) as peer:
+    with _reader(address, number) as peer:
         while True:
             peer.send(encode(GetStatus()))
 
@@ -144,7 +125,7 @@ def refused(worker_address: str, revoked: Path, address: str, number: int) -> No
 
 
 def _is_refused(address: str, key: PeerKey) -> bool:
-    with _closing(Dealer(address, key, beside=_first())) as peer:
+    with _closing(NextDealer(_first(), address, key)) as peer:
         deadline = time.monotonic() + _REFUSAL_SECONDS
         while (left := deadline - time.monotonic()) > 0:
             peer.receive(left)
@@ -160,7 +141,7 @@ def recorded_handshake() -> bytes:
     """Return what a peer with the key of ``V2V_KEYS`` sends to a server that only listens: greeting, first message."""
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
-        _closing(Dealer(f"tcp://127.0.0.1:{server.getsockname()[1]}", beside=_first())),
+        _closing(NextDealer(_first(), f"tcp://127.0.0.1:{server.getsockname()[1]}")),
         server.accept()[0] as link,
     ):
         link.sendall(_GREETING % b"CURVE".ljust(20, b"\0"))
@@ -181,9 +162,7 @@ def handshakes(address: str, number: int) -> None:
 
 
 KINDS: dict[str, Callable[[str, int], None]] = {
-    "unfinished": functools.partial(_hold, b"\x01\x00" * 1000),
-    "segments": functools.partial(_hold, b"\x01\x22" + bytes(34)),
-    **{each.__name__: each for each in (headers, hello, leave, look, idle, flood, trickle)},
+    each.__name__: each for each in (headers, hello, leave, look, idle, flood, trickle)
 }
 REFUSED, HANDSHAKES = "refused", "handshakes"
 KEYED_KINDS = (REFUSED, HANDSHAKES)
@@ -206,19 +185,6 @@ def attack(address: str, act: Callable[[str, int], None]) -> NoReturn:
 def _greeting(address: str) -> bytes:
     """Return the 64 bytes of a ZMTP greeting: with CURVE if there is a key for that address, else NULL."""
     return _GREETING % (b"CURVE" if address and key_for(address, "consumer", None) else b"NULL").ljust(20, b"\0")
-
-
-@contextmanager
-def _raw(address: str) -> Iterator[socket.socket]:
-    """Connect a raw socket and complete a ZMTP handshake without a key; a server with keys ends it."""
-    with _connected(address) as peer:
-        peer.sendall(_greeting("") + _READY)
-        answer = b""
-        while b"READY" not in answer:
-            if not (piece := peer.recv(4096)):
-                raise ConnectionResetError
-            answer += piece
-        yield peer
 
 
 def _connected(address: str) -> socket.socket:
@@ -265,11 +231,10 @@ def _closing(peer: Dealer) -> Iterator[Dealer]:
         peer.close()
 
 
-def _dealer(address: str, number: int | None) -> AbstractContextManager[Dealer]:
-    """Connect a peer that takes one message at a time, under a name of its number; None takes a new name."""
+def _reader(address: str, number: int | None) -> AbstractContextManager[Reader]:
+    """Connect a peer under a name of its number; None takes a new name."""
     name = b"leaver-" + os.urandom(8) if number is None else b"hostile-%d-%d" % (os.getpid(), number)
-    options: dict[str, int | bytes] = {"ROUTING_ID": name, "RCVHWM": 1, "SNDHWM": 1000, "SNDTIMEO": 2000}
-    return _closing(Dealer(address, options=options, beside=_first()))
+    return closing(Reader(_first(), address, name))
 
 
 def main() -> NoReturn:

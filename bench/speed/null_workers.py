@@ -24,10 +24,11 @@ import numpy.typing as npt
 
 from bench.processes import Roles
 from tests.clips import write_clip
+from tests.oracles.dealers import NextDealer, wait
 from v2v_client.local_server import LocalServer
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import RemoteError, ServerLost
-from v2v_protocol.link.dealer import Dealer, wait
+from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import (
     Begun,
     Denied,
@@ -91,7 +92,7 @@ class NullWorkers:
         self._leases: dict[Dealer, deque[Lease]] = defaultdict(deque)
         self._begun: dict[Dealer, int] = {}
         for number in range(count):
-            link = Dealer(address, "", "worker", beside=self._first)
+            link = NextDealer(self._first, address, "", "worker")
             name = f"null-{os.getpid()}-{number}"
             link.connect()
             self._names[link] = name

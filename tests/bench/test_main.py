@@ -79,7 +79,7 @@ def test_every_bench_has_a_parser_and_a_line_in_the_list() -> None:
         ("link --videos clips --mbit 0", "argument --mbit: 0: give a finite number above 0"),
         ("soak --videos clips --minutes nan", "argument --minutes: nan: give a finite number above 0"),
         ("chaos --videos clips --faults worker-kill,typo", "--faults typo: choose of worker-kill, "),
-        ("siege --footage film --kinds refused", "--kinds refused: choose of unfinished, "),
+        ("siege --footage film --kinds refused", "--kinds refused: choose of headers, "),
         ("fuzz --live 5", "--live needs a corpus: give --videos DIR"),
         ("flow --videos none", "No such file or directory: 'none'"),
     ],

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tests.oracles.dense import Trace, trace
+from tests.oracles.noise import standard_normals, start_uniforms
 from v2v_protocol.bounds import most_events
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
@@ -130,12 +131,12 @@ def trace_of(camera: Camera, frames: npt.NDArray[Any], real: Real) -> Trace:
         levels = flat.astype(real)
     noisy = np.empty((0, 0), real)
     if camera.noise_sigma > 0.0:
-        noisy = noise.standard_normals(key, steps, pixels).astype(real) * real(camera.noise_sigma)
+        noisy = standard_normals(key, steps, pixels).astype(real) * real(camera.noise_sigma)
     hot = np.zeros(pixels, real)
     position, normal = noise.hot_pixels(key, camera.hot_pixel_count, pixels)
     hot[position] = normal.astype(real) * real(camera.hot_pixel_sigma)
     positive, negative = real(camera.threshold_pos), real(camera.threshold_neg)
-    start = noise.start_uniforms(key, pixels).astype(real) * (positive + negative) - negative
+    start = start_uniforms(key, pixels).astype(real) * (positive + negative) - negative
     tolerance = rounding_tolerance(camera.threshold_pos, camera.threshold_neg)
     return trace(levels, noisy, hot, start, positive, negative, tolerance)
 
@@ -145,7 +146,7 @@ def imbalance(camera: Camera, frames: npt.NDArray[Any], seen: Trace) -> float:
     steps, pixels, key = len(frames) - 1, frames[0].size, noise_key_of_seed(camera.seed)
     ends = frames[[0, -1]].reshape(2, pixels)
     level = log_table_float64(camera.gamma, camera.log_eps, camera.signal)[ends] if frames.dtype.kind == "u" else ends
-    normals = noise.standard_normals(key, steps, pixels).astype(np.float64) if camera.noise_sigma else None
+    normals = standard_normals(key, steps, pixels).astype(np.float64) if camera.noise_sigma else None
     position, hot_normal = noise.hot_pixels(key, camera.hot_pixel_count, pixels)
     hot = np.zeros(pixels)
     hot[position] = hot_normal

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from tests.oracles import extremes_in_time as in_time
 from tests.oracles.balance import Camera, balance, imbalance, trace_of
 from tests.oracles.dense import trace
+from tests.oracles.noise import standard_normals
 from v2v_protocol.bounds import most_events
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import Recipe, preset
@@ -283,7 +284,7 @@ def noise_correlation() -> Finding:
         params = draw(
             recipe, seed=seed, epoch=epoch, index=index, picture_height_px=180, picture_width_px=320, video_id="v"
         )
-        return noise.standard_normals(params.noise_key, steps, pixels).astype(np.float64)
+        return standard_normals(params.noise_key, steps, pixels).astype(np.float64)
 
     base = normals(5, 3, 1000)
     pairs = {f"pixel +{lag}": (base[:, lag:], base[:, :-lag]) for lag in (1, 2, 128)}

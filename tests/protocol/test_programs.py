@@ -13,6 +13,9 @@ from pathlib import Path
 import pytest
 
 from v2v_protocol import programs
+from v2v_protocol.command import Parser, run_command
+from v2v_protocol.errors import UsageError
+from v2v_server.system.log import Log
 
 HOME = Path(__file__).parents[2]
 PROJECT = tomllib.loads((HOME / "pyproject.toml").read_text("utf-8"))["project"]
@@ -123,3 +126,39 @@ def test_what_a_program_starts_does_not_come_from_the_folder_that_somebody_stand
     monkeypatch.chdir(gone)
     gone.rmdir()
     assert "PYTHONSAFEPATH" in programs.environment()
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("a\x1b[31m.mp4", "a\\x1b[31m.mp4"),
+        ("bell\x07", "bell\\x07"),
+        ("\u202egpm.exe", "\\u202egpm.exe"),
+        ("not UTF-8 \udcff", "not UTF-8 \\xff"),
+        ("\ud800", "\\ud800"),
+        ("Vidéo 動画.mp4", "Vidéo 動画.mp4"),
+    ],
+)
+def test_what_is_printed_or_logged_steers_no_terminal(
+    text: str, shown: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    programs.show(f"{text}\n{text}")
+    assert capsys.readouterr().out == f"{shown}\n{shown}\n"
+    Log().say(text)
+    assert capsys.readouterr().err == f"{shown}\n"
+    said = UsageError(f"{text}: no such video")
+    parser = Parser("v2v-test", "", "A test.", [])
+    assert run_command(parser, lambda arguments: (_ for _ in ()).throw(said), []) == 2
+    assert capsys.readouterr().err == f"v2v-test: {shown}: no such video\n"
+
+
+def test_the_null_device_takes_the_place_of_a_closed_stream() -> None:
+    """Otherwise the next file that is opened gets what others write to standard error."""
+    script = (
+        "import os, sys; from v2v_protocol.programs import open_standard_streams; open_standard_streams(); "
+        "print('lost', file=sys.stderr); os.write(2, b'lost'); "
+        "print(os.path.realpath('/proc/self/fd/2'), os.get_inheritable(2), os.open(os.devnull, os.O_RDONLY) > 2)"
+    )
+    command = ["sh", "-c", f'exec "{sys.executable}" -c "$0" 2>&-', script]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False, cwd=HOME)
+    assert (done.returncode, done.stdout) == (0, f"{os.devnull} True True\n")

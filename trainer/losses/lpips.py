@@ -26,7 +26,7 @@ SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 """Mean and standard deviation of ImageNet for pictures in -1 .. 1: red, green, blue."""
 
-HEADS_FROM = "the wheel of the lpips package (https://pypi.org/project/lpips/), lpips/weights/v0.1/{net}.pth"
+HEADS_FROM = "the wheel of the Python package lpips 0.1.4, lpips/weights/v0.1/{net}.pth"
 
 LENGTH_FLOOR = 1e-10
 SMALLEST_SQUARE = 1e-30

@@ -235,8 +235,9 @@ class Conversation:
             "no sample was received" if self._last is None else f"last sample: epoch {self._epoch}, index {self._last}"
         )
         return ServerLost(
-            f"{self._address}: nothing received for {self._server.silence(now):.0f} s; {last}; start v2v-serve there, "
-            f"or wait longer with timeout_seconds (now {self._patience.timeout_seconds:g})"
+            f"{self._address}: nothing received for {self._server.silence(now):.0f} s; {last}; start v2v-serve there "
+            "(without keys it serves its own user only), or wait longer with timeout_seconds "
+            f"(now {self._patience.timeout_seconds:g})"
         )
 
     # --- asking -------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import itertools
 import math
 import os
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from socket import create_connection
 from threading import Thread
@@ -37,18 +37,8 @@ _MOST_SILENT = 5
 _ASK_EVERY = 5
 _OUR_SIGNATURE = b"\xff" + bytes(8) + b"\x7f\x03"
 _RECONNECT_MS, _LONGEST_RECONNECT_MS = 100, 1000
-_MORE = int(zmq.SNDMORE)
+_NOBLOCK, _NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
 _monitors = itertools.count()
-_NO_OPTIONS: Mapping[str, int | bytes] = {}
-
-
-def wait(dealers: Sequence[Dealer], seconds: float) -> list[Dealer]:
-    """Wait until one of several dealers has a message; return those that have one."""
-    poller = zmq.Poller()
-    by_socket = {dealer._open(dealer._socket): dealer for dealer in dealers}
-    for each in by_socket:
-        poller.register(each, zmq.POLLIN)
-    return [by_socket[ready] for ready, _ in poller.poll(math.ceil(seconds * 1000))]
 
 
 class Dealer:
@@ -58,8 +48,6 @@ class Dealer:
         address: ``tcp://host:port``.
         keys: this peer's key, or the path of its file; None uses the file that ``V2V_KEYS`` names, "" uses no key.
         side: what this peer is: "consumer" or "worker".
-        options: ZeroMQ options by name, in place of ours; with ``SNDTIMEO`` sending waits for room.
-        beside: share the context and thread of this dealer, which must be closed later than this one.
 
     Raises:
         KeyRefused: the key file cannot be used.
@@ -72,17 +60,11 @@ class Dealer:
         address: str,
         keys: str | PeerKey | None = None,
         side: str = "consumer",
-        *,
-        options: Mapping[str, int | bytes] = _NO_OPTIONS,
-        beside: Dealer | None = None,
     ) -> None:
         self._address = address
         self._key = keys if isinstance(keys, PeerKey) else key_for(address, side, keys)
         self._handshakes = Handshakes(address, self._key, side)
-        self._options = options
-        self._flags = int(0 if "SNDTIMEO" in options else zmq.NOBLOCK)
-        self._is_shared = beside is not None
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context() if beside is None else beside._context
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
         self._poller = zmq.Poller()
@@ -113,8 +95,6 @@ class Dealer:
             socket.setsockopt(zmq.MAXMSGSIZE, largest_frame_bytes)
             socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
             socket.setsockopt(zmq.RECONNECT_IVL_MAX, _LONGEST_RECONNECT_MS)
-            for name, value in self._options.items():
-                socket.setsockopt(getattr(zmq, name), value)
             events = f"inproc://handshakes-{next(_monitors)}"
             socket.monitor(events, HANDSHAKE_EVENTS)
             if self._key is not None:
@@ -161,9 +141,7 @@ class Dealer:
         try:
             self.disconnect(linger_ms=0)
         finally:
-            if self._is_shared:
-                pass
-            elif self._torn:
+            if self._torn:
                 # Terminating waits for every socket. Waiting here would keep the traceback alive that holds one open.
                 Thread(target=self._context.destroy, kwargs={"linger": 0}, daemon=True).start()
             else:
@@ -174,8 +152,8 @@ class Dealer:
         socket = self._open(self._socket)
         try:
             for frame in frames[:-1]:  # send_multipart combines flags of an enumeration, which takes longer
-                socket.send(frame, self._flags | _MORE, copy=False)
-            socket.send(frames[-1], self._flags, copy=False)
+                socket.send(frame, _NOBLOCK_MORE, copy=False)
+            socket.send(frames[-1], _NOBLOCK, copy=False)
         except zmq.Again:
             pass  # the handshake failed, which ended the connection for good: has_reconnected() reports why
         except zmq.ZMQError as error:

@@ -1,18 +1,18 @@
 """Listen for peers on a ROUTER socket, and limit what they can cost. I/O.
 
 Memory: ZeroMQ keeps at most MOST_UNREAD whole messages from a peer, and at most MOST_QUEUED messages for one.
-:mod:`v2v_protocol.link.guard` limits bytes, unfinished messages and connections.
+:mod:`v2v_protocol.link.guard` limits connections.
 """
 
 from __future__ import annotations
 
 import os
+import socket
 import sys
 import time
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import zmq
 
@@ -35,21 +35,6 @@ _ZERO_COPY_RECEIVE = 10  # an option of contexts that pyzmq has no name for
 _NOBLOCK, _NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What peers of a router may cost.
-
-    Attributes:
-        frame_bytes: largest frame of a message.
-        connections: largest number at a time; None if only our own user can connect, who needs no guard.
-        queued_bytes: largest number of bytes queued for one peer; None limits no bytes in either direction.
-    """
-
-    frame_bytes: int
-    connections: int | None
-    queued_bytes: int | None = None
-
-
 class Routers:
     """The routers of one process, which share keys and an I/O thread.
 
@@ -67,14 +52,31 @@ class Routers:
         self._routers: list[Router] = []
         self._poller = zmq.Poller()
         try:
-            self.gate = None if keys is None else Gate(self.context, keys)
+            self.gate = Gate(self.context, keys)
         except BaseException:
             self.context.destroy(linger=0)
             raise
 
-    def open(self, side: str, limits: Limits) -> Router:
-        """Return a new router for peers of a side, "consumer" or "worker"."""
-        router = Router(self.context, side, limits, self.gate)
+    def open(
+        self,
+        side: str,
+        largest_frame_bytes: int,
+        most_connections: int | None,
+        has_session: Callable[[bytes], bool],
+        admits: Callable[[socket.socket], bool] | None = None,
+    ) -> Router:
+        """Return a new router.
+
+        Args:
+            side: of its peers, "consumer" or "worker".
+            largest_frame_bytes: a peer that sends a larger frame is disconnected.
+            most_connections: largest number at a time; None if only our own user can connect, who needs no guard.
+            has_session, admits: see :class:`v2v_protocol.link.guard.ConnectionGuard`.
+        """
+        router = Router(self.context, side, largest_frame_bytes, self.gate)
+        if most_connections is not None:
+            router.guard = ConnectionGuard(router.socket, most_connections, has_session, admits)
+            self.gate.watch(side, router.guard)
         self._routers.append(router)
         self._poller.register(router.socket, zmq.POLLIN)
         return router
@@ -86,10 +88,7 @@ class Routers:
 
     def close(self) -> None:
         """Close all routers; unsent messages are dropped."""
-        for router in self._routers:
-            router.close()
-        if self.gate is not None:
-            self.gate.close()
+        self.gate.close()
         self.context.destroy(linger=0)
 
 
@@ -100,19 +99,22 @@ class Received:
     Attributes:
         identity: routing id of its connection.
         frames: the message: the first frame as bytes, the others in ZeroMQ's memory.
-        user: the key of its connection; empty without keys and over ``ipc://``.
+        user: the key of its connection; empty without keys, and for a worker of this host.
     """
 
     identity: bytes
-    frames: list[Any]
-    user: str
+    frames: Sequence[Any]
+    user: str = ""
+
+
+R = TypeVar("R", bound=Received)
 
 
 class Router:
     """One listening socket. :meth:`Routers.open` creates it."""
 
     def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], side: str, limits: Limits, gate: Gate | None = None
+        self, context: zmq.Context[zmq.Socket[bytes]], side: str, largest_frame_bytes: int, gate: Gate
     ) -> None:
         self.socket = router = context.socket(zmq.ROUTER)
         self._side, self._gate = side, gate
@@ -121,7 +123,7 @@ class Router:
         router.setsockopt(zmq.LINGER, 0)
         router.setsockopt(zmq.SNDHWM, MOST_QUEUED)
         router.setsockopt(zmq.RCVHWM, MOST_UNREAD)
-        router.setsockopt(zmq.MAXMSGSIZE, limits.frame_bytes)
+        router.setsockopt(zmq.MAXMSGSIZE, largest_frame_bytes)
         router.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         # Unroutable messages raise instead of vanishing.
         router.setsockopt(zmq.ROUTER_MANDATORY, 1)
@@ -134,11 +136,7 @@ class Router:
         # reveal it. Without TCP keep-alive the connection would stay open for the life of this process.
         router.setsockopt(zmq.TCP_KEEPALIVE, 1)
         router.setsockopt(zmq.TCP_KEEPALIVE_IDLE, _KEEPALIVE_SECONDS)
-        self.guard = (
-            None
-            if limits.connections is None
-            else ConnectionGuard(router, limits.connections, limits.queued_bytes, is_encrypted=gate is not None)
-        )
+        self.guard: ConnectionGuard | None = None
 
     def bind(self, address: str, flag: str, *, admits_all: bool = False) -> str:
         """Listen at an address; return it with its port.
@@ -152,7 +150,7 @@ class Router:
             UsageError: the address cannot be bound.
         """
         # Only our own user may connect to an ipc:// address.
-        if self._gate is not None and not admits_all and not address.startswith("ipc:"):
+        if not admits_all and not address.startswith("ipc:"):
             self._gate.require(self.socket, self._side)
         # Otherwise IPv4 addresses come back in their IPv6 form, which few readers recognise.
         self.socket.setsockopt(zmq.IPV6, int("[" in address))
@@ -162,9 +160,9 @@ class Router:
             raise UsageError(f"{flag} {address}: {error.strerror or error}") from error
         return self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
-    def receive(self) -> Received | None:
-        """Return an available message, if its sender's key has not been revoked since it connected, and it has at most
-        MOST_FRAMES frames.
+    def receive(self, kind: type[R]) -> R | None:
+        """Return an available message as a ``kind`` of :class:`Received`. One of a connection that may not stay, of a
+        revoked key, or with more than MOST_FRAMES frames is dropped.
         """
         frames: list[Any] = []
         try:
@@ -177,17 +175,19 @@ class Router:
             return None  # the connection has just ended, and its message is gone
         sender, user = identity.bytes, ""
         if self.guard is not None:
-            with suppress(zmq.ZMQError):  # ZeroMQ does not know this for messages of connections that have just ended
-                self.guard.heard(sender, int(identity.get(zmq.SRCFD)), frames)
-        if self._gate is not None:
-            with suppress(zmq.ZMQError):  # it came over ipc://, and has no key
-                user = self._users[sender] = str(identity.get("User-Id"))
-                if not self._gate.admits(self._side, user):
-                    return None  # the next review disconnects it
+            # ZeroMQ knows neither for connections over ipc://, which have no handshake of ours.
+            number, _, user = str(_about(identity, "User-Id") or "").partition(" ")
+            descriptor = int(_about(identity, zmq.SRCFD) or -1)
+            if not self.guard.heard(sender, descriptor, int(number) if number else None):
+                return None
+        if user:
+            self._users[sender] = user
+            if not self._gate.admits(self._side, user):
+                return None  # the next review disconnects it
         if len(frames) > MOST_FRAMES:
             self.disconnect(sender)
             return None
-        return Received(sender, frames, user)
+        return kind(sender, frames, user)
 
     def send(self, identity: bytes, frames: Sequence[Any]) -> bool:
         """Queue a message; return False if the peer is not connected any more or does not read."""
@@ -202,8 +202,6 @@ class Router:
             if error.errno == zmq.EHOSTUNREACH:
                 return False
             raise
-        if self.guard is not None:
-            self.guard.sent(identity, sum(map(len, frames)))
         return True
 
     def disconnect(self, identity: bytes) -> None:
@@ -216,20 +214,22 @@ class Router:
         Disconnect peers whose key was revoked.
         """
         ended = [] if self.guard is None else self.guard.take_ended()
-        if self._gate is not None:
-            self._review(self._gate, ended)
+        self._review(ended)
         return ended
 
-    def _review(self, gate: Gate, ended: Iterable[bytes]) -> None:
+    def _review(self, ended: Iterable[bytes]) -> None:
         for identity in ended:
             self._users.pop(identity, None)
         if (now := time.monotonic()) >= self._review_at:
             self._review_at = now + _REVIEW_SECONDS
             for identity, user in self._users.items():
-                if not gate.admits(self._side, user):
+                if not self._gate.admits(self._side, user):
                     self.disconnect(identity)
 
-    def close(self) -> None:
-        """Stop the guard. :meth:`Routers.close` closes the socket."""
-        if self.guard is not None:
-            self.guard.close()
+
+def _about(frame: Any, name: str | int) -> str | int | None:
+    """Return a property of a frame; None if it has none."""
+    try:
+        return frame.get(name)  # type: ignore[no-any-return]
+    except zmq.ZMQError:
+        return None

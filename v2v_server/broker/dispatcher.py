@@ -141,6 +141,10 @@ class Dispatcher:
         """Return the number of consumers that are connected, as far as is known."""
         return sum(session.left_at is None for session in self.sessions)
 
+    def has_session(self, identity: bytes) -> bool:
+        """Return whether a peer is a consumer with a session, or a worker that said hello."""
+        return self.sessions.get(identity) is not None or identity in self.registry
+
     def identity_of(self, request: Request) -> SampleId | None:
         """Return the identity of the sample that a request asks for; None if its consumer is gone."""
         session = self.sessions.get(request.session)

@@ -7,52 +7,30 @@ Samples pass through in the frames that arrived; only the small header before th
 
 Memory: a consumer asks for more only after it has taken what it was sent. So the broker holds at most the sum over all
 sessions of credit x sample bytes (in ZeroMQ's send queue of a slow consumer) + workers x 2 x sample bytes. A peer that
-asks and never reads is disconnected at ``router.MOST_QUEUED`` messages, which is above any credit, or at the bytes of
-its credit (:mod:`v2v_protocol.link.guard`).
+asks and never reads is disconnected at ``router.MOST_QUEUED`` messages, which is above any credit.
 """
 
 from __future__ import annotations
 
+import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 from v2v_protocol.link.curve import KeyStore
-from v2v_protocol.link.guard import MOST_CONNECTIONS
-from v2v_protocol.link.router import Limits, Routers
+from v2v_protocol.link.router import Received, Routers
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_REQUEST_BYTES
 from v2v_server.broker.actions import ToConsumer, ToWorker
+from v2v_server.system.process import MOST_CONNECTIONS
 
 
-@dataclass(frozen=True, slots=True)
-class FromConsumer:
-    """A message that a consumer sent.
-
-    Attributes:
-        identity: routing id of its connection.
-        frames: the message.
-        user: name of the key of its connection; empty without keys.
-    """
-
-    identity: bytes
-    frames: Sequence[Any]
-    user: str = ""
+class FromConsumer(Received):
+    """A message that a consumer sent."""
 
 
-@dataclass(frozen=True, slots=True)
-class FromWorker:
-    """A message that a worker sent.
-
-    Attributes:
-        identity: routing id of its connection.
-        frames: the message.
-        user: name of the key of its connection; empty without keys, and for a worker of this host.
-    """
-
-    identity: bytes
-    frames: Sequence[Any]
-    user: str = ""
+class FromWorker(Received):
+    """A message that a worker sent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,9 +87,10 @@ class Sockets:
         bind: address for consumers.
         worker_bind: address for workers.
         most_connections: largest number of consumer connections at a time, and of worker connections.
-        most_queued_bytes: largest number of bytes queued for one consumer.
+        has_session: returns whether a peer's connection is kept when another needs its place; called by another thread.
         keys: keys of the peers that may connect over ``tcp://``; None admits all peers.
         local_bind: address for workers of this host, which have no key; used if ``worker_bind`` requires keys.
+        admits: returns whether a connection that was just accepted may stay; None admits all.
 
     Raises:
         UsageError: an address cannot be bound; the message names the flag.
@@ -124,20 +103,20 @@ class Sockets:
         worker_bind: str,
         *,
         most_connections: int = MOST_CONNECTIONS,
-        most_queued_bytes: int = 1 << 40,
+        has_session: Callable[[bytes], bool] = lambda identity: False,
         keys: KeyStore | None = None,
         local_bind: str = "",
+        admits: Callable[[socket.socket], bool] | None = None,
     ) -> None:
         self.waited_seconds = 0.0
         self._routers = Routers(keys)
         try:
             self._consumers = self._routers.open(
-                "consumer", Limits(LARGEST_REQUEST_BYTES, most_connections, most_queued_bytes)
+                "consumer", LARGEST_REQUEST_BYTES, most_connections, has_session, admits
             )
-            # Workers send large samples, so only the number of their connections is limited.
             is_private = worker_bind.startswith("ipc:")
             self._workers = self._routers.open(
-                "worker", Limits(LARGEST_ARRAY_BYTES, None if is_private else most_connections)
+                "worker", LARGEST_ARRAY_BYTES, None if is_private else most_connections, has_session, admits
             )
             self.address = self._consumers.bind(bind, "--bind")
             local = ""
@@ -155,10 +134,10 @@ class Sockets:
         ready = self._routers.wait(seconds)
         self.waited_seconds += time.monotonic() - began
         arrivals: list[Arrival] = []
-        if self._workers in ready and (message := self._workers.receive()) is not None:
-            arrivals.append(FromWorker(message.identity, message.frames, message.user))
-        if self._consumers in ready and (message := self._consumers.receive()) is not None:
-            arrivals.append(FromConsumer(message.identity, message.frames, message.user))
+        if self._workers in ready and (sample := self._workers.receive(FromWorker)) is not None:
+            arrivals.append(sample)
+        if self._consumers in ready and (request := self._consumers.receive(FromConsumer)) is not None:
+            arrivals.append(request)
         arrivals += map(ConsumerGone, self._consumers.take_ended())
         self._workers.take_ended()
         return arrivals

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress, format_duration
 from v2v_protocol.spec import SCENES
 from v2v_server.corpus.catalogue import Catalogue
@@ -96,7 +97,7 @@ def _run(arguments: argparse.Namespace) -> None:
             catalogue = catalogue_ahead(asked, parts, probed, shown.notice)
     lines = _of_part(part, shard) if shard is not None else _of_all(catalogue)
     for line in [*lines, f"probed {probed.files} files in {format_duration(time.monotonic() - begun)}"]:
-        print(line)
+        show(line)
 
 
 class _Probed:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.programs import show
 from v2v_server.offline.doctor import BAD, NOTE, look_around
 
 
@@ -37,15 +38,15 @@ def _run(arguments: argparse.Namespace) -> int:
     for finding in look_around(arguments.port, arguments.videos, arguments.recipe, arguments.rows, arguments.cache_dir):
         found_bad = found_bad or finding.level == BAD
         has_defects = has_defects or (finding.level, finding.about) == (NOTE, "pictures")
-        print(f"{finding.level:4}  {finding.about:12}  {finding.text}", flush=True)
+        show(f"{finding.level:4}  {finding.about:12}  {finding.text}")
         if finding.change:
-            print(f"{'':20}-> {finding.change}", flush=True)
+            show(f"{'':20}-> {finding.change}")
     if found_bad:
-        print("problems found: see the lines that begin with bad")
+        show("problems found: see the lines that begin with bad")
     elif has_defects:
-        print("the videos can be served, but their pictures have defects: see the notes about pictures")
+        show("the videos can be served, but their pictures have defects: see the notes about pictures")
     else:
-        print("no problems found")
+        show("no problems found")
     return FAILED if found_bad else 0
 
 

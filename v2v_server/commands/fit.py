@@ -10,6 +10,7 @@ from pathlib import Path
 from v2v_pictures.files import write_png
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
 from v2v_recordings.forms import FORMS
 from v2v_recordings.items import ConvertOptions, SensorSize
@@ -70,7 +71,7 @@ def _run(arguments: argparse.Namespace) -> None:
         columns["recording"] = measure({"log_eps": 1e-3, "gamma": 2.2, **_thresholds(fitted)})
     if arguments.sheet is not None:
         columns["sheet"] = _sheet(arguments.sheet)
-    print(table(columns))
+    show(table(columns))
 
 
 def _fit(arguments: argparse.Namespace) -> FittedCamera:
@@ -86,7 +87,7 @@ def _fit(arguments: argparse.Namespace) -> FittedCamera:
         raise UsageError(f"--out {out}: give a name that ends in .yaml, as --recipe expects")
     with Progress(source.name, "%") as progress:
         fitted = fit(source, static=arguments.static, options=options, progress=progress)
-    print("\n".join(report_lines(fitted, source.name)))
+    show("\n".join(report_lines(fitted, source.name)))
     try:
         write_recipe(out, fitted, source.name)
     except OSError as error:

@@ -11,6 +11,7 @@ from pathlib import Path
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.keys import SIDES
+from v2v_protocol.programs import show
 from v2v_server.keys.folder import KeyFolder
 
 
@@ -40,21 +41,21 @@ def _run(arguments: argparse.Namespace) -> None:
         raise UsageError(f"{arguments.action} needs the name of a key, as in v2v-keys {arguments.action} gpu1")
     if arguments.action == "init":
         folder.init()
-        print(f"made {path}: v2v-serve --keys {path}")
+        show(f"made {path}: v2v-serve --keys {path}")
     elif arguments.action == "new":
         if arguments.side is None:
             raise UsageError(f"new {arguments.name}: give the side that will use it, --for {' or --for '.join(SIDES)}")
         out = Path(arguments.out or f"{arguments.name}.key")
         folder.new(arguments.name, arguments.side, out)
-        print(
+        show(
             f"made {out} for a {arguments.side}: copy it there over a secure channel with mode 600, set V2V_KEYS to it"
         )
     elif arguments.action == "list":
         for side, names in folder.allowed().items():
             for public, name in names.items():
-                print(f"{side:8}  {name:24}  {public}")
+                show(f"{side:8}  {name:24}  {public}")
     else:
-        print(f"revoked {arguments.name} ({', '.join(folder.revoke(arguments.name))})")
+        show(f"revoked {arguments.name} ({', '.join(folder.revoke(arguments.name))})")
 
 
 def _default_folder() -> Path:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
 from v2v_protocol.spec import SCENES
@@ -127,11 +128,15 @@ def _run(arguments: argparse.Namespace) -> int:
             progress=lambda done, total, made, expected: shown(done, total, _size(made, expected)),
         )
     for line in summary(report, encoding, time.monotonic() - started):
+<<<<<<< HEAD
         print(line)
     for ending, sidecars in catalogue.sidecars.items():
         if sidecars.states:
             where = f"copy them to the same places in {arguments.destination} to serve these labels"
             print(f"{len(sidecars.states)} sidecars {ending} (labels) were left beside their videos: {where}")
+=======
+        show(line)
+>>>>>>> w-c
     if arguments.json is not None:
         refused = (*report.not_looked_at, *report.unusable)
         records = [asdict(video) for video in report.videos] + [

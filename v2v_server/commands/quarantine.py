@@ -15,6 +15,7 @@ from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
+from v2v_protocol.programs import show
 from v2v_protocol.records import write_json
 from v2v_server.corpus.sources.source import SourceOptions, open_source
 from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
@@ -44,8 +45,8 @@ def _run(arguments: argparse.Namespace) -> None:
         _clear(file, quarantine)
     in_force = quarantine.entries(quarantine.latest)
     for line in quarantine.lines:
-        print(f"{'in force' if line in in_force else 'not now ':8}  {line}")
-    print(f"snapshot {quarantine.latest} holds {len(in_force)} entries ({file})")
+        show(f"{'in force' if line in in_force else 'not now ':8}  {line}")
+    show(f"snapshot {quarantine.latest} holds {len(in_force)} entries ({file})")
     if arguments.json is not None:
         records = [asdict(line) | {"in_force": line in in_force} for line in quarantine.lines]
         write_json(arguments.json, records)

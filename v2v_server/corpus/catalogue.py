@@ -217,10 +217,6 @@ class Catalogue:
         """Return what the status says of it."""
         return CorpusPart(str(self.source), len(self.videos), len(self.refusals))
 
-    def digest_under(self, scene: str) -> str:
-        """See :meth:`CorpusFacts.digest_under`."""
-        return self.facts.digest_under(scene)
-
     def fail_fast(self) -> None:
         """Report a locked index at once instead of waiting 30 s, because a server's loop must not block."""
         self._store.fail_fast()

@@ -19,10 +19,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
+from v2v_protocol.programs import printable
 from v2v_protocol.safe_json import parse_json
 from v2v_server.corpus.index.file import IndexRow
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sources.names import UNPRINTABLE, printable
+from v2v_server.corpus.sources.names import UNPRINTABLE
 from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.encoding import Encoding
 from v2v_server.video.fingerprint import is_same_file

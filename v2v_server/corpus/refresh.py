@@ -6,7 +6,7 @@ import hashlib
 import os
 import sqlite3
 from collections.abc import Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from itertools import groupby
 from pathlib import Path
 
@@ -69,6 +69,8 @@ def refresh_index(
             "probes every video again. Make room or give write access, delete the file if it is damaged, or choose "
             "another place with V2V_CACHE_DIR"
         )
+        if notice is not None:
+            notice(f"the catalogue's index {path} cannot be used ({error}): probing every video again", is_urgent=True)
         return *_refreshed(None, source, ids, scenes, processes, progress, notice), [note]
     if store.replaced_version is None:
         return store, table, []
@@ -88,7 +90,7 @@ def _refreshed(
     progress: Progress | None,
     notice: Notice | None,
 ) -> tuple[Store, VideoTable]:
-    store = Store(path)
+    store = Store(path, notice)
     try:
         kind = None if scenes is None else scenes.kind
         if kind is not None:
@@ -106,7 +108,6 @@ def _refreshed(
             table = _table(store, ids, kind)
         if scenes is not None and scenes.collect(store, source, table, processes, progress, notice):
             table = _table(store, ids, kind)
-        _remove_earlier_caches(path)
         return store, table
     except BaseException:
         store.close()
@@ -140,11 +141,3 @@ def _gone(source: VideoSource, ids: Sequence[str], notice: Notice | None) -> lis
         if notice is not None:
             notice(f"looking for files that are gone from {source}: {done} of {len(ids)} that are not listed")
     return gone
-
-
-def _remove_earlier_caches(index: Path | None) -> None:
-    """Remove the files beside the index that releases before 0.2 made of it."""
-    for suffix in (".columns", ".scenes"):
-        if index is not None:
-            with suppress(OSError):
-                index.with_suffix(suffix).unlink(missing_ok=True)

@@ -16,6 +16,7 @@ from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError, VideoUnreadable
 from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
+from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.sample import DEFAULT_ARRAYS, Sample, SampleId, array_layout
@@ -105,7 +106,7 @@ class Remaker:
             VideoUnreadable: this host cannot read a candidate's file, which a server may have read.
         """
         catalogue, spec = self._catalogue, self._spec
-        SampleId(spec.digest, catalogue.digest_under(spec.scene), 0, seed, epoch, index)
+        SampleId(spec.digest, catalogue.facts.digest_under(spec.scene), 0, seed, epoch, index)
         if index >= self.count:
             raise UsageError(f"index {index}: the epoch has {self.count} samples, 0 .. {self.count - 1}")
         request = Request(b"", epoch, index, snapshot=self._snapshot)
@@ -222,7 +223,7 @@ def simulate_to_file(
     quarantine = read_quarantine(quarantine_path(catalogue.source.name, cache_dir)) if snapshot else Quarantine()
     quarantine.entries(snapshot)  # before any work: whether there is such a snapshot
     for refusal in catalogue.refusals:
-        print(f"cannot be used: {refusal}")
+        show(f"cannot be used: {refusal}")
     remade = Remaker(catalogue, stream, arrays, quarantine, snapshot).made(seed, epoch, index)
     sample = remade.sample
     if not out.name.endswith(".npz"):
@@ -237,13 +238,13 @@ def simulate_to_file(
         if events is not None:
             made = list_sample_events(remade.lease, remade.decoded)
             write_events(events, made)
-            print(f"{len(made)} events written to {events}")
+            show(f"{len(made)} events written to {events}")
     except OSError as error:
         raise UsageError(f"{error.filename or out}: {error.strerror}") from error
     for name, why in sample.provenance.unlabelled.items():
-        print(f"no {name}: {why}")
+        show(f"no {name}: {why}")
     params = sample.provenance.params
-    print(
+    show(
         f"{sample.provenance.video} from frame {sample.provenance.start_frame}: "
         + ", ".join(f"{name} {array.dtype}{list(array.shape)}" for name, array in sample.arrays.items())
         + f"; thresholds +{params.threshold_pos:.3f} -{params.threshold_neg:.3f}, noise {params.noise_sigma:.3f}, "

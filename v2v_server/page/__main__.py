@@ -7,17 +7,33 @@ import os
 import socket
 import sys
 from collections.abc import Sequence
+from typing import Any, ClassVar
 
 import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from v2v_protocol.link.user import OwnUser
 from v2v_server.page.app import make_app
-from v2v_server.page.silent import BoundedProtocol
 from v2v_server.page.source import Source
 from v2v_server.status.client import StatusClient
+from v2v_server.system.log import Log
 from v2v_server.system.process import die_with_parent
 
 _NICE = 10
 """Niceness of the page's process, so that it takes no time from the server and its workers."""
+_RULE = "the page serves only root and the server's user; give --insecure to let every user of this host watch"
+
+
+class OwnUserProtocol(H11Protocol):
+    """Close connections of other users of this host before they send a request."""
+
+    own_user: ClassVar[OwnUser]
+
+    def connection_made(self, transport: Any) -> None:
+        """Check a new connection, see asyncio.Protocol."""
+        super().connection_made(transport)
+        if not self.own_user.admits(transport.get_extra_info("socket")):
+            transport.abort()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -29,11 +45,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--parent-pid", required=True, type=int, help="process id of the server, with which this process ends"
     )
     parser.add_argument("--names", default="", help="host names to accept, separated by commas")
+    parser.add_argument("--log-format", default="text", help="text or json")
+    parser.add_argument("--insecure", action="store_true", help="serve every user")
     arguments = parser.parse_args(argv)
     die_with_parent(arguments.parent_pid)
     os.nice(_NICE)
     # No key: this address admits the server's own user, see v2v_server.page.child.
     source = Source(StatusClient(arguments.connect, keys=""))
+    is_open = arguments.insecure or sys.platform != "linux"
+    if not is_open:
+        OwnUserProtocol.own_user = OwnUser(_RULE, Log(is_json=arguments.log_format == "json").say)
     config = uvicorn.Config(
         make_app(source, filter(None, arguments.names.split(","))),
         log_level="warning",
@@ -43,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         ws="none",
         timeout_graceful_shutdown=1,
         limit_concurrency=256,
-        http=BoundedProtocol,
+        http=H11Protocol if is_open else OwnUserProtocol,
     )
     with socket.socket(fileno=arguments.fd) as listening:
         uvicorn.Server(config).run(sockets=[listening])

@@ -32,12 +32,16 @@ class PageProcess:
     Args:
         host, port: where to listen.
         names: host names to accept, separated by commas.
+        log_format: of the page's log lines.
+        is_insecure: serve every user, not only this process's own and root.
 
     Raises:
         UsageError: the port cannot be bound, or a package is missing.
     """
 
-    def __init__(self, host: str, port: int, names: str = "") -> None:
+    def __init__(
+        self, host: str, port: int, names: str = "", log_format: str = "text", *, is_insecure: bool = False
+    ) -> None:
         missing = [name for name in _PACKAGES if find_spec(name) is None]
         if missing:
             raise UsageError(
@@ -45,7 +49,7 @@ class PageProcess:
                 "pip install '.[server,page]' in a checkout of v2v-stream"
             )
         self._socket = _listening(host, port)
-        self._names = names
+        self._flags = ["--names", names, "--log-format", log_format, *["--insecure"] * is_insecure]
         self._address = ""
         self._process: subprocess.Popen[bytes] | None = None
         self._start_at = 0.0
@@ -90,7 +94,7 @@ class PageProcess:
         return subprocess.Popen(
             [
                 *(sys.executable, "-m", "v2v_server.page", "--connect", self._address, "--fd", str(descriptor)),
-                *("--parent-pid", str(os.getpid()), "--names", self._names),
+                *("--parent-pid", str(os.getpid()), *self._flags),
             ],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,

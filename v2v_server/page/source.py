@@ -5,11 +5,10 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
-from v2v_protocol.errors import RemoteError, V2VError
-from v2v_protocol.messages import ErrorCode
+from v2v_protocol.errors import V2VError
 
 FRESH_SECONDS = 0.4
 """A status of at most this age is reused."""
@@ -79,10 +78,6 @@ class Source:
     def _request(self) -> LatestStatus:
         try:
             status = self._client.get_status(_ANSWER_SECONDS)
-        except RemoteError as error:
-            if error.code == ErrorCode.BUSY and self._answered is not None:  # the server is alive
-                self._answered = replace(self._answered, at=self._clock())
-            return LatestStatus(None, str(error), self._clock())
         except V2VError as error:
             return LatestStatus(None, str(error), self._clock())
         answered = self._answered = LatestStatus(status, "", self._clock())

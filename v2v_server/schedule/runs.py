@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.scenes.pieces import SplitVideos
-from v2v_server.corpus.scenes.scene import NO_BARS, Flag, Pieces, Sides, sides_of
+from v2v_server.corpus.scenes.scene import Flag, Pieces, Sides, sides_of
 
 _SKIPPED = {
     "fades": Flag.FADE,
@@ -48,11 +48,6 @@ class Cleaning:
         kept = spec.kept_defects
         skipped = sum(flag for kind, flag in _SKIPPED.items() if kind not in kept)
         return cls(skipped, "cuts" not in kept, "duplicates" not in kept, "bars" not in kept)
-
-
-def usable_sides(sides: Sides, spec: StreamSpec) -> Sides:
-    """Return the bars that a spec leaves out."""
-    return NO_BARS if "bars" in spec.kept_defects else sides
 
 
 class Runs:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from v2v_protocol.recipe import Recipe
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
@@ -24,15 +25,11 @@ def corpus_summary(
         catalogue, spec, table: of the server.
         list_refused: whether to name all of those videos, not only the first few.
     """
-    recipe = spec.recipe
-    span = (
-        f"{recipe.spans} grids of {recipe.voxel_seconds[1]:g} s"
-        if recipe.is_timed
-        else f"{recipe.frames_needed} frames"
-    )
+    span, lines = _span(catalogue, spec.recipe)
     lines = [
         f"{len(catalogue.videos)} videos in {catalogue.source}: {table.videos} give {table.count} sequences of "
-        f"{span} (at most {spec.max_sequences_per_video} a video), rows {catalogue.rows}"
+        f"{span} (at most {spec.max_sequences_per_video} a video), rows {catalogue.rows}",
+        *lines,
     ]
     if spec.scene != "off":
         split = 0 if catalogue.videos.split is None else len(catalogue.videos.split)
@@ -53,6 +50,27 @@ def corpus_summary(
         lines.append(f"{len(catalogue.refusals)} files cannot be used at all:")
         lines += _listed(catalogue.refusals, list_refused)
     return lines
+
+
+def _span(catalogue: Catalogue, recipe: Recipe) -> tuple[str, list[str]]:
+    """Return what a sequence consists of, and a warning if frames are too far apart for the recipe's grids."""
+    if not recipe.is_timed:
+        return f"{recipe.frames_needed} frames", []
+    rates = catalogue.videos.frames_per_second
+    steps = recipe.frame_stride / rates[rates > 0.0]  # of videos without a rate there are no sequences
+    if not len(steps):
+        return f"{recipe.spans} grids", []
+    # A grid has the number of steps that comes nearest to its duration, and at least one.
+    made = [np.maximum(np.rint(wanted / steps), 1.0) * steps for wanted in recipe.voxel_seconds]
+    shortest, longest = f"{made[0].min():.3g}", f"{made[1].max():.3g}"
+    span = f"{recipe.spans} grids of {shortest if shortest == longest else f'{shortest} to {longest}'} s"
+    coarse = np.count_nonzero(steps > recipe.voxel_seconds[1])
+    warning = (
+        f"warning: voxel_seconds = {recipe.voxel_seconds[1]:g} is shorter than the time between frames of {coarse} "
+        f"videos (at most {steps.max():.3g} s), and a grid of theirs lasts from frame to frame: raise voxel_seconds, "
+        "or serve videos with more frames a second"
+    )
+    return span, [warning] if coarse else []
 
 
 def _listed(refused: Sequence[Refusal], all_of_them: bool) -> list[str]:

@@ -134,30 +134,6 @@ def box_muller(x: Words, y: Words) -> tuple[Reals, Reals]:
     return radius * (np.float32(1) - twice * sine), radius * (twice * _cubic(COS_COEFFICIENTS, square))
 
 
-def standard_normals(key: NoiseKey, steps: int, pixels: int) -> Reals:
-    """Return the noise of every step, before it is scaled.
-
-    Returns:
-        [steps, pixels] float32; steps counted from 0 (the step from frame 0 to frame 1), pixels in row order.
-    """
-    pairs = (steps + 1) // 2
-    place = np.arange(pixels)
-    radius_words, angle_words = words(key, PIXEL_RADIUS, place), words(key, PIXEL_ANGLE, place)
-    pair_radius, pair_angle = words(key, PAIR_RADIUS, np.arange(pairs)), words(key, PAIR_ANGLE, np.arange(pairs))
-    normals = np.empty((2 * pairs, pixels), np.float32)
-    for pair in range(pairs):
-        x, y = mix(radius_words ^ pair_radius[pair], angle_words ^ pair_angle[pair])
-        normals[2 * pair], normals[2 * pair + 1] = box_muller(x, y)
-    return normals[:steps]
-
-
-def start_uniforms(key: NoiseKey, pixels: int) -> Reals:
-    """Return the start of each pixel's residual between -threshold_neg (0) and +threshold_pos (1): [pixels] float32 in
-    [0, 1), multiples of 2**-24.
-    """
-    return (words(key, START, np.arange(pixels)) >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
-
-
 def hot_pixels(
     key: NoiseKey, count: int, pixels: int, words_of: WordsOf = words
 ) -> tuple[npt.NDArray[np.int64], Reals]:

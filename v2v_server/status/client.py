@@ -65,7 +65,10 @@ class StatusClient:
                 self._link.has_reconnected()  # raises if the server refuses the key
             elif (latest := self._latest(frames)) is not None:
                 return latest
-        raise ServerLost(f"{self._address}: no answer for {timeout_seconds:g} s; is v2v-serve running there?")
+        raise ServerLost(
+            f"{self._address}: no answer for {timeout_seconds:g} s; is v2v-serve running there? Without keys it serves "
+            "its own user only"
+        )
 
     def _latest(self, frames: Frames) -> dict[str, Any] | None:
         """Return the newest answer that has arrived; skip late answers to earlier requests."""

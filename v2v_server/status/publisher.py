@@ -1,6 +1,7 @@
 """Keep the history of a service, build its status on request, and answer the requests.
 
-A status is built at most a few times a second, whatever the number of clients and requests.
+A status is built at most a few times a second, whatever the number of clients and requests, and all of them get the
+same bytes. So every request is answered: a client has one at a time, and connections are limited.
 """
 
 from __future__ import annotations
@@ -8,10 +9,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from v2v_protocol.messages import ErrorCode
 from v2v_protocol.messages import Status as StatusMessage
 from v2v_protocol.wire import Frames, encode
-from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker, denial
+from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
 from v2v_server.status.history import History
 from v2v_server.status.parts import Status
 from v2v_server.status.snapshot import Service, to_json
@@ -19,8 +19,6 @@ from v2v_server.status.snapshot import Service, to_json
 ANSWER_SECONDS = 0.4
 LARGEST_SHARE = 0.02
 """Share of the loop's time that building may take; with thousands of workers and consumers it happens less often."""
-MOST_WAITING = 64
-"""Clients that are answered with one status."""
 
 
 class StatusPublisher:
@@ -63,13 +61,9 @@ class StatusPublisher:
             is_attended=self._history.is_attended(now),
         )
 
-    def ask(self, request: SendStatus) -> list[ToConsumer | ToWorker]:
-        """Take a request; return what to send at once: nothing, or a denial if too many wait."""
-        if request in self._waiting or len(self._waiting) < MOST_WAITING:
-            self._waiting[request] = None
-            return []
-        text = f"{MOST_WAITING} clients wait for the status of this server, its limit: try again"
-        return [_to(request, denial(ErrorCode.BUSY, text))]
+    def ask(self, request: SendStatus) -> None:
+        """Take a request, which :meth:`tick` answers."""
+        self._waiting[request] = None
 
     def tick(self, now: float) -> list[ToConsumer | ToWorker]:
         """Return the answers that are due. Call a few times a second."""

@@ -8,7 +8,7 @@ from typing import Any, TextIO
 from rich.console import Console
 from rich.text import Text
 
-from v2v_server.corpus.sources.names import printable
+from v2v_protocol.programs import printable
 from v2v_server.status.parts import Status, meanings_at
 from v2v_server.status.text import figures
 from v2v_server.status.top import consumers_table

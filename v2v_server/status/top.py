@@ -12,8 +12,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from v2v_protocol.programs import printable
 from v2v_protocol.progress import format_duration
-from v2v_server.corpus.sources.names import printable
 from v2v_server.status.parts import Status, meanings_at
 from v2v_server.status.text import figures
 

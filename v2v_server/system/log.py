@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from typing import Any, Literal, TextIO
 
 from v2v_protocol.errors import V2VError
+from v2v_protocol.programs import printable
 
 LOG_FORMATS = ("text", "json")
 Level = Literal["info", "warning", "error"]
@@ -47,7 +48,7 @@ class Log:
         """
         if self.is_json:
             text = json.dumps({"time": self._wall_clock(), "level": level, "text": text, **about}, default=str)
-        write(sys.stderr, text + "\n")
+        write(sys.stderr, printable(text) + "\n")
 
 
 @contextmanager

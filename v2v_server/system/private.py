@@ -12,7 +12,7 @@ def open_private(path: Path, flags: int) -> int:
     """Open a regular file of ours with mode 0600, and return its descriptor. Never blocks.
 
     Args:
-        path: the file. Other users lose access to an existing file.
+        path: the file. Other users lose access to an existing file, unless it lies behind a symbolic link.
         flags: of ``os.open``; with ``O_CREAT`` a missing file is made.
 
     Raises:
@@ -23,7 +23,8 @@ def open_private(path: Path, flags: int) -> int:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, "not a regular file", str(path))
-        if status.st_uid == os.geteuid() and stat.S_IMODE(status.st_mode) & 0o077:
+        is_open = stat.S_IMODE(status.st_mode) & 0o077
+        if status.st_uid == os.geteuid() and is_open and not path.is_symlink():
             os.fchmod(descriptor, 0o600)
     except BaseException:
         os.close(descriptor)

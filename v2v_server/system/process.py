@@ -20,6 +20,7 @@ from v2v_protocol.errors import CorpusError
 
 _PR_SET_PDEATHSIG = 1
 _TURN_SECONDS = 0.1  # the longest time slice that Linux grants
+MOST_CONNECTIONS = 4096 + 256
 _MOST_FILES = 1 << 16  # one connection per consumer and worker, and one logbook per worker
 _SCHED_ATTR_CALLS = {"x86_64": (315, 314), "aarch64": (275, 274)}  # numbers of sched_getattr and sched_setattr
 
@@ -80,6 +81,18 @@ def open_many_files() -> None:
     if soft != resource.RLIM_INFINITY and soft < most:
         with suppress(OSError, ValueError):  # a system may allow fewer than it reports
             resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+
+
+def most_connections(files_for_others: int) -> int:
+    """Return the number of connections that leaves at least half of this process's descriptors to everything else.
+
+    Args:
+        files_for_others: descriptors that workers take.
+    """
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY:
+        return MOST_CONNECTIONS
+    return max(1, min(MOST_CONNECTIONS, (soft - files_for_others) // 2))
 
 
 def limit_memory(most_bytes: int) -> None:

@@ -16,7 +16,7 @@ from bench.chaos.trimming_server import MODULE
 from tests.clips import panned_luma, write_clip
 from tests.waiting import until
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts the bytes of a connection")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a connection guard")
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,7 @@ from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoC
 from v2v_server.corpus import catalogue as catalogue_module
 from v2v_server.corpus import probe as probe_module
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.index import file as index_file
 from v2v_server.corpus.index.file import SCHEMA_VERSION
 from v2v_server.corpus.manifest import MANIFEST_NAME
 from v2v_server.corpus.probe import ProbeFile, probe_files
@@ -563,6 +564,51 @@ def test_an_index_that_another_process_holds_is_said_at_once(
             catalogue.frame_index_bytes(name, 0, 3)
         other.execute("ROLLBACK")
     assert catalogue.frame_index_bytes(name, 0, 3)
+
+
+def test_a_start_says_soon_that_another_process_holds_the_index_and_again_how_it_went(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opener(corpus).close()
+    (file,) = opener.cache.glob("catalogue-*.sqlite3")
+    monkeypatch.setattr(index_file, "_SAY_SECONDS", 0.2)
+    said: list[str] = []
+    with closing(sqlite3.connect(file, isolation_level=None, check_same_thread=False)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+
+        def notice(text: str, *, is_urgent: bool = False) -> None:
+            if is_urgent:
+                said.append(text)
+                if len(said) == 1:
+                    other.execute("ROLLBACK")
+
+        assert opener(corpus, notice=notice).notes == ()
+    assert [text.partition(":")[0] for text in said] == [
+        f"another process holds the catalogue's index {file}", f"the catalogue's index {file} is free again",
+    ]  # fmt: skip
+    monkeypatch.setattr(index_file, "_BUSY_SECONDS", 0.5)
+    said.clear()
+    with closing(sqlite3.connect(file, isolation_level=None)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        (note,) = opener(corpus, notice=lambda text, *, is_urgent=False: said.append(text) if is_urgent else None).notes
+    assert "keeps it in memory" in note
+    assert "waiting for at most 0.5 s" in said[0]
+    assert "cannot be used (database is locked): probing every video again" in said[1]
+
+
+def test_an_index_behind_a_link_keeps_its_targets_mode(corpus: Path, opener: Opener, tmp_path: Path) -> None:
+    opener(corpus).close()
+    (file,) = opener.cache.glob("catalogue-*.sqlite3")
+    target = tmp_path / "shared.sqlite3"
+    file.rename(target)
+    target.chmod(0o664)
+    file.symlink_to(target)
+    assert opener(corpus).notes == ()
+    assert target.stat().st_mode & 0o777 == 0o664
+    file.unlink()
+    target.rename(file)
+    opener(corpus)
+    assert file.stat().st_mode & 0o777 == 0o600
 
 
 def test_the_index_of_a_long_video_is_opened_once(

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
 
 from tests.server.named_corpus import SMALL, SMALL_SPEC, NamedCorpus, corpus, video
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.videos import VideoEntry
+from v2v_server.schedule import summary
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.schedule.summary import corpus_summary
 from v2v_server.video.rows import Rows
@@ -23,6 +28,27 @@ def test_a_corpus_without_trouble_is_one_line() -> None:
     assert lines(corpus(video("a.mp4"), video("b.mp4", frames=9), rows="top:0.75")) == [
         "2 videos in /corpus: 2 give 12 sequences of 5 frames (at most 10 a video), rows top:0.75"
     ]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "made"),
+    [
+        ((0.001, 0.001), "2 grids of 0.0333 s"),
+        ((0.06, 0.06), "2 grids of 0.0667 s"),
+        ((0.001, 0.1), "2 grids of 0.0333 to 0.1 s"),
+    ],
+)
+def test_the_duration_of_grids_is_the_one_that_is_made(seconds: tuple[float, float], made: str) -> None:
+    recipe = replace(SMALL, frames_per_bin=1, voxel_seconds=seconds)
+    catalogue = SimpleNamespace(videos=SimpleNamespace(frames_per_second=np.array([30.0, np.nan])))
+    span, more = summary._span(catalogue, recipe)  # type: ignore[arg-type]
+    assert span == made
+    if seconds[1] < 1 / 30:
+        (warning,) = more
+        assert warning.startswith("warning: voxel_seconds = 0.001 is shorter than the time between frames of 1 videos")
+        assert "0.0333 s" in warning
+    else:
+        assert not more
 
 
 def test_refusals_name_reason_and_remedy() -> None:

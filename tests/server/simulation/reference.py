@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tests.oracles.noise import shot_words, standard_normals, start_uniforms
 from v2v_server.simulation import noise
-from v2v_server.simulation.effects import EFFECTS, mismatch, shot_noise
+from v2v_server.simulation.effects import EFFECTS, mismatch
 from v2v_server.simulation.voxel import LARGEST_COUNT, rounding_tolerance
 
 
@@ -37,8 +38,8 @@ def simulate(
     steps, pixels = len(level) - 1, level.shape[1]
     positive, negative = real(threshold_pos), real(threshold_neg)
     tolerance = real(rounding_tolerance(threshold_pos, threshold_neg))
-    residual = noise.start_uniforms(key, pixels).astype(real) * (positive + negative) - negative
-    normals = None if noise_scale is None else noise.standard_normals(key, steps, pixels)
+    residual = start_uniforms(key, pixels).astype(real) * (positive + negative) - negative
+    normals = None if noise_scale is None else standard_normals(key, steps, pixels)
     position, normal = noise.hot_pixels(key, hot_count, pixels)
     drift = normal.astype(real) * real(hot_sigma)
     counts = np.zeros((steps // frames_per_bin, pixels), real)
@@ -86,10 +87,10 @@ def simulate_with_effects(
     normal = np.stack(mismatch.normals(key, pixels)).astype(real)
     share = np.maximum(real(1) + normal * spread.sigma, spread.smallest_share)
     positive, negative = real(threshold_pos) * share[0], real(threshold_neg) * share[1]
-    residual = noise.start_uniforms(key, pixels).astype(real) * (positive + negative) - negative
-    normals = noise.standard_normals(key, steps, pixels)
+    residual = start_uniforms(key, pixels).astype(real) * (positive + negative) - negative
+    normals = standard_normals(key, steps, pixels)
     position, normal = noise.hot_pixels(key, hot_count, pixels)
-    shot_words = shot_noise.shot_words(key, steps, pixels)
+    decided = shot_words(key, steps, pixels)
     seen, blind = level[0].copy(), np.zeros(pixels, real)
     counts = np.zeros((steps, pixels), real)
     for step in range(steps):
@@ -117,7 +118,7 @@ def simulate_with_effects(
             residual = potential - signed * threshold
         if len(shot.shot):
             chances = shot.shot.view(np.uint32)[of_step][:, grey[step + 1]]
-            rising, falling = ((words[step] < chances).sum(axis=0) for words in shot_words)
+            rising, falling = ((words[step] < chances).sum(axis=0) for words in decided)
             signed = signed + (rising - falling).astype(real)
             residual = np.where(rising + falling > 0, real(0), residual)
         counts[step] = signed

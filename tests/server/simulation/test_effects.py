@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.oracles.noise import shot_words, standard_normals, start_uniforms
 from tests.server.simulation import effect_oracle, reference
 from tests.server.simulation.effect_oracle import Camera, Chance
 from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
@@ -119,12 +120,12 @@ def test_kernel_equals_the_oracle(effects: Effects, noise_sigma: float, seed: in
     durations = np.array([0.02, 0.04, 0.1])[np.arange(steps) % 3]
     params = params_of(effects or ALL, seed, noise_sigma=noise_sigma, hot_pixel_count=2, hot_pixel_sigma=3.0)
     effects, key = params.effects, params.noise_key
-    change = noise.standard_normals(key, steps, pixels).astype(np.float64) * noise_sigma * np.sqrt(durations)[:, None]
+    change = standard_normals(key, steps, pixels).astype(np.float64) * noise_sigma * np.sqrt(durations)[:, None]
     position, normal = noise.hot_pixels(key, 2, pixels)
     change[:, position] += 3.0 * normal.astype(np.float64) * durations[:, None]
-    shot = np.stack(shot_noise.shot_words(key, steps, pixels)).astype(np.float64) * 2.0**-32
+    shot = np.stack(shot_words(key, steps, pixels)).astype(np.float64) * 2.0**-32
     chance = Chance(
-        noise.start_uniforms(key, pixels).astype(np.float64),
+        start_uniforms(key, pixels).astype(np.float64),
         change,
         np.stack(mismatch.normals(key, pixels)).astype(np.float64),
         shot,

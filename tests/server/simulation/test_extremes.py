@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from tests.oracles.balance import Camera, arithmetic, balance, imbalance, trace_of
 from tests.oracles.extremes import Finding, Row, record_of, refused, rows, texture
+from tests.oracles.noise import standard_normals, start_uniforms
 from tests.server.simulation import oracle, reference
 from v2v_protocol.bounds import LARGEST_EVENTS, LARGEST_NORMAL, most_events
 from v2v_protocol.errors import RecipeError, UsageError
@@ -87,13 +88,13 @@ def test_the_balance_sees_a_lost_event() -> None:
 @pytest.mark.parametrize("threshold", [0.05, 0.3, 1e-4])
 def test_the_trace_agrees_with_the_oracle(threshold: float) -> None:
     camera, frames = Camera(threshold, 1.3 * threshold, 0.05, 7, 3.0), texture(30)
-    normals = noise.standard_normals(noise_key_of_seed(0), 30, 48).astype(np.float64) * camera.noise_sigma
+    normals = standard_normals(noise_key_of_seed(0), 30, 48).astype(np.float64) * camera.noise_sigma
     position, hot = noise.hot_pixels(noise_key_of_seed(0), 7, 48)
     normals[:, position] += hot.astype(np.float64) * camera.hot_pixel_sigma
     expected = oracle.simulate(
         oracle.log_intensity(frames.reshape(31, 48), camera.gamma, camera.log_eps),
         normals,
-        noise.start_uniforms(noise_key_of_seed(0), 48).astype(np.float64),
+        start_uniforms(noise_key_of_seed(0), 48).astype(np.float64),
         threshold_pos=camera.threshold_pos,
         threshold_neg=camera.threshold_neg,
         tolerance=rounding_tolerance(camera.threshold_pos, camera.threshold_neg),

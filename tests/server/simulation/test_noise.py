@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.oracles.noise import shot_words, standard_normals, start_uniforms
 from v2v_server.simulation import noise
-from v2v_server.simulation.effects import dead_pixels, mismatch, shot_noise
+from v2v_server.simulation.effects import dead_pixels, mismatch
 
 KEY = (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344)
 
@@ -17,7 +18,7 @@ KEY = (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344)
 @pytest.fixture(scope="module")
 def normals() -> np.ndarray:
     """[200, 51200]: 10.24 million draws."""
-    return noise.standard_normals(KEY, 200, 51_200)
+    return standard_normals(KEY, 200, 51_200)
 
 
 def test_mean_variance_and_shape(normals: np.ndarray) -> None:
@@ -79,7 +80,7 @@ def test_neighbouring_steps_are_independent(normals: np.ndarray, steps: Any) -> 
 def test_keys_that_differ_in_one_bit_are_independent(normals: np.ndarray, word: Any, bit: Any) -> None:
     other = list(KEY)
     other[word] ^= 1 << bit
-    near = noise.standard_normals((other[0], other[1], other[2], other[3]), 40, 25_000)
+    near = standard_normals((other[0], other[1], other[2], other[3]), 40, 25_000)
     ours = normals[:40, :25_000]
     assert abs(correlation(ours, near)) < 4.5
     assert abs(correlation(ours**2 - 1, (near**2 - 1) / 2)) < 4.5
@@ -97,7 +98,7 @@ def test_four_corners_of_pixel_and_pair_are_independent(normals: np.ndarray) -> 
 
 def test_zero_and_tiny_keys_are_as_good_as_any() -> None:
     for key in ((0, 0, 0, 0), (1, 0, 0, 0), (0, 0, 0, 1)):
-        z = noise.standard_normals(key, 40, 25_000).astype(np.float64)
+        z = standard_normals(key, 40, 25_000).astype(np.float64)
         assert abs(z.mean()) < 4.5 / math.sqrt(z.size)
         assert abs(z.var() - 1) < 4.5 * math.sqrt(2 / z.size)
         assert np.abs(np.asarray(np.corrcoef(z))[np.triu_indices(40, 1)]).max() < 5 / math.sqrt(25_000)
@@ -111,7 +112,7 @@ def test_words_of_one_purpose_are_distinct_and_purposes_differ() -> None:
 
 
 def test_start_uniforms_are_uniform() -> None:
-    u = noise.start_uniforms(KEY, 200_000)
+    u = start_uniforms(KEY, 200_000)
     assert u.min() >= 0
     assert u.max() < 1
     counts = np.histogram(u, 50, (0, 1))[0]
@@ -152,7 +153,7 @@ def test_mismatch_normals_are_normal_and_independent() -> None:
         assert abs((np.abs(sample) > 2).mean() - 0.0455) < 4 * math.sqrt(0.0455 / sample.size)
         assert abs(np.corrcoef(sample[1:], sample[:-1])[0, 1]) < 4 / math.sqrt(sample.size)
     assert abs(np.corrcoef(positive, negative)[0, 1]) < 4 / math.sqrt(positive.size)
-    noisy = noise.standard_normals((5, 6, 7, 8), 2, 200_000)
+    noisy = standard_normals((5, 6, 7, 8), 2, 200_000)
     for step in noisy:
         assert abs(np.corrcoef(positive, step)[0, 1]) < 4 / math.sqrt(positive.size)
 
@@ -160,7 +161,7 @@ def test_mismatch_normals_are_normal_and_independent() -> None:
 def test_shot_words_are_uniform_and_independent() -> None:
     """Of pixel, step and sign; the smallest ones too, which alone make events."""
     steps, pixels = 200, 2000
-    both = np.stack(shot_noise.shot_words((9, 8, 7, 6), steps, pixels)) * 2.0**-32
+    both = np.stack(shot_words((9, 8, 7, 6), steps, pixels)) * 2.0**-32
     n = both[0].size
     for uniform in both:
         assert abs(uniform.mean() - 0.5) < 4 / math.sqrt(12 * n)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.clips import panned_luma
+from tests.oracles.noise import standard_normals, start_uniforms
 from tests.server.simulation import oracle
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
@@ -53,7 +54,7 @@ def differing_ppm(names: list[str], threshold: float, ratio: float, sigma: float
         key = (number, 22, 333, 4444)
         params = SampleParams(threshold_pos, threshold_neg, sigma, 2, 3.0, (), 1.0, 0, 0, False, 0.0, key)
         got = simulate_clip(frames, params, recipe, "float32").voxels
-        noisy = noise.standard_normals(key, recipe.steps, pixels).astype(np.float64) * sigma
+        noisy = standard_normals(key, recipe.steps, pixels).astype(np.float64) * sigma
         position, normal = noise.hot_pixels(key, 2, pixels)
         noisy[:, position] += normal.astype(np.float64) * 3.0
         level = oracle.log_intensity(
@@ -62,7 +63,7 @@ def differing_ppm(names: list[str], threshold: float, ratio: float, sigma: float
         trace = oracle.simulate(
             level,
             noisy,
-            noise.start_uniforms(key, pixels).astype(np.float64),
+            start_uniforms(key, pixels).astype(np.float64),
             threshold_pos=threshold_pos,
             threshold_neg=threshold_neg,
             tolerance=0.0 if plain_floor else rounding_tolerance(threshold_pos, threshold_neg),

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.oracles.noise import standard_normals, start_uniforms
 from tests.server.simulation import oracle, reference
 from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from v2v_protocol.recipe import Recipe
@@ -157,7 +158,7 @@ def test_a_ramp_of_two_log_units_at_a_tenth_gives_twenty_events() -> None:
     np.testing.assert_array_equal(voxels, np.full((2, 5, 64, 65), 2))
     # With the paper's random start, a pixel that starts below zero has to climb back first.
     total = simulate_log(ramp, threshold_pos=0.1, bins=5, seed=4).voxels.sum((0, 1)).ravel()
-    start = noise.start_uniforms(noise_key_of_seed(4), 64 * 65)
+    start = start_uniforms(noise_key_of_seed(4), 64 * 65)
     np.testing.assert_array_equal(total, np.where(start >= 0.5, 20, 19))
 
 
@@ -175,7 +176,7 @@ def test_equal_thresholds_swap_polarity_with_inverted_intensity() -> None:
     # The start of the residual is mirrored too, so only totals are comparable, to one event.
     assert np.abs(up.sum((0, 1)) + down.sum((0, 1))).max() <= 10
     key = noise_key_of_seed(0)
-    start = noise.start_uniforms(key, 200).astype(np.float64)
+    start = start_uniforms(key, 200).astype(np.float64)
     forward = oracle.simulate(
         level.reshape(51, -1), np.zeros((50, 200)), start, threshold_pos=0.1, threshold_neg=0.2, tolerance=0.0
     )
@@ -190,8 +191,8 @@ def test_events_account_for_every_change() -> None:
     steps, pixels = 60, 150
     level = oracle.log_intensity(moving_frames(steps + 1, 10, 15).reshape(steps + 1, -1), 2.2, 1e-3)
     key = noise_key_of_seed(3)
-    normals = noise.standard_normals(key, steps, pixels).astype(np.float64) * 0.1
-    start = noise.start_uniforms(key, pixels).astype(np.float64)
+    normals = standard_normals(key, steps, pixels).astype(np.float64) * 0.1
+    start = start_uniforms(key, pixels).astype(np.float64)
     trace = oracle.simulate(
         level, normals, start, threshold_pos=0.2, threshold_neg=0.3, tolerance=rounding_tolerance(0.2, 0.3)
     )

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.oracles.in_time import bilinear_of, counts_of, stacked_histogram, watch
+from tests.oracles.noise import standard_normals, start_uniforms
 from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from tests.server.simulation.test_pixel import moving_frames
 from tests.server.video.test_real_videos import FOLDER as REAL_VIDEOS
@@ -102,12 +103,12 @@ def test_kernel_equals_the_oracle(data: Any, precision: str, grids: int) -> None
     key = made.given.params.noise_key
     added = np.zeros((steps, pixels))
     if sigma:
-        added += noise.standard_normals(key, steps, pixels) * sigma
+        added += standard_normals(key, steps, pixels) * sigma
     position, normal = noise.hot_pixels(key, 2, pixels)
     added[:, position] += 0.5 * normal
     sums = np.concatenate([np.zeros((1, pixels)), np.cumsum(added, axis=0)])
     known += np.stack([np.interp(times, np.arange(steps + 1.0), sums[:, p]) for p in range(pixels)], axis=1)
-    start = -0.25 + noise.start_uniforms(key, pixels).astype(np.float64) * 0.45
+    start = -0.25 + start_uniforms(key, pixels).astype(np.float64) * 0.45
     edges = np.linspace(0, steps, steps * grids * bins + 1)
     wrong = 0
     for p in range(pixels):

@@ -71,9 +71,9 @@ class Published:
             self.transport.waited_seconds += 0.1 * (1.0 - busy_share)
             self.publisher.tick(self.at.now)
 
-    def ask(self, actions: list[Action]) -> list[ToConsumer | ToWorker]:
+    def ask(self, actions: list[Action]) -> None:
         (request,) = actions
-        return self.publisher.ask(cast(SendStatus, request))
+        self.publisher.ask(cast(SendStatus, request))
 
 
 def published(at: Peers, **settings: Any) -> Published:

@@ -9,18 +9,22 @@ alone, it does not matter which of them wrote it.
 from __future__ import annotations
 
 import sqlite3
+import time
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
+from v2v_server.corpus.sources.asking import Notice
 from v2v_server.system.private import make_private
 
 SCHEMA_VERSION = 5
 """Raise it with every change of the table or of what probing finds: an index of another version is made again."""
 
-_BUSY_SECONDS = 30.0
+_BUSY_SECONDS, _SAY_SECONDS = 30.0, 2.0
+"""Time to wait for another process that holds the index, and until that is said."""
 _TABLE = """
 CREATE TABLE video (
     id TEXT PRIMARY KEY,
@@ -129,6 +133,7 @@ class Store:
 
     Args:
         path: the SQLite file, made if missing; None keeps the index in memory.
+        notice: called with a line of text if another process holds the index.
 
     Attributes:
         path: that.
@@ -140,11 +145,12 @@ class Store:
     Every method may also raise UnicodeDecodeError for a damaged file: SQLite's message then quotes what is not UTF-8.
     """
 
-    def __init__(self, path: Path | None) -> None:
+    def __init__(self, path: Path | None, notice: Notice | None = None) -> None:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             make_private(path)  # SQLite gives its other files the mode of this one
         self.path = path
+        self._notice = notice or (lambda text, **how: None)
         self.replaced_version: int | None = None
         self._database = sqlite3.connect(
             ":memory:" if path is None else path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False
@@ -158,7 +164,7 @@ class Store:
     def _prepare(self) -> None:
         if self._version() == SCHEMA_VERSION:
             return
-        self._database.execute("BEGIN IMMEDIATE")
+        self._patiently("BEGIN IMMEDIATE")
         with self._database:
             version = self._version()
             if version == SCHEMA_VERSION:  # another process was faster
@@ -169,7 +175,21 @@ class Store:
             self._database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
     def _version(self) -> int:
-        return int(self._database.execute("PRAGMA user_version").fetchone()[0])
+        return int(self._patiently("PRAGMA user_version").fetchone()[0])
+
+    def _patiently(self, statement: str) -> sqlite3.Cursor:
+        """Execute a statement that may have to wait for another process, and say so if it does."""
+        began = time.monotonic()
+        text = f"another process holds the catalogue's index {self.path}: waiting for at most {_BUSY_SECONDS:g} s"
+        said = Timer(_SAY_SECONDS, self._notice, (text,), {"is_urgent": True})
+        said.start()
+        try:
+            done = self._database.execute(statement)
+        finally:
+            said.cancel()
+        if time.monotonic() - began > _SAY_SECONDS:
+            self._notice(f"the catalogue's index {self.path} is free again", is_urgent=True)
+        return done
 
     def rows(self, kind: FigureKind | None) -> Generator[tuple[Any, ...], None, None]:
         """Yield all records by id: the attributes of :class:`IndexRow` without the frame index, and a summary.
@@ -284,7 +304,7 @@ class Store:
             if version != SCHEMA_VERSION:
                 raise ValueError(f"is an index of version {version}, this program reads {SCHEMA_VERSION}")
             self.make_figures()
-            self._database.execute("BEGIN IMMEDIATE")
+            self._patiently("BEGIN IMMEDIATE")
             with self._database:
                 for table, columns in ("video", IndexRow.__slots__), ("figures", _FIGURE_COLUMNS):
                     if _has_table(other, table):
@@ -315,7 +335,7 @@ class Store:
     def _change(self, statement: str, rows: Sequence[tuple[object, ...]]) -> None:
         if not rows:
             return
-        self._database.execute("BEGIN IMMEDIATE")
+        self._patiently("BEGIN IMMEDIATE")
         with self._database:
             self._database.executemany(statement, rows)
 

@@ -14,8 +14,8 @@ from typing import TypeVar
 Q = TypeVar("Q")
 A = TypeVar("A")
 
-Notice = Callable[[str], None]
-"""Progress callback: a line of text."""
+Notice = Callable[..., None]
+"""Progress callback: a line of text; with ``is_urgent=True`` it is shown at once."""
 
 _AT_ONCE = 16
 _TOGETHER, _MOST_TOGETHER = 64, 1024

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.corpus.sources.names import printable
+from v2v_protocol.programs import printable
 
 LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
 

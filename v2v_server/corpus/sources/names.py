@@ -1,10 +1,10 @@
-"""Names of files: which of them are videos', and how a name is shown."""
+"""Names of files: which of them are videos'."""
 
 from __future__ import annotations
 
-import os
-import re
 from collections import Counter
+
+from v2v_protocol.programs import printable
 
 VIDEO_SUFFIXES = frozenset({
     ".3gp", ".avi", ".flv", ".h264", ".h265", ".hevc", ".ivf", ".m2ts", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov",
@@ -22,16 +22,6 @@ _NO_VIDEO_SUFFIXES = frozenset({
 _MOST_SUFFIXES_SHOWN = 10
 
 UNPRINTABLE = "its name is not UTF-8 text, or holds control characters; rename it"
-# C0 and C1 controls, separators of lines, and what changes the direction of text (Unicode 16, UAX 9).
-_STEERING = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]")
-
-
-def printable(name: str) -> str:
-    """Return a name that can be shown: bytes that are not UTF-8, and control and bidirectional characters, escaped."""
-    if name.isascii() and name.isprintable():  # as nearly all are, and there may be a million of them
-        return name
-    text = os.fsencode(name).decode("utf-8", "backslashreplace")
-    return _STEERING.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def is_video_name(name: str) -> bool:

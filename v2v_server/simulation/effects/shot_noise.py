@@ -88,20 +88,6 @@ def shot_table(means: Doubles) -> npt.NDArray[np.uint32]:
     return np.ascontiguousarray(np.stack(layers, axis=1))
 
 
-def shot_words(key: noise.NoiseKey, steps: int, pixels: int) -> tuple[noise.Words, noise.Words]:
-    """Return independent uniform words that decide the shot events: those of positive and of negative events.
-
-    ``mix`` of the words of pixel and step, as for the normals: with PIXEL_POS and STEP_POS in the place of the two
-    radius words, PIXEL_NEG and STEP_NEG in that of the two angle words.
-
-    Returns:
-        each [steps, pixels] uint32.
-    """
-    place, step = np.arange(pixels), np.arange(steps)
-    positive = noise.words(key, STEP_POS, step)[:, None] ^ noise.words(key, PIXEL_POS, place)
-    return noise.mix(positive, noise.words(key, STEP_NEG, step)[:, None] ^ noise.words(key, PIXEL_NEG, place))
-
-
 @hook
 def start(tables, own, block, at):
     """Compute the words of the pixels and of the steps."""

@@ -155,14 +155,6 @@ def test_scenes_come_from_the_index(corpus: Corpus) -> None:
     assert fewer[1] == [each for each in runs if each[0] != "003.mp4"]
 
 
-def test_files_beside_the_index_of_earlier_releases_are_removed(corpus: Corpus) -> None:
-    put_scenes(corpus, *corpus.names)
-    for suffix in (".columns", ".scenes"):
-        corpus.index.with_suffix(suffix).touch()
-    scenes(corpus)
-    assert list(corpus.cache.iterdir()) == [corpus.index]
-
-
 def test_figures_of_other_versions_are_known(corpus: Corpus) -> None:
     put_scenes(corpus, *corpus.names)
     with closing(Store(corpus.index)) as store:

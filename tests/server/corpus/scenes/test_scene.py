@@ -229,10 +229,10 @@ def test_off_changes_nothing(folder: Path) -> None:
     with opened(folder, scene=False) as before, opened(folder) as with_scenes, opened(folder, scene=False) as after:
         assert before.digest == with_scenes.digest == after.digest
         assert before.videos == after.videos
-        assert with_scenes.digest_under("off") == before.digest_under("off") == before.digest
-        assert with_scenes.digest_under("auto") != before.digest
+        assert with_scenes.facts.digest_under("off") == before.facts.digest_under("off") == before.digest
+        assert with_scenes.facts.digest_under("auto") != before.digest
         with pytest.raises(UsageError, match="--scene auto"):
-            before.digest_under("auto")
+            before.facts.digest_under("auto")
         with pytest.raises(CorpusError, match="without statistics"):
             before.scene("cut.mkv")
 

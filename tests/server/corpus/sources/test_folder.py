@@ -13,12 +13,13 @@ import pytest
 
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import CorpusError
+from v2v_protocol.programs import printable
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources import asking
 from v2v_server.corpus.sources.asking import answers, by_parts
 from v2v_server.corpus.sources.folder import MOST_PATHS, PSEUDO, Folder, video_files
 from v2v_server.corpus.sources.listfile import ListEntry, read_list
-from v2v_server.corpus.sources.names import left_out_note, printable
+from v2v_server.corpus.sources.names import left_out_note
 from v2v_server.corpus.sources.source import open_source
 
 STEERING = {

@@ -1,0 +1,117 @@
+"""Find the user at the other end of a connection on loopback. I/O, Linux.
+
+A peer on this host has a socket of its own, whose local end is the address that we see as its peer. The kernel knows
+which user made it. An exact query (``sock_diag(7)``) takes microseconds and needs no rights. Where it finds nothing or
+is not allowed, ``/proc/net/tcp`` is read, in time that grows with the number of connections.
+
+A closed socket has no inode and seems to belong to root, so only an established one with an inode counts.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from ipaddress import IPv6Address, ip_address
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+_TABLES = Path("/proc/net")
+_OVERFLOW_USER = Path("/proc/sys/kernel/overflowuid")
+_SAY_SECONDS = 60.0
+_ESTABLISHED = 1
+_SOCK_DIAG, _BY_FAMILY, _REQUEST, _ERROR = 4, 20, 1, 2  # of linux/netlink.h and linux/sock_diag.h
+_HEADER_BYTES, _OWNER_AT = 16, 80  # in an answer: header and struct inet_diag_msg, which ends with user and inode
+_ANY_INTERFACE_OR_COOKIE = struct.pack("=III", 0, 0xFFFFFFFF, 0xFFFFFFFF)
+_MAPPED = bytes(10) + b"\xff\xff"
+_End: TypeAlias = tuple[bytes, int]
+
+
+class OwnUser:
+    """Admit connections of this process's user and of root.
+
+    Args:
+        rule: who is served and what to do, for the line about a refused user.
+        say: writes that line, at most once a minute for each user.
+    """
+
+    def __init__(self, rule: str, say: Callable[[str, Literal["warning"]], object]) -> None:
+        self._rule, self._say = rule, say
+        self._said_at: dict[int | None, float] = {}
+        # Users that a user namespace does not map all have this number, so it identifies none.
+        self._overflow = int(_OVERFLOW_USER.read_text())
+
+    def admits(self, link: socket.socket) -> bool:
+        """Return whether a connection may stay."""
+        if link.family == socket.AF_UNIX:  # ZeroMQ admits only our own user there
+            return True
+        with suppress(OSError):  # it has just ended
+            own, user = os.geteuid(), owner(_end(link.getpeername()), _end(link.getsockname()))
+            if user == 0 or (user == own and user != self._overflow):
+                return True
+            is_there = link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] == _ESTABLISHED
+            if is_there and (now := time.monotonic()) >= self._said_at.get(user, now):
+                self._said_at[user] = now + _SAY_SECONDS
+                who = "an unknown user" if user is None else f"user {user}"
+                self._say(f"refused a connection of {who} to a process of user {own}: {self._rule}", "warning")
+        return False
+
+
+def owner(local: _End, remote: _End) -> int | None:
+    """Return the user of the socket with these ends; None if there is none."""
+    # A socket for IPv6 may use IPv4 addresses, which it writes in the longer form.
+    forms = [(socket.AF_INET6, local, remote)]
+    if local[0].startswith(_MAPPED):
+        forms.insert(0, (socket.AF_INET, (local[0][12:], local[1]), (remote[0][12:], remote[1])))
+    for form in forms:
+        try:
+            found = _ask(*form)
+        except OSError:
+            found = _look_up(*form)
+        if found is not None:
+            return found
+    return None
+
+
+def _end(address: tuple[str, int]) -> _End:
+    """Return an address of a socket as 16 bytes and a port."""
+    host = ip_address(address[0])
+    return (host.packed if isinstance(host, IPv6Address) else _MAPPED + host.packed), address[1]
+
+
+def _ask(family: int, local: _End, remote: _End) -> int | None:
+    """Ask for one socket (``struct inet_diag_req_v2``).
+
+    Raises:
+        OSError: there is no such socket, or the kernel does not answer such queries.
+    """
+    query = struct.pack("=BBBxI", family, socket.IPPROTO_TCP, 0, 1 << _ESTABLISHED)
+    query += struct.pack("!HH16s16s", local[1], remote[1], local[0], remote[0]) + _ANY_INTERFACE_OR_COOKIE
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, _SOCK_DIAG) as kernel:
+        kernel.send(struct.pack("=IHHII", _HEADER_BYTES + len(query), _BY_FAMILY, _REQUEST, 0, 0) + query)
+        answer = kernel.recv(4096, socket.MSG_DONTWAIT)
+    if struct.unpack_from("=IH", answer)[1] == _ERROR:
+        # There is no such socket (ENOENT), or the kernel lacks the module that looks (ENOENT too).
+        raise OSError(-int(struct.unpack_from("=i", answer, _HEADER_BYTES)[0]), "no answer")
+    user, inode = struct.unpack_from("=II", answer, _OWNER_AT)
+    # If nothing has these ends, the answer is the socket that listens at the local one.
+    is_it = answer[17] == _ESTABLISHED and struct.unpack_from("!HH", answer, 20) == (local[1], remote[1])
+    return int(user) if is_it and inode else None
+
+
+def _look_up(family: int, local: _End, remote: _End) -> int | None:
+    """Look for one socket in the kernel's table."""
+    with suppress(OSError), (_TABLES / ("tcp" if family == socket.AF_INET else "tcp6")).open() as table:
+        for line in table:
+            fields = line.split()
+            if fields[1:4] == [_hexadecimal(local), _hexadecimal(remote), f"{_ESTABLISHED:02X}"] and fields[9] != "0":
+                return int(fields[7])
+    return None
+
+
+def _hexadecimal(end: _End) -> str:
+    words = struct.unpack(f"={len(end[0]) // 4}I", end[0])
+    return f"{''.join(f'{word:08X}' for word in words)}:{end[1]:04X}"
