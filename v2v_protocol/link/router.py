@@ -1,7 +1,13 @@
 """Listen for peers on a ROUTER socket, and limit what they can cost. I/O.
 
 Memory: ZeroMQ keeps at most MOST_UNREAD whole messages from a peer, and at most MOST_QUEUED messages for one.
-:mod:`v2v_protocol.link.guard` limits bytes, unfinished messages and connections.
+:mod:`v2v_protocol.link.guard` limits unfinished messages and connections.
+
+Bytes for a peer are *in flight* from :meth:`Router.send` until ZeroMQ has freed the message: the system has taken them,
+or the connection has ended. pyzmq's tracker of a message tells. Below ``_TRACKED_BYTES`` it is not worth its time, so
+small messages count together with the next one that completes this size. If too much is in flight to all peers
+together, those that have taken nothing for ``_STUCK_SECONDS`` are disconnected. Who sends large messages holds them
+back, by the counts of :meth:`Router.take_in_flight`.
 """
 
 from __future__ import annotations
@@ -9,9 +15,10 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections import deque
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import zmq
@@ -30,6 +37,10 @@ HANDSHAKE_MS = 3000
 """Time limit of a handshake, after which ZeroMQ disconnects the peer."""
 _KEEPALIVE_SECONDS = 300
 _REVIEW_SECONDS = 0.5
+_TRACKED_BYTES = 1 << 16
+_STUCK_SECONDS = 10.0
+_COUNT_SECONDS = 1e-4
+"""Time between two counts of the bytes in flight, for each peer that has any: a count takes a hundredth of it."""
 _ZERO_COPY_RECEIVE = 10  # an option of contexts that pyzmq has no name for
 # Plain numbers: combining two flags of an enumeration takes longer than sending a small frame.
 _NOBLOCK, _NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
@@ -43,11 +54,13 @@ class Limits:
         frame_bytes: largest frame of a message.
         connections: largest number at a time; None if only our own user can connect, who needs no guard.
         queued_bytes: largest number of bytes queued for one peer; None limits no bytes in either direction.
+        in_flight_bytes: bytes in flight to all peers together above which those that take nothing are disconnected.
     """
 
     frame_bytes: int
     connections: int | None
     queued_bytes: int | None = None
+    in_flight_bytes: int = 1 << 62
 
 
 class Routers:
@@ -108,6 +121,24 @@ class Received:
     user: str
 
 
+@dataclass(slots=True)
+class _InFlight:
+    """What is in flight to one peer.
+
+    Attributes:
+        since: when the last message went, or the first was sent.
+        messages: tracker and size of each, oldest first; the size includes untracked ones before it.
+    """
+
+    since: float
+    messages: deque[tuple[zmq.MessageTracker, int]] = field(default_factory=deque)
+
+    @property
+    def nbytes(self) -> int:
+        """Return the sum of the sizes."""
+        return sum(size for _, size in self.messages)
+
+
 class Router:
     """One listening socket. :meth:`Routers.open` creates it."""
 
@@ -117,7 +148,11 @@ class Router:
         self.socket = router = context.socket(zmq.ROUTER)
         self._side, self._gate = side, gate
         self._users: dict[bytes, str] = {}
-        self._review_at = 0.0
+        self._review_at = self._count_at = 0.0
+        self._most_in_flight_bytes = limits.in_flight_bytes
+        self._in_flight: dict[bytes, _InFlight] = {}
+        self._untracked: dict[bytes, int] = {}  # bytes for each peer since its last tracked message
+        self._changed: set[bytes] = set()
         router.setsockopt(zmq.LINGER, 0)
         router.setsockopt(zmq.SNDHWM, MOST_QUEUED)
         router.setsockopt(zmq.RCVHWM, MOST_UNREAD)
@@ -190,21 +225,53 @@ class Router:
         return Received(sender, frames, user)
 
     def send(self, identity: bytes, frames: Sequence[Any]) -> bool:
-        """Queue a message; return False if the peer is not connected any more or does not read."""
+        """Queue a message. If the peer is not connected any more, does not read, or cannot be sent to for another
+        reason, disconnect it and return False.
+        """
+        size, last = sum(map(len, frames)), frames[-1]
+        counted = self._untracked.pop(identity, 0) + size
+        if counted >= _TRACKED_BYTES:
+            last = zmq.Frame(last, track=True, copy_threshold=0)
         try:
             self.socket.send(identity, _NOBLOCK_MORE)
             for frame in frames[:-1]:
                 self.socket.send(frame, _NOBLOCK_MORE, copy=False)
-            self.socket.send(frames[-1], _NOBLOCK, copy=False)
-        except zmq.Again:
+            self.socket.send(last, _NOBLOCK, copy=False)
+        except zmq.ZMQError:
+            self.disconnect(identity)
             return False
-        except zmq.ZMQError as error:
-            if error.errno == zmq.EHOSTUNREACH:
-                return False
-            raise
+        if counted >= _TRACKED_BYTES:
+            queue = self._in_flight.setdefault(identity, _InFlight(time.monotonic()))
+            queue.messages.append((last.tracker, counted))
+            self._changed.add(identity)
+        else:
+            self._untracked[identity] = counted
         if self.guard is not None:
-            self.guard.sent(identity, sum(map(len, frames)))
+            self.guard.sent(identity, size)
         return True
+
+    def take_in_flight(self) -> dict[bytes, int]:
+        """Return the bytes in flight to each peer for which they have changed since the last call. If there are too
+        many in all, disconnect the peer that has taken nothing for the longest time. Call it in each turn of the loop.
+        """
+        if self._in_flight and (now := time.monotonic()) >= self._count_at:
+            self._count_at = now + _COUNT_SECONDS * len(self._in_flight)
+            for identity, queue in self._in_flight.items():
+                while queue.messages and queue.messages[0][0].done:
+                    queue.messages.popleft()
+                    queue.since = now
+                    self._changed.add(identity)
+            identity, queue = min(self._in_flight.items(), key=lambda each: each[1].since)
+            in_all = sum(queue.nbytes for queue in self._in_flight.values())
+            if in_all > self._most_in_flight_bytes and now - queue.since > _STUCK_SECONDS:
+                queue.since = now  # its memory is freed a moment later; until then the next one is looked at
+                self.disconnect(identity)
+        changed = {identity: self._in_flight[identity].nbytes for identity in self._changed}
+        self._changed.clear()
+        for identity, nbytes in changed.items():
+            if not nbytes:
+                del self._in_flight[identity]
+        return changed
 
     def disconnect(self, identity: bytes) -> None:
         """End the connection of a peer."""
@@ -216,18 +283,15 @@ class Router:
         Disconnect peers whose key was revoked.
         """
         ended = [] if self.guard is None else self.guard.take_ended()
-        if self._gate is not None:
-            self._review(self._gate, ended)
-        return ended
-
-    def _review(self, gate: Gate, ended: Iterable[bytes]) -> None:
         for identity in ended:
             self._users.pop(identity, None)
-        if (now := time.monotonic()) >= self._review_at:
+            self._untracked.pop(identity, None)
+        if self._gate is not None and (now := time.monotonic()) >= self._review_at:
             self._review_at = now + _REVIEW_SECONDS
             for identity, user in self._users.items():
-                if not gate.admits(self._side, user):
+                if not self._gate.admits(self._side, user):
                     self.disconnect(identity)
+        return ended
 
     def close(self) -> None:
         """Stop the guard. :meth:`Routers.close` closes the socket."""

@@ -203,13 +203,18 @@ class Dispatcher:
                     return [_deny(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
                 self.counters.waited_seconds += session.add_wait(message.waited_seconds, now)
                 denials = self._want(session, message)
-                return denials or [*self._grants.answer_shared(session, message), *self._grants.assign(now)]
+                return denials or [*self._grants.answer_shared(session), *self._grants.assign(now)]
             case WorkerHello():
                 stray = ProtocolError("this is the consumers' port: connect to the address of --worker-bind")
                 return [self._fault(identity, self._malformed(stray))]
             case _:
                 stray = ProtocolError(f"consumers cannot send {type(message).__name__}")
                 return [self._fault(identity, self._malformed(stray))]
+
+    def in_flight(self, identity: bytes, nbytes: int, now: float) -> list[Action]:
+        """Note how many bytes are on their way to a consumer, and serve the requests that waited for it to read."""
+        session = self.sessions.set_in_flight(identity, nbytes)
+        return [] if session is None else [*self._grants.answer_shared(session), *self._grants.assign(now)]
 
     def consumer_gone(self, identity: bytes, now: float) -> None:
         """Note that a consumer's connection has ended. The consumer may reconnect at once and find its session."""

@@ -5,10 +5,10 @@ The loop (:mod:`v2v_server.serve`) uses only the :class:`ServerTransport` protoc
 
 Samples pass through in the frames that arrived; only the small header before them is read.
 
-Memory: a consumer asks for more only after it has taken what it was sent. So the broker holds at most the sum over all
-sessions of credit x sample bytes (in ZeroMQ's send queue of a slow consumer) + workers x 2 x sample bytes. A peer that
-asks and never reads is disconnected at ``router.MOST_QUEUED`` messages, which is above any credit, or at the bytes of
-its credit (:mod:`v2v_protocol.link.guard`).
+Memory: what a consumer has not read counts against its credit and its share of MOST_IN_FLIGHT_BYTES
+(:mod:`v2v_server.broker.session`). A peer that asks and never reads is disconnected at ``router.MOST_QUEUED`` messages,
+which is above any credit, or after some time if there are too many bytes in all (:mod:`v2v_protocol.link.router`).
+Workers add at most 2 samples each.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from v2v_protocol.link.guard import MOST_CONNECTIONS
 from v2v_protocol.link.router import Limits, Routers
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_REQUEST_BYTES
 from v2v_server.broker.actions import ToConsumer, ToWorker
+from v2v_server.broker.session import MOST_IN_FLIGHT_BYTES
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +67,20 @@ class ConsumerGone:
     identity: bytes
 
 
-Arrival: TypeAlias = FromConsumer | FromWorker | ConsumerGone
+@dataclass(frozen=True, slots=True)
+class InFlight:
+    """How much of what was sent to a consumer has not left this process yet, after a change.
+
+    Attributes:
+        identity: routing id of its connection.
+        nbytes: bytes, without small messages.
+    """
+
+    identity: bytes
+    nbytes: int
+
+
+Arrival: TypeAlias = FromConsumer | FromWorker | ConsumerGone | InFlight
 
 
 class ServerTransport(Protocol):
@@ -85,8 +99,8 @@ class ServerTransport(Protocol):
         """Total time that :meth:`receive` has waited without a message, seconds."""
 
     def receive(self, seconds: float) -> list[Arrival]:
-        """Return at most one message of each side, the workers' first, so that neither side can starve the other. Ended
-        connections follow last.
+        """Return at most one message of each side, the workers' first, so that neither side can starve the other.
+        Changes of what is in flight come first, ended connections last.
 
         Args:
             seconds: longest wait for any of them.
@@ -110,6 +124,7 @@ class Sockets:
         worker_bind: address for workers.
         most_connections: largest number of consumer connections at a time, and of worker connections.
         most_queued_bytes: largest number of bytes queued for one consumer.
+        most_in_flight_bytes: largest number of bytes in flight to all consumers that take nothing.
         keys: keys of the peers that may connect over ``tcp://``; None admits all peers.
         local_bind: address for workers of this host, which have no key; used if ``worker_bind`` requires keys.
 
@@ -125,6 +140,7 @@ class Sockets:
         *,
         most_connections: int = MOST_CONNECTIONS,
         most_queued_bytes: int = 1 << 40,
+        most_in_flight_bytes: int = MOST_IN_FLIGHT_BYTES,
         keys: KeyStore | None = None,
         local_bind: str = "",
     ) -> None:
@@ -132,7 +148,7 @@ class Sockets:
         self._routers = Routers(keys)
         try:
             self._consumers = self._routers.open(
-                "consumer", Limits(LARGEST_REQUEST_BYTES, most_connections, most_queued_bytes)
+                "consumer", Limits(LARGEST_REQUEST_BYTES, most_connections, most_queued_bytes, most_in_flight_bytes)
             )
             # Workers send large samples, so only the number of their connections is limited.
             is_private = worker_bind.startswith("ipc:")
@@ -154,12 +170,13 @@ class Sockets:
         began = time.monotonic()
         ready = self._routers.wait(seconds)
         self.waited_seconds += time.monotonic() - began
-        arrivals: list[Arrival] = []
+        arrivals: list[Arrival] = [InFlight(*each) for each in self._consumers.take_in_flight().items()]
         if self._workers in ready and (message := self._workers.receive()) is not None:
             arrivals.append(FromWorker(message.identity, message.frames, message.user))
         if self._consumers in ready and (message := self._consumers.receive()) is not None:
             arrivals.append(FromConsumer(message.identity, message.frames, message.user))
         arrivals += map(ConsumerGone, self._consumers.take_ended())
+        self._workers.take_in_flight()
         self._workers.take_ended()
         return arrivals
 
