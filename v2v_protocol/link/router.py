@@ -18,7 +18,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import zmq
@@ -121,24 +121,6 @@ class Received:
     user: str
 
 
-@dataclass(slots=True)
-class _InFlight:
-    """What is in flight to one peer.
-
-    Attributes:
-        since: when the last message went, or the first was sent.
-        messages: tracker and size of each, oldest first; the size includes untracked ones before it.
-    """
-
-    since: float
-    messages: deque[tuple[zmq.MessageTracker, int]] = field(default_factory=deque)
-
-    @property
-    def nbytes(self) -> int:
-        """Return the sum of the sizes."""
-        return sum(size for _, size in self.messages)
-
-
 class Router:
     """One listening socket. :meth:`Routers.open` creates it."""
 
@@ -150,7 +132,8 @@ class Router:
         self._users: dict[bytes, str] = {}
         self._review_at = self._count_at = 0.0
         self._most_in_flight_bytes = limits.in_flight_bytes
-        self._in_flight: dict[bytes, _InFlight] = {}
+        self._in_flight: dict[bytes, deque[tuple[zmq.MessageTracker, int]]] = {}  # oldest first, with their bytes
+        self._taken_at: dict[bytes, float] = {}  # when a peer last took one of them, or the first was sent
         self._untracked: dict[bytes, int] = {}  # bytes for each peer since its last tracked message
         self._changed: set[bytes] = set()
         router.setsockopt(zmq.LINGER, 0)
@@ -241,8 +224,8 @@ class Router:
             self.disconnect(identity)
             return False
         if counted >= _TRACKED_BYTES:
-            queue = self._in_flight.setdefault(identity, _InFlight(time.monotonic()))
-            queue.messages.append((last.tracker, counted))
+            self._taken_at.setdefault(identity, time.monotonic())
+            self._in_flight.setdefault(identity, deque()).append((last.tracker, counted))
             self._changed.add(identity)
         else:
             self._untracked[identity] = counted
@@ -257,20 +240,18 @@ class Router:
         if self._in_flight and (now := time.monotonic()) >= self._count_at:
             self._count_at = now + _COUNT_SECONDS * len(self._in_flight)
             for identity, queue in self._in_flight.items():
-                while queue.messages and queue.messages[0][0].done:
-                    queue.messages.popleft()
-                    queue.since = now
+                while queue and queue[0][0].done:
+                    queue.popleft()
+                    self._taken_at[identity] = now
                     self._changed.add(identity)
-            identity, queue = min(self._in_flight.items(), key=lambda each: each[1].since)
-            in_all = sum(queue.nbytes for queue in self._in_flight.values())
-            if in_all > self._most_in_flight_bytes and now - queue.since > _STUCK_SECONDS:
-                queue.since = now  # its memory is freed a moment later; until then the next one is looked at
-                self.disconnect(identity)
-        changed = {identity: self._in_flight[identity].nbytes for identity in self._changed}
+            stuck, taken_at = min(self._taken_at.items(), key=lambda each: each[1])
+            in_all = sum(size for queue in self._in_flight.values() for _, size in queue)
+            if in_all > self._most_in_flight_bytes and now - taken_at > _STUCK_SECONDS:
+                self.disconnect(stuck)
+        changed = {each: sum(size for _, size in self._in_flight[each]) for each in self._changed}
         self._changed.clear()
-        for identity, nbytes in changed.items():
-            if not nbytes:
-                del self._in_flight[identity]
+        for identity in [identity for identity, nbytes in changed.items() if not nbytes]:
+            del self._in_flight[identity], self._taken_at[identity]
         return changed
 
     def disconnect(self, identity: bytes) -> None:

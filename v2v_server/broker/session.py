@@ -32,8 +32,6 @@ from v2v_server.schedule.epoch import Schedule
 
 MOST_IN_FLIGHT_BYTES = 512 << 20
 """Bytes in flight to all consumers together above which one that takes nothing is disconnected."""
-_LAG_BYTES = 1 << 16
-"""A consumer may have read this much, or one sample, although it still counts: it has requested more already."""
 GONE_SECONDS = 10.0
 """Time that a consumer has to return to its session after its connection ended."""
 SILENT_SECONDS = 60.0
@@ -290,12 +288,15 @@ class Sessions:
         return session if nbytes < before else None
 
     def room(self, session: Session) -> int:
-        """Return how many more requests of a session may be served now, which may be negative."""
+        """Return how many more requests of a session may be served now, which may be negative.
+
+        One sample, or 64 KiB of small ones, may have been read although it still counts.
+        """
         sample, unread = sum(session.form.sizes), self._in_flight.get(session.identity, 0)
         if unread and unread >= max(sample, MOST_IN_FLIGHT_BYTES // len(self._in_flight)):
             return 0
         at_work = len(session.unanswered) - len(session.waiting) + self._leases.abandoned(session.identity)
-        return session.credit - at_work - max(0, unread - max(sample, _LAG_BYTES)) // sample
+        return session.credit - at_work - max(0, unread - max(sample, 1 << 16)) // sample
 
     def _requeue(self, session: Session) -> None:
         """Queue a session if it has waiting requests and room for them; else dequeue it."""

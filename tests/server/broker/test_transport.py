@@ -171,7 +171,7 @@ def test_those_that_take_nothing_are_disconnected_if_there_is_too_much_in_all(mo
                 reads.recv_multipart()
                 gone.update(each.identity for each in sockets.receive(0.01) if isinstance(each, ConsumerGone))
                 queues = sockets._consumers._in_flight.values()
-                return bool(gone) and sum(queue.nbytes for queue in queues) <= 100 * MIB
+                return bool(gone) and sum(size for queue in queues for _, size in queue) <= 100 * MIB
 
             until(is_bounded)
             assert b"reads" not in gone
