@@ -121,7 +121,7 @@ def test_a_long_key_costs_no_more_than_a_short_one(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr("v2v_protocol.settings.difflib", SimpleNamespace(get_close_matches=compare))
     for key in ("size" * 15_000, ["size"] * 15_000):
-        with pytest.raises(UsageError, match="^unknown toy key"):
+        with pytest.raises(UsageError, match=r"^unknown toy key"):
             require_known([key], settings_of(Toy), "toy key")
     assert [len(key) <= 200 for key in compared] == [True, True]
 

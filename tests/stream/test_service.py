@@ -136,7 +136,7 @@ BAD_SURROUNDINGS = [
     (["--videos", "{empty}"], "no video found"),
     (["--videos", "{clips}", "--set", "crop_width_px=128"], "no video gives a sequence"),
     (["--videos", "{clips}", "--bind", "tcp://127.0.0.1:{taken}"], "Address already in use"),
-    (["--videos", "{clips}", "--workers", "0", "--port-file", "{clips}/no/such/folder/port"], "--port-file"),
+    (["--videos", "{clips}", "--bind", "tcp://127.0.0.1:*", "--port-file", "{clips}/no/such/port"], "--port-file"),
 ]
 
 

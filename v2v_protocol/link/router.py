@@ -5,7 +5,7 @@ Memory: ZeroMQ keeps at most MOST_UNREAD whole messages from a peer, and at most
 
 Bytes for a peer are *in flight* from :meth:`Router.send` until ZeroMQ has freed the message: the system has taken them,
 or the connection has ended. pyzmq's tracker of a message tells. Below ``_TRACKED_BYTES`` it is not worth its time, so
-small messages count together with the next one that completes this size. If too much is in flight to all peers
+small messages count together with the next one that completes this size. Above MOST_IN_FLIGHT_BYTES to all peers
 together, those that have taken nothing for ``_STUCK_SECONDS`` are disconnected. Who sends large messages holds them
 back, by the counts of :meth:`Router.take_in_flight`.
 """
@@ -26,6 +26,7 @@ import zmq
 from v2v_protocol.errors import UsageError
 from v2v_protocol.link.curve import Gate, KeyStore
 from v2v_protocol.link.guard import ConnectionGuard
+from v2v_protocol.wire import MOST_IN_FLIGHT_BYTES
 
 MOST_QUEUED = 512
 """Messages queued for one peer at which it is disconnected."""
@@ -54,13 +55,11 @@ class Limits:
         frame_bytes: largest frame of a message.
         connections: largest number at a time; None if only our own user can connect, who needs no guard.
         queued_bytes: largest number of bytes queued for one peer; None limits no bytes in either direction.
-        in_flight_bytes: bytes in flight to all peers together above which those that take nothing are disconnected.
     """
 
     frame_bytes: int
     connections: int | None
     queued_bytes: int | None = None
-    in_flight_bytes: int = 1 << 62
 
 
 class Routers:
@@ -131,7 +130,6 @@ class Router:
         self._side, self._gate = side, gate
         self._users: dict[bytes, str] = {}
         self._review_at = self._count_at = 0.0
-        self._most_in_flight_bytes = limits.in_flight_bytes
         self._in_flight: dict[bytes, deque[tuple[zmq.MessageTracker, int]]] = {}  # oldest first, with their bytes
         self._taken_at: dict[bytes, float] = {}  # when a peer last took one of them, or the first was sent
         self._untracked: dict[bytes, int] = {}  # bytes for each peer since its last tracked message
@@ -246,7 +244,7 @@ class Router:
                     self._changed.add(identity)
             stuck, taken_at = min(self._taken_at.items(), key=lambda each: each[1])
             in_all = sum(size for queue in self._in_flight.values() for _, size in queue)
-            if in_all > self._most_in_flight_bytes and now - taken_at > _STUCK_SECONDS:
+            if in_all > MOST_IN_FLIGHT_BYTES and now - taken_at > _STUCK_SECONDS:
                 self.disconnect(stuck)
         changed = {each: sum(size for _, size in self._in_flight[each]) for each in self._changed}
         self._changed.clear()

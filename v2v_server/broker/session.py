@@ -25,13 +25,12 @@ from v2v_protocol.errors import LimitExceeded
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.sample import Form, array_layout
 from v2v_protocol.spec import StreamSpec
+from v2v_protocol.wire import MOST_IN_FLIGHT_BYTES
 from v2v_server.broker.blame import runs_alone
 from v2v_server.broker.fair_queue import FairQueue
 from v2v_server.broker.leases import LeaseBook, Request
 from v2v_server.schedule.epoch import Schedule
 
-MOST_IN_FLIGHT_BYTES = 512 << 20
-"""Bytes in flight to all consumers together above which one that takes nothing is disconnected."""
 GONE_SECONDS = 10.0
 """Time that a consumer has to return to its session after its connection ended."""
 SILENT_SECONDS = 60.0

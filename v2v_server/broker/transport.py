@@ -23,7 +23,6 @@ from v2v_protocol.link.guard import MOST_CONNECTIONS
 from v2v_protocol.link.router import Limits, Routers
 from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_REQUEST_BYTES
 from v2v_server.broker.actions import ToConsumer, ToWorker
-from v2v_server.broker.session import MOST_IN_FLIGHT_BYTES
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +123,6 @@ class Sockets:
         worker_bind: address for workers.
         most_connections: largest number of consumer connections at a time, and of worker connections.
         most_queued_bytes: largest number of bytes queued for one consumer.
-        most_in_flight_bytes: largest number of bytes in flight to all consumers that take nothing.
         keys: keys of the peers that may connect over ``tcp://``; None admits all peers.
         local_bind: address for workers of this host, which have no key; used if ``worker_bind`` requires keys.
 
@@ -140,7 +138,6 @@ class Sockets:
         *,
         most_connections: int = MOST_CONNECTIONS,
         most_queued_bytes: int = 1 << 40,
-        most_in_flight_bytes: int = MOST_IN_FLIGHT_BYTES,
         keys: KeyStore | None = None,
         local_bind: str = "",
     ) -> None:
@@ -148,7 +145,7 @@ class Sockets:
         self._routers = Routers(keys)
         try:
             self._consumers = self._routers.open(
-                "consumer", Limits(LARGEST_REQUEST_BYTES, most_connections, most_queued_bytes, most_in_flight_bytes)
+                "consumer", Limits(LARGEST_REQUEST_BYTES, most_connections, most_queued_bytes)
             )
             # Workers send large samples, so only the number of their connections is limited.
             is_private = worker_bind.startswith("ipc:")

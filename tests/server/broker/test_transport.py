@@ -158,7 +158,8 @@ def test_a_consumer_that_never_reads_is_disconnected_at_the_limit_of_messages(so
 
 def test_those_that_take_nothing_are_disconnected_if_there_is_too_much_in_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(router, "_STUCK_SECONDS", 0.5)
-    sockets = Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*", most_in_flight_bytes=100 * MIB)
+    monkeypatch.setattr(router, "MOST_IN_FLIGHT_BYTES", 100 * MIB)
+    sockets = Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
     sample, gone = bytes(4 * MIB), set[bytes]()
     try:
         with consumers(sockets, b"reads", *(b"deaf %d" % number for number in range(8))) as (reads, *_):
