@@ -6,8 +6,8 @@ Memory: ZeroMQ keeps at most MOST_UNREAD whole messages from a peer, and at most
 Bytes for a peer are *in flight* from :meth:`Router.send` until ZeroMQ has freed the message: the system has taken them,
 or the connection has ended. pyzmq's tracker of a message tells. Below ``_TRACKED_BYTES`` it is not worth its time, so
 small messages count together with the next one that completes this size. Above MOST_IN_FLIGHT_BYTES to all peers
-together, those that have taken nothing for ``_STUCK_SECONDS`` are disconnected. Who sends large messages holds them
-back, by the counts of :meth:`Router.take_in_flight`.
+together, those that have taken nothing for ``_STUCK_SECONDS`` are disconnected. The sender of large messages holds
+further ones back, by the counts of :meth:`Router.take_in_flight`.
 """
 
 from __future__ import annotations

@@ -8,8 +8,8 @@ this: the new session takes over the debt of the old one, and its abandoned requ
 workers have finished them.
 
 Memory: a request is served while the samples that workers make for its session, and those that were sent and that its
-consumer has not read, are fewer than its credit, and while its unread bytes are below one sample or an
-equal share of MOST_IN_FLIGHT_BYTES. So a consumer that never reads holds at most its credit, all of them together hold
+consumer has not read, are fewer than its credit, and while its unread bytes are below an equal share of
+MOST_IN_FLIGHT_BYTES, or one sample. So a consumer that never reads holds at most its credit, all of them together hold
 about that number of bytes, and none of them holds up the others.
 """
 
