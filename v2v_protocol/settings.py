@@ -246,8 +246,10 @@ def require_whole(name: str, value: object, low: int, high: int) -> int:
 
 
 def nearest(key: object, known: Iterable[str]) -> str:
-    """Return a hint, " (did you mean 'bins'?)", or "" if no known key is similar."""
-    close = difflib.get_close_matches(str(key), list(known), n=1)
+    """Return a hint, " (did you mean 'bins'?)", or "" if no known key is similar. A longer key is compared in part: the
+    time grows with its length, and a peer may send one of 60 kB.
+    """
+    close = difflib.get_close_matches(str(key)[:_LONGEST_SHOWN], list(known), n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 

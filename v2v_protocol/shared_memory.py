@@ -80,11 +80,14 @@ def read_arrays(descriptor: int, sizes: Sequence[int]) -> list[memoryview]:
     """Map memory with the arrays of one sample read-only, all pages at once.
 
     Args:
-        descriptor: of the memory; it may be closed afterwards.
+        descriptor: of the memory; it may be closed afterwards. The mapping keeps a duplicate open.
         sizes: bytes of each array.
 
     Returns:
-        the bytes of each array. The memory is unmapped when nothing refers to them any more.
+        the bytes of each array, all parts of one ``mmap``, which is unmapped when nothing refers to them any more.
+
+    Raises:
+        OSError: the system has no descriptor or no memory left.
     """
     *offsets, total = array_offsets(sizes, 1)
     whole = memoryview(mmap.mmap(descriptor, total, mmap.MAP_PRIVATE | mmap.MAP_POPULATE, mmap.PROT_READ))

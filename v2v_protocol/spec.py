@@ -43,6 +43,8 @@ DEFECTS = ("bars", "black", "combed", "cuts", "duplicates", "fades", "white")
 MOST_SAMPLES_PER_DECODE = 32
 MOST_SUBSTEPS = 16
 """Largest number of sub-steps of a step between video frames."""
+MARGIN_PX = 16
+"""Margin around the crop that sub-steps are made from."""
 LATER_FIELDS = ("substep_px", "keep_defects", "still_share", "moving_share", "quiet_share", "tolerance")
 """Fields that the plain form leaves out at their defaults, so that older digests hold."""
 _OF_SCENES = {"quiet_share": 1.0, "moving_share": 0.0}

@@ -50,6 +50,8 @@ LARGEST_REQUEST_BYTES = 1 << 16
 MOST_CONTAINERS = 4096
 """Lists and maps in a header. They cost a hundred times their bytes; a Lease, the largest in use, has some dozens."""
 LARGEST_ARRAY_BYTES = 1 << 31
+MOST_IN_FLIGHT_BYTES = 512 << 20
+"""Bytes on their way to all peers of a socket above which one that takes nothing is disconnected."""
 LARGEST_TUPLE = 65_536
 ARRAY_DTYPES = ("int8", "uint8", "int16", "uint16", "float16", "float32")
 _DTYPE_NAMES = {np.dtype(name): name for name in ARRAY_DTYPES}

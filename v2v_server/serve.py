@@ -34,7 +34,7 @@ from v2v_server.broker.actions import (
 from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Request
-from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, ServerTransport, Sockets
+from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, InFlight, ServerTransport, Sockets
 from v2v_server.broker.worker_registry import clean_name
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
@@ -254,6 +254,8 @@ class Server:
                     self._carry_out(self._dispatcher.from_worker(identity, frames, now, user))
                 case FromConsumer(identity, frames, user):
                     self._carry_out(self._dispatcher.from_consumer(identity, frames, now, user))
+                case InFlight(identity, nbytes):
+                    self._carry_out(self._dispatcher.in_flight(identity, nbytes, now))
                 case ConsumerGone(identity):
                     self._dispatcher.consumer_gone(identity, now)
                     self._give_back_at = min(self._give_back_at, now + _GIVE_BACK_SECONDS)

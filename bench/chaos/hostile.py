@@ -4,6 +4,7 @@
 
     headers    the largest and most expensive header that is allowed, as fast as possible
     hello      sends Hello ten times a second, requests as much as allowed, and never reads
+    deaf       sends Hello once, requests the same samples again and again, and never reads
     leave      sends Hello under a new name and disconnects, repeatedly: its sessions stay
     look       requests the state of the service without a pause, and never reads
     idle       opens connections, half of them in the middle of the handshake, and sends nothing
@@ -70,6 +71,15 @@ def hello(address: str, number: int) -> None:
             peer.send(encode(Hello(SPEC, ("voxels", "frames"), 2000, number)))
             peer.send(encode(Want(epoch, tuple(range(256)))))
             time.sleep(0.1)
+
+
+def deaf(address: str, number: int) -> None:
+    """See the module."""
+    with _dealer(address, number) as peer:
+        peer.send(encode(Hello(SPEC, ("voxels", "frames"), 32, 0)))
+        while True:
+            peer.send(encode(Want(0, tuple(range(32)))))
+            time.sleep(0.001)
 
 
 def leave(address: str, number: int) -> None:
@@ -162,7 +172,7 @@ def handshakes(address: str, number: int) -> None:
 
 
 KINDS: dict[str, Callable[[str, int], None]] = {
-    each.__name__: each for each in (headers, hello, leave, look, idle, flood, trickle)
+    each.__name__: each for each in (headers, hello, deaf, leave, look, idle, flood, trickle)
 }
 REFUSED, HANDSHAKES = "refused", "handshakes"
 KEYED_KINDS = (REFUSED, HANDSHAKES)

@@ -185,6 +185,20 @@ def test_a_poison_video_is_quarantined_and_stays_so(monkeypatch: pytest.MonkeyPa
     assert {item.quarantine for batch in again for item in batch.provenance} == {len(verdicts)}
 
 
+def test_memory_that_runs_out_is_no_verdict_on_a_video_for_other_specs(
+    monkeypatch: pytest.MonkeyPatch, clips: Path, cache: Path
+) -> None:
+    """One spec may ask for more than a worker has. Another spec of the same video is not to blame."""
+    fault = {"stage": "decode", "action": "memory", "video": "deep/er/f.mp4"}
+    with _faulty(monkeypatch, clips, "--cache-dir", str(cache), **fault) as server:
+        batches = epoch_of(server.address)
+    assert fault["video"] not in {item.video for batch in batches for item in batch.provenance}
+    verdicts = [json.loads(text) for text in next(cache.glob("quarantine-*.jsonl")).read_text().splitlines()]
+    assert {(line["path"], line["spec"]) for line in verdicts} == {
+        (fault["video"], item.id.spec_digest) for item in batches[0].provenance
+    }
+
+
 def test_killing_workers_from_outside_never_refuses_a_video(clips: Path, reference: list[str]) -> None:
     got = []
     with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:

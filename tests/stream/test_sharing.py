@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import resource
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing
 from pathlib import Path
 
+import psutil
 import pytest
 
+from tests.clips import panned_luma, write_clip
 from tests.stream.conftest import SMALL, SMALL_FLAGS
 from tests.stream.test_loaders import singles
+from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
+from v2v_protocol.link.dealer import Dealer
+from v2v_protocol.messages import Hello, Want
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.wire import encode
 from v2v_server.status.client import StatusClient
 
 Samples = list[tuple[int, str]]
@@ -59,3 +69,37 @@ def test_four_consumers_get_the_bytes_of_unshared_samples(server: LocalServer, c
         assert totals["decodes"] == len(alone)
     else:
         assert totals["shared"] > 0
+
+
+LARGE = Recipe(voxels_per_clip=4, bins=5, crop_height_px=160, crop_width_px=208)
+LARGE_BYTES = 4 * 160 * 208 * (5 + 1)
+DEAF = 40
+FILES = 200
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="prlimit(2)")
+def test_consumers_that_never_read_cost_their_credit_and_nothing_else(tmp_path: Path) -> None:
+    """They request the same samples thousands of times, and each message that waits once took a descriptor."""
+    write_clip(tmp_path / "a.mp4", panned_luma(201, 160, 208, step=(1, 2)), gop=50)
+    with LocalServer(tmp_path, workers=1, flags=[*SMALL_FLAGS, "--share-gib", "0.05"]) as server, ExitStack() as stack:
+        alone = [list(singles(batch)) for batch in V2VStreamDataset(server.address, batch_size=4, recipe=LARGE)]
+        broker = psutil.Process(server.pid)
+        before = broker.memory_info().rss
+        files = broker.num_fds()
+        resource.prlimit(server.pid, resource.RLIMIT_NOFILE, (FILES, FILES))
+        first = stack.enter_context(closing(Dealer(server.address)))
+        deaf = [
+            stack.enter_context(closing(Dealer(server.address, options={"RCVHWM": 1, "SNDHWM": 2000}, beside=first)))
+            for _ in range(DEAF)
+        ]
+        for each in deaf:
+            each.connect()
+            each.send(encode(Hello({"recipe": LARGE.to_dict()}, ("voxels", "frames"), 4, 0)))
+        for _ in range(500):
+            for each in deaf:
+                each.send(encode(Want(0, tuple(range(8)))))
+        with StatusClient(server.address) as client:
+            until(lambda: client.get_status()["totals"]["shared"] >= DEAF)
+        assert [list(singles(batch)) for batch in V2VStreamDataset(server.address, batch_size=4, recipe=LARGE)] == alone
+        assert broker.num_fds() < files + DEAF + 60
+        assert broker.memory_info().rss - before < DEAF * 10 * LARGE_BYTES

@@ -2,6 +2,12 @@
 
 Memory: ZeroMQ keeps at most MOST_UNREAD whole messages from a peer, and at most MOST_QUEUED messages for one.
 :mod:`v2v_protocol.link.guard` limits connections.
+
+Bytes for a peer are *in flight* from :meth:`Router.send` until ZeroMQ has freed the message: the system has taken them,
+or the connection has ended. pyzmq's tracker of a message tells. Below ``_TRACKED_BYTES`` it is not worth its time, so
+small messages count together with the next one that completes this size. Above MOST_IN_FLIGHT_BYTES to all peers
+together, those that have taken nothing for ``_STUCK_SECONDS`` are disconnected. The sender of large messages holds
+further ones back, by the counts of :meth:`Router.take_in_flight`.
 """
 
 from __future__ import annotations
@@ -10,7 +16,8 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -19,6 +26,7 @@ import zmq
 from v2v_protocol.errors import UsageError
 from v2v_protocol.link.curve import Gate, KeyStore
 from v2v_protocol.link.guard import ConnectionGuard
+from v2v_protocol.wire import MOST_IN_FLIGHT_BYTES
 
 MOST_QUEUED = 512
 """Messages queued for one peer at which it is disconnected."""
@@ -30,6 +38,10 @@ HANDSHAKE_MS = 3000
 """Time limit of a handshake, after which ZeroMQ disconnects the peer."""
 _KEEPALIVE_SECONDS = 300
 _REVIEW_SECONDS = 0.5
+_TRACKED_BYTES = 1 << 16
+_STUCK_SECONDS = 10.0
+_COUNT_SECONDS = 1e-4
+"""Time between two counts of the bytes in flight, for each peer that has any: a count takes a hundredth of it."""
 _ZERO_COPY_RECEIVE = 10  # an option of contexts that pyzmq has no name for
 # Plain numbers: combining two flags of an enumeration takes longer than sending a small frame.
 _NOBLOCK, _NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
@@ -119,7 +131,11 @@ class Router:
         self.socket = router = context.socket(zmq.ROUTER)
         self._side, self._gate = side, gate
         self._users: dict[bytes, str] = {}
-        self._review_at = 0.0
+        self._review_at = self._count_at = 0.0
+        self._in_flight: dict[bytes, deque[tuple[zmq.MessageTracker, int]]] = {}  # oldest first, with their bytes
+        self._taken_at: dict[bytes, float] = {}  # when a peer last took one of them, or the first was sent
+        self._untracked: dict[bytes, int] = {}  # bytes for each peer since its last tracked message
+        self._changed: set[bytes] = set()
         router.setsockopt(zmq.LINGER, 0)
         router.setsockopt(zmq.SNDHWM, MOST_QUEUED)
         router.setsockopt(zmq.RCVHWM, MOST_UNREAD)
@@ -190,19 +206,49 @@ class Router:
         return kind(sender, frames, user)
 
     def send(self, identity: bytes, frames: Sequence[Any]) -> bool:
-        """Queue a message; return False if the peer is not connected any more or does not read."""
+        """Queue a message. If the peer is not connected any more, does not read, or cannot be sent to for another
+        reason, disconnect it and return False.
+        """
+        size, last = sum(map(len, frames)), frames[-1]
+        counted = self._untracked.pop(identity, 0) + size
+        if counted >= _TRACKED_BYTES:
+            last = zmq.Frame(last, track=True, copy_threshold=0)
         try:
             self.socket.send(identity, _NOBLOCK_MORE)
             for frame in frames[:-1]:
                 self.socket.send(frame, _NOBLOCK_MORE, copy=False)
-            self.socket.send(frames[-1], _NOBLOCK, copy=False)
-        except zmq.Again:
+            self.socket.send(last, _NOBLOCK, copy=False)
+        except zmq.ZMQError:
+            self.disconnect(identity)
             return False
-        except zmq.ZMQError as error:
-            if error.errno == zmq.EHOSTUNREACH:
-                return False
-            raise
+        if counted >= _TRACKED_BYTES:
+            self._taken_at.setdefault(identity, time.monotonic())
+            self._in_flight.setdefault(identity, deque()).append((last.tracker, counted))
+            self._changed.add(identity)
+        else:
+            self._untracked[identity] = counted
         return True
+
+    def take_in_flight(self) -> dict[bytes, int]:
+        """Return the bytes in flight to each peer for which they have changed since the last call. If there are too
+        many in all, disconnect the peer that has taken nothing for the longest time. Call it in each turn of the loop.
+        """
+        if self._in_flight and (now := time.monotonic()) >= self._count_at:
+            self._count_at = now + _COUNT_SECONDS * len(self._in_flight)
+            for identity, queue in self._in_flight.items():
+                while queue and queue[0][0].done:
+                    queue.popleft()
+                    self._taken_at[identity] = now
+                    self._changed.add(identity)
+            stuck, taken_at = min(self._taken_at.items(), key=lambda each: each[1])
+            in_all = sum(size for queue in self._in_flight.values() for _, size in queue)
+            if in_all > MOST_IN_FLIGHT_BYTES and now - taken_at > _STUCK_SECONDS:
+                self.disconnect(stuck)
+        changed = {each: sum(size for _, size in self._in_flight[each]) for each in self._changed}
+        self._changed.clear()
+        for identity in [identity for identity, nbytes in changed.items() if not nbytes]:
+            del self._in_flight[identity], self._taken_at[identity]
+        return changed
 
     def disconnect(self, identity: bytes) -> None:
         """End the connection of a peer."""
@@ -214,17 +260,15 @@ class Router:
         Disconnect peers whose key was revoked.
         """
         ended = [] if self.guard is None else self.guard.take_ended()
-        self._review(ended)
-        return ended
-
-    def _review(self, ended: Iterable[bytes]) -> None:
         for identity in ended:
             self._users.pop(identity, None)
+            self._untracked.pop(identity, None)
         if (now := time.monotonic()) >= self._review_at:
             self._review_at = now + _REVIEW_SECONDS
             for identity, user in self._users.items():
                 if not self._gate.admits(self._side, user):
                     self.disconnect(identity)
+        return ended
 
 
 def _about(frame: Any, name: str | int) -> str | int | None:

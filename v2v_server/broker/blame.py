@@ -3,7 +3,7 @@
     crashed, hung                the sample is the cause: its candidate is refused at once and quarantined
     unexplained                  an exception, no memory, a lost connection, storage that does not answer: the sample is
                                  tried again; after two such losses it runs alone on its worker, and a third one
-                                 counts like a crash
+                                 counts like a crash, for its spec only: memory may be what this spec takes
     killed                       from outside (pre-emption, an operator): says nothing about any sample
 
 Only the lease that the worker had begun is judged. The leases queued behind it go back unchanged.
@@ -38,8 +38,8 @@ class Loss:
         text: what happened, in words: "was ended by SIGSEGV".
         lease: the lease in work by the worker's own record, 0 for no lease; None without a record. Then the last lease
             that the worker announced counts.
-        for_all: whether the video is refused under every spec: only if it was being decoded, or nothing is known.
-            Otherwise the cause may be what its spec asks for.
+        for_all: whether the video is refused under every spec: only if it was being decoded, or nothing is known, and
+            the loss is not unexplained. Otherwise the cause may be what its spec asks for.
     """
 
     cause: Cause

@@ -59,7 +59,7 @@ from v2v_server.sharing.ring import SampleRing
 
 MOST_SESSIONS = 4096
 MOST_FAULTS = 16
-"""Malformed messages after which a consumer is disconnected: answering one costs as much as a sample."""
+"""Malformed messages and refused specs after which a consumer is disconnected: an answer costs as much as a sample."""
 
 
 class Dispatcher:
@@ -113,7 +113,7 @@ class Dispatcher:
         self._worker_side = WorkerSide(
             facts, self.sessions, self.leases, self.registry, self.candidates, self._grants, self.counters
         )
-        self._faults: dict[bytes, int] = {}  # malformed messages of connected consumers
+        self._faults: dict[bytes, int] = {}  # malformed messages and refused specs of connected consumers
 
     @property
     def blocked_reason(self) -> str:
@@ -180,7 +180,7 @@ class Dispatcher:
         try:
             message = _only(frames)
         except ProtocolError as error:
-            return [self._fault(identity, error)]
+            return [self._fault(identity, self._malformed(error))]
         session = self.sessions.get(identity)
         if session is not None and session.user != user:
             session = None  # a session belongs to one key
@@ -207,13 +207,18 @@ class Dispatcher:
                     return [_deny(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
                 self.counters.waited_seconds += session.add_wait(message.waited_seconds, now)
                 denials = self._want(session, message)
-                return denials or [*self._grants.answer_shared(session, message), *self._grants.assign(now)]
+                return denials or [*self._grants.answer_shared(session), *self._grants.assign(now)]
             case WorkerHello():
                 stray = ProtocolError("this is the consumers' port: connect to the address of --worker-bind")
-                return [self._fault(identity, stray)]
+                return [self._fault(identity, self._malformed(stray))]
             case _:
                 stray = ProtocolError(f"consumers cannot send {type(message).__name__}")
-                return [self._fault(identity, stray)]
+                return [self._fault(identity, self._malformed(stray))]
+
+    def in_flight(self, identity: bytes, nbytes: int, now: float) -> list[Action]:
+        """Note how many bytes are on their way to a consumer, and serve the requests that waited for it to read."""
+        session = self.sessions.set_in_flight(identity, nbytes)
+        return [] if session is None else [*self._grants.answer_shared(session), *self._grants.assign(now)]
 
     def consumer_gone(self, identity: bytes, now: float) -> None:
         """Note that a consumer's connection has ended. The consumer may reconnect at once and find its session."""
@@ -246,7 +251,7 @@ class Dispatcher:
             session, welcome = self._admission.admit(identity, hello, workers, now)
             session.user, session.owner = user, owner
         except (UsageError, CorpusError) as error:
-            return _deny(identity, ErrorCode.SPEC, str(error))
+            return self._fault(identity, denial(ErrorCode.SPEC, str(error)))
         for before in {identity, *self.sessions.owned_by(owner)}:
             self._grants.forget_session(before)
         self.sessions.open(session)
@@ -256,7 +261,7 @@ class Dispatcher:
         try:
             slots = _slots(want)
         except ProtocolError as error:
-            return [self._fault(session.identity, error)]
+            return [self._fault(session.identity, self._malformed(error))]
         try:
             for index in want.indices[:1]:
                 SampleId(session.spec.digest, self._facts.digest, NUMERICS_VERSION, session.seed, want.epoch, index)
@@ -267,13 +272,12 @@ class Dispatcher:
             return [_deny(session.identity, ErrorCode.RANGE, str(error))]
         return []
 
-    def _fault(self, identity: bytes, error: ProtocolError) -> Action:
-        """Answer a malformed message from a consumer."""
+    def _fault(self, identity: bytes, answer: Frames) -> Action:
+        """Answer a malformed message or a refused spec of a consumer; disconnect it after too many."""
         faults = self._faults[identity] = self._faults.pop(identity, 0) + 1
         if len(self._faults) > MOST_SESSIONS:
             del self._faults[next(iter(self._faults))]
-        answer = ToConsumer(identity, self._malformed(error))
-        return answer if faults <= MOST_FAULTS else Disconnect(identity)
+        return ToConsumer(identity, answer) if faults <= MOST_FAULTS else Disconnect(identity)
 
     def _malformed(self, error: ProtocolError) -> Frames:
         self.counters.malformed += 1

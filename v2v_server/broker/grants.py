@@ -18,7 +18,7 @@ from typing import Any
 
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.errors import ProtocolError
-from v2v_protocol.messages import Lease, SampleHeader, Want
+from v2v_protocol.messages import Lease, SampleHeader
 from v2v_protocol.refusal import RefusalKind
 from v2v_protocol.sample import Form
 from v2v_protocol.spec import StreamSpec
@@ -171,18 +171,19 @@ class Grants:
         """
         return request if self._ring is None else replace(request, slot=self._ring.lent(lease))
 
-    def answer_shared(self, session: Session, want: Want) -> list[Action]:
-        """Answer the new requests whose samples are in the ring, and let those that are being made follow."""
+    def answer_shared(self, session: Session) -> list[Action]:
+        """Answer waiting requests whose samples are in the ring, and let those that are being made follow."""
         if self._ring is None:
             return []
         actions: list[Action] = []
-        indices, taken = set(want.indices), set()
+        taken, room = set[Request](), self._sessions.room(session)
         for request in list(session.waiting):
-            if request.epoch == want.epoch and request.index in indices:
-                answer = self._share(session, self._candidates.current(request, session))
-                if answer is not None:
-                    actions += answer
-                    taken.add(request)
+            if (
+                len(taken) < room
+                and (answer := self._share(session, self._candidates.current(request, session))) is not None
+            ):
+                actions += answer
+                taken.add(request)
         self._sessions.take_waiting(session, taken)
         return actions
 

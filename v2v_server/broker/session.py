@@ -7,7 +7,10 @@ Worker time is shared by deficit round robin (:mod:`v2v_server.broker.fair_queue
 this: the new session takes over the debt of the old one, and its abandoned requests count against its credit until the
 workers have finished them.
 
-Memory: the server queues at most credit x sample bytes for a session, whatever the consumer does.
+Memory: a request is served while the samples that workers make for its session, and those that were sent and that its
+consumer has not read, are fewer than its credit, and while its unread bytes are below an equal share of
+MOST_IN_FLIGHT_BYTES, or one sample. So a consumer that never reads holds at most its credit, all of them together hold
+about that number of bytes, and none of them holds up the others.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from v2v_protocol.errors import LimitExceeded
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.sample import Form, array_layout
 from v2v_protocol.spec import StreamSpec
+from v2v_protocol.wire import MOST_IN_FLIGHT_BYTES
 from v2v_server.broker.blame import runs_alone
 from v2v_server.broker.fair_queue import FairQueue
 from v2v_server.broker.leases import LeaseBook, Request
@@ -163,6 +167,7 @@ class Sessions:
     def __init__(self, leases: LeaseBook) -> None:
         self._leases = leases
         self._sessions: dict[bytes, Session] = {}
+        self._in_flight: dict[bytes, int] = {}
         self._departed: deque[tuple[tuple[object, ...], ConsumerTotals]] = deque(maxlen=_MOST_DEPARTED)
         self._numbers = count()
         self._queue = FairQueue()
@@ -272,10 +277,29 @@ class Sessions:
         self._requeue(session)
         return request
 
-    def _requeue(self, session: Session) -> None:
-        """Queue a session if it has waiting requests, and credit beyond its abandoned ones; else dequeue it."""
+    def set_in_flight(self, identity: bytes, nbytes: int) -> Session | None:
+        """Note how many bytes are in flight to a peer; return its session if there were more before."""
+        before = self._in_flight.pop(identity, 0)
+        if nbytes:
+            self._in_flight[identity] = nbytes
+        if (session := self._sessions.get(identity)) is not None:
+            self._requeue(session)
+        return session if nbytes < before else None
+
+    def room(self, session: Session) -> int:
+        """Return how many more requests of a session may be served now, which may be negative.
+
+        One sample, or 64 KiB of small ones, may have been read although it still counts.
+        """
+        sample, unread = sum(session.form.sizes), self._in_flight.get(session.identity, 0)
+        if unread and unread >= max(sample, MOST_IN_FLIGHT_BYTES // len(self._in_flight)):
+            return 0
         at_work = len(session.unanswered) - len(session.waiting) + self._leases.abandoned(session.identity)
-        self._queue.set_waiting(session.identity, waits=bool(session.waiting) and at_work < session.credit)
+        return session.credit - at_work - max(0, unread - max(sample, 1 << 16)) // sample
+
+    def _requeue(self, session: Session) -> None:
+        """Queue a session if it has waiting requests and room for them; else dequeue it."""
+        self._queue.set_waiting(session.identity, waits=bool(session.waiting) and self.room(session) > 0)
 
     def take_siblings(self, request: Request) -> list[Request]:
         """Take the waiting requests that are made from the same clip as ``request``."""

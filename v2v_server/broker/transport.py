@@ -5,9 +5,10 @@ The loop (:mod:`v2v_server.serve`) uses only the :class:`ServerTransport` protoc
 
 Samples pass through in the frames that arrived; only the small header before them is read.
 
-Memory: a consumer asks for more only after it has taken what it was sent. So the broker holds at most the sum over all
-sessions of credit x sample bytes (in ZeroMQ's send queue of a slow consumer) + workers x 2 x sample bytes. A peer that
-asks and never reads is disconnected at ``router.MOST_QUEUED`` messages, which is above any credit.
+Memory: what a consumer has not read counts against its credit and its share of MOST_IN_FLIGHT_BYTES
+(:mod:`v2v_server.broker.session`). A peer that asks and never reads is disconnected at ``router.MOST_QUEUED`` messages,
+which is above any credit, or after some time if there are too many bytes in all (:mod:`v2v_protocol.link.router`).
+Workers add at most 2 samples each.
 """
 
 from __future__ import annotations
@@ -44,7 +45,20 @@ class ConsumerGone:
     identity: bytes
 
 
-Arrival: TypeAlias = FromConsumer | FromWorker | ConsumerGone
+@dataclass(frozen=True, slots=True)
+class InFlight:
+    """How much of what was sent to a consumer has not left this process yet, after a change.
+
+    Attributes:
+        identity: routing id of its connection.
+        nbytes: bytes, without small messages.
+    """
+
+    identity: bytes
+    nbytes: int
+
+
+Arrival: TypeAlias = FromConsumer | FromWorker | ConsumerGone | InFlight
 
 
 class ServerTransport(Protocol):
@@ -63,8 +77,8 @@ class ServerTransport(Protocol):
         """Total time that :meth:`receive` has waited without a message, seconds."""
 
     def receive(self, seconds: float) -> list[Arrival]:
-        """Return at most one message of each side, the workers' first, so that neither side can starve the other. Ended
-        connections follow last.
+        """Return at most one message of each side, the workers' first, so that neither side can starve the other.
+        Changes of what is in flight come first, ended connections last.
 
         Args:
             seconds: longest wait for any of them.
@@ -133,12 +147,13 @@ class Sockets:
         began = time.monotonic()
         ready = self._routers.wait(seconds)
         self.waited_seconds += time.monotonic() - began
-        arrivals: list[Arrival] = []
+        arrivals: list[Arrival] = [InFlight(*each) for each in self._consumers.take_in_flight().items()]
         if self._workers in ready and (sample := self._workers.receive(FromWorker)) is not None:
             arrivals.append(sample)
         if self._consumers in ready and (request := self._consumers.receive(FromConsumer)) is not None:
             arrivals.append(request)
         arrivals += map(ConsumerGone, self._consumers.take_ended())
+        self._workers.take_in_flight()
         self._workers.take_ended()
         return arrivals
 

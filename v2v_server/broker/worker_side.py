@@ -222,7 +222,9 @@ class WorkerSide:
             if isinstance(verdict, Request):
                 self._sessions.put_back(verdict)
             else:
-                actions += self._candidates.quarantine_candidate(request, verdict, for_all=loss.for_all)
+                actions += self._candidates.quarantine_candidate(
+                    request, verdict, for_all=loss.for_all and loss.cause is not Cause.UNEXPLAINED
+                )
         return actions + self._grants.assign(now)
 
     def _malformed(self, error: ProtocolError) -> Frames:

@@ -128,15 +128,11 @@ def _run(arguments: argparse.Namespace) -> int:
             progress=lambda done, total, made, expected: shown(done, total, _size(made, expected)),
         )
     for line in summary(report, encoding, time.monotonic() - started):
-<<<<<<< HEAD
-        print(line)
+        show(line)
     for ending, sidecars in catalogue.sidecars.items():
         if sidecars.states:
             where = f"copy them to the same places in {arguments.destination} to serve these labels"
-            print(f"{len(sidecars.states)} sidecars {ending} (labels) were left beside their videos: {where}")
-=======
-        show(line)
->>>>>>> w-c
+            show(f"{len(sidecars.states)} sidecars {ending} (labels) were left beside their videos: {where}")
     if arguments.json is not None:
         refused = (*report.not_looked_at, *report.unusable)
         records = [asdict(video) for video in report.videos] + [

@@ -15,13 +15,12 @@ that is wrong: the pixels on its way brighten and darken again. So a step in whi
 All of it but the prediction is integer arithmetic, so that every host makes the same bytes.
 """
 
-from v2v_server.motion.clip import MARGIN_PX, cells_of, levels_between, levels_of, load, substeps
+from v2v_server.motion.clip import cells_of, levels_between, levels_of, load, substeps
 from v2v_server.motion.matching import Vectors, motion
 from v2v_server.motion.plane import MotionOfCuts, MotionOfPictures, motions
 from v2v_server.motion.pyramid import Cells, Pyramid
 
 __all__ = [
-    "MARGIN_PX",
     "Cells",
     "MotionOfCuts",
     "MotionOfPictures",

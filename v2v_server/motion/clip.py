@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_protocol.spec import MOST_SUBSTEPS
+from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS
 from v2v_server.motion.lanes import CELL_PX
 from v2v_server.motion.matching import UNITS_PER_PX, Vectors
 from v2v_server.motion.plane import motions
@@ -25,8 +25,6 @@ from v2v_server.simulation.draw import resized_size
 from v2v_server.simulation.view import Frames, Window, contrast_table, crop_place, crop_region, resized
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
 
-MARGIN_PX = 16
-"""Margin around the crop that levels are warped from."""
 _LONGEST = 1 << 14
 _LEAST_SHARE = 1 / 256
 _FASTEST_SHARE = 0.1
@@ -98,9 +96,11 @@ def levels_of(
         )
     part = top, left, recipe.crop_height_px, recipe.crop_width_px
     levels = levels_between(frames, part, source_index, substep_px, vectors, mirrored=params.flip)
-    if levels is None or params.contrast == 0.0:
-        return levels
-    return levels._replace(grey=contrast_table(params.contrast, 255 * FINE_STEPS)[levels.grey])
+    if levels is not None and params.contrast != 0.0:
+        table = contrast_table(params.contrast, 255 * FINE_STEPS)
+        for level in levels.grey:  # one at a time: indices take 8 bytes a pixel
+            level[...] = table[level]
+    return levels
 
 
 def levels_between(

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, MOST_STEPS_PER_GRID, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
-from v2v_protocol.spec import StreamSpec
+from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.scenes.pieces import SplitVideos
 from v2v_server.corpus.scenes.scene import NO_BARS, Sides
 from v2v_server.corpus.videos import VideoEntry
@@ -30,7 +30,9 @@ from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.rows import Rows
 
 MOST_CLIP_BYTES = 2 << 30
-"""Largest size of the decoded frames of one lease, bytes."""
+"""Largest size of the decoded frames of one lease without margins, in 8 bits."""
+MOST_LEASE_BYTES = 7 << 30
+"""Largest memory that one lease may take, with all that its spec may ask for; a worker has a GiB more."""
 _BLOCK = 256
 """Videos whose sequences are counted again for a look-up. Larger blocks take more time, smaller ones more memory."""
 
@@ -295,29 +297,45 @@ def _all_cut(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal:
     return _unsuited(video, "all its sequences are still or quiet", "still_share 1 and quiet_share 1")
 
 
-def _frame_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec) -> int:
-    """Return the size of one decoded frame of all samples of a lease. Frames are held whole until they are resized,
-    however small the sample is.
+def _frame_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec) -> tuple[int, int]:
+    """Return what each frame of a lease adds to the decoded frames of all its samples, without margins and in 8 bits,
+    and at most to the memory of its worker. Requested arrays decide nothing here: they never change which videos are
+    shown.
+
+    Frames are held whole until they are resized, however small the sample is. With scene "auto" those of all samples
+    are held twice while repeated ones are left out. One sample at a time then has its view and a copy of it, voxels,
+    and the levels between its frames.
     """
-    recipe = spec.recipe
+    recipe, samples = spec.recipe, spec.samples_per_decode
     top, bottom = rows.bounds(video.height_px)
-    cropped = recipe.resize_scale == (1.0, 1.0)
-    frame = recipe.crop_height_px * recipe.crop_width_px if cropped else (bottom - top) * video.width_px
-    return frame * spec.samples_per_decode
+    whole, crop = (bottom - top) * video.width_px, recipe.crop_height_px * recipe.crop_width_px
+    read, sides = crop, 2 * max(spec.flow_margin_px, MARGIN_PX if spec.substep_px else 0)
+    window = min(whole, (recipe.crop_height_px + sides) * (recipe.crop_width_px + sides))
+    if recipe.resize_scale != (1.0, 1.0):
+        read = window = whole
+    elif spec.flow_margin_px < 0:
+        window = whole
+    depth, held = 1 if recipe.light == "sdr" else 2, samples + (1 if spec.scene == "off" else samples)
+    seen = 2 * depth + np.dtype(spec.voxel_dtype).itemsize + (2 * (MOST_SUBSTEPS - 1) if spec.substep_px else 0)
+    return read * samples, depth * window * held + seen * crop
 
 
 def _most_steps(video: VideoEntry, rows: Rows, spec: StreamSpec) -> int:
-    """Return the largest number of steps whose decoded frames a lease may hold."""
-    return MOST_CLIP_BYTES // _frame_bytes(video, rows, spec) - 1
+    """Return the largest number of steps whose frames a lease may hold."""
+    read, taken = _frame_bytes(video, rows, spec)
+    return min(MOST_CLIP_BYTES // read, MOST_LEASE_BYTES // taken) - 1
 
 
 def _too_large(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:
     steps = int(spec.recipe.reach_at(video.frames_per_second)) // spec.recipe.frame_stride
     if steps <= _most_steps(video, rows, spec):
         return None
-    size = _frame_bytes(video, rows, spec) * (steps + 1)
-    reason = f"one sample takes {size >> 20} MiB of decoded frames, the limit is {MOST_CLIP_BYTES >> 20} MiB"
-    return _unsuited(video, reason, "fewer voxels_per_clip or samples_per_decode, or resize_scale 1")
+    read, taken = (size * (steps + 1) for size in _frame_bytes(video, rows, spec))
+    reason = f"one sample takes up to {taken >> 20} MiB of memory, the limit is {MOST_LEASE_BYTES >> 20} MiB"
+    if read > MOST_CLIP_BYTES:
+        reason = f"one sample takes {read >> 20} MiB of decoded frames, the limit is {MOST_CLIP_BYTES >> 20} MiB"
+    remedy = "fewer voxels_per_clip or samples_per_decode, a smaller flow_margin_px, substep_px 0, or resize_scale 1"
+    return _unsuited(video, reason, remedy)
 
 
 def _too_small(video: VideoEntry, rows: Rows, recipe: Recipe, sides: Sides = NO_BARS) -> Refusal | None:

@@ -8,9 +8,13 @@ from __future__ import annotations
 import os
 import weakref
 from collections.abc import Sequence
+from functools import cached_property
 
 from v2v_protocol.arena import ArenaName, Slot, array_offsets
 from v2v_protocol.shared_memory import create_memory, read_arrays, seal_memory
+
+mappings: weakref.WeakSet[object] = weakref.WeakSet()
+"""All mappings that exist, each with a descriptor of its own: also those that only messages on their way refer to."""
 
 
 class SampleMemory:
@@ -43,6 +47,15 @@ class SampleMemory:
             return False
         return True
 
-    def arrays(self) -> list[memoryview]:
-        """Return the bytes of each array. They stay valid without this object."""
-        return read_arrays(self._descriptor, self._sizes)
+    @cached_property
+    def arrays(self) -> Sequence[bytes | memoryview]:
+        """Bytes of each array, for all messages: mapped once, or copied if the system has no descriptor left. They stay
+        valid without this object.
+        """
+        try:
+            arrays = read_arrays(self._descriptor, self._sizes)
+        except OSError:
+            offsets = array_offsets(self._sizes, 1)
+            return [os.pread(self._descriptor, size, at) for size, at in zip(self._sizes, offsets, strict=False)]
+        mappings.add(arrays[0].obj)
+        return arrays

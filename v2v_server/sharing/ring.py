@@ -7,7 +7,8 @@ sealed memory, and thus nothing that a process can write to.
 A consumer may open the memory after the ring has dropped the sample. It finds nothing there and asks again without a
 slot; that answer is a message, which holds its bytes itself.
 
-Memory: at most ``most_bytes``, or one sample, and the samples that are being made.
+Memory: at most ``most_bytes``, or one sample, the samples that are being made, and dropped ones that are still on their
+way to a consumer, which the credit of all consumers bounds (:mod:`v2v_server.broker.session`).
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from typing import Any
 from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.messages import SampleHeader
 from v2v_protocol.wire import Buffer, Frames, encode
-from v2v_server.sharing.memory import SampleMemory
+from v2v_server.sharing.memory import SampleMemory, mappings
 
-_FILES_A_SAMPLE = 4
-"""Allowed open files per sample, so that samples use at most a quarter of the process's limit."""
+_FILES_SHARE = 4
+"""Samples use at most this part of the process's open files."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +58,7 @@ class SharedSample:
             changes["slot"] = slot.number
             if self.memory is not None:
                 return encode(replace(self.header, arena=self.memory.slot.arena, **changes))
-        frames = self.frames if self.memory is None else self.memory.arrays()
+        frames = self.frames if self.memory is None else self.memory.arrays
         return [*encode(replace(self.header, **changes)), *frames]
 
 
@@ -86,8 +87,8 @@ class SampleRing:
             sizes: bytes of each array.
         """
         files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-        used = _FILES_A_SAMPLE * (len(self._samples) + len(self._lent))
-        if files != resource.RLIM_INFINITY and used >= files:
+        used = 2 * (len(self._samples) + len(self._lent)) + len(mappings)
+        if files != resource.RLIM_INFINITY and used >= files // _FILES_SHARE:
             return None
         try:
             self._lent[lease] = SampleMemory(sizes)
@@ -117,7 +118,7 @@ class SampleRing:
         if frames:
             memory = None
         elif memory is not None and not memory.seal():
-            frames, memory = [bytes(array) for array in memory.arrays()], None
+            frames, memory = [bytes(array) for array in memory.arrays], None
         sample = SharedSample(replace(header, slot=NO_SLOT), frames, memory)
         before = self._samples.pop(key, None)
         self._samples[key] = sample

@@ -134,7 +134,8 @@ def apply_view(frames: Frames, params: SampleParams, recipe: Recipe, signal: Sig
     if params.flip:
         seen = seen[:, :, ::-1]
     if params.contrast != 0.0:
-        seen = contrast_table(params.contrast, signal.white)[seen]
+        table = contrast_table(params.contrast, signal.white)
+        seen = np.stack([table[frame] for frame in seen])  # one at a time: indices take 8 bytes a pixel
     return np.ascontiguousarray(seen)
 
 

@@ -24,6 +24,7 @@ from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Lease, WorkerHello
 from v2v_protocol.wire import Frames
 from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.schedule.sequences import MOST_LEASE_BYTES
 from v2v_server.simulation.variants import USUAL
 from v2v_server.store.cache import Cache
 from v2v_server.system.compile_cache import compile_cache
@@ -63,8 +64,8 @@ from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 _SOON_FETCHED_BYTES = 32 << 20
 """The worker keeps its leases while it fetches a video up to this size; it returns them for a larger one."""
-LARGEST_MEMORY_BYTES = 8 << 30
-"""Four times the frames of the largest clip of a lease. A worker that needs more ends, and its sample is refused."""
+LARGEST_MEMORY_BYTES = MOST_LEASE_BYTES + (1 << 30)
+"""A worker that needs more ends. After three such ends its sample is refused for its spec."""
 LONGEST_LEASE_SECONDS = 3600.0
 """Limit of processor time for one lease. The server gives up its own workers sooner, by wall-clock time; this limit
 ends hung workers on other hosts."""

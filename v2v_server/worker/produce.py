@@ -33,11 +33,11 @@ from v2v_protocol.sample import (
     empty_value,
     new_arrays,
 )
-from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
+from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
-from v2v_server.motion import MARGIN_PX, cells_of, levels_of
+from v2v_server.motion import cells_of, levels_of
 from v2v_server.simulation.draw import choose_crop, draw
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.kernels import ARRAYS, list_events

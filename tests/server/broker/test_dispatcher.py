@@ -791,14 +791,19 @@ def still_serves(at: Peers) -> None:
     assert sorted(at.samples(b"good consumer")) == [(0, 0), (0, 1)]
 
 
-def test_who_sends_nothing_but_nonsense_is_cut_off() -> None:
+@pytest.mark.parametrize(
+    "frames",
+    [[b"garbage"], encode(Hello({"x" * 60_000: 1}, ("voxels",), 4, 0))],
+    ids=["nonsense", "refused specs"],
+)
+def test_a_peer_that_sends_only_faults_is_disconnected(frames: list[bytes]) -> None:
     at = peers()
     for _ in range(MOST_FAULTS):
-        (answer,) = at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0)
+        (answer,) = at.dispatcher.from_consumer(b"bad", frames, 0.0)
         assert isinstance(answer, ToConsumer)
-    assert at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0) == [Disconnect(b"bad")]
+    assert at.dispatcher.from_consumer(b"bad", frames, 0.0) == [Disconnect(b"bad")]
     at.dispatcher.consumer_gone(b"bad", 0.0)
-    (answer,) = at.dispatcher.from_consumer(b"bad", [b"garbage"], 0.0)
+    (answer,) = at.dispatcher.from_consumer(b"bad", frames, 0.0)
     assert isinstance(answer, ToConsumer)
     still_serves(at)
 

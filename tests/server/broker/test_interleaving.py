@@ -257,6 +257,12 @@ class Interleaving(RuleBasedStateMachine):
             self.at.worker_says(identity, Result(lease.lease), *sample_frames(0, lease.indices[0]))
         self._listen()
 
+    @rule(identity=consumers, nbytes=st.sampled_from((0, 1, 1 << 16, 1 << 17, 1 << 40)))
+    def in_flight(self, identity: bytes, nbytes: int) -> None:
+        """Some of what was sent is not read yet, or again none of it."""
+        self.at.carry_out(self.at.dispatcher.in_flight(identity, nbytes, self.at.now))
+        self._listen()
+
     @rule(seconds=st.sampled_from((0.1, 1.5, 10.0, DEADLINE / 2, DEADLINE + 1)))
     def time_passes(self, seconds: float) -> None:
         for identity in self.owed:
@@ -300,6 +306,8 @@ class Interleaving(RuleBasedStateMachine):
             self._listen()
         for identity in (b"w1", b"w2", b"w3", b"w4"):
             self.at.die(identity)
+        for identity in (b"c", b"d"):
+            self.in_flight(identity, 0)
         healthy = (b"healthy", b"also healthy")
         for identity in healthy:
             self.at.join(identity)

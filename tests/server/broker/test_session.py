@@ -14,6 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from v2v_protocol.errors import LimitExceeded
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.spec import StreamSpec
+from v2v_protocol.wire import MOST_IN_FLIGHT_BYTES
 from v2v_server.broker.leases import LeaseBook, Request
 from v2v_server.broker.session import Session, Sessions
 from v2v_server.schedule.epoch import Schedule
@@ -49,6 +50,61 @@ def take(sessions: Sessions) -> Request:
     if request is None:
         raise AssertionError("no request waits")
     return request
+
+
+# --- what is not read yet ---------------------------------------------------------------------------------------------
+
+
+def test_samples_that_are_not_read_yet_count_against_the_credit() -> None:
+    a, b = session(b"a", credit=8), session(b"b", credit=8)
+    sessions = opened(a, b)
+    for each in (a, b):
+        sessions.want(each, 0, range(8))
+    sample = sum(a.form.sizes)
+    assert sessions.room(a) == 8
+    for unread, room in ((1, 8), (sample, 8), (3 * sample + 1000, 6), (9 * sample, 0), (20 * sample, -11), (0, 8)):
+        assert sessions.set_in_flight(b"a", unread) is (None if room < 8 or unread else a)
+        assert sessions.room(a) == room
+    take(sessions), take(sessions)
+    assert sessions.room(a) == sessions.room(b) == 7
+
+
+def test_a_consumer_that_does_not_read_is_passed_over_until_it_does() -> None:
+    a, b = session(b"a", credit=2), session(b"b", credit=2)
+    sessions = opened(a, b)
+    for each in (a, b):
+        sessions.want(each, 0, [0, 1])
+    sessions.set_in_flight(b"a", 3 * sum(a.form.sizes))
+    assert [take(sessions).session for _ in range(2)] == [b"b", b"b"]
+    assert sessions.next_request() is None
+    assert sessions.set_in_flight(b"a", 0) is a
+    assert [take(sessions).session for _ in range(2)] == [b"a", b"a"]
+
+
+def test_what_is_in_flight_outlives_a_hello() -> None:
+    """It lies in the same connection's queue, whatever the consumer says."""
+    sessions = opened(session(b"a"))
+    sessions.set_in_flight(b"a", 1 << 40)
+    sessions.open(again := session(b"a"))
+    sessions.want(again, 0, [0])
+    assert sessions.next_request() is None
+
+
+@given(st.integers(1, 400))
+def test_all_consumers_that_do_not_read_share_one_limit(count: int) -> None:
+    """Each may hold one sample, and the next ones as long as all of them hold less than the limit."""
+    everyone = [session(b"%d" % number, credit=400) for number in range(count)]
+    sessions, sample = opened(*everyone), sum(everyone[0].form.sizes)
+    held = dict.fromkeys(everyone_names := [each.identity for each in everyone], 0)
+    for identity in everyone_names:
+        held[identity] = sample
+        sessions.set_in_flight(identity, sample)
+    while growing := [each for each in everyone if held[each.identity] < 100 * sample and sessions.room(each) > 0]:
+        for each in growing:
+            held[each.identity] += sample
+            sessions.set_in_flight(each.identity, held[each.identity])
+    assert sum(held.values()) <= max(MOST_IN_FLIGHT_BYTES, count * sample) + count * sample
+    assert all(held.values())
 
 
 # --- asking -----------------------------------------------------------------------------------------------------------

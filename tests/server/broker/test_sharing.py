@@ -42,6 +42,22 @@ def test_a_request_for_a_sample_in_work_follows_it() -> None:
     assert at.dispatcher.counters.decodes == 1
 
 
+def test_a_consumer_gets_no_more_shared_samples_than_it_reads() -> None:
+    at = sharing(b"c", b"d")
+    at.join()
+    at.want(*range(4), identity=b"c")
+    at.work_off()
+    at.dispatcher.in_flight(b"d", 1 << 40, at.now)
+    at.want(*range(4), identity=b"d")
+    assert at.samples(b"d") == []
+    at.want(*range(4), 4, 5, identity=b"c")
+    at.work_off()
+    assert len(at.samples(b"c")) == 10
+    at.carry_out(at.dispatcher.in_flight(b"d", 0, at.now))
+    assert sorted(at.samples(b"d")) == [(0, index) for index in range(4)]
+    assert at.dispatcher.counters.decodes == 6
+
+
 def test_a_finished_sample_is_sent_even_if_no_worker_is_left() -> None:
     at = sharing(b"c", b"d")
     at.join()

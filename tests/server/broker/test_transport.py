@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import zmq
 
 from tests.waiting import until
+from v2v_protocol.link import router
 from v2v_protocol.messages import Ping, Pong, Stop
 from v2v_protocol.wire import encode
 from v2v_server.broker.actions import ToConsumer, ToWorker
-from v2v_server.broker.transport import Arrival, FromConsumer, FromWorker, Sockets
+from v2v_server.broker.transport import Arrival, ConsumerGone, FromConsumer, FromWorker, InFlight, Sockets
 
 
 @pytest.fixture
@@ -95,3 +98,97 @@ def test_one_message_of_each_side_comes_at_a_time_the_workers_first(sockets: Soc
             assert [bytes(one.frames[1]) for one in came if isinstance(one, kind)] == [b"\0", b"\1"]
         assert sockets.send(ToWorker(b"w", encode(Stop())))
         assert sockets.send(ToConsumer(b"c", encode(Pong())))
+
+
+MIB = 1 << 20
+
+
+@contextmanager
+def consumers(sockets: Sockets, *names: bytes) -> Iterator[list[zmq.Socket[bytes]]]:
+    """Peers that said something, and whose sockets take one message each until they are read."""
+    context = zmq.Context()
+    try:
+        peers = [context.socket(zmq.DEALER) for _ in names]
+        for peer, name in zip(peers, names, strict=True):
+            for option, value in ((zmq.RCVHWM, 1), (zmq.RECONNECT_IVL, -1), (zmq.ROUTING_ID, name)):
+                peer.setsockopt(option, value)
+            peer.connect(sockets.address)
+            peer.send_multipart(encode(Ping()))
+            until(lambda: any(isinstance(arrival, FromConsumer) for arrival in sockets.receive(0.1)))
+        yield peers
+    finally:
+        context.destroy(linger=0)
+
+
+def counts(sockets: Sockets, found: dict[bytes, int]) -> dict[bytes, int]:
+    """Add what is in flight to each consumer as far as it has changed."""
+    return found | {each.identity: each.nbytes for each in sockets.receive(0.01) if isinstance(each, InFlight)}
+
+
+def test_bytes_are_in_flight_until_their_consumer_takes_them(sockets: Sockets) -> None:
+    with consumers(sockets, b"deaf", b"reads") as (deaf, reads):
+        for name in (b"deaf", b"reads"):
+            assert all(sockets.send(ToConsumer(name, [b"", bytes(4 * MIB)])) for _ in range(30))
+        found: dict[bytes, int] = {}
+        found = counts(sockets, found)
+        assert max(found.values()) <= 120 * MIB
+        for _ in range(30):
+            assert len(reads.recv_multipart()) == 2
+        until(lambda: found.update(counts(sockets, found)) or not found[b"reads"])
+        assert 90 * MIB < found[b"deaf"] < 120 * MIB
+        for _ in range(30):
+            deaf.recv_multipart()
+        until(lambda: found.update(counts(sockets, found)) or not found[b"deaf"])
+
+
+def test_small_messages_are_in_flight_too(sockets: Sockets) -> None:
+    with consumers(sockets, b"deaf"):
+        found: dict[bytes, int] = {b"deaf": 0}
+        for _ in range(400):
+            assert sockets.send(ToConsumer(b"deaf", [bytes(60_000)]))
+            found = counts(sockets, found)
+        assert 10 * MIB < found[b"deaf"] <= 24 * MIB
+
+
+def test_a_consumer_that_never_reads_is_disconnected_at_the_limit_of_messages(sockets: Sockets) -> None:
+    with consumers(sockets, b"deaf"):
+        until(lambda: not sockets.send(ToConsumer(b"deaf", [bytes(60_000)])))
+        until(lambda: ConsumerGone(b"deaf") in sockets.receive(0.01))
+
+
+def test_those_that_take_nothing_are_disconnected_if_there_is_too_much_in_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(router, "_STUCK_SECONDS", 0.5)
+    monkeypatch.setattr(router, "MOST_IN_FLIGHT_BYTES", 100 * MIB)
+    sockets = Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
+    sample, gone = bytes(4 * MIB), set[bytes]()
+    try:
+        with consumers(sockets, b"reads", *(b"deaf %d" % number for number in range(8))) as (reads, *_):
+            for number in range(8):
+                for _ in range(10):
+                    assert sockets.send(ToConsumer(b"deaf %d" % number, [b"", bytearray(sample)]))
+
+            def is_bounded() -> bool:
+                assert sockets.send(ToConsumer(b"reads", [b"", bytearray(sample)]))
+                reads.recv_multipart()
+                gone.update(each.identity for each in sockets.receive(0.01) if isinstance(each, ConsumerGone))
+                queues = sockets._consumers._in_flight.values()
+                return bool(gone) and sum(size for queue in queues for _, size in queue) <= 100 * MIB
+
+            until(is_bounded)
+            assert b"reads" not in gone
+            assert 2 <= len(gone) < 8
+    finally:
+        sockets.close()
+
+
+def test_a_failed_call_costs_only_the_answer(sockets: Sockets, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Broken:
+        def send(self, *arguments: object, **options: object) -> None:
+            raise zmq.ZMQError(errno.ENOMEM)
+
+    with consumers(sockets, b"c") as (peer,):
+        with monkeypatch.context() as patch:
+            patch.setattr(sockets._consumers, "socket", Broken())
+            assert not sockets.send(ToConsumer(b"c", encode(Pong())))
+        until(lambda: ConsumerGone(b"c") in sockets.receive(0.01))
+        assert not peer.poll(0)

@@ -14,8 +14,8 @@ from tests.oracles.rendered import Errors, counts_of, errors, log_levels, render
 from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_protocol.spec import MOST_SUBSTEPS
-from v2v_server.motion import MARGIN_PX, cells_of, levels_between, levels_of, motions, substeps
+from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS
+from v2v_server.motion import cells_of, levels_between, levels_of, motions, substeps
 from v2v_server.motion.matching import UNITS_PER_PX
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.view import Window, apply_view, source_window, without_margin

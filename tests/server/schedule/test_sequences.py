@@ -7,9 +7,11 @@ import itertools
 import math
 import re
 import tracemalloc
+from bisect import bisect_right
 from typing import Any
 from unittest import mock
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -23,8 +25,9 @@ from v2v_server.corpus.scenes.scene import Flag
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.schedule import sequences
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
-from v2v_server.schedule.sequences import MOST_CLIP_BYTES, SequenceTable
+from v2v_server.schedule.sequences import MOST_CLIP_BYTES, MOST_LEASE_BYTES, SequenceTable
 from v2v_server.video.rows import Rows
+from v2v_server.worker.process import LARGEST_MEMORY_BYTES
 
 FULL = Rows()
 
@@ -285,6 +288,36 @@ def test_what_a_worker_would_have_to_hold_is_refused_before_it_starts() -> None:
     assert re.fullmatch(r"one sample takes 20\d\d MiB of decoded frames, the limit is 2048 MiB", refusal.reason)
     assert "resize_scale 1" in refusal.remedy
     assert under(most + 1).count  # cropped as it is decoded
+
+
+@pytest.mark.parametrize(
+    ("asked", "recipe"),
+    [
+        ({"flow_margin_px": -1}, {}),
+        ({"flow_margin_px": 2000}, {}),
+        ({"samples_per_decode": 32, "flow_margin_px": 500}, {}),
+        ({}, {"crop_height_px": 400, "crop_width_px": 600, "light": "declared"}),
+        ({"substep_px": 1.0}, {"crop_height_px": 100, "crop_width_px": 200}),
+        ({"substep_px": 1.0, "flow_margin_px": 0}, {"crop_height_px": 100, "crop_width_px": 200}),
+        ({"scene": "off", "voxel_dtype": "float32"}, {"crop_height_px": 300, "crop_width_px": 600}),
+    ],
+)
+def test_all_that_a_lease_may_take_counts(asked: dict[str, Any], recipe: dict[str, Any]) -> None:
+    """A crop of 16 x 16 px with the whole picture as its margin once ended three workers, and its healthy video."""
+    long = video("v.mp4", frames=200_000, width_px=1920, height_px=1080)
+
+    def under(steps: int, **fields: Any) -> SequenceTable:
+        made = Recipe(voxels_per_clip=steps, bins=1, **({"crop_height_px": 16, "crop_width_px": 16} | recipe | fields))
+        return table(long, spec=StreamSpec(made, **asked))
+
+    most = bisect_right(range(1, 100_000), 0, key=lambda steps: not under(steps).count)
+    (refusal,) = under(most + 1).refusals
+    told = re.fullmatch(r"one sample takes up to (\d+) MiB of memory, the limit is 7168 MiB", refusal.reason)
+    assert told is not None
+    assert 7168 <= int(told[1]) < 7300
+    crop = int(np.prod(under(1)._spec.recipe.crop_px)) * asked.get("samples_per_decode", 1)
+    assert crop * most < MOST_CLIP_BYTES, "the frames alone would not have been refused"
+    assert LARGEST_MEMORY_BYTES - MOST_LEASE_BYTES == 1 << 30
 
 
 def test_rows_count() -> None:

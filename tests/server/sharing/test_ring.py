@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import mmap
 import os
+import resource
 from collections.abc import Sequence
 
 import hypothesis.strategies as st
@@ -16,6 +18,7 @@ from v2v_protocol.arena import ArenaName, Slot
 from v2v_protocol.messages import SampleHeader
 from v2v_protocol.shared_memory import open_memory
 from v2v_protocol.wire import Frames, decode
+from v2v_server.sharing.memory import mappings
 from v2v_server.sharing.ring import SampleRing
 from v2v_server.worker.output_buffer import slot_arrays
 
@@ -68,6 +71,44 @@ def test_every_consumer_reads_what_the_worker_wrote(slot: Slot | None) -> None:
         assert read(message) == content(9)
     assert ring.get("key") is sample
     assert ring.get("other") is None
+
+
+def open_files() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+def test_all_messages_of_a_sample_share_one_mapping() -> None:
+    ring = SampleRing(1 << 20)
+    fill(ring, 1, 9)
+    sample, before = ring.add("key", 1, header(), []), open_files()
+    messages = [sample.message(None, is_first=False) for _ in range(100)]
+    assert open_files() == before + 1
+    assert all(read(message) == content(9) for message in messages)
+
+
+def test_without_a_descriptor_for_a_mapping_a_sample_is_copied(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: object) -> None:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    ring = SampleRing(1 << 20)
+    fill(ring, 1, 9)
+    sample = ring.add("key", 1, header(), [])
+    monkeypatch.setattr("v2v_protocol.shared_memory.mmap.mmap", refuse)
+    assert read(sample.message(None, is_first=True)) == content(9)
+
+
+def test_samples_on_their_way_count_against_the_open_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ring has dropped them, and their messages still hold a descriptor each."""
+    ring, on_their_way = SampleRing(1), list[Frames]()
+    used = len(mappings)
+    monkeypatch.setattr(resource, "getrlimit", lambda which: (4 * (used + 10), 4 * (used + 10)))
+    while ring.lend(99, SIZES) is not None:
+        ring.release(())
+        fill(ring, len(on_their_way), 9)
+        on_their_way.append(ring.add("key", len(on_their_way), header(), []).message(None, is_first=True))
+    assert 5 <= len(on_their_way) <= 10
+    on_their_way.clear()
+    assert ring.lend(0, SIZES) is not None
 
 
 def test_finished_memory_cannot_be_written_to() -> None:

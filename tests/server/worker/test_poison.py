@@ -170,7 +170,8 @@ def test_unexplained_deaths_make_it_run_alone_and_one_more_refuses_it() -> None:
     assert [lease.indices for lease in at.leases[b"w"]] == [(0,)]
     at.begin()
     at.die(cause=Cause.UNEXPLAINED, text="exited with status 1")
-    assert at.recorded == [against(lease, "a worker exited with status 1 over it")]
+    # Memory that its spec took, for instance: no verdict for others.
+    assert at.recorded == [replace(against(lease, "a worker exited with status 1 over it"), spec=SMALL_SPEC.digest)]
     at.join()
     # A new candidate has no deaths to its name.
     assert [(lease.indices, lease.candidate) for lease in at.leases[b"w"]] == [((0,), 1), ((3,), 0)]

@@ -17,12 +17,7 @@ import zmq
 
 from tests.oracles.dealers import wait
 from tests.protocol.wire_messages import example
-<<<<<<< HEAD
 from v2v_protocol.errors import SidecarError, UsageError, VideoError
-from v2v_protocol.link.dealer import wait
-=======
-from v2v_protocol.errors import UsageError, VideoError
->>>>>>> w-c
 from v2v_protocol.messages import Begun, Goodbye, Lease, LeaseFailed, Message, Ping, Pong, Result, Stop, WorkerHello
 from v2v_protocol.sample import Layout, new_arrays
 from v2v_protocol.wire import decode, encode
