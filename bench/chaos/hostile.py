@@ -75,7 +75,7 @@ def hello(address: str, number: int) -> None:
 
 def deaf(address: str, number: int) -> None:
     """See the module."""
-    with _dealer(address, number) as peer:
+    with _reader(address, number) as peer:
         peer.send(encode(Hello(SPEC, ("voxels", "frames"), 32, 0)))
         while True:
             peer.send(encode(Want(0, tuple(range(32)))))
