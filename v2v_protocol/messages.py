@@ -314,6 +314,7 @@ class Lease:
         packed: whether to compress arrays that go into the message.
         sidecars: fingerprints of the video's sidecars that the arrays are made from, by ending; a missing one is left
             out.
+        remark: what is not served of the video, or not as it is meant; goes into the provenance.
     """
 
     lease: int
@@ -341,6 +342,7 @@ class Lease:
     slot: int = 0
     packed: bool = False
     sidecars: Mapping[str, Any] = field(default_factory=dict)
+    remark: str = ""
 
 
 @dataclass(frozen=True, slots=True)

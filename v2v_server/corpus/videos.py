@@ -34,6 +34,7 @@ class VideoEntry:
         width_px, height_px: size of the upright picture, before ``rows``.
         frames_per_second: average rate; NaN where unknown.
         codec: FFmpeg's name of the format.
+        remark: what is not served of it, or not as it is meant (:class:`v2v_server.video.probe.VideoFacts`).
         threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
         pieces: its pieces, see :func:`v2v_server.corpus.scenes.pieces.encoded_pieces`; None where the catalogue was
             opened without ``scene``.
@@ -46,6 +47,7 @@ class VideoEntry:
     height_px: int
     frames_per_second: float
     codec: str
+    remark: str = ""
     threshold_pos: float | None = None
     threshold_neg: float | None = None
     pieces: bytes | None = None
@@ -60,8 +62,8 @@ class Videos(Sequence[VideoEntry]):
         split: the videos that are divided into pieces; None where that is unknown.
 
     Attributes:
-        ids, fingerprints, frames, frames_per_second, width_px, height_px, interlaced: columns, one value for each
-            video.
+        ids, fingerprints, frames, frames_per_second, width_px, height_px, interlaced, remark: columns, one value for
+            each video.
         split: as given.
     """
 
@@ -73,6 +75,7 @@ class Videos(Sequence[VideoEntry]):
         self.ids, self.fingerprints, self.frames = table.ids, table.fingerprints, table.frames
         self.frames_per_second = table.frames_per_second
         self.width_px, self.height_px, self.interlaced = table.width_px, table.height_px, table.interlaced
+        self.remark = table.remark
 
     def find(self, id: str) -> int | None:
         """Return the number of the video with an id; None if there is none."""
@@ -131,6 +134,7 @@ class Videos(Sequence[VideoEntry]):
             height_px=record.height_px,
             frames_per_second=math.nan if record.frames_per_second is None else record.frames_per_second,
             codec=record.codec,
+            remark=record.remark,
             threshold_pos=pos,
             threshold_neg=neg,
             pieces=None if self.split is None else self.split.encoded(number),

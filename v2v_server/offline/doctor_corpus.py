@@ -18,7 +18,7 @@ from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
 from v2v_server.config import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.offline.aperture import clean_aperture
+from v2v_server.video.container import clean_aperture
 from v2v_server.offline.doctor_motion import look_at_motion
 from v2v_server.offline.doctor_pictures import look_at_pictures
 from v2v_server.offline.remake import Remaker, open_shown
