@@ -15,19 +15,23 @@ from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
-import numpy as np
-
 _WAY = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
 _STSD_HEAD_BYTES = 8
 _ENTRY_HEAD_BYTES = 78
 """Of a visual sample entry, in front of its boxes; width and height lie at 24."""
 _CLAP_BYTES = 32
 _MOST_BOXES = 10_000
+_ANY_END = 1 << 62
 _ISO_KINDS = frozenset({b"ftyp", b"styp", b"moov", b"mdat", b"moof", b"free", b"skip", b"wide"})
 _EBML, _SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
 _TRANSPORT_BYTES = {188: 0, 192: 4, 204: 0}
 """Bytes of a packet of a transport stream, and those in front of its sync byte."""
 _SYNC = 0x47
+_TRANSPORT_PACKET = re.compile(rb"\x47([\x40-\x5f].)(?:[\x10-\x1f]|[\x30-\x3f](.))", re.DOTALL)
+"""The beginning of a packet in which a packet of a track begins, behind an adaptation field of this length."""
+_START_CODE, _VIDEO = b"\0\0\1", bytes(range(0xE0, 0xF0))
+_PART_BYTES = 188 * 192 * 51 * 8
+"""Whole packets of each size."""
 _HEAD_BYTES = 1 << 20
 _MATROSKA_DOLBY = re.compile(rb"dv[cv]C.{0,16}?\x41\xed[\x81-\xfe](.{5})", re.DOTALL)
 """The beginning of the configuration, as a mapping of block additions holds it."""
@@ -48,12 +52,10 @@ def clean_aperture(path: Path) -> tuple[Fraction, Fraction] | None:
     """
     with path.open("rb") as file:
         for head, kind, at in _boxes_of_entries(file):
-            if kind != b"clap":
-                continue
             picture = Fraction(int.from_bytes(head[24:26], "big")), Fraction(int.from_bytes(head[26:28], "big"))
             file.seek(at)
             values = [int.from_bytes(file.read(4), "big") for _ in range(_CLAP_BYTES // 4)]
-            if values[1] and values[3]:
+            if kind == b"clap" and values[1] and values[3]:
                 width, height = Fraction(values[0], values[1]), Fraction(values[2], values[3])
                 if 0 < width <= picture[0] and 0 < height <= picture[1] and (width, height) != picture:
                     return width, height
@@ -72,10 +74,8 @@ def dolby_vision_profile(path: str) -> int | None:
             if kind in _DOLBY_KINDS:
                 file.seek(at)
                 records.append(file.read(5))
-    for record in records:
-        if record[2] >> 1 in _NOT_LUMA_PROFILES and not record[4] >> 4:
-            return record[2] >> 1
-    return None
+    profiles = [record[2] >> 1 for record in records if len(record) == 5 and not record[4] >> 4]
+    return next((profile for profile in profiles if profile in _NOT_LUMA_PROFILES), None)
 
 
 def describe_cut(path: str) -> str:
@@ -89,16 +89,18 @@ def describe_cut(path: str) -> str:
         stated = 0
         if head[:4] == b"RIFF" and head[4:8] != b"\xff\xff\xff\xff":
             stated = 8 + int.from_bytes(head[4:8], "little")
-        elif head[:4] == _EBML and (at := head.find(_SEGMENT)) > 0:
+        elif head[:4] == _EBML and 0 < (at := head.find(_SEGMENT)) < len(head) - 12:
             length = 9 - head[at + 4].bit_length()  # the first bit that is set tells the bytes of the number
             digits = int.from_bytes(head[at + 4 : at + 4 + length], "big") & ((1 << 7 * length) - 1)
             if digits != (1 << 7 * length) - 1:  # all ones: unknown
                 stated = at + 4 + length + digits
         elif head[4:8] in _ISO_KINDS:
-            stated = max((until for _, _, until in _boxes(file, 0, 1 << 63, _ISO_KINDS)), default=0)
+            ends = (until for _, _, until in _boxes(file, 0, _ANY_END, _ISO_KINDS))
+            stated = next((until for until in ends if size < until < _ANY_END), 0)
         elif (length := _transport_bytes(head)) and size % length:
             stated = size // length * length + length
-    return f"is truncated: {size:,} of at least {stated:,} bytes are there" if stated > size else ""
+    # A last byte of padding may be missing.
+    return f"is truncated: {size:,} of at least {stated:,} bytes are there" if stated > size + 1 else ""
 
 
 def count_transport_pictures(path: str) -> Counter[int]:
@@ -111,19 +113,11 @@ def count_transport_pictures(path: str) -> Counter[int]:
     """
     found = Counter[int]()
     with open(path, "rb") as file:
-        length = _transport_bytes(file.read(_HEAD_BYTES))
-        file.seek(0)
-        while length and len(data := file.read(length * 4096)) >= length:
-            packets = np.frombuffer(data, np.uint8, len(data) // length * length).reshape(-1, length)
-            packets = packets[:, _TRANSPORT_BYTES[length] :]
-            begins = (packets[:, 0] == _SYNC) & (packets[:, 1] & 0x40 > 0) & (packets[:, 3] & 0x10 > 0)
-            packets = packets[begins]
-            skipped = np.where(packets[:, 3] & 0x20, 1 + packets[:, 4].astype(np.int64), 0)
-            at = np.minimum(4 + skipped, packets.shape[1] - 4)
-            codes = [packets[np.arange(len(packets)), at + number] for number in range(4)]
-            is_video = (codes[0] == 0) & (codes[1] == 0) & (codes[2] == 1) & (codes[3] & 0xF0 == 0xE0)
-            tracks = (packets[:, 1] & 0x1F).astype(np.int64) << 8 | packets[:, 2]
-            found.update(tracks[is_video].tolist())
+        while data := file.read(_PART_BYTES):
+            for packet in _TRANSPORT_PACKET.finditer(data):
+                at = packet.end() + (packet[2][0] if packet[2] else 0)
+                if data[at : at + 3] == _START_CODE and data[at + 3 : at + 4] in _VIDEO:
+                    found[int.from_bytes(packet[1], "big") & 0x1FFF] += 1
     return found
 
 
@@ -164,4 +158,5 @@ def _boxes(
         if len(head) < 8 or not at <= until <= end or (kinds is not None and head[4:8] not in kinds):
             return
         yield head[4:8], at, until
-        begin = until
+        if (begin := until) >= end:
+            return

@@ -120,7 +120,7 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
         interlaced=head.interlaced_frame or shown.fields,
         index=index,
         content=_content(shown, index, head),
-        remark="; ".join(filter(None, (*_left_out(name, shown, index, change), others, _other_levels(name)))),
+        remark="; ".join(filter(None, (*_left_out(name, shown, index, change), others))),
     )
 
 
@@ -230,7 +230,7 @@ def _index(shown: _Shown, head: VideoFrame, uncounted: FrameIndex) -> FrameIndex
 
 
 def _left_out(name: str, shown: _Shown, index: FrameIndex, change: str) -> Iterator[str]:
-    """Compare the frames that are served with all pictures of the track, and yield what is missing."""
+    """Yield what is missing of the track: the frames that are served are compared with all of its pictures."""
     cut = describe_cut(name) or ("is truncated" if shown.is_cut else "")
     yield f"{cut}; its last picture is left out" if shown.is_cut else cut
     empty = np.setdiff1d(np.array(shown.signs.empty_pts, np.int64), index.pts)
@@ -238,20 +238,18 @@ def _left_out(name: str, shown: _Shown, index: FrameIndex, change: str) -> Itera
     if (missing := stored - len(index)) > 0:
         change = f"{missing} of {stored} pictures are left out: {change or 'they do not decode'}"
     yield change
+    if profile := dolby_vision_profile(name):
+        yield f"is {DOLBY_VISION} {profile}, which stores IPT-PQ: its grey is not luma"
 
 
 def _other_tracks(name: str, container: InputContainer, stream: VideoStream) -> str:
     """Say which other tracks of pictures a file has; "" if none."""
-    tracks = [f"{track.width}x{track.height} px" for track in moving_tracks(container) if track is not stream]
+    others = [track.codec_context for track in moving_tracks(container) if track is not stream]
+    tracks = [f"{decoder.width}x{decoder.height} px" for decoder in others if decoder]
     if container.format.name == "mpegts":
         counts = count_transport_pictures(name)
         tracks = [f"{count} pictures of track {pid}" for pid, count in sorted(counts.items()) if pid != stream.id]
     return f"other tracks are left out: {', '.join(tracks)}" if tracks else ""
-
-
-def _other_levels(name: str) -> str:
-    profile = dolby_vision_profile(name)
-    return "" if profile is None else f"is {DOLBY_VISION} {profile}, which stores IPT-PQ: its grey is not luma"
 
 
 def _content(shown: _Shown, index: FrameIndex, head: VideoFrame) -> str:
@@ -273,7 +271,9 @@ def _rate(index: FrameIndex, shown: _Shown, stated: Sequence[float]) -> float:
         steps = steps[~are_gaps]
         return len(steps) * denominator / (int(steps.sum()) * numerator)
     span = max(shown.pts, default=0) - min(shown.pts, default=0)
-    if 0 < span < min(len(shown.pts), 2 * len(set(shown.pts))) - 1:  # frames follow each other within a tick of the clock
+    if (
+        0 < span < min(len(shown.pts), 2 * len(set(shown.pts))) - 1
+    ):  # frames follow each other within a tick of the clock
         average = (len(shown.pts) - 1) * denominator / (span * numerator)
         return next((each for each in stated if abs(each / average - 1) < _RATE_TOLERANCE), average)
     return stated[0] if stated else float("nan")

@@ -61,8 +61,8 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
     """Open a container and its video track; both are closed at the end.
 
     Of several tracks it is one with a decoder and more than one frame, the default one before others, a larger picture
-    before smaller ones, and the first of equals. Stills such as cover art do not count. The decoder runs in the calling thread only. A file is opened by
-    itself: nothing that it names.
+    before smaller ones, and the first of equals. Stills such as cover art do not count. The decoder runs in the calling
+    thread only. A file is opened by itself: nothing that it names.
 
     Args:
         path: the file.
@@ -80,10 +80,8 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
     except av.ArgumentError as error:
         why = f"is of no format that is read here, or damaged ({reason(error)}); these are read: {', '.join(FORMATS)}"
         raise VideoError(name, None, why) from error
-    except OSError as error:
-        raise VideoError(name, None, f"cannot be opened: {reason(error)}") from error
-    except av.FFmpegError as error:
-        cut = describe_cut(name)
+    except (av.FFmpegError, OSError) as error:
+        cut = "" if isinstance(error, OSError) else describe_cut(name)
         raise VideoError(name, None, f"{cut}{', and ' * bool(cut)}cannot be opened: {reason(error)}") from error
     except UnicodeError as error:
         why = f"cannot be opened: the name of the file is not valid text ({error}); rename it"
@@ -133,13 +131,11 @@ def _chosen(name: str, container: InputContainer, tracks: Sequence[VideoStream])
     if len(readable) > 1 and 0 in frames.values():
         frames |= _frames_at_the_beginning(name, [index for index, count in frames.items() if not count])
     moving = [track for track in readable if frames[track.index] > 1]
-    return min(moving or readable or tracks, key=_rank)
-
-
-def _rank(track: VideoStream) -> tuple[bool, int, int]:
-    decoder = track.codec_context
-    size_px = decoder.width * decoder.height if decoder else 0
-    return not track.disposition & Disposition.default, -size_px, track.index
+    sizes = {track.index: track.codec_context.width * track.codec_context.height for track in readable}
+    return min(
+        moving or readable or tracks,
+        key=lambda track: (not track.disposition & Disposition.default, -sizes.get(track.index, 0), track.index),
+    )
 
 
 def _frames_at_the_beginning(name: str, indexes: Sequence[int]) -> Counter[int]:
@@ -168,31 +164,26 @@ def packets(
     Args:
         cut: receives that last one.
     """
-    before, size = None, 0
+    last: Packet[VideoStream] | None = None
     for packet in container.demux(stream):
         if packet.size:
-            if before is not None:
-                size = before.size
-                yield before
-            before = packet
-    if before is None:
-        return
-    if not _is_cut(container, before, size):
-        yield before
-    elif cut is not None:
-        cut.append(before)
+            if last is not None:
+                yield last
+            last = packet
+    if last is not None and not _is_cut(container, last):
+        yield last
+    elif last is not None and cut is not None:
+        cut.append(last)
 
 
-def _is_cut(container: InputContainer, packet: Packet[VideoStream], size_before: int) -> bool:
+def _is_cut(container: InputContainer, packet: Packet[VideoStream]) -> bool:
     """Return whether the last packet of a track lacks its end."""
-    if packet.is_corrupt:
-        return True
     kind = container.format.name
     if kind == "mjpeg":
         return _END_OF_IMAGE not in bytes(packet)[-_MARKER_BYTES:]
-    if kind == "dv":  # all pictures have the same size
-        return packet.size < size_before
-    return kind == "mpegts" and bool(describe_cut(container.name))
+    if kind == "dv":  # all pictures have the same size; the demuxer fills up the last one
+        return container.size % packet.size > 0
+    return packet.is_corrupt or (kind == "mpegts" and bool(describe_cut(container.name)))
 
 
 def pictures(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:

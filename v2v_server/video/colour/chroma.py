@@ -7,8 +7,8 @@ Values are the stored ones, shifted and stretched like full-range luma
     Cb = round((stored - 128 s) 255 / (224 s)), limited range, s = 2**(bits - 8);
     Cb = round((stored - 2**(bits - 1)) 255 / (2**bits - 1)), full range.
 
-The file states the matrix to red, green and blue; one that states none, or another than these, has that of BT.601, as in
-FFmpeg.
+The file states the matrix to red, green and blue; one that states none, or another than these, has that of BT.601, as
+in FFmpeg.
 """
 
 from __future__ import annotations
