@@ -242,7 +242,8 @@ def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     add_videos(parser, "real videos")
     add_whole(parser, "--clips", 10, "clips to make defects of; 0: look for noise only", least=0)
-    add_whole(parser, "--samples", 120, "samples of the videos to look for noise in")
+    add_whole(parser, "--samples", 120, "samples of the videos to look for noise in; 0: none", least=0)
+    parser.add_argument("--only-find", action="store_true", help="count what is found, and simulate nothing")
 
 
 def measure(asked: argparse.Namespace) -> Report:
@@ -270,8 +271,9 @@ def measure(asked: argparse.Namespace) -> Report:
                     said += [f"{each} {video} {rate}" for each in found.keys() - {kind}]
                     if kind and not _is_there(name, film, seed, found.get(kind)):
                         missed.append(f"{video} {rate}")
-                events = _false_events(name, [film for _, film in clips], made, pictures, scenes)
-                false.append({"measure": "events", "made": name, "bit_rate": rate} | events)
+                if not asked.only_find:
+                    events = _false_events(name, [film for _, film in clips], made, pictures, scenes)
+                    false.append({"measure": "events", "made": name, "bit_rate": rate} | events)
             cases = len(clips) * len(_BIT_RATES)
             records.append(
                 {"measure": "made", "made": name, "cases": cases, "found": cases - len(missed) if kind else None,
@@ -282,6 +284,6 @@ def measure(asked: argparse.Namespace) -> Report:
     share = sum(each["found"] for each in counted) / sum(each["cases"] for each in counted) if clips else 1.0
     lines = [f"{share:.1%} of the defects are found"] if clips else []
     bars = [] if share >= LEAST_FOUND else [f"{share:.1%} of the defects are found; the bar is {LEAST_FOUND:.0%}"]
-    noise = noisy_samples(asked.videos, asked.samples)
+    noise = noisy_samples(asked.videos, asked.samples) if asked.samples and not asked.only_find else []
     tables = [(records, _CASES), (false, _EVENTS), (noise, _NOISE)]
     return Report([*records, *false, *noise], tables, lines, bars)

@@ -85,7 +85,7 @@ def test_a_file_without_its_list_of_frames_is_called_truncated(tmp_path: Path) -
         (b"\0\0\0\x10ftypisom\0\0\0\0" + struct.pack(">I", 90) + b"mdat", "is truncated: 50 of at least 106 bytes"),
         (b"\0\0\0\x10ftypisom\0\0\0\0" + struct.pack(">I", 0) + b"mdat", ""),  # up to the end of the file
         (b"\0\0\0\x10ftypisom\0\0\0\0" + b"\xff" * 8, ""),  # no box
-        (b"\0\0\0\x10ftypisom\0\0\0\0\0\0\0\1mdat" + b"\xff" * 8, "is truncated"),
+        (b"\0\0\0\x10ftypisom\0\0\0\0\0\0\0\1mdat" + struct.pack(">Q", 1000), "is truncated: 50 of at least 1,016"),
         (b"\x1a\x45\xdf\xa3\x80\x18\x53\x80\x67\x40\x60", "is truncated: 50 of at least 107 bytes are there"),
         (b"\x1a\x45\xdf\xa3\x80\x18\x53\x80\x67\x01" + b"\xff" * 7, ""),  # unknown
         (b"\x1a\x45\xdf\xa3", ""),

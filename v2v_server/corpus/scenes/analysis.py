@@ -14,7 +14,7 @@ is at least 2 grey levels, the next frame does not go back, and what of m_t is n
 
     u(t) = var m_t - cov(m_t-1, m_t)^2 / var m_t-1,
 
-is at least 0.35^2 var m_t and 3.5^2 times that of each of the eight steps before and after. In a shot that stands still
+is at least 0.35^2 var m_t and 3^2 times that of each of the eight steps before and after. In a shot that stands still
 (median of d below 0.2 grey levels) that is something which appears, not a jump.
 
 All of this is exact arithmetic, the same everywhere. Repeats are found in ``steps``, the other stretches in
@@ -63,8 +63,6 @@ _LEAST_BOUNDARY_LEVELS = 2.0
 _LEAST_BOUNDARY_SHARE = 0.35
 _LEAST_BOUNDARY_RATIO = 3.0
 _NEIGHBOURS = 5
-_LEAST_JUMP_SHARE = 0.35
-_LEAST_JUMP_RATIO = 3.5
 _LEAST_JUMP_PACE = 0.2
 """Grey levels."""
 _JUMP_REACH = 8
@@ -219,8 +217,8 @@ class SceneAnalysis:
         around, paces = ([*each[spans[0]], *each[spans[1]]] for each in (self._news, self._steps))
         return (
             len(around) >= _JUMP_REACH
-            and news >= _LEAST_JUMP_SHARE**2 * self._variances[at + 1]
-            and news >= _LEAST_JUMP_RATIO**2 * max(around)
+            and news >= _LEAST_BOUNDARY_SHARE**2 * self._variances[at + 1]
+            and news >= _LEAST_BOUNDARY_RATIO**2 * max(around)
             and float(np.median(paces)) >= _LEAST_JUMP_PACE
         )
 
