@@ -34,10 +34,10 @@ class VideoEntry:
         width_px, height_px: size of the upright picture, before ``rows``.
         frames_per_second: average rate; NaN where unknown.
         codec: FFmpeg's name of the format.
-        remark: what is not served of it, or not as it is meant (:class:`v2v_server.video.probe.VideoFacts`).
         threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
         pieces: its pieces, see :func:`v2v_server.corpus.scenes.pieces.encoded_pieces`; None where the catalogue was
             opened without ``scene``.
+        remark: what is not served of it, or not as it is meant (:class:`v2v_server.video.probe.VideoFacts`).
     """
 
     id: str
@@ -47,10 +47,10 @@ class VideoEntry:
     height_px: int
     frames_per_second: float
     codec: str
-    remark: str = ""
     threshold_pos: float | None = None
     threshold_neg: float | None = None
     pieces: bytes | None = None
+    remark: str = ""
 
 
 class Videos(Sequence[VideoEntry]):
@@ -134,10 +134,10 @@ class Videos(Sequence[VideoEntry]):
             height_px=record.height_px,
             frames_per_second=math.nan if record.frames_per_second is None else record.frames_per_second,
             codec=record.codec,
-            remark=record.remark,
             threshold_pos=pos,
             threshold_neg=neg,
             pieces=None if self.split is None else self.split.encoded(number),
+            remark=record.remark,
         )
 
 

@@ -72,6 +72,10 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
         yield "note", "corpus", text, change
     for note in catalogue.notes:
         yield "note", "corpus", note, ""
+    for what, values in ("interlaced", found.interlaced), ("not served whole, or not as they are meant", found.remark):
+        named = [f"{found.ids[at]} {values[at]}".removesuffix(" True") for at in np.flatnonzero(values).tolist()]
+        if len(named) > 1:  # the notes name the first ones
+            yield "note", "corpus", f"{what}: {name_all(named)}", ""
     yield from _how_videos_are_stored(catalogue)
     yield from _labels(catalogue)
     frames_needed = int(np.median(spec.recipe.sequence_at(found.frames_per_second))) + 1
@@ -124,18 +128,17 @@ def _how_videos_are_stored(catalogue: Catalogue) -> Iterator[Line]:
     counted = [id for id in ids if not catalogue.frame_index(id).seekable]
     if counted:
         text = (
-            f"{len(counted)} videos have no time stamps that name their frames ({counted[0]}): every clip of them is "
-            "decoded from the beginning of its file"
+            f"{len(counted)} videos have no time stamps that name their frames ({name_all(counted)}): every clip of "
+            "them is decoded from the beginning of its file"
         )
         yield "note", "corpus", text, "run v2v-prepare once: all frames of a prepared corpus are quick to read"
     if not catalogue.source.is_local:
         return
-    cropped = [(id, shown) for id in ids if (shown := clean_aperture(catalogue.path(id))) is not None]
-    if cropped:
-        id, (width, height) = cropped[0]
+    shown = {id: clean_aperture(catalogue.path(id)) for id in ids}
+    if cropped := [f"{id}: {float(size[0]):g}x{float(size[1]):g} px" for id, size in shown.items() if size]:
         text = (
-            f"{len(cropped)} videos state a clean aperture, a part of the picture for players to show ({id}: "
-            f"{float(width):g}x{float(height):g} px): it is not applied, the whole stored picture is served"
+            f"{len(cropped)} videos state a clean aperture, a part of the picture for players to show "
+            f"({name_all(cropped)}): it is not applied, the whole stored picture is served"
         )
         change = "crop such videos once (ffmpeg -i IN -vf crop=W:H OUT) if their borders hold no picture"
         yield "note", "corpus", text, change

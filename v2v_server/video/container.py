@@ -24,7 +24,7 @@ _MOST_BOXES = 10_000
 _ANY_END = 1 << 62
 _ISO_KINDS = frozenset({b"ftyp", b"styp", b"moov", b"mdat", b"moof", b"free", b"skip", b"wide"})
 _EBML, _SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
-_TRANSPORT_BYTES = {188: 0, 192: 4, 204: 0}
+TRANSPORT_BYTES = {188: 0, 192: 4, 204: 0}
 """Bytes of a packet of a transport stream, and those in front of its sync byte."""
 _SYNC = 0x47
 _TRANSPORT_PACKET = re.compile(rb"\x47([\x40-\x5f].)(?:[\x10-\x1f]|[\x30-\x3f](.))", re.DOTALL)
@@ -123,7 +123,7 @@ def count_transport_pictures(path: str) -> Counter[int]:
 
 def _transport_bytes(head: bytes) -> int:
     """Return the bytes of a packet of a transport stream; 0 of other files."""
-    for length, before in _TRANSPORT_BYTES.items():
+    for length, before in TRANSPORT_BYTES.items():
         if head[before::length][:8] == bytes([_SYNC]) * 8:
             return length
     return 0

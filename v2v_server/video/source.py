@@ -18,7 +18,7 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError, VideoUnreadable
-from v2v_server.video.container import describe_cut
+from v2v_server.video.container import TRANSPORT_BYTES, describe_cut
 
 FORMATS = (
     "mov", "matroska", "avi", "dv", "flv", "ivf", "mpegts", "mpeg", "mpegvideo", "m4v", "mxf", "ogg", "asf", "h264",
@@ -183,7 +183,9 @@ def _is_cut(container: InputContainer, packet: Packet[VideoStream]) -> bool:
         return _END_OF_IMAGE not in bytes(packet)[-_MARKER_BYTES:]
     if kind == "dv":  # all pictures have the same size; the demuxer fills up the last one
         return container.size % packet.size > 0
-    return packet.is_corrupt or (kind == "mpegts" and bool(describe_cut(container.name)))
+    # A packet of a transport stream does not say whether it has its end.
+    is_broken_off = kind == "mpegts" and all(container.size % each for each in TRANSPORT_BYTES)
+    return packet.is_corrupt or is_broken_off
 
 
 def pictures(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
