@@ -65,7 +65,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
     text += f"; {int(found.frames.sum())} frames that decode"
     yield "ok", "corpus", text, ""
     if catalogue.refusals:
-        text = f"{len(catalogue.refusals)} files cannot be used: {name_all(list(map(str, catalogue.refusals)))}"
+        text = f"{len(catalogue.refusals)} files cannot be used: {name_all(catalogue.refusals)}"
         change = "they are skipped: repair them, or leave them out of --videos"
         if any(os.strerror(errno.EACCES) in refusal.reason for refusal in catalogue.refusals):
             change += "; where permission is denied, let this user read the file and its folders (chmod, chown)"
@@ -86,7 +86,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
     useless = len(found) - table.videos
     if useless:
         change = _remedy(table.longest_clips, spec.recipe.voxels_per_clip)
-        why = name_all([str(table.refusals[place]) for place in range(useless)])
+        why = name_all(table.refusals)
         level = "note" if table.count else "bad"
         yield level, "corpus", f"{useless} videos give no sequence of the recipe {recipe}: {why}", change
     if not table.count:

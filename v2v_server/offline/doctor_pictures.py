@@ -102,16 +102,16 @@ class _Found(NamedTuple):
     """An excerpt, its frames that decode, their defects, what the levels of the video mean; why none decodes."""
 
     excerpt: _Excerpt
-    frames: int
+    frames: int = 0
     defects: tuple[Defect, ...] = ()
     signal: Signal = SDR
     problem: str = ""
 
 
-def name_all(texts: Sequence[str]) -> str:
-    """Return texts in one line; the first hundred of them."""
-    more = len(texts) - _MOST_NAMED
-    return "; ".join(texts[:_MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
+def name_all(items: Sequence[object]) -> str:
+    """Return the texts of items in one line; the first hundred of them."""
+    more = len(items) - _MOST_NAMED
+    return "; ".join(map(str, items[:_MOST_NAMED])) + (f"; and {more} more" if more > 0 else "")
 
 
 def hides_motion(defects: Iterable[Defect], can_be_followed: bool = True) -> bool:
@@ -127,7 +127,7 @@ def hides_motion(defects: Iterable[Defect], can_be_followed: bool = True) -> boo
 def defects_of_video(catalogue: Catalogue, id: str) -> tuple[Defect, ...]:
     """Return the defects in the middle of a video, in this process; none where it does not decode."""
     (video,) = (video for video in catalogue.videos if video.id == id)
-    return _look_at(_excerpt(catalogue, video)).defects
+    return _Found(excerpt := _excerpt(catalogue, video), *_look_at(excerpt)).defects
 
 
 def look_at_pictures(
@@ -259,11 +259,11 @@ def _found(excerpts: Iterable[_Excerpt], processes: int) -> Iterator[_Found]:
         _look_at, excerpts, processes, lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES, compile_cache()
     )
     for excerpt, result in results:
-        yield _Found(excerpt, 0, problem=result.how) if isinstance(result, Died) else result
+        yield _Found(excerpt, problem=result.how) if isinstance(result, Died) else _Found(excerpt, *result)
 
 
-def _look_at(excerpt: _Excerpt) -> _Found:
-    """Return what was found in an excerpt; no frames where they do not decode."""
+def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal, str]:
+    """Return the number of frames, their defects, and what their levels mean; why where they do not decode."""
     # Import lazily: the process that draws up the report needs no OpenCV.
     from v2v_server.corpus.scenes.analysis import analyse
 
@@ -276,8 +276,8 @@ def _look_at(excerpt: _Excerpt) -> _Found:
                 scene = analyse(stream_luma(path, index, excerpt.start, excerpt.count, window))
             signal = signal_of(path, index)
     except V2VError as error:
-        return _Found(excerpt, 0, problem=getattr(error, "reason", str(error)))
-    return _Found(excerpt, scene.end, defects_of(scene), signal)
+        return 0, (), SDR, getattr(error, "reason", str(error))
+    return scene.end, defects_of(scene), signal, ""
 
 
 def _has_variable_rate(excerpt: _Excerpt) -> bool:
