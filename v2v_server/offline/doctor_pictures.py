@@ -127,7 +127,8 @@ def hides_motion(defects: Iterable[Defect], can_be_followed: bool = True) -> boo
 def defects_of_video(catalogue: Catalogue, id: str) -> tuple[Defect, ...]:
     """Return the defects in the middle of a video, in this process; none where it does not decode."""
     (video,) = (video for video in catalogue.videos if video.id == id)
-    return _Found(excerpt := _excerpt(catalogue, video), *_look_at(excerpt)).defects
+    _, defects, _, _ = _look_at(_excerpt(catalogue, video))
+    return defects
 
 
 def look_at_pictures(
