@@ -315,6 +315,7 @@ class Lease:
         sidecars: fingerprints of the video's sidecars that the arrays are made from, by ending; a missing one is left
             out. To workers it may be [fingerprint, part]: bytes, the table of the files of a folder that the clip
             needs; or a text, why the sidecar is not used, perhaps without a fingerprint.
+        remark: what is not served of the video, or not as it is meant; goes into the provenance.
     """
 
     lease: int
@@ -342,6 +343,7 @@ class Lease:
     slot: int = 0
     packed: bool = False
     sidecars: Mapping[str, Any] = field(default_factory=dict)
+    remark: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 from v2v_protocol.programs import printable, show
 
+_Item = TypeVar("_Item")
 LOG_SECONDS = 10.0
 _FIRST_SECONDS = 1.0
 """A task that ends sooner shows nothing."""
@@ -83,6 +84,14 @@ class Progress:
         """Show a step whose total is not known, if it is time to or ``is_urgent``."""
         if (now := self._clock()) >= self._due or is_urgent:
             self._show(now, text, "", 0.0, None)
+
+    @classmethod
+    def over(cls, what: str, unit: str, items: Iterable[_Item], total: int) -> Iterator[_Item]:
+        """Yield items, and show how many there were."""
+        with cls(what, unit) as progress:
+            for done, item in enumerate(items, 1):
+                progress(done, total)
+                yield item
 
     @property
     def _is_shown(self) -> bool:

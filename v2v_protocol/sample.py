@@ -222,6 +222,7 @@ class Provenance:
         left_out: effects of the draw that were not simulated (``tolerance`` of the spec); the others were.
         substeps: parts that the clip's steps were divided into along the motion, undivided steps included; 0: the spec
             states no ``substep_px``, so no motion was used.
+        remark: what is not served of the video, or not as it is meant; empty for most.
     """
 
     id: SampleId
@@ -243,6 +244,7 @@ class Provenance:
     grid_seconds: tuple[float, ...] = ()
     left_out: tuple[str, ...] = ()
     substeps: int = 0
+    remark: str = ""
 
     @property
     def labelled(self) -> bool:
@@ -268,6 +270,7 @@ class Provenance:
         }
         optional = (
             "scene", "saturated", "sidecars", "unlabelled", "boxes_dropped", "grid_seconds", "left_out", "substeps",
+            "remark",
         )  # fmt: skip
         return {name: value for name, value in values.items() if value or name not in optional}
 
@@ -324,8 +327,6 @@ def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> L
     for name in arrays:
         if name not in ARRAYS:
             raise UsageError(f"arrays: unknown array {name!r}; known: {', '.join(ARRAYS)}")
-    if recipe.is_timed and "frames_all" in arrays:
-        raise UsageError("arrays: frames_all has another length in each sample with voxel_seconds: ask for frames")
     return {name: ARRAYS[name](recipe, voxel_dtype) for name in arrays}
 
 

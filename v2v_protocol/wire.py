@@ -89,7 +89,7 @@ _LATER: dict[type[Any], dict[str, Any]] = {
     Welcome: {"sidecars": ""},
     LeaseFailed: {"sidecar": ""},
     SampleHeader: {"arena": ""},
-    Lease: {"sidecars": {}},
+    Lease: {"sidecars": {}, "remark": ""},
 }
 """Fields that were added within a protocol version, with their defaults: a header leaves them out at the default."""
 

@@ -295,6 +295,7 @@ def lease_for(
         width_px=video.width_px,
         height_px=video.height_px,
         frames_per_second=0.0 if math.isnan(video.frames_per_second) else video.frames_per_second,
+        remark=video.remark,
         thresholds=thresholds,
         start_frame=sequence.start_frame,
         frame_index=b"",

@@ -372,6 +372,11 @@ def _snapshot(
             "taken at different times woven together, so that what moves is combed and makes false events. Deinterlace "
             "such videos once (ffmpeg -i IN -vf bwdif=send_field OUT), or leave them out",
         ]
+    if remarks := {videos.ids[at]: videos.remark[at] for at in np.flatnonzero(videos.remark).tolist()}:
+        notes = [
+            *notes,
+            f"{len(remarks)} videos are not served whole, or not as they are meant{format_problems(remarks)}",
+        ]
     if corpus.left_out:
         notes = [*notes, corpus.left_out]
     if shorter:

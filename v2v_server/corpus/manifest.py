@@ -87,6 +87,7 @@ class PreparedVideo:
         psnr_db: all frames against the source's, full-range luma, peak 255; None with a problem.
         worst_psnr_db: the same of the worst frame.
         problem: why there is no prepared file; None if there is one.
+        remark: of the source, see :class:`v2v_server.video.probe.VideoFacts`.
         scene: statistics of the source's frames, base64 of ``Scene.to_bytes()``; "" where they were not asked for.
     """
 
@@ -103,6 +104,7 @@ class PreparedVideo:
     worst_psnr_db: float | None = None
     problem: str | None = None
     scene: str = ""
+    remark: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,6 +199,7 @@ class Manifest:
             height_px=video.height_px,
             width_px=video.width_px,
             frames_per_second=video.frames_per_second,
+            remark=video.remark,
             problem=None,
         )
 

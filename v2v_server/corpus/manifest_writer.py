@@ -53,7 +53,7 @@ class ManifestWriter:
 
 
 def _line(item: Header | PreparedVideo, aside: bool = False) -> bytes:
-    values: dict[str, object] = asdict(item)
+    values: dict[str, object] = {name: value for name, value in asdict(item).items() if name != "remark" or value}
     if aside:
         values["aside"] = True
     return json.dumps(values, allow_nan=False).encode() + b"\n"

@@ -66,6 +66,7 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
         frames_per_second=None if math.isnan(facts.frames_per_second) else facts.frames_per_second,
         codec=facts.codec,
         interlaced=facts.interlaced,
+        remark=facts.remark,
         frame_index=facts.index.to_bytes(),
     )
 

@@ -38,6 +38,7 @@ class VideoEntry:
         threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
         pieces: its pieces, see :func:`v2v_server.corpus.scenes.pieces.encoded_pieces`; None where the catalogue was
             opened without ``scene``.
+        remark: what is not served of it, or not as it is meant (:class:`v2v_server.video.probe.VideoFacts`).
     """
 
     id: str
@@ -50,6 +51,7 @@ class VideoEntry:
     threshold_pos: float | None = None
     threshold_neg: float | None = None
     pieces: bytes | None = None
+    remark: str = ""
 
 
 class Videos(Sequence[VideoEntry]):
@@ -61,8 +63,8 @@ class Videos(Sequence[VideoEntry]):
         split: the videos that are divided into pieces; None where that is unknown.
 
     Attributes:
-        ids, fingerprints, frames, frames_per_second, width_px, height_px, interlaced: columns, one value for each
-            video.
+        ids, fingerprints, frames, frames_per_second, width_px, height_px, interlaced, remark: columns, one value for
+            each video.
         split: as given.
     """
 
@@ -74,6 +76,7 @@ class Videos(Sequence[VideoEntry]):
         self.ids, self.fingerprints, self.frames = table.ids, table.fingerprints, table.frames
         self.frames_per_second = table.frames_per_second
         self.width_px, self.height_px, self.interlaced = table.width_px, table.height_px, table.interlaced
+        self.remark = table.remark
 
     def find(self, id: str) -> int | None:
         """Return the number of the video with an id; None if there is none."""
@@ -140,6 +143,7 @@ class Videos(Sequence[VideoEntry]):
             threshold_pos=pos,
             threshold_neg=neg,
             pieces=None if self.split is None else self.split.encoded(number),
+            remark=record.remark,
         )
 
 

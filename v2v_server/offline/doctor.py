@@ -44,7 +44,6 @@ _TORCH_SECONDS = 120.0
 _NAME = re.compile(r"([A-Za-z0-9_.-]+)(?:\[([a-z]+)\])?")
 _FLOOR = re.compile(r">=([0-9.]+)")
 _EXTRA = re.compile(r"extra == ['\"]([a-z]+)['\"]")
-_SHOWN = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +87,7 @@ def look_around(port: int, videos: str | None, recipe: str, rows: str, cache_dir
     else:
         # Needs packages of that extra.
         corpus = importlib.import_module("v2v_server.offline.doctor_corpus")
-        yield from (Finding(*line) for line in corpus.look_at_corpus(videos, recipe, rows, cache_dir, _SHOWN))
+        yield from (Finding(*line) for line in corpus.look_at_corpus(videos, recipe, rows, cache_dir))
 
 
 def _missing(part: str) -> list[str]:

@@ -7,6 +7,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from itertools import islice
 
 import numpy as np
@@ -18,11 +19,13 @@ from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
 from v2v_server.config import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.offline.aperture import clean_aperture
+from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
+from v2v_server.labels.formats import READERS
 from v2v_server.offline.doctor_motion import look_at_motion
-from v2v_server.offline.doctor_pictures import look_at_pictures
+from v2v_server.offline.doctor_pictures import look_at_pictures, name_all
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.video.container import clean_aperture
 from v2v_server.video.rows import Rows
 
 Line = tuple[str, str, str, str]
@@ -32,13 +35,12 @@ _VIDEOS_OPENED = 10_000
 """Most videos of which more is read than their line of the index."""
 
 
-def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, shown: int) -> Iterator[Line]:
+def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None) -> Iterator[Line]:
     """Check a corpus and yield lines of the report.
 
     Args:
         videos, rows, cache_dir: as of :func:`v2v_server.corpus.catalogue.open_catalogue`.
         recipe: name of a preset, or a YAML file.
-        shown: how many refusals of a kind to name.
 
     Raises:
         UsageError: wrong recipe or rows.
@@ -51,36 +53,40 @@ def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, s
         yield "bad", "corpus", str(error), "give a folder, a video or a list file that this user can read"
         return
     try:
-        yield from _lines(catalogue, spec, recipe, shown)
+        yield from _lines(catalogue, spec, recipe)
     finally:
         catalogue.close()
 
 
-def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str, shown: int) -> Iterator[Line]:
+def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line]:
     found = catalogue.videos
     codecs = Counter(video.codec for video in found)
     text = f"{len(found)} videos: {', '.join(f'{count} {codec}' for codec, count in codecs.most_common())}"
     text += f"; {int(found.frames.sum())} frames that decode"
     yield "ok", "corpus", text, ""
     if catalogue.refusals:
-        few = "; ".join(map(str, catalogue.refusals[:shown]))
-        more = len(catalogue.refusals) - shown
-        text = f"{len(catalogue.refusals)} files cannot be used: {few}" + (f"; and {more} more" if more > 0 else "")
+        text = f"{len(catalogue.refusals)} files cannot be used: {name_all(catalogue.refusals)}"
         change = "they are skipped: repair them, or leave them out of --videos"
         if any(os.strerror(errno.EACCES) in refusal.reason for refusal in catalogue.refusals):
             change += "; where permission is denied, let this user read the file and its folders (chmod, chown)"
         yield "note", "corpus", text, change
     for note in catalogue.notes:
         yield "note", "corpus", note, ""
+    for what, values in ("interlaced", found.interlaced), ("not served whole, or not as they are meant", found.remark):
+        named = [f"{found.ids[at]} {values[at]}".removesuffix(" True") for at in np.flatnonzero(values).tolist()]
+        if len(named) > 1:  # the notes name the first ones
+            yield "note", "corpus", f"{what}: {name_all(named)}", ""
     yield from _how_videos_are_stored(catalogue)
-    yield from look_at_pictures(catalogue, int(np.median(spec.recipe.sequence_at(found.frames_per_second))) + 1)
-    yield from look_at_motion(catalogue)
+    yield from _labels(catalogue)
+    frames_needed = int(np.median(spec.recipe.sequence_at(found.frames_per_second))) + 1
+    defects = yield from look_at_pictures(catalogue, frames_needed)
+    yield from look_at_motion(catalogue, defects)
     yield from _rates(found.frames_per_second, spec.recipe)
     table = SequenceTable(found, catalogue.rows, spec)
     useless = len(found) - table.videos
     if useless:
         change = _remedy(table.longest_clips, spec.recipe.voxels_per_clip)
-        why = "; ".join(str(table.refusals[place]) for place in range(min(shown, useless)))
+        why = name_all(table.refusals)
         level = "note" if table.count else "bad"
         yield level, "corpus", f"{useless} videos give no sequence of the recipe {recipe}: {why}", change
     if not table.count:
@@ -122,21 +128,36 @@ def _how_videos_are_stored(catalogue: Catalogue) -> Iterator[Line]:
     counted = [id for id in ids if not catalogue.frame_index(id).seekable]
     if counted:
         text = (
-            f"{len(counted)} videos have no time stamps that name their frames ({counted[0]}): every clip of them is "
-            "decoded from the beginning of its file"
+            f"{len(counted)} videos have no time stamps that name their frames ({name_all(counted)}): every clip of "
+            "them is decoded from the beginning of its file"
         )
         yield "note", "corpus", text, "run v2v-prepare once: all frames of a prepared corpus are quick to read"
     if not catalogue.source.is_local:
         return
-    cropped = [(id, shown) for id in ids if (shown := clean_aperture(catalogue.path(id))) is not None]
-    if cropped:
-        id, (width, height) = cropped[0]
+    shown = {id: clean_aperture(catalogue.path(id)) for id in ids}
+    if cropped := [f"{id}: {float(size[0]):g}x{float(size[1]):g} px" for id, size in shown.items() if size]:
         text = (
-            f"{len(cropped)} videos state a clean aperture, a part of the picture for players to show ({id}: "
-            f"{float(width):g}x{float(height):g} px): it is not applied, the whole stored picture is served"
+            f"{len(cropped)} videos state a clean aperture, a part of the picture for players to show "
+            f"({name_all(cropped)}): it is not applied, the whole stored picture is served"
         )
         change = "crop such videos once (ffmpeg -i IN -vf crop=W:H OUT) if their borders hold no picture"
         yield "note", "corpus", text, change
+
+
+def _labels(catalogue: Catalogue) -> Iterator[Line]:
+    """Count the labels in the sidecars of a local corpus."""
+    for ending, reader in READERS.items() if catalogue.source.is_local else ():
+        read, labelled, boxes = 0, 0, 0
+        marks = catalogue.sidecars[ending].fingerprints
+        for id, mark in islice(marks.items(), _VIDEOS_OPENED):
+            index = catalogue.frame_index(id)
+            with suppress(Exception), open_sidecar(catalogue.source, sidecar_id(id, ending), mark) as opened:
+                table = reader(opened, (index.height_px, index.width_px))
+                labelled += len(set(table.frames.tolist()).union(table.annotated or ()))
+                read, boxes = read + 1, boxes + len(table.frames)
+        if marks:
+            text = f"{read} of {len(marks)} sidecars {ending} can be read: {labelled} frames have labels, {boxes} boxes"
+            yield "ok" if read == len(marks) else "note", "labels", text, ""
 
 
 def _remedy(longest: Sequence[int], wanted: int) -> str:

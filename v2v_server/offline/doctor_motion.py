@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from typing import Any
 
 from v2v_protocol.errors import V2VError
+from v2v_protocol.progress import Progress
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES
+from v2v_server.corpus.scenes.findings import Defect
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.offline.doctor_pictures import spread_videos
+from v2v_server.offline.doctor_pictures import hides_motion, spread_videos
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.system.process import usable_cores
@@ -39,28 +41,40 @@ class _Middle:
     window: Window
 
 
-def look_at_motion(catalogue: Catalogue) -> Iterator[tuple[str, str, str, str]]:
-    """Predict the loss in some videos of a local corpus, in bounded time, and yield the line of the report."""
+def look_at_motion(
+    catalogue: Catalogue, defects: Mapping[str, Sequence[Defect]]
+) -> Iterator[tuple[str, str, str, str]]:
+    """Predict the loss in some videos of a local corpus, in bounded time, and yield the line of the report.
+
+    Args:
+        defects: by id. Videos whose frames repeat or are combed have no motion that can be predicted.
+    """
     if not catalogue.source.is_local:
         return
     results = run_isolated(
         _predicted, _middles(catalogue), usable_cores(), lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES,
         compile_cache(),
     )  # fmt: skip
-    found = [result for _, result in results if not isinstance(result, Died) and result]
+    results = Progress.over("looking at motion", "videos", results, min(MOST_VIDEOS, len(catalogue.videos)))
+    found = {
+        middle.id: result
+        for middle, result in results
+        if not isinstance(result, Died) and result and not hides_motion(defects.get(middle.id, ()))
+    }
     if not found:
         return
     # Import lazily: these load OpenCV, which worked in the processes that found something.
     from v2v_server.motion.prediction import Prediction
     from v2v_server.offline.motion import describe_loss
 
-    total = sum((Prediction(*each) for each in found), Prediction())
+    total = sum((Prediction(*each) for each in found.values()), Prediction())
     change = ""
     if not total.is_slow:
         change = "more frames a second lose less"
         if total.can_be_followed:
             change += "; so does substep_px: 1 in the spec, for processor time"
-    text = f"{describe_loss(total)}; {_FRAMES} frames in the middle of {len(found)} videos"
+    loss = describe_loss(total, [each for id in found for each in defects.get(id, ())])
+    text = f"{loss}; {_FRAMES} frames in the middle of {len(found)} videos"
     yield "ok" if total.is_slow else "note", "motion", text.removeprefix("motion: "), change
 
 

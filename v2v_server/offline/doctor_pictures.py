@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 
 from v2v_protocol.errors import V2VError
+from v2v_protocol.progress import Progress
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES
@@ -39,6 +41,7 @@ from v2v_server.video.decode import stream_luma
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.orientation import Window
+from v2v_server.video.probe import DOLBY_VISION
 
 MOST_VIDEOS = 12
 SECONDS_OF_EACH = 8
@@ -48,7 +51,9 @@ _ASSUMED_RATE = 30.0
 _LONGEST_SECONDS = 60.0
 """After this time no other video is begun."""
 _LONGEST_VIDEO_SECONDS = 30.0
-_SHOWN = 3
+_MOST_NAMED = 100
+_HIDING = frozenset({DUPLICATES, COMBED})
+"""Defects from which no motion can be told."""
 _SERVED_VIDEOS = 4
 """Videos that a server looks at."""
 _SERVER_WAITS_SECONDS = 20.0
@@ -65,7 +70,7 @@ _EFFECTS = {
     NOISY: "still stretches with much noise",
 }
 _AUTO = "v2v-serve --scene auto"
-_CHANGES = {
+CHANGES = {
     DUPLICATES: f"a repeated frame makes no events, and the next step those of two: {_AUTO} drops repeats",
     CUTS: "a cut, or a jump over missing frames, fills the picture with false events: "
     f"{_AUTO} lets no sequence cross one",
@@ -90,45 +95,85 @@ class _Excerpt:
     start: int
     count: int
     window: Window
+    remark: str
 
 
-_Found = tuple[_Excerpt, int, tuple[Defect, ...], Signal]
-"""An excerpt, its frames that decode, their defects, and what the levels of the video mean."""
+class _Found(NamedTuple):
+    """An excerpt, its frames that decode, their defects, what the levels of the video mean; why none decodes."""
+
+    excerpt: _Excerpt
+    frames: int = 0
+    defects: tuple[Defect, ...] = ()
+    signal: Signal = SDR
+    problem: str = ""
 
 
-def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple[str, str, str, str]]:
+def name_all(items: Sequence[object]) -> str:
+    """Return the texts of items in one line; the first hundred of them."""
+    more = len(items) - _MOST_NAMED
+    return "; ".join(map(str, items[:_MOST_NAMED])) + (f"; and {more} more" if more > 0 else "")
+
+
+def hides_motion(defects: Iterable[Defect], can_be_followed: bool = True) -> bool:
+    """Return whether defects are what changes between frames, so that a prediction from motion says nothing.
+
+    Args:
+        can_be_followed: whether motion explains the frames all the same.
+    """
+    hiding = _HIDING if can_be_followed else _HIDING | {CUTS, FADES}
+    return any(each.kind in hiding for each in defects)
+
+
+def defects_of_video(catalogue: Catalogue, id: str) -> tuple[Defect, ...]:
+    """Return the defects in the middle of a video, in this process; none where it does not decode."""
+    (video,) = (video for video in catalogue.videos if video.id == id)
+    _, defects, _, _ = _look_at(_excerpt(catalogue, video))
+    return defects
+
+
+def look_at_pictures(
+    catalogue: Catalogue, frames_needed: int
+) -> Generator[tuple[str, str, str, str], None, dict[str, tuple[Defect, ...]]]:
     """Look for defects in some videos of a local corpus, in bounded time, and yield lines of the report.
 
     Args:
         frames_needed: frames of a sequence.
+
+    Returns:
+        the defects that were found, by id.
     """
     if not catalogue.source.is_local:
         yield "ok", "pictures", "not looked at: these videos lie on another host", ""
-        return
-    results = sorted(_found(_excerpts(catalogue, MOST_VIDEOS), usable_cores()), key=lambda each: each[0].id)
-    found, sequences = [each for each in results if each[1]], _sequences_of(results, frames_needed)
+        return {}
+    looked = _found(_excerpts(catalogue, MOST_VIDEOS), usable_cores())
+    looked = Progress.over("looking at pictures", "videos", looked, min(MOST_VIDEOS, len(catalogue.videos)))
+    results = sorted(looked, key=lambda each: each.excerpt.id)
+    found, sequences = [each for each in results if each.frames], _sequences_of(results, frames_needed)
     text = f"looked at {len(found)} of {len(catalogue.videos)} videos, at most {SECONDS_OF_EACH} s and "
     text += f"{_MOST_FRAMES} frames of each: {len(sequences)} sequences"
-    if failed := len(results) - len(found):
-        text += f"; {failed} more did not decode within {_LONGEST_VIDEO_SECONDS:.0f} s"
+    if failed := [f"{each.excerpt.id}: {each.problem}" for each in results if not each.frames]:
+        text += f"; {len(failed)} more did not decode ({name_all(failed)})"
     yield "ok", "pictures", text, ""
     for kind, effect in _EFFECTS.items():
-        having = [(excerpt, each) for excerpt, _, defects, _ in found for each in defects if each.kind == kind]
+        named = [
+            f"{each.excerpt.id}: {defect.text}" for each in found for defect in each.defects if defect.kind == kind
+        ]
         count = _affected(sequences, kind)
         if count:
-            named = "; ".join(f"{excerpt.id}: {each.text}" for excerpt, each in having[:_SHOWN])
-            more = f"; and {len(having) - _SHOWN} more" if len(having) > _SHOWN else ""
-            text = f"{count} of {len(sequences)} sequences ({100 * count // len(sequences)}%) have {effect} ({named}"
-            yield "note", "pictures", f"{text}{more})", _CHANGES[kind]
-    if varying := [excerpt.id for excerpt, _, _, _ in found if _has_variable_rate(excerpt)]:
-        text = f"{len(varying)} of {len(found)} videos have a variable rate ({', '.join(varying[:_SHOWN])})"
+            share = f"{count} of {len(sequences)} sequences ({100 * count // len(sequences)}%)"
+            yield "note", "pictures", f"{share} have {effect} ({name_all(named)})", CHANGES[kind]
+    if varying := [each.excerpt.id for each in found if _has_variable_rate(each.excerpt)]:
+        text = f"{len(varying)} of {len(found)} videos have a variable rate ({name_all(varying)})"
         change = "recipes that state times use the time stamps; a bin of frames then lasts differently long"
         yield "note", "pictures", text, change
-    if stated := [(excerpt.id, signal) for excerpt, _, _, signal in found if signal != SDR]:
-        named = "; ".join(f"{id}: {signal}" for id, signal in stated[:_SHOWN])
-        more = f"; and {len(stated) - _SHOWN} more" if len(stated) > _SHOWN else ""
-        text = f"{len(stated)} of {len(found)} videos have other levels than {SDR} ({named}{more})"
+    if stated := [
+        f"{each.excerpt.id}: {each.signal}"
+        for each in found
+        if each.signal != SDR and DOLBY_VISION not in each.excerpt.remark
+    ]:
+        text = f"{len(stated)} of {len(found)} videos have other levels than {SDR} ({name_all(stated)})"
         yield "note", "pictures", text, "v2v-serve --set light=declared uses them; otherwise they are read as 8-bit SDR"
+    return {each.excerpt.id: each.defects for each in found}
 
 
 def check_in_background(
@@ -195,12 +240,18 @@ def spread_videos(catalogue: Catalogue, most: int, seconds: float) -> Iterator[t
 
 def _excerpts(catalogue: Catalogue, most: int) -> Iterator[_Excerpt]:
     """Yield the middle of some videos."""
-    for video, index, window in spread_videos(catalogue, most, _LONGEST_SECONDS):
-        rate = video.frames_per_second
-        rate = rate if rate and math.isfinite(rate) else _ASSUMED_RATE
-        count = max(1, min(len(index), _MOST_FRAMES, round(SECONDS_OF_EACH * rate)))
-        start = (len(index) - count) // 2 if index.seekable else 0
-        yield _Excerpt(video.id, catalogue.source, index, start, count, window)
+    for video, _, _ in spread_videos(catalogue, most, _LONGEST_SECONDS):
+        yield _excerpt(catalogue, video)
+
+
+def _excerpt(catalogue: Catalogue, video: VideoEntry) -> _Excerpt:
+    index, rate = catalogue.frame_index(video.id), video.frames_per_second
+    rate = rate if rate and math.isfinite(rate) else _ASSUMED_RATE
+    count = max(1, min(len(index), _MOST_FRAMES, round(SECONDS_OF_EACH * rate)))
+    start = (len(index) - count) // 2 if index.seekable else 0
+    top, bottom = catalogue.rows.bounds(index.height_px)
+    window = top, 0, bottom - top, index.width_px
+    return _Excerpt(video.id, catalogue.source, index, start, count, window, video.remark)
 
 
 def _found(excerpts: Iterable[_Excerpt], processes: int) -> Iterator[_Found]:
@@ -209,11 +260,11 @@ def _found(excerpts: Iterable[_Excerpt], processes: int) -> Iterator[_Found]:
         _look_at, excerpts, processes, lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES, compile_cache()
     )
     for excerpt, result in results:
-        yield (excerpt, 0, (), SDR) if isinstance(result, Died) else (excerpt, *result)
+        yield _Found(excerpt, problem=result.how) if isinstance(result, Died) else _Found(excerpt, *result)
 
 
-def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal]:
-    """Return the number of frames, their defects, and what their levels mean; no frames where they do not decode."""
+def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal, str]:
+    """Return the number of frames, their defects, and what their levels mean; why where they do not decode."""
     # Import lazily: the process that draws up the report needs no OpenCV.
     from v2v_server.corpus.scenes.analysis import analyse
 
@@ -225,9 +276,9 @@ def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal]:
             else:
                 scene = analyse(stream_luma(path, index, excerpt.start, excerpt.count, window))
             signal = signal_of(path, index)
-    except V2VError:
-        return 0, (), SDR
-    return scene.end, defects_of(scene), signal
+    except V2VError as error:
+        return 0, (), SDR, getattr(error, "reason", str(error))
+    return scene.end, defects_of(scene), signal, ""
 
 
 def _has_variable_rate(excerpt: _Excerpt) -> bool:
@@ -241,15 +292,13 @@ def _has_variable_rate(excerpt: _Excerpt) -> bool:
 def _sequences_of(results: Iterable[_Found], needed: int) -> list[tuple[_Found, tuple[int, int]]]:
     """Return the sequences of the excerpts that decode; an excerpt shorter than a sequence counts as one."""
     return [
-        (each, (first, first + min(each[1], needed)))
+        (each, (first, first + min(each.frames, needed)))
         for each in results
-        if each[1]
-        for first in range(0, each[1] - min(each[1], needed) + 1, min(each[1], needed))
+        if each.frames
+        for first in range(0, each.frames - min(each.frames, needed) + 1, min(each.frames, needed))
     ]
 
 
 def _affected(sequences: list[tuple[_Found, tuple[int, int]]], kind: str) -> int:
     """Return the number of sequences with a defect of a kind."""
-    return sum(
-        any(each.kind == kind and each.touches(*span) for each in defects) for (_, _, defects, _), span in sequences
-    )
+    return sum(any(each.kind == kind and each.touches(*span) for each in found.defects) for found, span in sequences)

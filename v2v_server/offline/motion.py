@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -18,7 +18,9 @@ from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.scenes.findings import Defect
 from v2v_server.motion.prediction import SUBSTEP_PX, Prediction, predict
+from v2v_server.offline.doctor_pictures import CHANGES, hides_motion
 from v2v_server.offline.leases import lease_for
 from v2v_server.offline.remake import RemadeSample, Remaker
 from v2v_server.schedule.sequences import VideoSequence
@@ -78,8 +80,15 @@ def predicted_loss(made: RemadeSample) -> Prediction:
     return predict(apply_view(without_margin(frames, plan.params, recipe, plan.margin_px), plan.params, recipe))
 
 
-def describe_loss(found: Prediction) -> str:
-    """Return one line for the user about what the motion between frames costs and whether sub-steps help."""
+def describe_loss(found: Prediction, defects: Sequence[Defect] = ()) -> str:
+    """Return one line for the user about what the motion between frames costs and whether sub-steps help.
+
+    Args:
+        defects: of the videos. Where they are what changes, motion is not.
+    """
+    if hides_motion(defects, found.can_be_followed):
+        causes = dict.fromkeys(f"{each.text}: {CHANGES[each.kind]}" for each in defects if each.kind in CHANGES)
+        return f"changes that motion does not explain: {'; '.join(causes)}"
     if found.is_slow:
         return (
             f"motion: {found.px_per_frame:.2g} px a frame at the median of what moves; substep_px would change little"

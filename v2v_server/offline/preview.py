@@ -27,6 +27,7 @@ from v2v_protocol.sample import Provenance, sidecar_endings
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.motion.prediction import Prediction
+from v2v_server.offline.doctor_pictures import defects_of_video
 from v2v_server.offline.motion import WholePictures, describe_loss, moving_seeds, predicted_loss, quiet_voxels
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
@@ -34,6 +35,7 @@ from v2v_server.simulation.intensity import tone_table
 from v2v_server.store.clips import clips_of, signal_of
 from v2v_server.video.collect import Cut
 from v2v_server.video.luma import SDR
+from v2v_server.video.probe import DOLBY_VISION
 
 LABELS = ("boxes", "masks")
 """Arrays that are drawn if the videos have their sidecars."""
@@ -111,12 +113,14 @@ def preview(
                 loss += lost
                 progress(len(cameras), len(shots))  # the first may include compiling; the estimate begins after it
         whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
+        shown = sorted({camera.provenance.video for camera in cameras}) if first.scene == "off" else ()
+        defects = [each for id in shown for each in defects_of_video(catalogue, id)]
     finally:
         catalogue.close()
     _check_sizes(cameras, out.suffix)
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
-    say(describe_loss(loss))
+    say(describe_loss(loss, defects))
     write(out, _content(out.suffix, whole, cameras, title, moments))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
 
@@ -196,7 +200,8 @@ def _camera(
     arrays = ("voxels", "frames", *(("flow",) if with_flow else ()), *labels)
     made = Remaker(catalogue, stream, arrays).made(shot.seed, 0, 0)
     provenance = made.sample.provenance
-    if note := _signal_note(catalogue, provenance, stream.recipe):
+    remark = f"{provenance.video} {provenance.remark}" if provenance.remark else ""
+    for note in filter(None, (remark, _signal_note(catalogue, provenance, stream.recipe))):
         notes.setdefault(note, []).append(title)
     whole = _whole_picture(catalogue, provenance, stream.recipe)
     camera = Camera.of(made.sample.arrays, provenance, title, stream.recipe, whole)
@@ -210,6 +215,8 @@ def _signal_note(catalogue: Catalogue, provenance: Provenance, recipe: Recipe) -
     id = provenance.video
     with catalogue.source.open_local(id, provenance.fingerprint) as path:
         signal = signal_of(path, catalogue.frame_index(id))
+    if DOLBY_VISION in provenance.remark:
+        return ""  # its levels are not what they are called
     if signal == SDR or recipe.light == "declared":
         return "" if signal == SDR else f"{id} has {signal}"
     return f"{id} has {signal}, and is read as {SDR}: --set light=declared uses what it has"

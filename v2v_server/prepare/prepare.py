@@ -351,8 +351,9 @@ def _record(video: VideoEntry, height: int, width: int, result: Made | str, enco
     # A fingerprint begins with the size in bytes.
     size = int(video.fingerprint.partition("-")[0])
     record = PreparedVideo(
-        video.id, video.fingerprint, size, video.frames, None if math.isnan(rate) else rate, height, width
-    )
+        video.id, video.fingerprint, size, video.frames, None if math.isnan(rate) else rate, height, width,
+        remark=video.remark,
+    )  # fmt: skip
     if isinstance(result, str):
         return replace(record, problem=result)
     return replace(

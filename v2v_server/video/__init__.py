@@ -1,6 +1,7 @@
 """One video file: from its bytes to luma.
 
 source       opening it, for sequential reading
+container    what its container states beyond that
 probe        what it holds
 packets      what a packet says without being decoded
 signs        whether packets may not be the frames

@@ -54,11 +54,13 @@ class Delivered:
         pts: time stamps from the first sound frame on, :data:`NO_TIMESTAMP` for none.
         sound: number of frames in front of the first damage behind that one.
         is_damaged: whether an error or a damaged frame came behind the first sound frame.
+        change: what is different from the frame behind these on, for the user; "" if nothing is.
     """
 
     pts: array[int] = field(default_factory=lambda: array("q"))
     sound: int = 0
     is_damaged: bool = False
+    change: str = ""
 
     @classmethod
     def of(cls, path: str, head: VideoFrame, check: Callable[[int], None]) -> Delivered:
@@ -85,6 +87,8 @@ class Delivered:
                     if frame.is_corrupt and not found.pts:
                         continue
                     if (frame.height, frame.width) != (head.height, head.width) or not luma.describes(frame):
+                        form, before = _form(frame), _form(head)
+                        found.change = f"from frame {len(found.pts)} on they are {form} instead of {before}"
                         return found
                     found.is_damaged |= frame.is_corrupt
                     found.sound += not found.is_damaged
@@ -110,3 +114,7 @@ class Delivered:
         if not self.is_damaged and np.count_nonzero(kept & ~came) > _MOST_LOST * last:
             return None
         return listed.only(kept)
+
+
+def _form(frame: VideoFrame) -> str:
+    return f"{frame.width}x{frame.height} px of {LumaFormat.of(frame)}"

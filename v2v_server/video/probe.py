@@ -6,8 +6,8 @@ import hashlib
 import os
 import time
 from array import array
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
 
 import av
 import numpy as np
@@ -18,17 +18,23 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError
+from v2v_server.video.colour.chroma import SMPTE_240M, stated_matrix
+from v2v_server.video.container import count_transport_pictures, describe_cut, dolby_vision_profile
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX, NO_TIMESTAMP, FrameIndex, unseekable
 from v2v_server.video.listing import Delivered, is_confirmed
 from v2v_server.video.luma import LumaFormat
 from v2v_server.video.orientation import Orientation
 from v2v_server.video.packets import Fields, is_hidden
 from v2v_server.video.signs import PacketSigns, steps_and_gaps, times_are_doubtful
-from v2v_server.video.source import opened, packets, reason, time_base
+from v2v_server.video.source import moving_tracks, opened, packets, reason, time_base
 
 LONGEST_CPU_SECONDS = 1200.0
 """Processor time that listing the frames of a file may take: of the longest films it is seconds, and some minutes where
 they have to be decoded."""
+
+_RATE_TOLERANCE = 0.05
+"""Most relative distance of a stated rate from the average."""
+DOLBY_VISION = "Dolby Vision profile"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +53,7 @@ class VideoFacts:
         interlaced: whether the first picture, or any that is stored as two fields, says that its even and odd rows were
             taken at different times.
         content: 32 hexadecimal digits that name what the track stores: every packet, and when each frame is shown.
+        remark: what is not served of the file, or not as it is meant, and why; "" if all is.
     """
 
     frames: int
@@ -60,6 +67,7 @@ class VideoFacts:
     index: FrameIndex
     interlaced: bool = False
     content: str = ""
+    remark: str = ""
 
 
 def probe(path: str | os.PathLike[str]) -> VideoFacts:
@@ -79,7 +87,8 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
             base = time_base(stream)
             # Read before the container is closed: the stream's fields are gone after that. The average counts the
             # fields of H.264 in AVI.
-            rate = stream.guessed_rate or stream.average_rate
+            rates = stream.guessed_rate, stream.average_rate, stream.codec_context.framerate
+            others = _other_tracks(name, container, stream)
             reorders = bool(stream.codec_context.has_b_frames)
             stores_pts = _stores_pts(container)
             codec = stream.codec_context.codec.canonical_name
@@ -90,10 +99,11 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
     if not (1 <= height <= LARGEST_SIDE_PX and 1 <= width <= LARGEST_SIDE_PX):
         raise VideoError(name, None, f"its pictures of {width}x{height} px are larger than {LARGEST_SIDE_PX} px a side")
     uncounted = unseekable(1, base, height, width, orientation)
-    index = _index(shown, head, uncounted) if stores_pts or not reorders else None
+    index, change = _index(shown, head, uncounted) if stores_pts or not reorders else None, ""
     if index is None or _is_doubtful(shown, reorders) or not is_confirmed(name, index):
         found = Delivered.of(name, head, _Effort(name).check)
         index = None if index is None else found.confirmed(index, shown.signs.empty_pts)
+        change = found.change or (f"is damaged from frame {found.sound} on" if found.is_damaged else "")
         if index is None:
             index = unseekable(found.sound, base, height, width, orientation)
     if not len(index):
@@ -104,12 +114,13 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
         width_px=width,
         codec=codec,
         pixel_format=head.format.name,
-        frames_per_second=_rate(index, rate),
+        frames_per_second=_rate(index, shown, [float(each) for each in rates if each]),
         rotation_degrees=head.rotation,
         full_range=LumaFormat.of(head).full_range,
         interlaced=head.interlaced_frame or shown.fields,
         index=index,
-        content=_content(shown, index),
+        content=_content(shown, index, head),
+        remark="; ".join(filter(None, (*_left_out(name, shown, index, change), others))),
     )
 
 
@@ -122,6 +133,7 @@ class _Shown:
     dts: array[int] = field(default_factory=lambda: array("q"))
     is_keyframe: bytearray = field(default_factory=bytearray)
     fields: bool = False
+    is_cut: bool = False  # the last one lacks its end, and is left out
     stored: hashlib._Hash = field(default_factory=hashlib.sha256)  # of every packet of the track
 
     def add(self, packet: Packet[VideoStream]) -> None:
@@ -136,8 +148,9 @@ def _walk(name: str, container: InputContainer, stream: VideoStream) -> tuple[Vi
     fields = Fields(stream.codec_context.extradata) if codec == "h264" else None
     head: VideoFrame | None = None
     failure: av.FFmpegError | None = None
+    cut: list[Packet[VideoStream]] = []
     shown, effort = _Shown(PacketSigns(stream)), _Effort(name)
-    for packet in packets(container, stream):
+    for packet in packets(container, stream, cut):
         effort.check(len(shown.pts))
         if head is None:
             head, failure = _first_sound(stream, packet, failure)
@@ -151,7 +164,7 @@ def _walk(name: str, container: InputContainer, stream: VideoStream) -> tuple[Vi
         head, failure = _first_sound(stream, None, failure)
     if head is None:
         raise VideoError(name, 0, f"no frame decodes: {reason(failure) if failure else 'its track is empty'}")
-    shown.fields = fields is not None and fields.seen
+    shown.fields, shown.is_cut = fields is not None and fields.seen, bool(cut)
     return head, shown
 
 
@@ -216,8 +229,33 @@ def _index(shown: _Shown, head: VideoFrame, uncounted: FrameIndex) -> FrameIndex
     )
 
 
-def _content(shown: _Shown, index: FrameIndex) -> str:
+def _left_out(name: str, shown: _Shown, index: FrameIndex, change: str) -> Iterator[str]:
+    """Yield what is missing of the track: the frames that are served are compared with all of its pictures."""
+    cut = describe_cut(name) or ("is truncated" if shown.is_cut else "")
+    yield f"{cut}; its last picture is left out" if shown.is_cut else cut
+    empty = np.setdiff1d(np.array(shown.signs.empty_pts, np.int64), index.pts)
+    stored = len(shown.pts) - len(empty)
+    if (missing := stored - len(index)) > 0:
+        change = f"{missing} of {stored} pictures are left out: {change or 'they do not decode'}"
+    yield change
+    if profile := dolby_vision_profile(name):
+        yield f"is {DOLBY_VISION} {profile}, which stores IPT-PQ: its grey is not luma"
+
+
+def _other_tracks(name: str, container: InputContainer, stream: VideoStream) -> str:
+    """Say which other tracks of pictures a file has; "" if none."""
+    others = [track.codec_context for track in moving_tracks(container) if track is not stream]
+    tracks = [f"{decoder.width}x{decoder.height} px" for decoder in others if decoder]
+    if container.format.name == "mpegts":
+        counts = count_transport_pictures(name)
+        tracks = [f"{count} pictures of track {pid}" for pid, count in sorted(counts.items()) if pid != stream.id]
+    return f"other tracks are left out: {', '.join(tracks)}" if tracks else ""
+
+
+def _content(shown: _Shown, index: FrameIndex, head: VideoFrame) -> str:
     stored = shown.stored.copy()
+    if (matrix := stated_matrix(head)) == SMPTE_240M:
+        stored.update(matrix.encode())  # colour of such files was that of BT.601 under the name without it
     if index.orientation != Orientation():
         stored.update(f"{index.orientation};".encode())
     for part in (index.pts, index.keyframes):
@@ -225,11 +263,17 @@ def _content(shown: _Shown, index: FrameIndex) -> str:
     return stored.hexdigest()[:32]
 
 
-def _rate(index: FrameIndex, stated: Fraction | None) -> float:
-    """Return frames per second: the average without gaps, else what the container states."""
+def _rate(index: FrameIndex, shown: _Shown, stated: Sequence[float]) -> float:
+    """Return frames per second: the average without gaps, else the first that the file states."""
+    numerator, denominator = index.time_base
     if index.seekable and len(index) > 1:
-        numerator, denominator = index.time_base
         steps, are_gaps = steps_and_gaps(index.pts)
         steps = steps[~are_gaps]
         return len(steps) * denominator / (int(steps.sum()) * numerator)
-    return float(stated) if stated else float("nan")
+    span = max(shown.pts, default=0) - min(shown.pts, default=0)
+    if (
+        0 < span < min(len(shown.pts), 2 * len(set(shown.pts))) - 1
+    ):  # frames follow each other within a tick of the clock
+        average = (len(shown.pts) - 1) * denominator / (span * numerator)
+        return next((each for each in stated if abs(each / average - 1) < _RATE_TOLERANCE), average)
+    return stated[0] if stated else float("nan")

@@ -18,6 +18,7 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError, VideoUnreadable
+from v2v_server.video.container import TRANSPORT_BYTES, describe_cut
 
 FORMATS = (
     "mov", "matroska", "avi", "dv", "flv", "ivf", "mpegts", "mpeg", "mpegvideo", "m4v", "mxf", "ogg", "asf", "h264",
@@ -48,6 +49,9 @@ _OPTIONS = {
 }
 _JPEG = b"\xff\xd8\xff"
 _STILL = Disposition.attached_pic | Disposition.timed_thumbnails | Disposition.still_image
+_MARKER_BYTES = 1024
+"""Bytes at the end of a picture in which its last marker lies; behind it there may be padding."""
+_END_OF_IMAGE = b"\xff\xd9"  # ITU-T T.81, B.1.1.3
 _PACKETS_LOOKED_AT = 256
 """Of a file with several tracks: enough to see which of them hold a single picture."""
 
@@ -56,9 +60,9 @@ _PACKETS_LOOKED_AT = 256
 def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, VideoStream]]:
     """Open a container and its video track; both are closed at the end.
 
-    Of several tracks it is one with a decoder and more than one frame, the default one before others, the first before
-    later ones. Stills such as cover art do not count. The decoder runs in the calling thread only. A file is opened by
-    itself: nothing that it names.
+    Of several tracks it is one with a decoder and more than one frame, the default one before others, a larger picture
+    before smaller ones, and the first of equals. Stills such as cover art do not count. The decoder runs in the calling
+    thread only. A file is opened by itself: nothing that it names.
 
     Args:
         path: the file.
@@ -77,12 +81,13 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
         why = f"is of no format that is read here, or damaged ({reason(error)}); these are read: {', '.join(FORMATS)}"
         raise VideoError(name, None, why) from error
     except (av.FFmpegError, OSError) as error:
-        raise VideoError(name, None, f"cannot be opened: {reason(error)}") from error
+        cut = "" if isinstance(error, OSError) else describe_cut(name)
+        raise VideoError(name, None, f"{cut}{', and ' * bool(cut)}cannot be opened: {reason(error)}") from error
     except UnicodeError as error:
         why = f"cannot be opened: the name of the file is not valid text ({error}); rename it"
         raise VideoError(name, None, why) from error
     try:
-        tracks = [track for track in container.streams.video if not track.disposition & _STILL]
+        tracks = moving_tracks(container)
         if not tracks:
             raise VideoError(name, None, "has no video track")
         stream = _chosen(name, container, tracks)
@@ -105,6 +110,11 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
         container.close()
 
 
+def moving_tracks(container: InputContainer) -> list[VideoStream]:
+    """Return the tracks of pictures that are not stills such as cover art."""
+    return [track for track in container.streams.video if not track.disposition & _STILL]
+
+
 def _open(name: str) -> InputContainer:
     # FFmpeg takes "12:30.mp4" for an address; no absolute path looks like one. Tags need not be UTF-8: old cameras and
     # QuickTime write others.
@@ -121,8 +131,10 @@ def _chosen(name: str, container: InputContainer, tracks: Sequence[VideoStream])
     if len(readable) > 1 and 0 in frames.values():
         frames |= _frames_at_the_beginning(name, [index for index, count in frames.items() if not count])
     moving = [track for track in readable if frames[track.index] > 1]
+    sizes = {track.index: track.codec_context.width * track.codec_context.height for track in readable}
     return min(
-        moving or readable or tracks, key=lambda track: (not track.disposition & Disposition.default, track.index)
+        moving or readable or tracks,
+        key=lambda track: (not track.disposition & Disposition.default, -sizes.get(track.index, 0), track.index),
     )
 
 
@@ -143,11 +155,37 @@ def _raw_format(name: str) -> str | None:
         return "mjpeg" if file.read(len(_JPEG)) == _JPEG else None
 
 
-def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
-    """Yield the track's packets in stored order, without empty ones, which would end the decoder (AVI's drops)."""
+def packets(
+    container: InputContainer, stream: VideoStream, cut: list[Packet[VideoStream]] | None = None
+) -> Iterator[Packet[VideoStream]]:
+    """Yield the track's packets in stored order, without empty ones, which would end the decoder (AVI's drops), and
+    without a last one that the end of the file cuts short, which many decoders show as if it were whole.
+
+    Args:
+        cut: receives that last one.
+    """
+    last: Packet[VideoStream] | None = None
     for packet in container.demux(stream):
         if packet.size:
-            yield packet
+            if last is not None:
+                yield last
+            last = packet
+    if last is not None and not _is_cut(container, last):
+        yield last
+    elif last is not None and cut is not None:
+        cut.append(last)
+
+
+def _is_cut(container: InputContainer, packet: Packet[VideoStream]) -> bool:
+    """Return whether the last packet of a track lacks its end."""
+    kind = container.format.name
+    if kind == "mjpeg":
+        return _END_OF_IMAGE not in bytes(packet)[-_MARKER_BYTES:]
+    if kind == "dv":  # all pictures have the same size; the demuxer fills up the last one
+        return container.size % packet.size > 0
+    # A packet of a transport stream does not say whether it has its end.
+    is_broken_off = kind == "mpegts" and all(container.size % each for each in TRANSPORT_BYTES)
+    return packet.is_corrupt or is_broken_off
 
 
 def pictures(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:

@@ -262,6 +262,7 @@ def make_sample(
             grid_seconds=_grid_seconds(context),
             left_out=context.left_out,
             substeps=0 if context.saturated is None else context.substeps,
+            remark=lease.remark,
         ),
     )
 

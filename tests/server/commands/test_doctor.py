@@ -8,17 +8,23 @@ import socket
 import struct
 import subprocess
 import sys
+from contextlib import closing
 from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.clips import damaged, panned_luma, write_clip
+from tests.clips import damaged, panned_luma, truncated, write_clip
 from v2v_protocol.recipe import Recipe
 from v2v_server.commands import doctor as command
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.scenes.findings import COMBED, DUPLICATES
+from v2v_server.motion.prediction import predict
 from v2v_server.offline import doctor, doctor_corpus, doctor_motion, doctor_pictures
 from v2v_server.offline.doctor import BAD, NOTE, OK, Finding, control_group_memory
+from v2v_server.offline.doctor_pictures import defects_of_video
+from v2v_server.offline.motion import describe_loss
 
 
 @pytest.fixture(autouse=True)
@@ -277,3 +283,43 @@ def with_clean_aperture(source: Path, target: Path, width: int, height: int) -> 
         (size,) = struct.unpack_from(">I", content, begin)
         struct.pack_into(">I", content, begin, size + len(clap))
     target.write_bytes(content)
+
+
+def test_the_doctor_names_every_video_and_counts_labels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for number in range(7):
+        write_clip(tmp_path / f"short{number}.mp4", panned_luma(12, 140, 160))
+    write_clip(tmp_path / "long.mp4", panned_luma(60, 140, 160))
+    truncated(tmp_path / "short0.mp4", tmp_path / "cut.mp4", 0.5)
+    (tmp_path / "long.boxes.txt").write_text("1,1,10,10,20,20,1,1,1\n3,1,10,10,20,20,1,1,1\n3,2,50,50,20,20,1,1,1\n")
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("voxels_per_clip: 10\nbins: 5\n")
+    _, said = told(capsys, "--videos", str(tmp_path), "--cache-dir", str(tmp_path), "--recipe", str(recipe))
+    assert "1 files cannot be used: cut.mp4: is truncated: " in said
+    (line,) = (line for line in said.splitlines() if "videos give no sequence" in line)
+    assert all(f"short{number}.mp4" in line for number in range(7))
+    assert "1 of 1 sidecars .boxes.txt can be read: 2 frames have labels, 3 boxes" in said
+
+
+@pytest.mark.parametrize("kind", ["twos", "combed", "plain"])
+def test_preview_and_doctor_agree_on_what_changes(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moving = panned_luma(120, 140, 160, step=(0, 3))
+    woven = moving[::2].copy()
+    woven[:, 1::2] = moving[1::2, 1::2]
+    luma = {"twos": moving[np.arange(60) // 2], "combed": woven, "plain": moving[:60]}[kind]
+    (tmp_path / "videos").mkdir()
+    write_clip(tmp_path / "videos" / "clip.mkv", luma, codec="ffv1", pixel_format="gray", full_range=True)
+    _, said = told(capsys, "--videos", str(tmp_path / "videos"), "--cache-dir", str(tmp_path))
+    with closing(open_catalogue(tmp_path / "videos", cache_dir=tmp_path / "index", processes=0)) as catalogue:
+        defects = defects_of_video(catalogue, "clip.mkv")
+    text = describe_loss(predict(luma), defects)
+    assert "flicker" not in text
+    if kind == "plain":
+        assert not defects
+        return
+    change = doctor_pictures.CHANGES[DUPLICATES if kind == "twos" else COMBED]
+    assert text.startswith("changes that motion does not explain: ")
+    assert change in text
+    assert change in said
+    assert "flicker" not in said

@@ -43,6 +43,7 @@ def corpus(tmp_path: Path) -> Path:
                 29.97,
                 "h264",
                 False,
+                "",
                 None,
                 b"index",
             )

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from v2v_server.video.collect import ChromaCut
-from v2v_server.video.colour.chroma import ChromaStack
+from v2v_server.video.colour.chroma import ChromaStack, stated_matrix
 from v2v_server.video.colour.rgb import add_colour, differences_of
 from v2v_server.video.luma import LumaFormat, luma_plane, range_table
 from v2v_server.video.orientation import Orientation
@@ -47,6 +47,22 @@ def full_size(frame: VideoFrame) -> npt.NDArray[np.int64]:
         columns = np.arange(frame.width) // -(-frame.width // component.width)
         found.append(samples[np.ix_(rows, columns)])
     return np.array(found, np.int64)
+
+
+@pytest.mark.parametrize(
+    ("stated", "matrix", "weights"),
+    [
+        (Colorspace.SMPTE240M, "SMPTE 240M", (0.212, 0.087)),  # ITU-T H.273, table 4
+        (Colorspace.ITU709, "BT.709", (0.2126, 0.0722)),
+        (Colorspace.ITU601, "BT.601", (0.299, 0.114)),
+    ],
+)
+def test_the_stated_matrix_is_used(stated: Colorspace, matrix: str, weights: tuple[float, float]) -> None:
+    frame = VideoFrame(16, 16, "yuv420p")
+    frame.colorspace = stated
+    assert stated_matrix(frame) == matrix
+    (red, blue), (kr, kb) = differences_of(matrix, 1.0)[[0, 3], 128 + 50], weights
+    assert (red, blue) == (round(2 * (1 - kr) * 50), round(2 * (1 - kb) * 50))
 
 
 @given(

@@ -25,7 +25,7 @@ CHUNK = 4096
 _LARGEST_RATE = 1e9
 _NUMBER_TYPES = "qqqqiidb"
 """Types of size, mtime, ctime, frames, width, height, rate and interlaced, in the letters of :mod:`array` and NumPy."""
-_UNREADABLE = (-1, 0, 0, "", 0, 0, 0, None, "", 0, "the index lost its record; start again to probe it", None)
+_UNREADABLE = (-1, 0, 0, "", 0, 0, 0, None, "", 0, "", "the index lost its record; start again to probe it", None)
 """The columns after the id where the index has no sound row. No file has a size of -1, so it is probed."""
 
 
@@ -98,7 +98,7 @@ class VideoTable:
         frames, width_px, height_px: integers [N].
         frames_per_second: float64 [N], NaN where unknown.
         interlaced: bool [N].
-        codec, problem: objects [N], strings; no problem is None.
+        codec, remark, problem: objects [N], strings; no problem is None.
         summaries: bytes [N], of the figures that were asked for; empty where there are none.
     """
 
@@ -110,6 +110,7 @@ class VideoTable:
     frames_per_second: npt.NDArray[np.float64]
     interlaced: npt.NDArray[np.bool_]
     codec: npt.NDArray[np.object_]
+    remark: npt.NDArray[np.object_]
     problem: npt.NDArray[np.object_]
     summaries: StringColumn
 
@@ -128,7 +129,7 @@ class VideoTable:
         """
         strings, start, left = (bytearray(), bytearray(), bytearray()), 0, iter(rows)
         # Allocated once: arrays that grow leave holes in the heap, a third of their size.
-        columns = [np.empty(count, dtype) for dtype in ("i", "i", "i", *_NUMBER_TYPES, "O", "O")]
+        columns = [np.empty(count, dtype) for dtype in ("i", "i", "i", *_NUMBER_TYPES, "O", "O", "O")]
         while chunk := list(islice(left, CHUNK)):
             for utf8, *part in _converted(chunk):
                 for string, more in zip(strings, utf8, strict=True):
@@ -138,9 +139,9 @@ class VideoTable:
                     column[start:end] = values
                 start = end
         ids, fingerprints, summaries = map(StringColumn, strings, columns[:3])
-        size, mtime, ctime, frames, width, height, rate, interlaced, codec, problem = columns[3:]
+        size, mtime, ctime, frames, width, height, rate, interlaced, codec, remark, problem = columns[3:]
         numbers = frames, width, height, rate, interlaced.view(np.bool_)
-        return cls(ids, fingerprints, *numbers, codec, problem, summaries), np.stack((size, mtime, ctime), 1)
+        return cls(ids, fingerprints, *numbers, codec, remark, problem, summaries), np.stack((size, mtime, ctime), 1)
 
     def where(self, mask: npt.NDArray[np.bool_]) -> VideoTable:
         """Return the rows at which the mask is set."""
@@ -166,6 +167,7 @@ class VideoTable:
             frames_per_second=None if math.isnan(rate) else rate,
             codec=self.codec[at],
             interlaced=bool(self.interlaced[at]),
+            remark=self.remark[at],
             problem=self.problem[at],
         )
 
@@ -190,7 +192,7 @@ def _columns(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
     """
     columns = tuple(zip(*rows, strict=True))
     ids, sizes, mtimes, ctimes, fingerprints, frames, widths, heights, rates = columns[:9]
-    codecs, interlaced, problems, summaries = columns[9:]
+    codecs, interlaced, remarks, problems, summaries = columns[9:]
     if None in rates:
         rates = tuple(math.nan if rate is None else rate for rate in rates)
     values = sizes, mtimes, ctimes, frames, widths, heights, rates, interlaced
@@ -206,7 +208,7 @@ def _columns(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
     blobs = [summary if isinstance(summary, bytes) else b"" for summary in summaries]
     strings = _utf8(ids), _utf8(fingerprints), (b"".join(blobs), array("i", map(len, blobs)))
     utf8, lengths = zip(*strings, strict=True)
-    return utf8, *lengths, *numbers, list(map(sys.intern, codecs)), problems
+    return utf8, *lengths, *numbers, list(map(sys.intern, codecs)), list(map(sys.intern, remarks)), problems
 
 
 def _utf8(strings: Sequence[str]) -> tuple[bytes, array[int]]:

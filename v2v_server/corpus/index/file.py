@@ -20,7 +20,7 @@ from typing import Any
 from v2v_server.corpus.sources.asking import Notice
 from v2v_server.system.private import make_private
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 """Raise it with every change of the table or of what probing finds: an index of another version is made again."""
 
 _BUSY_SECONDS, _SAY_SECONDS = 30.0, 2.0
@@ -38,6 +38,7 @@ CREATE TABLE video (
     frames_per_second REAL,
     codec TEXT NOT NULL,
     interlaced INTEGER NOT NULL,
+    remark TEXT NOT NULL,
     problem TEXT,
     frame_index BLOB
 )"""
@@ -94,7 +95,7 @@ class IndexRow:
         size_bytes, mtime_ns, ctime_ns: of the file when it was probed; a size of -1, which no file has, lets it be
             probed again at the next start.
         fingerprint: see :mod:`v2v_server.video.fingerprint`.
-        frames, width_px, height_px, frames_per_second, codec, interlaced: see
+        frames, width_px, height_px, frames_per_second, codec, interlaced, remark: see
             :class:`v2v_server.video.probe.VideoFacts`; frames_per_second is None where unknown.
         problem: why the file cannot be used; None if it can.
         frame_index: ``FrameIndex.to_bytes()``; None with a problem, and where only the other columns were read.
@@ -111,6 +112,7 @@ class IndexRow:
     frames_per_second: float | None = None
     codec: str = ""
     interlaced: bool = False
+    remark: str = ""
     problem: str | None = None
     frame_index: bytes | None = None
 

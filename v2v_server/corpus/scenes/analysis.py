@@ -9,6 +9,14 @@ do not count, and d(s, t) = mean |m_s - m_t|. Frame t begins a shot if d(t-1, t)
 - not above twice d(t-1, t+1): the next frame does not go back, as after a flash;
 - large beside most steps around it (``is_cut``): repeated frames make the median small.
 
+Missing frames of a moving shot leave a picture of less difference. Frame t begins another piece of it too, if d(t-1, t)
+is at least 2 grey levels, the next frame does not go back, and what of m_t is not m_t-1 in another light,
+
+    u(t) = var m_t - cov(m_t-1, m_t)^2 / var m_t-1,
+
+is at least 0.35^2 var m_t and 3^2 times that of each of the eight steps before and after. In a shot that stands still
+(median of d below 0.2 grey levels) that is something which appears, not a jump.
+
 All of this is exact arithmetic, the same everywhere. Repeats are found in ``steps``, the other stretches in
 ``stretches``; dissolves are not found. Motion is that of dense inverse search on pictures of a quarter of the size,
 over the first four of every eight frames, rounded to 1/64 px a frame.
@@ -55,6 +63,10 @@ _LEAST_BOUNDARY_LEVELS = 2.0
 _LEAST_BOUNDARY_SHARE = 0.35
 _LEAST_BOUNDARY_RATIO = 3.0
 _NEIGHBOURS = 5
+_LEAST_JUMP_PACE = 0.2
+"""Grey levels."""
+_JUMP_REACH = 8
+"""Steps."""
 _LARGEST_RETURN = 0.5
 _BARS_EVERY = 8
 """Frames."""
@@ -94,6 +106,7 @@ class SceneAnalysis:
         self._combed: list[tuple[int, bool]] = []
         self._steps: list[float] = []  # d(t-1, t)
         self._returns: list[float] = []  # d(t-1, t+1)
+        self._news: list[float] = []  # u(t), (1/64 grey level)^2
         self._changes: list[_Tiles] = []  # of frame 1, 2 ...: largest change over four frames
         self._motions: list[tuple[int, int, _Tiles]] = []  # (frame, later frame, px a frame)
         self._shares: list[tuple[int, float, float]] = []  # (frame, dark, clipped)
@@ -109,7 +122,7 @@ class SceneAnalysis:
         number, self._frames = self._frames, self._frames + 1
         blocks = block_sums(picture)
         self._means.append(float(blocks.mean()) / 64)
-        self._variances.append(_variance(blocks))
+        self._variances.append(_covariance(blocks, blocks) / blocks.size**2)
         self._light.append(int(blocks.sum()) // blocks.size)
         self._flat.append(is_flat(blocks))
         self._still.append(is_still(self._blocks[0] if self._blocks else blocks, blocks))
@@ -120,6 +133,7 @@ class SceneAnalysis:
             if number % LAG_FRAMES == 0:
                 self._combed.append((number, _is_combed(picture, np.abs(blocks - self._blocks[-1]))))
             self._steps.append(_difference(self._blocks[-1], blocks))
+            self._news.append(_unexplained(self._blocks[-1], blocks))
             self._changes.append(_largest(np.abs(blocks - self._blocks[0])) / 64)
         if len(self._blocks) > 1:
             self._returns.append(_difference(self._blocks[-2], blocks))
@@ -181,20 +195,32 @@ class SceneAnalysis:
     def _shot_boundaries(self) -> tuple[int, ...]:
         boundaries = []
         for at, step in enumerate(self._steps):  # from frame ``at`` to ``at + 1``
-            contrast = (self._variances[at] + self._variances[at + 1]) / 64**2
-            if step < _LEAST_BOUNDARY_LEVELS or step**2 < _LEAST_BOUNDARY_SHARE**2 * contrast:
-                continue
-            around = self._steps[max(0, at - _NEIGHBOURS) : at] + self._steps[at + 1 : at + 1 + _NEIGHBOURS]
-            if around and step < _LEAST_BOUNDARY_RATIO * float(np.median(around)):
+            if step < _LEAST_BOUNDARY_LEVELS:
                 continue
             if at < len(self._returns) and self._returns[at] < _LARGEST_RETURN * step:
                 continue  # a flash begins
             if at and self._returns[at - 1] < _LARGEST_RETURN * step:
                 continue  # it ends
-            if not is_cut(self._step_changes, at):
-                continue
-            boundaries.append(at + 1)
+            if self._is_another_picture(at, step) or self._is_jump(at):
+                boundaries.append(at + 1)
         return tuple(boundaries)
+
+    def _is_another_picture(self, at: int, step: float) -> bool:
+        contrast = (self._variances[at] + self._variances[at + 1]) / 64**2
+        around = self._steps[max(0, at - _NEIGHBOURS) : at] + self._steps[at + 1 : at + 1 + _NEIGHBOURS]
+        is_large = not around or step >= _LEAST_BOUNDARY_RATIO * float(np.median(around))
+        return is_large and step**2 >= _LEAST_BOUNDARY_SHARE**2 * contrast and is_cut(self._step_changes, at)
+
+    def _is_jump(self, at: int) -> bool:
+        news = self._news[at]
+        spans = slice(max(0, at - _JUMP_REACH), at), slice(at + 1, at + 1 + _JUMP_REACH)
+        around, paces = ([*each[spans[0]], *each[spans[1]]] for each in (self._news, self._steps))
+        return (
+            len(around) >= _JUMP_REACH
+            and news >= _LEAST_BOUNDARY_SHARE**2 * self._variances[at + 1]
+            and news >= _LEAST_BOUNDARY_RATIO**2 * max(around)
+            and float(np.median(paces)) >= _LEAST_JUMP_PACE
+        )
 
 
 def analyse(pictures: Iterable[Picture]) -> Scene:
@@ -219,10 +245,15 @@ def block_sums(picture: Picture) -> npt.NDArray[np.int64]:
     return blocks
 
 
-def _variance(blocks: npt.NDArray[np.int64]) -> float:
-    """Return the variance of whole numbers, rounded once."""
-    total, squares = int(blocks.sum()), int(np.square(blocks).sum())
-    return (blocks.size * squares - total * total) / blocks.size**2
+def _covariance(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> int:
+    """Return the covariance of whole numbers, times the square of their count."""
+    return first.size * int((first * second).sum()) - int(first.sum()) * int(second.sum())
+
+
+def _unexplained(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> float:
+    """Return the variance of block means that those of the picture before do not have in another light."""
+    before, both, after = _covariance(first, first), _covariance(first, second), _covariance(second, second)
+    return (after * before - both**2) / (before * second.size**2) if before else after / second.size**2
 
 
 def _is_combed(picture: Picture, change: npt.NDArray[np.int64]) -> bool:

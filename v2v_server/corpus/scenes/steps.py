@@ -8,6 +8,9 @@ In a regular pattern a step is a repeat if its change is at most 1/5 (almost hal
 largest around it: coders with few bits blend a repeat with its neighbours. A pattern is a period of 2 to 12 steps in
 which four fifths of the steps at some places are such repeats, and at most half at the other places, in one shot.
 
+A single step is a repeat if its change is at most 1/12 of that of each of the four steps before and after, unless the
+step before it is large: a coder with few bits repeats its keyframes, which look unlike the frames before them.
+
 Elsewhere a step is a repeat if its change is at most 1/6 of the median before it and of that after it, and either at
 most 1/25 of the largest on either side, or the next step makes up for it. Where motion comes to rest or begins, only
 one side is that large.
@@ -29,6 +32,7 @@ _MEDIAN_RATIO = 6
 _PATTERN_RATIO = 5
 _REACH = 4
 _CUT_REACH = 8
+_SURE_RATIO = 12
 _NOISE = 64
 """Change of a block that may be coder noise: a grey level, in 1/64."""
 _LEAST_CHANGE = (5 * 64) ** 2 // 150
@@ -59,7 +63,7 @@ def duplicated(changes: Sequence[int], blocks: int, boundaries: Sequence[int] = 
         boundaries: frames at which another shot begins.
 
     Returns:
-        [N]; repeats outside of patterns are False where there are too few to be more than chance.
+        [N]; repeats outside of patterns are False where there are too few to be more than chance, unless sure.
     """
     each, least = np.array(changes, np.int64), _LEAST_CHANGE * blocks
     flags, others = np.zeros(len(each), bool), np.zeros(len(each), bool)
@@ -69,6 +73,8 @@ def duplicated(changes: Sequence[int], blocks: int, boundaries: Sequence[int] = 
         flags[shot] = pattern
         if not pattern.any():
             others[shot] = [_is_repeat(changes[shot], at, least) for at in range(end - 1 - first)]
+        sure = [_is_surely_repeat(changes[shot], at, least) for at in range(end - 1 - first)]
+        flags[shot] |= np.array(sure, bool)
     count = int(others.sum())
     return flags | others if count >= _LEAST_COUNT and 1000 * count >= _LEAST_PER_MILLE * len(each) else flags
 
@@ -82,9 +88,9 @@ def _in_pattern(changes: npt.NDArray[np.int64], least: int) -> npt.NDArray[np.bo
     largest = np.partition(around, -2, axis=1)[:, -2]
     moves = largest >= least
     small = moves & (_PATTERN_RATIO * changes <= largest)
-    for period in range(2, min(_LONGEST_PERIOD, count // 4) + 1):
-        shares = [(int(small[place::period].sum()), len(small[place::period])) for place in range(period)]
-        repeats = [5 * found >= 4 * steps for found, steps in shares]
+    for period in range(2, min(_LONGEST_PERIOD, int(moves.sum()) // 4) + 1):
+        shares = [(int(small[place::period].sum()), int(moves[place::period].sum())) for place in range(period)]
+        repeats = [5 * found >= 4 * steps > 0 for found, steps in shares]
         others = [2 * found <= steps for found, steps in shares]
         enough = sum(found for (found, _), repeat in zip(shares, repeats, strict=True) if repeat) >= _LEAST_COUNT
         if enough and any(others) and all(one or other for one, other in zip(repeats, others, strict=True)):
@@ -104,6 +110,14 @@ def _is_repeat(changes: Sequence[int], at: int, least: int) -> bool:
         return False
     around = sorted([*before, *after])
     return _RATIO * changes[at] <= largest or 2 * after[0] >= 3 * around[len(around) // 2]
+
+
+def _is_surely_repeat(changes: Sequence[int], at: int, least: int) -> bool:
+    """Return whether a step of a shot repeats a frame, by itself."""
+    around = sorted([*changes[max(0, at - _REACH) : at], *changes[at + 1 : at + 1 + _REACH]])
+    if len(around) < 2 * _REACH or around[0] < max(2 * least, _SURE_RATIO * changes[at]):
+        return False
+    return changes[at - 1] <= 3 * around[_REACH]
 
 
 def is_cut(changes: Sequence[int], step: int) -> bool:

@@ -7,7 +7,8 @@ Values are the stored ones, shifted and stretched like full-range luma
     Cb = round((stored - 128 s) 255 / (224 s)), limited range, s = 2**(bits - 8);
     Cb = round((stored - 2**(bits - 1)) 255 / (2**bits - 1)), full range.
 
-The file states the matrix to red, green and blue; one that states none has that of BT.601, as in FFmpeg.
+The file states the matrix to red, green and blue; one that states none, or another than these, has that of BT.601, as
+in FFmpeg.
 """
 
 from __future__ import annotations
@@ -27,7 +28,11 @@ from v2v_server.video.orientation import Orientation, Window
 
 CELL_PX = 2
 DEFAULT_MATRIX = "BT.601"
-_STATED = {int(Colorspace.ITU709): "BT.709", int(Colorspace.BT2020): "BT.2020", 10: "BT.2020"}
+SMPTE_240M = "SMPTE 240M"
+_STATED = {
+    int(Colorspace.ITU709): "BT.709", int(Colorspace.SMPTE240M): SMPTE_240M, int(Colorspace.BT2020): "BT.2020",
+    10: "BT.2020",
+}  # fmt: skip
 
 
 class Chroma(NamedTuple):
@@ -35,7 +40,7 @@ class Chroma(NamedTuple):
 
     Attributes:
         cells: [n, 2, rows, columns] int8, Cb and Cr, upright.
-        matrix: "BT.601", "BT.709" or "BT.2020".
+        matrix: "BT.601", "BT.709", "SMPTE 240M" or "BT.2020".
     """
 
     cells: npt.NDArray[np.int8]
@@ -136,6 +141,11 @@ class ChromaStack:
         return Chroma(self._cells, self._matrix)
 
 
+def stated_matrix(frame: VideoFrame) -> str:
+    """Return the matrix of a decoded frame's colour."""
+    return _STATED.get(int(frame.colorspace), DEFAULT_MATRIX)
+
+
 _Plane = tuple[npt.NDArray[Any], int, int]
 
 
@@ -147,7 +157,7 @@ def _planes_of(frame: VideoFrame) -> tuple[Sequence[_Plane], npt.NDArray[np.int8
     luma = LumaFormat.of(frame)
     if luma.pixel_format.startswith("gray"):
         return (), _table(8, True), DEFAULT_MATRIX
-    matrix = _STATED.get(int(frame.colorspace), DEFAULT_MATRIX)
+    matrix = stated_matrix(frame)
     if not luma.has_plane:
         frame = frame.reformat(
             format="yuv444p", dst_colorspace=Colorspace.ITU601, dst_color_range=ColorRange.JPEG

@@ -16,7 +16,9 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-_MATRICES = {"BT.601": (0.299, 0.114), "BT.709": (0.2126, 0.0722), "BT.2020": (0.2627, 0.0593)}
+_MATRICES = {
+    "BT.601": (0.299, 0.114), "BT.709": (0.2126, 0.0722), "SMPTE 240M": (0.212, 0.087), "BT.2020": (0.2627, 0.0593),
+}  # fmt: skip
 """Kr and Kb (ITU-T H.273)."""
 
 _BYTES, _WHOLE = numba.uint8[:, :, ::1], numba.int64[::1]

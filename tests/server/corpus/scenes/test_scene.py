@@ -134,6 +134,23 @@ def test_cuts_in_quick_succession_to_black_and_of_dark_scenes() -> None:
     assert analyse(dark).shot_boundaries == (12,)
 
 
+def test_a_jump_within_a_moving_shot_is_found() -> None:
+    """Missing frames of a slow pan leave a picture that is partly the same."""
+    luma = pan(80, 1)
+    for missing in (20, 30):
+        assert analyse(np.concatenate([luma[:25], luma[25 + missing :]])).shot_boundaries == (25,)
+    assert analyse(np.concatenate([luma[:25], luma[27:]])).shot_boundaries == ()
+
+
+def test_what_appears_in_a_still_picture_and_another_light_are_no_jumps() -> None:
+    still = np.repeat(pan(1, 0), 40, axis=0)
+    still[20:, 40:72, 60:110] = 200
+    lit = pan(40, 1)
+    lit[20:] = np.rint(lit[20:] * 0.6 + 20)
+    for luma in (still, lit):
+        assert analyse(luma).shot_boundaries == ()
+
+
 @pytest.mark.parametrize("pace_px", [0, 1, 8, 20])
 def test_motion_is_no_cut(pace_px: int) -> None:
     assert analyse(pan(60, pace_px)).shot_boundaries == ()

@@ -42,9 +42,25 @@ def test_changes_below_coder_noise_are_no_motion() -> None:
 
 @pytest.mark.parametrize("repeats", [3, 4])
 def test_a_few_repeats_in_a_long_video_may_be_chance(repeats: int) -> None:
+    """Their step is an eighth of the others, and the next one makes up for it."""
     changes = [MOVING] * 100
-    changes[10 : 10 * (repeats + 1) : 10] = [0] * repeats
+    changes[10 : 10 * (repeats + 1) : 10] = [MOVING // 8] * repeats
+    changes[11 : 10 * (repeats + 1) + 1 : 10] = [2 * MOVING] * repeats
     assert duplicated(changes, BLOCKS).sum() == (repeats if repeats >= 4 else 0)
+
+
+@given(st.integers(0, 59), st.integers(0, MOVING // 12), st.data())
+def test_a_single_repeat_amid_motion_is_found(place: int, change: int, data: st.DataObject) -> None:
+    changes = [MOVING + data.draw(st.integers(0, MOVING)) for _ in range(60)]
+    changes[place] = change
+    expected = [place] if 4 <= place < 56 else []
+    assert np.flatnonzero(duplicated(changes, BLOCKS)).tolist() == expected
+
+
+def test_a_keyframe_that_a_coder_repeats_is_no_repeat() -> None:
+    changes = [MOVING] * 60
+    changes[29:31] = [30 * MOVING, 0]
+    assert not duplicated(changes, BLOCKS).any()
 
 
 @given(st.lists(st.booleans(), max_size=40), st.integers(1, 5), st.integers(0, 3))
