@@ -111,7 +111,7 @@ class Sockets:
         most_connections: largest number of consumer connections at a time, and of worker connections.
         most_queued_bytes: largest number of bytes queued for one consumer.
         keys: keys of the peers that may connect over ``tcp://``; None admits all peers.
-        local_bind: address for workers of this host, which have no key; used if ``worker_bind`` requires keys.
+        local_bind: address for workers of this host, which have no key; used if ``worker_bind`` is for other hosts.
 
     Raises:
         UsageError: an address cannot be bound; the message names the flag.
@@ -141,7 +141,7 @@ class Sockets:
             )
             self.address = self._consumers.bind(bind, "--bind")
             local = ""
-            if keys is not None and not is_private and local_bind:
+            if local_bind and not is_private:
                 local = self._workers.bind(local_bind, "--worker-bind", admits_all=True)
             self.worker_address = self._workers.bind(worker_bind, "--worker-bind")
             self.local_address = local or self.worker_address

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -85,7 +86,6 @@ class _Excerpt:
     """The part of a video that is looked at, in the rows that are used."""
 
     id: str
-    source: VideoSource
     index: FrameIndex
     start: int
     count: int
@@ -105,7 +105,9 @@ def look_at_pictures(catalogue: Catalogue, frames_needed: int) -> Iterator[tuple
     if not catalogue.source.is_local:
         yield "ok", "pictures", "not looked at: these videos lie on another host", ""
         return
-    results = sorted(_found(_excerpts(catalogue, MOST_VIDEOS), usable_cores()), key=lambda each: each[0].id)
+    results = sorted(
+        _found(catalogue.source, _excerpts(catalogue, MOST_VIDEOS), usable_cores()), key=lambda each: each[0].id
+    )
     found, sequences = [each for each in results if each[1]], _sequences_of(results, frames_needed)
     text = f"looked at {len(found)} of {len(catalogue.videos)} videos, at most {SECONDS_OF_EACH} s and "
     text += f"{_MOST_FRAMES} frames of each: {len(sequences)} sequences"
@@ -154,7 +156,7 @@ def check_in_background(
             return
         results = list[_Found]()
         try:
-            for each in _found(excerpts, processes):
+            for each in _found(catalogue.source, excerpts, processes):
                 if stop.is_set():
                     return
                 results.append(each)
@@ -200,26 +202,27 @@ def _excerpts(catalogue: Catalogue, most: int) -> Iterator[_Excerpt]:
         rate = rate if rate and math.isfinite(rate) else _ASSUMED_RATE
         count = max(1, min(len(index), _MOST_FRAMES, round(SECONDS_OF_EACH * rate)))
         start = (len(index) - count) // 2 if index.seekable else 0
-        yield _Excerpt(video.id, catalogue.source, index, start, count, window)
+        yield _Excerpt(video.id, index, start, count, window)
 
 
-def _found(excerpts: Iterable[_Excerpt], processes: int) -> Iterator[_Found]:
+def _found(source: VideoSource, excerpts: Iterable[_Excerpt], processes: int) -> Iterator[_Found]:
     """Yield what was found in each video; no frames where it does not decode in time."""
     results = run_isolated(
-        _look_at, excerpts, processes, lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES, compile_cache()
-    )
+        partial(_look_at, source), excerpts, processes, lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES,
+        compile_cache(),
+    )  # fmt: skip
     for excerpt, result in results:
         yield (excerpt, 0, (), SDR) if isinstance(result, Died) else (excerpt, *result)
 
 
-def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal]:
+def _look_at(source: VideoSource, excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal]:
     """Return the number of frames, their defects, and what their levels mean; no frames where they do not decode."""
     # Import lazily: the process that draws up the report needs no OpenCV.
     from v2v_server.corpus.scenes.analysis import analyse
 
     index, window = excerpt.index, excerpt.window
     try:
-        with excerpt.source.open_local(excerpt.id, "") as path:
+        with source.open_local(excerpt.id, "") as path:
             if is_store_file(path):
                 scene = analyse(islice(pictures_of(path, index, window), excerpt.count))
             else:
