@@ -452,7 +452,7 @@ def test_stop_reaps_what_ignores_every_request(start: Callable[[int, str], Pool]
         "import signal, sys, time\n"
         "for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):\n"
         "    signal.signal(number, signal.SIG_IGN)\n"
-        f"open({str(tmp_path)!r} + '/' + sys.argv[6], 'w').close()\n"
+        f"open({str(tmp_path)!r} + '/' + sys.argv[8], 'w').close()\n"
         "time.sleep(600)\n"
     )
     pool = start(2, stubborn)
