@@ -141,14 +141,13 @@ def run_isolated(
         while lanes:
             readable = _wait(lanes)
             for lane in list(lanes):
-                result = lane.receive() if lane.socket in readable else None
-                if result is None and lane.patience <= 0:
-                    result = lane.give_up()
-                if result is None:
+                finished = lane.receive() if lane.socket in readable else None
+                if finished is None and lane.patience <= 0:
+                    finished = lane.give_up()
+                if finished is None:
                     continue
-                finished = lane.job, result
                 for following in left:
-                    if isinstance(result, Died):
+                    if isinstance(finished[1], Died):
                         lanes.append(_Lane(function, deadline_seconds, memory_bytes, writable))
                         lanes.remove(lane)
                         lane.end()
@@ -195,11 +194,8 @@ class _Lane(Generic[J, R]):
 
     Attributes:
         socket: our end of the pair.
-        job: the latest.
-        patience: remaining seconds until it is overdue.
+        patience: remaining seconds until its job is overdue.
     """
-
-    job: J
 
     def __init__(
         self,
@@ -228,7 +224,7 @@ class _Lane(Generic[J, R]):
             other.close()
 
     def begin(self, job: J) -> None:
-        self.job = job
+        self._job = job
         self._allowed = self.patience = math.inf if self._deadline_seconds is None else self._deadline_seconds(job)
         self._unpacker = msgpack.Unpacker(**_LIMITS)
         try:
@@ -236,8 +232,8 @@ class _Lane(Generic[J, R]):
         except OSError:
             self._process.kill()  # it has died, or does not read: receive() finds the end
 
-    def receive(self) -> R | Died | None:
-        """Return the result of the job if the rest of it has arrived; None otherwise."""
+    def receive(self) -> tuple[J, R | Died] | None:
+        """Return the job and its result if the rest of it has arrived; None otherwise."""
         try:
             data = self.socket.recv(_CHUNK_BYTES)
         except OSError:
@@ -247,7 +243,7 @@ class _Lane(Generic[J, R]):
             death = self._kill()
             if not self._begun and death.exitcode >= 0:
                 raise UsageError(_NO_START.format(how=death.how))
-            return death
+            return self._job, death
         try:
             self._unpacker.feed(data)
             if not self._begun:
@@ -258,11 +254,11 @@ class _Lane(Generic[J, R]):
         except msgpack.OutOfData:
             return None
         except Exception:  # noqa: BLE001 - a process that a video has taken over sends anything
-            return replace(self._kill(), is_malformed=True)
-        return result
+            return self._job, replace(self._kill(), is_malformed=True)
+        return self._job, result
 
-    def give_up(self) -> Died:
-        return replace(self._kill(), exitcode=-signal.SIGKILL, overdue_seconds=self._allowed)
+    def give_up(self) -> tuple[J, R | Died]:
+        return self._job, replace(self._kill(), exitcode=-signal.SIGKILL, overdue_seconds=self._allowed)
 
     def _kill(self) -> Died:
         self._process.kill()
@@ -335,9 +331,11 @@ def _typed(kind: Any, value: Any) -> Any:
         KeyError, ValueError, OverflowError, V2VError: it is not one.
     """
     kinds = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
-    kind = {_plain_type(each): each for each in kinds}[type(value)]
-    if kind is Path:
-        return Path(os.fsdecode(value))
+    # A float that is whole may travel as an int.
+    by_plain = {int: float} if float in kinds else {}
+    kind = (by_plain | {_plain_type(each): each for each in kinds})[type(value)]
+    if kind in (Path, float):
+        return Path(os.fsdecode(value)) if kind is Path else float(value)
     if kind is int and value >= 2**63:
         raise OverflowError(f"{value} is larger than numbers are")
     if type(value) is not tuple:
