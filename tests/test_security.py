@@ -49,6 +49,15 @@ def test_received_data_is_never_executed() -> None:
     assert {call.path for call in calls() if call.function in CALLS} == {"v2v_client/position/shared.py"}
 
 
+def test_no_channel_between_processes_unpickles() -> None:
+    channels = ("Pipe", "Queue", "SimpleQueue", "Manager", "Listener", "Pool", "ProcessPoolExecutor", "recv_pyobj")
+    ends = tuple(f".{name}" for name in channels)
+    assert [
+        call for call in calls() if call.function.startswith("multiprocessing.") and call.function.endswith(ends)
+    ] == []
+    assert {call.path for call in calls() if call.function.endswith("recv_pyobj")} == set()
+
+
 def test_commands_never_use_a_shell() -> None:
     assert [call.path for call in calls() if "shell" in call.keywords] == []
 

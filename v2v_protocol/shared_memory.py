@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import mmap
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from v2v_protocol.arena import ArenaName, array_offsets
 
@@ -44,23 +44,35 @@ def seal_memory(descriptor: int, *, content: bool) -> None:
     fcntl(descriptor, F_ADD_SEALS, F_SEAL_SEAL | (F_SEAL_WRITE if content else 0))
 
 
-def open_memory(name: ArenaName, size: int, *, writable: bool) -> int:
+def find_memory(name: ArenaName, writable: bool) -> int:
+    """Open memory of another process; return the descriptor, which :func:`open_memory` checks.
+
+    Raises:
+        OSError: it does not exist, or is not accessible.
+    """
+    # Read the link first: opening another file type, such as a device or a pipe, may have side effects.
+    if os.readlink(name.path) != name.link:
+        raise FileNotFoundError(name.path)
+    return os.open(name.path, (os.O_RDWR if writable else os.O_RDONLY) | os.O_CLOEXEC | os.O_NONBLOCK)
+
+
+def open_memory(
+    name: ArenaName, size: int, *, writable: bool, find: Callable[[ArenaName, bool], int] = find_memory
+) -> int:
     """Open memory of another process; return the descriptor.
 
     Args:
         name: of the memory.
         size: its expected size, bytes.
         writable: open it for writing; otherwise its content must be sealed.
+        find: :func:`find_memory`, or how the descriptor comes from a process that may call it.
 
     Raises:
         OSError: it does not exist, is not accessible, has another size, or its size or content is not sealed.
     """
     from fcntl import F_GET_SEALS, F_SEAL_SHRINK, F_SEAL_WRITE, fcntl
 
-    # Read the link first: opening another file type, such as a device or a pipe, may have side effects.
-    if os.readlink(name.path) != name.link:
-        raise FileNotFoundError(name.path)
-    descriptor = os.open(name.path, (os.O_RDWR if writable else os.O_RDONLY) | os.O_CLOEXEC | os.O_NONBLOCK)
+    descriptor = find(name, writable)
     try:
         if os.readlink(f"/proc/self/fd/{descriptor}") != name.link:
             raise FileNotFoundError(name.path)

@@ -63,7 +63,7 @@ from v2v_server.system.start_times import StartTimes
 from v2v_server.system.status_fields import GIB
 from v2v_server.video.rows import Rows
 
-_FILES_A_WORKER = 4
+_FILES_A_WORKER = 6
 _TURN_SECONDS = 0.1
 """Longest wait of the loop without a message; also the interval of checks of deadlines and workers."""
 _SOON_SECONDS = 5.0
@@ -312,6 +312,8 @@ class Server:
                     if not self._transport.send(message) and not self._pool.watches(self._name(message.identity)):
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
                 case SendLease() as grant:
+                    if grant.lease.arena:
+                        self._pool.lend(self._name(grant.worker), grant.lease.arena)
                     todo.extendleft(reversed(self._corpus.complete(grant, todo)))
                 case Disconnect(identity):
                     self._transport.cut(identity)

@@ -103,7 +103,7 @@ class Sockets:
         most_connections: largest number of consumer connections at a time, and of worker connections.
         has_session: returns whether a peer's connection is kept when another needs its place; called by another thread.
         keys: keys of the peers that may connect over ``tcp://``; None admits all peers.
-        local_bind: address for workers of this host, which have no key; used if ``worker_bind`` requires keys.
+        local_bind: address for workers of this host, which have no key; used if ``worker_bind`` is for other hosts.
         admits: returns whether a connection that was just accepted may stay; None admits all.
 
     Raises:
@@ -134,7 +134,7 @@ class Sockets:
             )
             self.address = self._consumers.bind(bind, "--bind")
             local = ""
-            if keys is not None and not is_private and local_bind:
+            if local_bind and not is_private:
                 local = self._workers.bind(local_bind, "--worker-bind", admits_all=True)
             self.worker_address = self._workers.bind(worker_bind, "--worker-bind")
             self.local_address = local or self.worker_address

@@ -72,6 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--arenas-fd", type=int, help=argparse.SUPPRESS)
     return run_command(parser, partial(_run, times), argv, failures=(V2VError,), interrupted="")
 
 
@@ -97,8 +98,9 @@ def _work(times: StartTimes, arguments: argparse.Namespace) -> None:
         cache = Cache(folder, int(arguments.cache_gib * GIB), packing=packing)
     log = Log(is_json=arguments.log_format == "json")
     run_worker(
-        arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log, times
-    )
+        arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log, times,
+        arguments.arenas_fd,
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

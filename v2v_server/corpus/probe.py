@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -13,7 +14,7 @@ from v2v_protocol.errors import VideoError, VideoUnreadable
 from v2v_server.corpus.index.file import IndexRow
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.clips import facts_of
-from v2v_server.system.isolate import Died, run_isolated
+from v2v_server.system.isolate import Died, run_twice
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.probe import VideoFacts
 
@@ -100,8 +101,7 @@ def probe_files(
 ) -> Generator[IndexRow, None, None]:
     """Yield a record of each id, in any order.
 
-    A file at which a process died is probed once more after all others, alone: the process may have been killed from
-    outside, or memory was too short for it and its neighbours.
+    A file at which a process died is probed once more after all others, alone.
 
     Args:
         source: where the videos come from.
@@ -110,26 +110,21 @@ def probe_files(
         probe: probes one file; must be picklable.
         longest_seconds: limit for one file; the next start tries it again.
     """
-    isolated = partial(
-        run_isolated,
+    results = run_twice(
         partial(probe, source),
+        ids,
+        processes,
         deadline_seconds=lambda id: longest_seconds,
         memory_bytes=LARGEST_MEMORY_BYTES,
         writable=() if source.is_local else None,  # copies are fetched: from a network, into a folder
     )
-    suspects: list[str] = []
-    for id, found in isolated(ids, processes):
-        if isinstance(found, Died) and found.overdue_seconds:
-            yield IndexRow(id, -1, problem=f"cannot be probed: {found.how}; the next start tries again")
-        elif isinstance(found, Died):
-            suspects.append(id)
-        else:
-            yield found
-    for id, found in isolated(suspects, 1):
-        yield _culprit(source, id, found) if isinstance(found, Died) else found
+    for id, found in results:
+        yield _culprit(source, id, found) if isinstance(found, Died) else replace(found, id=id)
 
 
 def _culprit(source: VideoSource, id: str, death: Died) -> IndexRow:
+    if death.overdue_seconds:
+        return IndexRow(id, -1, problem=f"cannot be probed: {death.how}; the next start tries again")
     if not death.is_crash:
         why = f"could not be probed: the process ended over it twice ({death.how}), which says nothing of the file"
         return IndexRow(id, -1, problem=f"{why}; the next start tries again")

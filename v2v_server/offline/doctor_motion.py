@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
-from typing import Any
+from functools import partial
 
 from v2v_protocol.errors import V2VError
 from v2v_protocol.progress import Progress
@@ -27,6 +27,8 @@ _LONGEST_SECONDS = 30.0
 """After this time no other video is begun."""
 _LONGEST_VIDEO_SECONDS = 90.0
 """The first one may compile the kernels."""
+_Fields = tuple[tuple[float, ...], float, float, float, float, float, float, float]
+"""Of a Prediction."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +36,6 @@ class _Middle:
     """Frames in the middle of a video, and the part of the picture that is looked at."""
 
     id: str
-    source: VideoSource
     index: FrameIndex
     start: int
     count: int
@@ -52,8 +53,8 @@ def look_at_motion(
     if not catalogue.source.is_local:
         return
     results = run_isolated(
-        _predicted, _middles(catalogue), usable_cores(), lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES,
-        compile_cache(),
+        partial(_predicted, catalogue.source), _middles(catalogue), usable_cores(),
+        lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES, compile_cache(),
     )  # fmt: skip
     results = Progress.over("looking at motion", "videos", results, min(MOST_VIDEOS, len(catalogue.videos)))
     found = {
@@ -85,19 +86,19 @@ def _middles(catalogue: Catalogue) -> Iterator[_Middle]:
         height, width = min(rows, _SIDE_PX), min(columns, _SIDE_PX)
         window = top + (rows - height) // 2, left + (columns - width) // 2, height, width
         if count > 1:
-            yield _Middle(video.id, catalogue.source, index, start, count, window)
+            yield _Middle(video.id, index, start, count, window)
 
 
-def _predicted(middle: _Middle) -> tuple[Any, ...]:
-    """Return the fields of the prediction; none where the frames do not decode."""
+def _predicted(source: VideoSource, middle: _Middle) -> _Fields | None:
+    """Return the fields of the prediction; None where the frames do not decode."""
     import numpy as np
 
     from v2v_server.motion.prediction import predict
     from v2v_server.offline.motion import pictures_from
 
     try:
-        with middle.source.open_local(middle.id, "") as path:
+        with source.open_local(middle.id, "") as path:
             frames = list(pictures_from(path, middle.index, middle.start, middle.count, middle.window))
     except V2VError:
-        return ()
+        return None
     return astuple(predict(np.stack(frames)))

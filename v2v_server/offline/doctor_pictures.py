@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from typing import NamedTuple
 
@@ -90,7 +91,6 @@ class _Excerpt:
     """The part of a video that is looked at, in the rows that are used."""
 
     id: str
-    source: VideoSource
     index: FrameIndex
     start: int
     count: int
@@ -127,7 +127,7 @@ def hides_motion(defects: Iterable[Defect], can_be_followed: bool = True) -> boo
 def defects_of_video(catalogue: Catalogue, id: str) -> tuple[Defect, ...]:
     """Return the defects in the middle of a video, in this process; none where it does not decode."""
     (video,) = (video for video in catalogue.videos if video.id == id)
-    _, defects, _, _ = _look_at(_excerpt(catalogue, video))
+    _, defects, _, _ = _look_at(catalogue.source, _excerpt(catalogue, video))
     return defects
 
 
@@ -145,7 +145,7 @@ def look_at_pictures(
     if not catalogue.source.is_local:
         yield "ok", "pictures", "not looked at: these videos lie on another host", ""
         return {}
-    looked = _found(_excerpts(catalogue, MOST_VIDEOS), usable_cores())
+    looked = _found(catalogue.source, _excerpts(catalogue, MOST_VIDEOS), usable_cores())
     looked = Progress.over("looking at pictures", "videos", looked, min(MOST_VIDEOS, len(catalogue.videos)))
     results = sorted(looked, key=lambda each: each.excerpt.id)
     found, sequences = [each for each in results if each.frames], _sequences_of(results, frames_needed)
@@ -199,7 +199,7 @@ def check_in_background(
             return
         results = list[_Found]()
         try:
-            for each in _found(excerpts, processes):
+            for each in _found(catalogue.source, excerpts, processes):
                 if stop.is_set():
                     return
                 results.append(each)
@@ -251,26 +251,27 @@ def _excerpt(catalogue: Catalogue, video: VideoEntry) -> _Excerpt:
     start = (len(index) - count) // 2 if index.seekable else 0
     top, bottom = catalogue.rows.bounds(index.height_px)
     window = top, 0, bottom - top, index.width_px
-    return _Excerpt(video.id, catalogue.source, index, start, count, window, video.remark)
+    return _Excerpt(video.id, index, start, count, window, video.remark)
 
 
-def _found(excerpts: Iterable[_Excerpt], processes: int) -> Iterator[_Found]:
+def _found(source: VideoSource, excerpts: Iterable[_Excerpt], processes: int) -> Iterator[_Found]:
     """Yield what was found in each video; no frames where it does not decode in time."""
     results = run_isolated(
-        _look_at, excerpts, processes, lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES, compile_cache()
-    )
+        partial(_look_at, source), excerpts, processes, lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES,
+        compile_cache(),
+    )  # fmt: skip
     for excerpt, result in results:
         yield _Found(excerpt, problem=result.how) if isinstance(result, Died) else _Found(excerpt, *result)
 
 
-def _look_at(excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal, str]:
+def _look_at(source: VideoSource, excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal, str]:
     """Return the number of frames, their defects, and what their levels mean; why where they do not decode."""
     # Import lazily: the process that draws up the report needs no OpenCV.
     from v2v_server.corpus.scenes.analysis import analyse
 
     index, window = excerpt.index, excerpt.window
     try:
-        with excerpt.source.open_local(excerpt.id, "") as path:
+        with source.open_local(excerpt.id, "") as path:
             if is_store_file(path):
                 scene = analyse(islice(pictures_of(path, index, window), excerpt.count))
             else:

@@ -53,6 +53,7 @@ _STORED_BITS_PER_PIXEL = 2.2
 """Size of a lossless file, median of the measured clips (docs/prepare.md): 0.7 to 3.4."""
 
 _TELLING_SHARE = 0.02
+_CRASHES = "crashes the transcoder: its process died"
 
 Progress = Callable[[int, int, int, int], None]
 """Progress callback: (source frames done, source frames in total, bytes written, bytes expected in total)."""
@@ -296,17 +297,15 @@ def _outcomes(
     found: Iterator[tuple[_ToPrepare, Made | Scene | str | Died]] = ((job, result) for (job, _), result in isolated)
     for job, result in chain(found, changed):
         if isinstance(result, Died):
-            if result.overdue_seconds:
-                result = f"hangs the transcoder: {result.how}"
-            else:
-                result = f"crashes the transcoder: its process died ({result.how})"
+            result = f"hangs the transcoder: {result.how}" if result.overdue_seconds else f"{_CRASHES} ({result.how})"
         if isinstance(result, Scene) and job.standing is not None:
             yield job.video, replace(job.standing, scene=_text(result))
         elif isinstance(result, str) and job.standing is not None:
             yield job.video, Refusal(job.video.id, None, result)
         else:
-            assert not isinstance(result, Scene)
-            yield job.video, _record(job.video, *job.window[2:], result, encoding)
+            # Only a process that a video has taken over analyses what it was told to transcode.
+            made = f"{_CRASHES} (it sent a malformed result)" if isinstance(result, Scene) else result
+            yield job.video, _record(job.video, *job.window[2:], made, encoding)
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,7 +42,7 @@ def start_child(
         OSError: it cannot be started.
     """
     with contextlib.ExitStack() as open_here:
-        handed = [logbook.descriptor]
+        handed = [logbook.descriptor, logbook.arenas.fileno()]
         if key is not None:
             handed.append(open_here.enter_context(nameless_key(key)).fileno())
             flags = [*flags, "--keys", f"/dev/fd/{handed[-1]}"]
@@ -67,6 +67,7 @@ def start_program(arguments: Sequence[str], handed: Sequence[int], stdin: int = 
 def arguments(address: str, root: str, name: str, flags: Sequence[str], logbook: Logbook) -> list[str]:
     """Return the arguments of one worker, see :func:`start_child`."""
     return [
+        *("--arenas-fd", str(logbook.arenas.fileno())),
         *("--connect", address, "--videos", root, "--name", name),
         *("--parent-pid", str(os.getpid())),
         *flags,

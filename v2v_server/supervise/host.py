@@ -66,6 +66,9 @@ class WorkerPlace(Protocol):
     def status(self, now: float) -> ProcessStatus | None:
         """Return the latest observation of the worker's process; None without one."""
 
+    def lend(self, arena: str) -> None:
+        """Pass the worker the arena of its next lease, if it is a process of this host."""
+
     def leave(self) -> bool:
         """Tell the worker to finish its sample and exit; return False if there is none to tell."""
 

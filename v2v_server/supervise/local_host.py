@@ -153,6 +153,11 @@ class LocalPlace:
         pid = self.process.pid
         return ProcessStatus(status_of(pid), queued_seconds(pid), self.logbook.lease(), self.logbook.decodes(), now)
 
+    def lend(self, arena: str) -> None:
+        """Pass the worker the arena of its next lease."""
+        if self.logbook is not None:
+            self.logbook.lend(arena)
+
     def leave(self) -> bool:
         """Tell the worker to finish its sample and exit; return False if there is none to tell."""
         if self.process is not None:

@@ -166,6 +166,12 @@ class Pool:
                 found[slot.name.encode()] = Stall(stopped, queued)
         return found
 
+    def lend(self, identity: bytes, arena: str) -> None:
+        """Pass a worker the arena of its next lease. Call it before the lease is sent."""
+        slot = self._slot_of(identity)
+        if slot is not None:
+            slot.place.lend(arena)
+
     def give_up(self, identity: bytes, reason: str) -> Loss | None:
         """Kill a worker that hangs.
 

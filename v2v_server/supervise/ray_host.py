@@ -207,6 +207,9 @@ class RayPlace:
         """Return the latest observation of the worker's process; None without one."""
         return self.seen.process if self.is_running and self.seen is not None else None
 
+    def lend(self, arena: str) -> None:
+        """Do nothing: a worker on the consumer's host opens the arena by its name."""
+
     def leave(self) -> bool:
         """Tell the worker to finish its sample and exit; return False if there is none to tell."""
         self._is_leaving = True

@@ -24,7 +24,9 @@ class Standby:
     def __init__(self) -> None:
         self.logbook = Logbook()
         flags = ["--standby", str(os.getpid())]
-        self.process = start_program(flags, [self.logbook.descriptor], stdin=subprocess.PIPE)
+        self.process = start_program(
+            flags, [self.logbook.descriptor, self.logbook.arenas.fileno()], stdin=subprocess.PIPE
+        )
 
     def begin(self, arguments: Sequence[str]) -> None:
         """Tell it the arguments of ``v2v-worker``.

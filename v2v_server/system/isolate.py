@@ -1,7 +1,12 @@
 """Apply a function to many jobs in separate processes, so that a crash costs only the job that caused it.
 
-It uses spawned processes and pipes only. Locks, queues and shared memory need a writable ``/dev/shm``, which some
-containers do not have.
+It uses spawned processes and socket pairs only. Locks, queues and shared memory need a writable ``/dev/shm``, which
+some containers do not have.
+
+A process that a hostile video has taken over costs only its job too. Jobs and results travel as msgpack, which executes
+nothing: a dataclass as the list of its fields, a class with ``to_bytes`` as these bytes. The function's annotations say
+which types they have. A result of another type or size counts as the death of its process, and waiting for the rest of
+a message counts as waiting for the result.
 """
 
 from __future__ import annotations
@@ -12,12 +17,17 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from socket import socket, socketpair
+from types import UnionType
+from typing import Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgpack
 
 from v2v_protocol.errors import UsageError
 from v2v_server.system.process import die_with_parent, limit_memory
@@ -26,6 +36,19 @@ from v2v_server.system.sandbox import confine
 J = TypeVar("J")
 R = TypeVar("R")
 
+LARGEST_MESSAGE_BYTES = 64 << 20
+"""Size limit of a job or result. The largest in use holds the frame index of a video of 2**24 frames."""
+_LIMITS: Mapping[str, Any] = {
+    "max_buffer_size": LARGEST_MESSAGE_BYTES,
+    "max_str_len": 1 << 16,
+    "max_array_len": 1 << 17,
+    "max_map_len": 0,
+    "max_ext_len": 0,
+    "use_list": False,
+}
+"""What is unpacked takes at most thirty times the memory of its message."""
+_CHUNK_BYTES = 1 << 18
+_SEND_SECONDS = 60.0
 _EXIT_SECONDS = 5.0
 _LONGEST_WAIT_SECONDS = 10.0
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
@@ -43,15 +66,19 @@ class Died:
         exitcode: as in ``multiprocessing``: the exit status, or minus the number of a signal.
         overdue_seconds: time after which it was ended here; 0 if it died by itself.
         begun: whether the process had started when it died, so that it was working on the job.
+        is_malformed: whether it was ended here because its result was malformed or too large.
     """
 
     exitcode: int
     overdue_seconds: float = 0.0
     begun: bool = True
+    is_malformed: bool = False
 
     @property
     def how(self) -> str:
         """``signal SIGSEGV``, ``exit status 1``, ``ended after 60 s without a result``."""
+        if self.is_malformed:
+            return "it sent a malformed result"
         if self.overdue_seconds:
             return f"ended after {self.overdue_seconds:.0f} s without a result"
         if self.exitcode >= 0:
@@ -61,12 +88,14 @@ class Died:
 
     @property
     def is_crash(self) -> bool:
-        """Return whether the job is to blame: a signal that the process caused itself struck it at work.
+        """Return whether the job is to blame: a signal that the process caused itself struck it at work, or its result
+        was malformed.
 
         Otherwise it was killed from outside, the kernel was short of memory, it was overdue, or it exited with a
         status: an exception of this program, or a broken installation.
         """
-        return self.begun and self.exitcode < 0 and not self.overdue_seconds and -self.exitcode not in _FROM_OUTSIDE
+        struck = self.exitcode < 0 and not self.overdue_seconds and -self.exitcode not in _FROM_OUTSIDE
+        return self.begun and (struck or self.is_malformed)
 
 
 def run_isolated(
@@ -83,8 +112,10 @@ def run_isolated(
     with this process, however it ends. Ctrl-C reaches only this process.
 
     Args:
-        function: must be picklable, and return rather than raise: an exception counts as its process's death.
-        jobs: picklable; drawn as processes become free.
+        function: must be picklable, and return rather than raise: an exception counts as its process's death. The
+            annotations of its last parameter and its result are the types of jobs and results: plain values, tuples,
+            dataclasses of them, and classes with ``to_bytes`` and ``from_bytes``.
+        jobs: drawn as processes become free.
         processes: number of spawned processes; 0 runs the jobs in this process, unprotected.
         deadline_seconds: time limit of a job, including its process's start, before the process is killed; None: no
             limit. Only time spent waiting here counts, so no job is overdue because the whole program was stopped.
@@ -100,50 +131,69 @@ def run_isolated(
         yield from ((job, function(job)) for job in jobs)
         return
     left = iter(jobs)
-    lanes: dict[Connection, _Lane[J, R]] = {}
+    lanes: list[_Lane[J, R]] = []
     try:
         for job in left:
-            lane = _Lane(function, deadline_seconds, memory_bytes, writable)
-            lanes[lane.connection] = lane
-            lane.begin(job)
+            lanes.append(_Lane(function, deadline_seconds, memory_bytes, writable))
+            lanes[-1].begin(job)
             if len(lanes) == processes:
                 break
         while lanes:
-            _wait(lanes)
-            for ready in [connection for connection, lane in lanes.items() if connection.poll() or lane.patience <= 0]:
-                lane = lanes[ready]
-                finished = lane.finish() if ready.poll() else lane.give_up()
+            readable = _wait(lanes)
+            for lane in list(lanes):
+                finished = lane.receive() if lane.socket in readable else None
+                if finished is None and lane.patience <= 0:
+                    finished = lane.give_up()
                 if finished is None:
                     continue
                 for following in left:
                     if isinstance(finished[1], Died):
-                        lane = _Lane(function, deadline_seconds, memory_bytes, writable)
-                        lanes.pop(ready).end()
-                        lanes[lane.connection] = lane
+                        lanes.append(_Lane(function, deadline_seconds, memory_bytes, writable))
+                        lanes.remove(lane)
+                        lane.end()
+                        lane = lanes[-1]
                     lane.begin(following)
                     break
                 else:
-                    lanes.pop(ready).end()
+                    lanes.remove(lane)
+                    lane.end()
                 yield finished
     finally:
-        for lane in lanes.values():
+        for lane in lanes:
             lane.end()
 
 
-def _wait(lanes: dict[Connection, _Lane[J, R]]) -> None:
-    """Wait until there is a result or a job is overdue, but not for long."""
-    at_most = max(0.0, min(_LONGEST_WAIT_SECONDS, *(lane.patience for lane in lanes.values())))
+def run_twice(
+    function: Callable[[J], R], jobs: Iterable[J], processes: int, **limits: Any
+) -> Iterator[tuple[J, R | Died]]:
+    """Do the same, but try a job once more if its process died or its result is None: after all others, alone. The
+    process may have been killed from outside, memory was too short for it and its neighbours, or storage failed.
+    """
+    suspects: list[J] = []
+    for job, result in run_isolated(function, jobs, processes, **limits):
+        if result is None or (isinstance(result, Died) and not result.overdue_seconds):
+            suspects.append(job)
+        else:
+            yield job, result
+    yield from run_isolated(function, suspects, min(processes, 1), **limits)
+
+
+def _wait(lanes: list[_Lane[J, R]]) -> list[Any]:
+    """Wait until there is a part of a result or a job is overdue, but not for long; return the readable sockets."""
+    at_most = max(0.0, min(_LONGEST_WAIT_SECONDS, *(lane.patience for lane in lanes)))
     started = time.monotonic()
-    wait(list(lanes), at_most)
+    readable = wait([lane.socket for lane in lanes], at_most)
     spent = min(time.monotonic() - started, at_most)
-    for lane in lanes.values():
+    for lane in lanes:
         lane.patience -= spent
+    return readable
 
 
 class _Lane(Generic[J, R]):
     """One process and its job.
 
     Attributes:
+        socket: our end of the pair.
         patience: remaining seconds until its job is overdue.
     """
 
@@ -155,19 +205,20 @@ class _Lane(Generic[J, R]):
         writable: Sequence[Path] | None,
     ) -> None:
         self._deadline_seconds = deadline_seconds
+        self._function = function
         self.patience = math.inf
         self._begun = False
-        context = multiprocessing.get_context("spawn")
-        self.connection, other = context.Pipe()
+        self.socket, other = socketpair()
+        self.socket.settimeout(_SEND_SECONDS)
         given = other, function, os.getpid(), memory_bytes, writable
-        self._process = context.Process(target=_serve, args=given, daemon=True)
+        self._process = multiprocessing.get_context("spawn").Process(target=_serve, args=given, daemon=True)
         # The first process also starts multiprocessing's tracker, which would unblock SIGINT again.
         resource_tracker.ensure_running()
         try:
             with _interrupt_held_back():
                 self._process.start()
         except BaseException:
-            self.connection.close()
+            self.socket.close()
             raise
         finally:
             other.close()
@@ -175,33 +226,47 @@ class _Lane(Generic[J, R]):
     def begin(self, job: J) -> None:
         self._job = job
         self._allowed = self.patience = math.inf if self._deadline_seconds is None else self._deadline_seconds(job)
+        self._unpacker = msgpack.Unpacker(**_LIMITS)
         try:
-            self.connection.send(job)
+            self.socket.sendall(_packed(job))
         except OSError:
-            return  # it died before it received the job: finish() finds the end of the pipe
+            self._process.kill()  # it has died, or does not read: receive() finds the end
 
-    def finish(self) -> tuple[J, R | Died] | None:
-        """Return the result of the job; None if the process has only reported that it began."""
+    def receive(self) -> tuple[J, R | Died] | None:
+        """Return the job and its result if the rest of it has arrived; None otherwise."""
         try:
-            result = self.connection.recv()
-        except (EOFError, OSError):
-            self._process.join()
-            death = Died(self._process.exitcode or 0, begun=self._begun)
-            if not death.begun and death.exitcode >= 0:
-                raise UsageError(_NO_START.format(how=death.how)) from None
+            data = self.socket.recv(_CHUNK_BYTES)
+        except OSError:
+            data = b""
+        if not data:
+            self._process.join(_EXIT_SECONDS)
+            death = self._kill()
+            if not self._begun and death.exitcode >= 0:
+                raise UsageError(_NO_START.format(how=death.how))
             return self._job, death
-        if self._begun:
-            return self._job, result
-        self._begun = True
-        return None
+        try:
+            self._unpacker.feed(data)
+            if not self._begun:
+                self._begun = self._unpacker.unpack() is None
+            result: R = _typed(_hints(self._function)["return"], self._unpacker.unpack())
+            if self._unpacker.read_bytes(1):
+                raise ValueError("more than one result")
+        except msgpack.OutOfData:
+            return None
+        except Exception:  # noqa: BLE001 - a process that a video has taken over sends anything
+            return self._job, replace(self._kill(), is_malformed=True)
+        return self._job, result
 
     def give_up(self) -> tuple[J, R | Died]:
+        return self._job, replace(self._kill(), exitcode=-signal.SIGKILL, overdue_seconds=self._allowed)
+
+    def _kill(self) -> Died:
         self._process.kill()
         self._process.join(_EXIT_SECONDS)
-        return self._job, Died(-signal.SIGKILL, self._allowed, self._begun)
+        return Died(self._process.exitcode or 0, begun=self._begun)
 
     def end(self) -> None:
-        self.connection.close()
+        self.socket.close()
         self._process.terminate()
         self._process.join(_EXIT_SECONDS)
         if self._process.is_alive():
@@ -223,7 +288,7 @@ def _interrupt_held_back() -> Iterator[None]:
 
 
 def _serve(
-    connection: Connection,
+    connection: socket,
     function: Callable[[Any], Any],
     parent_pid: int,
     memory_bytes: int,
@@ -232,15 +297,59 @@ def _serve(
     die_with_parent(parent_pid)
     if memory_bytes:
         limit_memory(memory_bytes)
+    # The tracker is not confined, and removes what is named to it.
+    os.close(resource_tracker.getfd())  # type: ignore[arg-type]
     if writable is not None:
         confine(writable, network=False)
     signal.signal(
         signal.SIGINT, signal.SIG_IGN
     )  # a terminal sends it to all processes; the parent decides what follows
-    connection.send(None)  # report that it began: from here on, its end is not a failed start
-    while True:
-        try:
-            job = connection.recv()
-        except EOFError:
-            return
-        connection.send(function(job))
+    connection.sendall(_packed(None))  # report that it began: from here on, its end is not a failed start
+    for job in msgpack.Unpacker(connection.makefile("rb", buffering=0), **_LIMITS):
+        connection.sendall(_packed(function(_typed([*_hints(function).values()][-2], job))))
+
+
+def _hints(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the types of a function's parameters, in order, and of its result."""
+    return get_type_hints(getattr(function, "func", function))
+
+
+def _plain(value: Any) -> Any:
+    """Return plain data for what msgpack does not know."""
+    if isinstance(value, Path):
+        return os.fsencode(value)
+    return value.to_bytes() if hasattr(value, "to_bytes") else [getattr(value, each.name) for each in fields(value)]
+
+
+_packed: Callable[[Any], bytes] = partial(msgpack.packb, default=_plain)
+
+
+def _typed(kind: Any, value: Any) -> Any:
+    """Return plain data as a value of a type.
+
+    Raises:
+        KeyError, ValueError, OverflowError, V2VError: it is not one.
+    """
+    kinds = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    # A float that is whole may travel as an int.
+    by_plain = {int: float} if float in kinds else {}
+    kind = (by_plain | {_plain_type(each): each for each in kinds})[type(value)]
+    if kind in (Path, float):
+        return Path(os.fsdecode(value)) if kind is Path else float(value)
+    if kind is int and value >= 2**63:
+        raise OverflowError(f"{value} is larger than numbers are")
+    if type(value) is not tuple:
+        return value if kind is type(value) else kind.from_bytes(value)
+    parts = get_args(kind) or tuple(get_type_hints(kind).values())
+    if parts[-1:] == (...,):
+        parts = parts[:1] * len(value)
+    typed = tuple(_typed(part, each) for part, each in zip(parts, value, strict=True))
+    return kind(*typed) if isinstance(kind, type) else typed
+
+
+def _plain_type(kind: Any) -> type:
+    """Return the type of the plain data that stands for values of a type."""
+    if kind is Path or (hasattr(kind, "from_bytes") and kind not in (int, bool)):
+        return bytes
+    is_compound = get_origin(kind) is tuple or hasattr(kind, "_fields") or hasattr(kind, "__dataclass_fields__")
+    return tuple if is_compound else kind

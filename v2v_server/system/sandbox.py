@@ -3,7 +3,7 @@
 A file that exploits a flaw in the decoder can then read what its user can read, and use memory and time. But it
 
     starts no program, accesses no other process, gains no other rights            seccomp
-    opens no network connection, unless the process needs one                      seccomp
+    makes no socket, unless the process needs a network                            seccomp
     writes, creates and removes no file except below the given folders             Landlock
 
 Both are part of the kernel, need no rights, and are inherited by processes that it starts. Refused calls fail with
@@ -29,7 +29,6 @@ _ALLOW, _REFUSE = 0x7FFF0000, 0x00050000 | errno.EPERM
 _LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06
 _OTHER_ABI = 0x40000000
 """Calls from this number on belong to x86_64's 32-bit variant, which repeats every call."""
-_UNIX = 1
 
 _LANDLOCK = (444, 445, 446)  # create, add a rule, restrict; the same on all machines
 _PATH_BENEATH = 1
@@ -53,13 +52,13 @@ _REFUSED = {
 class _Machine:
     architecture: int  # as the kernel reports it to a filter
     seccomp: int
-    socket: int
+    sockets: tuple[int, ...]  # socket and socketpair
     refused: tuple[int, ...]
 
 
 _MACHINES = {
-    "x86_64": _Machine(0xC000003E, 317, 41, tuple(number for number, _ in _REFUSED.values())),
-    "aarch64": _Machine(0xC00000B7, 277, 198, tuple(number for _, number in _REFUSED.values())),
+    "x86_64": _Machine(0xC000003E, 317, (41, 53), tuple(number for number, _ in _REFUSED.values())),
+    "aarch64": _Machine(0xC00000B7, 277, (198, 199), tuple(number for _, number in _REFUSED.values())),
 }
 
 
@@ -91,9 +90,9 @@ def confine(writable: Iterable[Path] | None, *, network: bool) -> Confined:
 
     Args:
         writable: folders in which it may write; None does not restrict writing. Landlock holds for the calling thread,
-            and threads that it starts from now on. It also prevents opening files of other processes by
-            ``/proc/PID/fd``, which is how a sample gets into its consumer's memory.
-        network: whether it may open connections other than to sockets in this host's file system.
+            and threads that it starts from now on. It also closes memory and open files of other processes
+            (``/proc/PID/mem``, ``/proc/PID/fd``).
+        network: whether it may make sockets. Those that it has stay open.
 
     Returns:
         the restrictions that the system supports; the others were not applied.
@@ -118,11 +117,8 @@ def program(machine: _Machine, *, network: bool) -> bytes:
     refuse = _instruction(_RETURN, _REFUSE)
     code = [_instruction(_LOAD, 4), _instruction(_EQUAL, machine.architecture, then=1), refuse, _instruction(_LOAD, 0)]
     code += [_instruction(_AT_LEAST, _OTHER_ABI, otherwise=1), refuse]
-    for number in machine.refused:
+    for number in (*machine.refused, *(() if network else machine.sockets)):
         code += [_instruction(_EQUAL, number, otherwise=1), refuse]
-    if not network:
-        code += [_instruction(_EQUAL, machine.socket, otherwise=3), _instruction(_LOAD, 16)]
-        code += [_instruction(_EQUAL, _UNIX, then=1), refuse]
     return b"".join([*code, _instruction(_RETURN, _ALLOW)])
 
 

@@ -1,14 +1,24 @@
-"""The logbook: a record of the lease that a local worker works on, which outlives the worker.
+"""What a worker shares with its pool: a record of the lease in work, and a socket pair for the arenas of its leases.
 
 A worker that crashes loses its unsent messages. The server may then not know that it finished one sample and began the
 next, and would blame the wrong one. So the worker also writes the number of the lease in work into an unnamed file that
 it shares with the pool. The kernel keeps this file however the worker ends.
+
+A confined worker cannot open the memory of other processes. So the pool opens the arena of each lease, sends the
+descriptor before the lease, and closes its own. The worker takes it when it makes the sample. Neither keeps an arena
+open in between, so the memory of a consumer that is gone is freed.
 """
 
 from __future__ import annotations
 
 import os
 import tempfile
+from contextlib import suppress
+from socket import recv_fds, send_fds, socket, socketpair
+
+from v2v_protocol.arena import ArenaName
+from v2v_protocol.errors import ProtocolError
+from v2v_protocol.shared_memory import find_memory
 
 _BYTES = 8
 _DECODES, _SIMULATES = b"d", b"s"
@@ -16,12 +26,18 @@ IDLE = 0
 
 
 class Logbook:
-    """The pool's side: created before a worker starts, read after it ends."""
+    """The pool's side: created before a worker starts, read after it ends.
+
+    Attributes:
+        arenas: the worker's end of the socket pair.
+    """
 
     def __init__(self) -> None:
         # In memory where the system can: a server needs no writable folder for this.
         in_memory = hasattr(os, "memfd_create")
         self._file = os.fdopen(os.memfd_create("v2v-logbook"), "rb") if in_memory else tempfile.TemporaryFile()  # noqa: SIM115
+        self._pool, self.arenas = socketpair()
+        self._pool.setblocking(False)
 
     @property
     def descriptor(self) -> int:
@@ -37,12 +53,38 @@ class Logbook:
         """Return whether the worker was decoding a video."""
         return os.pread(self.descriptor, 1, _BYTES) == _DECODES
 
+    def lend(self, arena: str) -> None:
+        """Send the worker the descriptor of a lease's arena, or none if the arena is not accessible here."""
+        found: list[int] = []
+        with suppress(OSError, ProtocolError):
+            found.append(find_memory(ArenaName.parse(arena), writable=True))
+        with suppress(OSError):  # the worker has ended, or is stopped
+            send_fds(self._pool, [b"\0"], found)
+        for descriptor in found:
+            os.close(descriptor)
+
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Close the file and the socket pair."""
+        for each in (self._file, self._pool, self.arenas):
+            each.close()
 
 
 def note(descriptor: int | None, lease: int, *, decodes: bool = False) -> None:
     """Record the lease in work, or IDLE, and whether its video is being decoded. The worker's side."""
     if descriptor is not None:
         os.pwrite(descriptor, lease.to_bytes(_BYTES, "little") + (_DECODES if decodes else _SIMULATES), 0)
+
+
+def take_arena(arenas: socket, name: ArenaName, writable: bool) -> int:
+    """Return the descriptor of a lease's arena; close those of leases that were not worked on. The worker's side.
+
+    Raises:
+        OSError: the arena is not accessible to the pool, or nothing came in the socket's time.
+    """
+    while True:
+        _, found, *_ = recv_fds(arenas, 1, 1)
+        if not found:
+            raise FileNotFoundError(name.path)
+        if os.readlink(f"/proc/self/fd/{found[0]}") == name.link:
+            return found[0]
+        os.close(found[0])

@@ -1,7 +1,8 @@
 """Provide memory for a sample: its consumer's slot, or private memory if the slot is not accessible.
 
 The arena is opened and mapped for each sample, which takes less than a millisecond. So no mapping keeps the memory of a
-consumer that is gone, and a killed worker leaves nothing to clean up.
+consumer that is gone, and a killed worker leaves nothing to clean up. A confined worker cannot open it, and receives
+its descriptor from the server (:func:`v2v_server.worker.logbook.take_arena`).
 
 An arena with one slot, such as the server's (:mod:`v2v_server.sharing.memory`), is new memory as a rule. Writing a
 finished sample to it takes less than half the time of mapping it, because its pages need no zeros and no faults.
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import mmap
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, TypeAlias
@@ -24,8 +25,10 @@ from v2v_protocol.arena import NO_SLOT, ArenaName, Slot, array_offsets
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import Form, Layout, new_arrays
-from v2v_protocol.shared_memory import open_memory
+from v2v_protocol.shared_memory import find_memory, open_memory
 from v2v_protocol.wire import Buffer, Frames, encode_sample
+
+Find: TypeAlias = Callable[[ArenaName, bool], int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,24 +39,27 @@ class OutputBuffer:
         arrays: C-contiguous, of the sample's layout, with unspecified content. Shared memory is unmapped when they are
             freed.
         in_slot: whether they are the slot that the lease names.
+        find: how the lease's arena is found.
     """
 
     arrays: Mapping[str, npt.NDArray[Any]]
     in_slot: bool
+    find: Find = find_memory
 
 
-def open_output_buffer(lease: Lease, layout: Layout) -> OutputBuffer:
+def open_output_buffer(lease: Lease, layout: Layout, find: Find = find_memory) -> OutputBuffer:
     """Return the lease's slot if it names an accessible one, otherwise new memory.
 
     Args:
         lease: the work.
         layout: layout of its sample.
+        find: how its arena is found, see :func:`v2v_protocol.shared_memory.open_memory`.
     """
     if lease.slot != NO_SLOT and not _has_one_slot(lease.arena):
-        there = slot_arrays(Slot(lease.arena, lease.slot), layout)
+        there = slot_arrays(Slot(lease.arena, lease.slot), layout, find)
         if there is not None:
             return OutputBuffer(there, in_slot=True)
-    return OutputBuffer(new_arrays(layout), in_slot=False)
+    return OutputBuffer(new_arrays(layout), in_slot=False, find=find)
 
 
 def sample_message(
@@ -75,7 +81,7 @@ def sample_message(
         provenance, worker, cpu_seconds, decoded, cache: see :class:`v2v_protocol.messages.SampleHeader`.
         packed: compress arrays outside a slot even if the lease does not ask for it.
     """
-    in_slot = buffer.in_slot or (_has_one_slot(lease.arena) and _write(lease, buffer.arrays))
+    in_slot = buffer.in_slot or (_has_one_slot(lease.arena) and _write(lease, buffer))
     return encode_sample(
         epoch=lease.epoch,
         index=lease.indices[0],
@@ -98,8 +104,8 @@ def pack(raw: Buffer) -> bytes:
     return zstandard.ZstdCompressor(level=1, write_checksum=False).compress(raw)
 
 
-def slot_arrays(slot: Slot, layout: Layout) -> dict[str, npt.NDArray[Any]] | None:
-    """Map the arrays of a slot.
+def slot_arrays(slot: Slot, layout: Layout, find: Find = find_memory) -> dict[str, npt.NDArray[Any]] | None:
+    """Map the arrays of a slot. ``find`` finds its arena.
 
     Returns:
         None if that is not possible: the arena is not on this host, belongs to another user, is gone, has another size,
@@ -110,7 +116,7 @@ def slot_arrays(slot: Slot, layout: Layout) -> dict[str, npt.NDArray[Any]] | Non
         if not 0 < slot.number <= name.slots:
             return None
         places, total = _places(tuple(layout.items()), name.slots)
-        descriptor = open_memory(name, total, writable=True)
+        descriptor = open_memory(name, total, writable=True, find=find)
         try:
             return {
                 array: _map(descriptor, offset + (slot.number - 1) * size, size).view(dtype).reshape(shape)
@@ -129,12 +135,12 @@ def _has_one_slot(arena: str) -> bool:
         return False
 
 
-def _write(lease: Lease, arrays: Mapping[str, npt.NDArray[Any]]) -> bool:
+def _write(lease: Lease, buffer: OutputBuffer) -> bool:
     """Write a sample to the lease's arena of one slot; return False if it is not accessible or memory is full."""
-    raw = [array.reshape(-1).view(np.uint8).data for array in arrays.values()]
+    raw = [array.reshape(-1).view(np.uint8).data for array in buffer.arrays.values()]
     *offsets, total = array_offsets([len(each) for each in raw], 1)
     try:
-        descriptor = open_memory(ArenaName.parse(lease.arena), total, writable=True)
+        descriptor = open_memory(ArenaName.parse(lease.arena), total, writable=True, find=buffer.find)
         try:
             for offset, rest in zip(offsets, raw, strict=True):
                 while rest:

@@ -13,8 +13,8 @@ import secrets
 import signal
 import socket
 import time
+from functools import partial
 from importlib.resources.abc import Traversable
-from pathlib import Path
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.addresses import leaves_host
@@ -22,6 +22,7 @@ from v2v_protocol.errors import SidecarError, UsageError, VideoError
 from v2v_protocol.keys import key_for
 from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Lease, WorkerHello
+from v2v_protocol.shared_memory import find_memory
 from v2v_protocol.wire import Frames
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.schedule.sequences import MOST_LEASE_BYTES
@@ -56,7 +57,7 @@ from v2v_server.worker.conversation import (
 )
 from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.labels import read_ahead
-from v2v_server.worker.logbook import IDLE, note
+from v2v_server.worker.logbook import IDLE, note, take_arena
 from v2v_server.worker.output_buffer import open_output_buffer, sample_message
 from v2v_server.worker.produce import kernels_of, make_sample, sample_layout
 from v2v_server.worker.sidecars import open_sidecars, sidecar_files
@@ -71,6 +72,8 @@ LONGEST_LEASE_SECONDS = 3600.0
 ends hung workers on other hosts."""
 MOST_NAME_BYTES = 200
 """What an operator may call a worker; with what is added to it a name has 255 at most."""
+_LONGEST_ARENA_SECONDS = 1.0
+"""Longest wait for a lease's arena, which is sent before the lease. Without it the sample goes into the message."""
 _LINGER_MS = 5000
 """Time that leaving may spend on sending the last sample."""
 
@@ -90,6 +93,8 @@ class Worker:
         cache: cache of decoded clips for later epochs; None stores nothing.
         keys: file of its key; None reads the file that ``V2V_KEYS`` names, "" uses no key.
         log: log for people.
+        arenas: receives the arenas of leases from a server on this host; None opens them by their names. Such a worker
+            makes no other socket once it has heard its server, unless the videos come from a network.
 
     Raises:
         UsageError: the socket cannot connect to the address.
@@ -105,11 +110,14 @@ class Worker:
         cache: Cache | None = None,
         keys: str | None = None,
         log: Log | None = None,
+        arenas: socket.socket | None = None,
     ) -> None:
         self._link = Dealer(address, keys, "worker")
         self._name = name
         self._log = log or Log()
         self._logbook = logbook
+        self._find = find_memory if arenas is None else partial(take_arena, arenas)
+        self._is_confined = arenas is None
         self._clips = Clips(source, cache)
         self._at = IDLE  # the lease in work
         if cache is not None:
@@ -160,7 +168,7 @@ class Worker:
             began = time.monotonic()
             self._link.send(action.frames)
             self._handover_seconds += time.monotonic() - began
-        elif isinstance(action, Reconnect):
+        elif isinstance(action, Reconnect) and self._find is find_memory:
             # Always with the same IP version: at most 320 s pass until the next connection, and "localhost" and most
             # names have two, of which the server listens on one.
             self._link.connect()
@@ -254,6 +262,11 @@ class Worker:
             messages.append(bytes(frames[0]))
             frames = self._link.receive(0)
         self._link.has_reconnected()  # raises if the server refuses the key; the conversation notices interruptions
+        if messages and not self._is_confined:
+            # Only now, because ZeroMQ connects in a thread of its own. No lease came before, so no video was opened.
+            # A worker that loses this connection falls silent, and is ended and replaced by its server.
+            confine(None, network=not self._source.is_local)
+            self._is_confined = True
         return messages
 
     def _make_sample(self, lease: Lease) -> tuple[Frames, Timings]:
@@ -267,7 +280,7 @@ class Worker:
             if error.video == lease.video:
                 raise error  # otherwise opening the sidecar reports it
         began = time.monotonic()
-        buffer = open_output_buffer(lease, sample_layout(lease))
+        buffer = open_output_buffer(lease, sample_layout(lease), self._find)
         has_room = time.monotonic()
         started = time.process_time()
         clip, decoded = self._clips.take(lease)
@@ -340,15 +353,6 @@ def _files(lease: Lease) -> dict[str, str]:
     return {lease.video: lease.fingerprint, **dict(sidecar_files(lease).values())}
 
 
-def _written(source: VideoSource, address: str, cache: Cache | None) -> list[Path] | None:
-    """Return the folders that a worker writes to; None if they cannot be listed, because its samples may go to a
-    consumer's memory or the tools for object storage write elsewhere.
-    """
-    if not source.is_local or not leaves_host(address):
-        return None
-    return [*compile_cache(), *([] if cache is None else [cache.folder])]
-
-
 def run_worker(
     address: str,
     source: VideoSource,
@@ -359,6 +363,7 @@ def run_worker(
     keys: str | None = None,
     log: Log | None = None,
     times: StartTimes | None = None,
+    arenas: int | None = None,
 ) -> None:
     """Run one worker in this process until the server stops it.
 
@@ -372,6 +377,8 @@ def run_worker(
         keys: file of its key; None reads the file that ``V2V_KEYS`` names, "" uses no key.
         log: log for people.
         times: completed and perhaps logged once the worker is connected.
+        arenas: descriptor of its end of the socket pair for arenas if a server started it, see
+            :mod:`v2v_server.worker.logbook`; not used for a server on another host.
 
     Raises:
         UsageError: the socket cannot connect to the address, or the server rejects the key.
@@ -391,8 +398,15 @@ def run_worker(
     # Exclude objects that exist by now from collections, which then take a fraction of a millisecond.
     gc.collect()
     gc.freeze()
-    confine(_written(source, address, cache), network=not address.startswith("ipc:") or not source.is_local)
-    worker = Worker(name or unshared_name(None), source, address, logbook, cache, keys, log)
+    # Before ZeroMQ starts its threads, so that these are confined to the same files.
+    pool = socket.socket(fileno=arenas) if arenas is not None and address.startswith("ipc:") else None
+    if pool is not None:
+        pool.settimeout(_LONGEST_ARENA_SECONDS)
+    written = [*compile_cache(), *([] if cache is None else [cache.folder])]
+    # The tools for object storage write elsewhere, and a worker of this host without a pool opens arenas itself.
+    confines_files = source.is_local and (pool is not None or leaves_host(address))
+    confine(written if confines_files else None, network=True)
+    worker = Worker(name or unshared_name(None), source, address, logbook, cache, keys, log, pool)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # After ZeroMQ's threads have started, which should run without delay.
     take_long_turns()

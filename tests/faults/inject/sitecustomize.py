@@ -43,7 +43,10 @@ def _install(fault: dict) -> None:
 
     at = {"video": ""}
     decode_for, clips_of, simulate_clip = clips.decode_for, produce.clips_of, arrays.simulate_clip
-    sample_message = worker.sample_message
+    sample_message, confine = worker.sample_message, worker.confine
+    folder = Path(fault.get("once", "/nowhere")).parent
+    # A confined worker may write to no folder but its cache.
+    worker.confine = lambda written, **more: confine(written and [*written, folder], **more)
 
     def decoding(lease, *rest):
         at["video"] = lease.video

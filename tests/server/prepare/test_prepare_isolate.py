@@ -5,17 +5,23 @@ What the processes import is this module, so it imports little.
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import os
+import pickle
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from multiprocessing import resource_tracker
 from pathlib import Path
 
+import msgpack
 import psutil
 import pytest
 
-from v2v_server.system.isolate import Died, run_isolated
+from v2v_server.system.isolate import LARGEST_MESSAGE_BYTES, Died, run_isolated
 
 
 @pytest.fixture(autouse=True)
@@ -97,6 +103,75 @@ def test_how_a_process_died() -> None:
     assert [death.is_crash for death in deaths] == [False, True, False, False, True]
     assert not Died(-signal.SIGSEGV, begun=False).is_crash
     assert not Died(-signal.SIGSEGV, overdue_seconds=1.0).is_crash
+
+
+class Evil:
+    """What unpickling it does."""
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.mkdir, (os.environ.get("V2V_TEST_STRUCK", ""),)
+
+
+ATTACKS = {
+    "an object": pickle.dumps(Evil()),
+    "a framed object": len(pickle.dumps(Evil())).to_bytes(4, "big") + pickle.dumps(Evil()),
+    "too many bytes": b"",  # made when it is sent
+    "text": msgpack.packb("9"),
+    "two results": msgpack.packb(9) * 2,
+}
+
+
+def square_or_attack(job: tuple[int, str]) -> int:
+    """Do what a video can make a process do that it has taken over: write anything to the socket."""
+    number, attack = job
+    if attack:
+        (connection,) = (each for each in gc.get_objects() if isinstance(each, socket.socket))
+        with contextlib.suppress(OSError):
+            connection.sendall(ATTACKS.get(attack, b"\xc4"))
+            if attack == "too many bytes":
+                connection.sendall(b"\xc6" + LARGEST_MESSAGE_BYTES.to_bytes(4, "big") + bytes(LARGEST_MESSAGE_BYTES))
+            if attack == "no end":
+                os.close(connection.detach())
+        while True:
+            signal.pause()
+    return number * number
+
+
+def test_a_hostile_result_costs_one_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("V2V_TEST_STRUCK", str(tmp_path / "struck"))
+    jobs = [each for number, attack in enumerate(ATTACKS) for each in ((number, attack), (number, ""))]
+    results = dict(run_isolated(square_or_attack, jobs, 2, lambda job: 60.0))
+    assert not (tmp_path / "struck").exists()
+    for number, attack in enumerate(ATTACKS):
+        death = results[number, attack]
+        assert isinstance(death, Died), attack
+        assert (death.is_crash, death.how) == (True, "it sent a malformed result"), attack
+        assert results[number, ""] == number * number
+
+
+def test_half_a_result_costs_one_job() -> None:
+    jobs = [(1, ""), (2, "half a result"), (3, ""), (4, "no end"), (5, "")]
+    results = dict(run_isolated(square_or_attack, jobs, 1, lambda job: 3.0 if job[0] == 2 else 60.0))
+    assert results[2, "half a result"] == Died(-signal.SIGKILL, 3.0)
+    assert results[4, "no end"] == Died(-signal.SIGKILL)
+    assert [results[number, ""] for number in (1, 3, 5)] == [1, 9, 25]
+
+
+def test_a_process_cannot_have_files_removed_by_the_tracker() -> None:
+    pipe = os.readlink(f"/proc/self/fd/{resource_tracker.getfd()}")
+    assert dict(run_isolated(ends_of, [pipe], processes=1)) == {pipe: 0}
+
+
+def ends_of(pipe: str) -> int:
+    """Return how often this process has a pipe open."""
+    return sum(os.readlink(f"/proc/self/fd/{each}") == pipe for each in range(64) if is_open(each))
+
+
+def is_open(descriptor: int) -> bool:
+    with contextlib.suppress(OSError):
+        os.fstat(descriptor)
+        return True
+    return False
 
 
 def interrupts_let_through(job: None) -> tuple[bool, bool]:

@@ -452,7 +452,7 @@ def test_stop_reaps_what_ignores_every_request(start: Callable[[int, str], Pool]
         "import signal, sys, time\n"
         "for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):\n"
         "    signal.signal(number, signal.SIG_IGN)\n"
-        f"open({str(tmp_path)!r} + '/' + sys.argv[6], 'w').close()\n"
+        f"open({str(tmp_path)!r} + '/' + sys.argv[8], 'w').close()\n"
         "time.sleep(600)\n"
     )
     pool = start(2, stubborn)
@@ -488,6 +488,7 @@ def test_the_programs_of_real_workers() -> None:
     arguments = child_module.arguments("tcp://127.0.0.1:5556", "/a folder", "w-0.1", ["--debug"], logbook)
     assert (sys.executable, "-m", "v2v_server.commands.worker") == child_module.PROGRAM
     assert arguments == [
+        *("--arenas-fd", str(logbook.arenas.fileno())),
         *("--connect", "tcp://127.0.0.1:5556", "--videos", "/a folder", "--name", "w-0.1"),
         *("--parent-pid", str(os.getpid()), "--debug", "--logbook-fd", str(logbook.descriptor)),
     ]

@@ -31,6 +31,9 @@ class ToyPlace:
     def status(self, now: float) -> ProcessStatus | None:
         return ProcessStatus("running", lease=7, decodes=True, seen_at=now) if self.name else None
 
+    def lend(self, arena: str) -> None:
+        self.told.append(f"lend {arena}")
+
     def leave(self) -> bool:
         self.told.append("leave")
         return bool(self.name)

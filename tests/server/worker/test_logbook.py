@@ -1,4 +1,4 @@
-"""The logbook: what a worker was at, by its own hand, whatever ended it."""
+"""The logbook: what a worker was at, by its own hand, whatever ended it. The arenas of its leases."""
 
 from __future__ import annotations
 
@@ -6,11 +6,16 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 
 import pytest
 
-from v2v_server.worker.logbook import IDLE, Logbook, note
+from v2v_client.memory.arena import Arena
+from v2v_protocol.arena import ArenaName, Slot
+from v2v_protocol.errors import ProtocolError
+from v2v_server.worker.logbook import IDLE, Logbook, note, take_arena
+from v2v_server.worker.output_buffer import slot_arrays
 
 WRITES_AND_DIES = """
 import os, signal, sys
@@ -46,3 +51,85 @@ def test_a_worker_without_a_logbook_writes_nowhere() -> None:
 
 def test_it_has_no_name(book: Logbook) -> None:
     assert os.fstat(book.descriptor).st_nlink == 0
+
+
+# --- arenas -----------------------------------------------------------------------------------------------------------
+
+LAYOUT = {"voxels": ("int8", (2, 3))}
+needs_memfd = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this system has no memfd_create")
+
+
+def name_of(arena: Arena) -> ArenaName:
+    return ArenaName.parse(arena.slot(0).arena)
+
+
+def write(book: Logbook, slot: Slot, value: int) -> bool:
+    """Write to a slot as a confined worker does."""
+    there = slot_arrays(slot, LAYOUT, lambda name, writable: take_arena(book.arenas, name, writable))
+    if there is not None:
+        there["voxels"].fill(value)
+    return there is not None
+
+
+def holds(arena: Arena, value: int) -> bool:
+    return bool((arena.arrays(lambda: None)["voxels"][0] == value).all())
+
+
+@needs_memfd
+def test_a_worker_writes_where_its_pool_says(book: Logbook) -> None:
+    arena = Arena(LAYOUT, 2)
+    before = len(os.listdir("/proc/self/fd"))
+    book.lend(str(name_of(arena)))
+    assert write(book, arena.slot(0), 7)
+    assert len(os.listdir("/proc/self/fd")) == before
+    assert holds(arena, 7)
+
+
+@needs_memfd
+def test_a_descriptor_may_come_after_its_lease_but_not_much(book: Logbook) -> None:
+    arena = Arena(LAYOUT, 2)
+    book.arenas.settimeout(60.0)
+    late = threading.Timer(0.5, book.lend, [str(name_of(arena))])
+    late.start()
+    assert write(book, arena.slot(0), 8)
+    late.join()
+    book.arenas.settimeout(0.01)
+    assert not write(book, arena.slot(0), 9)
+    assert holds(arena, 8)
+
+
+@needs_memfd
+def test_arenas_of_leases_that_were_not_worked_on_are_closed(book: Logbook) -> None:
+    arenas = [Arena(LAYOUT, 2) for _ in range(5)]
+    before = len(os.listdir("/proc/self/fd"))
+    for arena in arenas:
+        book.lend(str(name_of(arena)))
+    assert write(book, arenas[3].slot(0), 7)
+    assert write(book, arenas[4].slot(0), 8)
+    assert len(os.listdir("/proc/self/fd")) == before
+    assert [holds(arena, value) for arena, value in zip(arenas, (0, 0, 0, 7, 8), strict=True)] == [True] * 5
+
+
+@needs_memfd
+def test_what_the_pool_cannot_open_is_no_arena(book: Logbook) -> None:
+    arena = Arena(LAYOUT, 2)
+    name = name_of(arena)
+    unknown = ArenaName(name.pid, name.descriptor, name.slots, "0" * 32)
+    gone = ArenaName(name.pid, 65_000, name.slots, name.token)
+    for each in (str(unknown), str(gone), "no arena"):
+        book.lend(each)
+        with pytest.raises(FileNotFoundError):
+            take_arena(book.arenas, name, True)
+    book.lend(str(name))
+    assert not write(book, Slot(str(ArenaName(name.pid, name.descriptor, 3000, name.token)), 1), 5)  # another size
+    with pytest.raises(ProtocolError):
+        ArenaName.parse("no arena")
+
+
+def test_a_worker_that_does_not_read_stops_no_pool(book: Logbook) -> None:
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(2000):
+        book.lend("0:0:1:" + "0" * 32)
+    assert len(os.listdir("/proc/self/fd")) == before
+    book.arenas.close()
+    book.lend("0:0:1:" + "0" * 32)

@@ -73,7 +73,9 @@ def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
         monkeypatch.setattr(worker_module, "make_sample", make)
         monkeypatch.setattr(worker_module, "sample_layout", lambda lease: LAYOUT)
         monkeypatch.setattr(
-            worker_module, "open_output_buffer", lambda lease, layout: OutputBuffer(new_arrays(layout), in_slot=True)
+            worker_module,
+            "open_output_buffer",
+            lambda lease, layout, arenas: OutputBuffer(new_arrays(layout), in_slot=True),
         )
         monkeypatch.setattr(worker_module, "kernels_of", lambda lease: frozenset({VARIANT} if lease.lease > 3 else ()))
         monkeypatch.setattr(worker_module, "is_compiled", lambda variant: True)

@@ -29,7 +29,7 @@ from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.clips import pictures_of
 from v2v_server.system.compile_cache import compile_cache
-from v2v_server.system.isolate import Died, run_isolated
+from v2v_server.system.isolate import run_twice
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import Window
 from v2v_server.video.rows import Rows
@@ -148,26 +148,18 @@ class SceneCollection:
                 index = store.frame_index(record.id, record.fingerprint) or b""
                 yield _Job(record.id, record.fingerprint, record.frames, index, self._window(record))
 
-        isolated = partial(
-            run_isolated,
+        results = run_twice(
             partial(_analyse, source),
+            jobs(),
+            processes,
             deadline_seconds=lambda job: LONGEST_SECONDS,
             memory_bytes=2 * LARGEST_MEMORY_BYTES,
             writable=compile_cache() if source.is_local else None,
         )
-        suspects = []
-        for job, found in isolated(jobs(), processes):
-            if isinstance(found, Died) and found.overdue_seconds:
-                continue  # the next start tries again
-            if isinstance(found, Died) or not found:
-                suspects.append(job)
-            else:
-                yield job, Scene.from_bytes(found)
-        # Once more, alone: the process may have been killed from outside, or for lack of memory, or its storage failed
-        # for a moment. A second failure is not kept: such a video counts as unknown, and the next start tries again.
-        for job, found in isolated(suspects, 1):
-            if not isinstance(found, Died) and found:
-                yield job, Scene.from_bytes(found)
+        for job, found in results:
+            if isinstance(found, Scene):
+                yield job, found
+            # Otherwise the video counts as unknown, and the next start tries again.
 
     def _prepared(self, record: IndexRow) -> bytes | None:
         """Return the encoded scene that the manifest states."""
@@ -201,10 +193,10 @@ class _Job:
     window: Window | None
 
 
-def _analyse(source: VideoSource, job: _Job) -> bytes:
-    """Return the encoded scene of one video, from what decodes before the first error.
+def _analyse(source: VideoSource, job: _Job) -> Scene | None:
+    """Return the scene of one video, from what decodes before the first error.
 
-    It is empty where the system, not the decoder, reports an error.
+    It is None where the system, not the decoder, reports an error.
     """
     # Import lazily: processes that only open a catalogue need no OpenCV.
     from v2v_server.corpus.scenes.analysis import SceneAnalysis
@@ -218,6 +210,6 @@ def _analyse(source: VideoSource, job: _Job) -> bytes:
                     analysis.add(picture)
         except VideoError as error:
             if isinstance(error, VideoUnreadable) or isinstance(error.__cause__, OSError):
-                return b""
+                return None
             # A worker that decodes the frames after the error reports the same error.
-    return analysis.scene().to_bytes()
+    return analysis.scene()

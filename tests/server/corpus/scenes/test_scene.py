@@ -40,7 +40,7 @@ from v2v_server.corpus.scenes.scene import (
 )  # fmt: skip
 from v2v_server.prepare.prepare import prepare
 from v2v_server.store.encoding import Encoding
-from v2v_server.system.isolate import run_isolated
+from v2v_server.system.isolate import run_twice
 from v2v_server.video.rows import Rows
 
 Luma = npt.NDArray[np.uint8]
@@ -281,7 +281,7 @@ def test_storage_that_fails_while_a_video_is_looked_at_is_asked_again(
     """Once at once, and else at the next start: otherwise a video would never have had a cut."""
     with opened(folder, scene=False), opened(folder, cache_dir=tmp_path / "other") as undisturbed:
         digest = undisturbed.scene_digest
-    monkeypatch.setattr(collect, "run_isolated", lambda work, jobs, *_, **__: run_isolated(work, jobs, 0))
+    monkeypatch.setattr(collect, "run_twice", lambda work, jobs, *_, **__: run_twice(work, jobs, 0))
     left = failing_opens(monkeypatch, cut=2, whole=1)
     with opened(folder) as first:
         assert left == {"cut": 0, "whole": 0}

@@ -1,0 +1,128 @@
+"""What SECURITY.md says of stream workers on the server's host, tried inside their confinement, and that samples still
+arrive through shared memory.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_workers
+from tests.waiting import until
+from v2v_client import V2VStreamDataset
+from v2v_client.local_server import LocalServer
+from v2v_server.status.client import StatusClient
+from v2v_server.system.sandbox import can_confine
+
+ATTEMPTS = Path(__file__).parent / "attempts"
+pytestmark = pytest.mark.skipif(
+    not can_confine().calls or not can_confine().files, reason="this kernel has no seccomp or no Landlock"
+)
+
+
+def totals(address: str) -> dict[str, Any]:
+    with StatusClient(address) as client:
+        found: dict[str, Any] = client.get_status()["totals"]
+        return found
+
+
+def open_files(pid: int) -> Counter[str]:
+    """Kinds of what a process has open: sockets and shared memory each count as one."""
+    names = []
+    for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+        try:
+            names.append(os.readlink(descriptor).partition(":")[0])
+        except FileNotFoundError:
+            continue  # closed meanwhile
+    return Counter(names)
+
+
+@pytest.mark.parametrize("flags", [(), ("--share-gib", "1"), ("--worker-bind", "tcp://127.0.0.1:*")])
+def test_a_worker_reads_files_and_nothing_else(
+    monkeypatch: pytest.MonkeyPatch, clips: Path, tmp_path: Path, flags: tuple[str, ...]
+) -> None:
+    home, report = tmp_path / "home", tmp_path / "report"
+    home.mkdir()
+    (home / "notes").write_bytes(b"before")
+    report.touch()
+    with subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"]) as other:
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(ATTEMPTS), os.environ.get("PYTHONPATH")))))
+        monkeypatch.setenv("V2V_ATTEMPTS", json.dumps({"report": str(report), "home": str(home), "pid": other.pid}))
+        try:
+            with LocalServer(clips, workers=2, flags=[*SMALL_FLAGS, *flags]) as server:
+                assert len(epoch_of(server.address)) == 8
+                seen = totals(server.address)
+                assert len(server_workers(server.pid)) == 2
+        finally:
+            other.kill()
+    assert seen["in_slots"] == seen["samples"] > 0
+    lines = [json.loads(line) for line in report.read_text().splitlines()]
+    assert lines
+    for found in lines:
+        assert found.pop("threads") == 1  # when the files were closed, so it holds for all later ones
+        assert found.pop("filters") == ["2"]  # in all threads: the second is the one against sockets
+        assert found.pop("in a thread") is True
+        assert found.pop("read") == "done"
+        assert [name for name, gave in found.items() if gave not in ("EPERM", "EACCES")] == []
+    assert (home / "notes").read_bytes() == b"before"
+
+
+def test_a_killed_workers_successor_gets_slots_and_a_consumer_that_leaves_no_memory(clips: Path) -> None:
+    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:
+        reference = [digest(batch) for batch in epoch_of(server.address)]
+        (worker,) = server_workers(server.pid)
+        before = open_files(server.pid)
+        worker.kill()
+        until(lambda: [each.pid for each in server_workers(server.pid)] not in ([], [worker.pid]))
+        earlier = totals(server.address)
+        assert [digest(batch) for batch in epoch_of(server.address)] == reference
+        later = totals(server.address)
+        assert later["in_slots"] - earlier["in_slots"] == later["samples"] - earlier["samples"] >= len(reference)
+        gc.collect()
+        until(lambda: open_files(server.pid)["/memfd"] == before["/memfd"])
+        (successor,) = server_workers(server.pid)
+        memory = "v2v-"
+        until(
+            lambda: (
+                not [
+                    each
+                    for process in (psutil.Process(server.pid), successor)
+                    for each in Path(f"/proc/{process.pid}/fd").iterdir()
+                    if memory in os.readlink(each) and "logbook" not in os.readlink(each)
+                ]
+            )
+        )
+
+
+def test_a_consumer_whose_memory_the_server_cannot_open_gets_messages(clips: Path, server: LocalServer) -> None:
+    reference = [digest(batch) for batch in epoch_of(server.address, seed=5)]
+    before = totals(server.address)
+    assert [digest(batch) for batch in epoch_of(server.address, seed=5, shared_memory=False)] == reference
+    after = totals(server.address)
+    assert after["in_slots"] == before["in_slots"]
+    assert after["samples"] > before["samples"]
+
+
+def test_a_worker_outlasts_a_server_that_is_stopped(clips: Path) -> None:
+    """It makes no other connection, so it must not give up this one."""
+    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:
+        iterator = iter(V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, timeout_seconds=120.0))
+        next(iterator)
+        (worker,) = server_workers(server.pid)
+        psutil.Process(server.pid).suspend()
+        try:
+            with pytest.raises(psutil.TimeoutExpired):
+                worker.wait(13.0)  # longer than the silence after which a worker elsewhere connects again
+        finally:
+            psutil.Process(server.pid).resume()
+        assert len(list(iterator)) == 7
+        assert [each.pid for each in server_workers(server.pid)] == [worker.pid]
