@@ -41,7 +41,7 @@ LARGEST_FILE_BYTES, MOST_BYTES, MOST_FILES, MOST_FOLDERS = 4 << 30, 64 << 30, 1 
 MOST_LENT_BYTES = 256 << 20
 """Limit of the files of a folder that one clip needs: they are held in memory."""
 _BLOCK_BYTES = 1 << 20
-_LARGEST_TABLE_BYTES = 64 << 20
+_LARGEST_TABLE_BYTES = 63 << 20
 _EVERY_FRAME = -1
 """Stands for the frame of a file whose name has no number: every clip needs it."""
 _DIGEST = 16
