@@ -16,6 +16,7 @@ from PIL import Image as Pictures
 from v2v_pictures import canvas
 from v2v_pictures.colours import BRIGHTER, DARKER, Image
 from v2v_protocol.errors import UsageError
+from v2v_protocol.write_aside import write_aside_and_rename
 
 _GIF_COLOURS, _GIF_COMMON, _GIF_STEP = 96, 24, 8
 _GIF_EXACT = (canvas.PAPER, canvas.INK, canvas.SOFT, canvas.LINE, canvas.MARK, canvas.PAUSED, BRIGHTER, DARKER)
@@ -84,13 +85,14 @@ def html_page(title: str, sheet: Image, film: Sequence[Image], frames_per_second
 
 
 def write(path: Path, content: bytes | str) -> None:
-    """Write a file.
+    """Write a file, all of it or nothing.
 
     Raises:
         UsageError: the folder is missing or cannot be written.
     """
     try:
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        with write_aside_and_rename(path) as partial:
+            partial.write_bytes(content.encode() if isinstance(content, str) else content)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from error
 

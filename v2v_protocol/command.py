@@ -12,18 +12,24 @@ import sys
 import textwrap
 import traceback
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Never
 
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION, __version__
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.settings import Setting, nearest, settings_of
+from v2v_protocol.write_aside import check_output
 
 FAILED = 1
 WRONG_USAGE = 2
 INTERRUPTED = 128 + signal.SIGINT
 _LONGEST_CHOICE = 30
 _HELP_WIDTH = 100
+JSON = (".json",)
+"""Endings of ``--json FILE``."""
 _GENERAL = "General"
+_NO_INPUTS = frozenset({"out", "destination", "cache_dir", "copies"})
+"""Arguments that name a folder to write to."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -49,6 +55,7 @@ class Parser(argparse.ArgumentParser):
             add_help=False,
         )
         self._given: list[str] = []
+        self._outputs: dict[str, tuple[str, Sequence[str]]] = {}
         self._groups: dict[str, argparse._ArgumentGroup] = {}
         general = self.group(_GENERAL)
         general.add_argument("-h", "--help", action="help", help="show this help and exit")
@@ -76,6 +83,31 @@ class Parser(argparse.ArgumentParser):
                 self.group(setting.group).add_argument(
                     flag, type=_reader(setting), metavar=_metavar(setting), help=_help(setting), **bare
                 )
+
+    def add_output(self, group: str, flag: str, endings: Sequence[str], help: str, required: bool = False) -> None:
+        """Add a flag for a file that the command writes. Before the work, :func:`run_command` checks the file.
+
+        Args:
+            endings: see :func:`check_output`; the first one is shown in the help if it is the only one.
+        """
+        metavar = f"FILE{endings[0]}" if len(endings) == 1 and endings != JSON else "FILE"
+        must = {"required": True} if required else {}
+        self.group(group).add_argument(flag, type=Path, metavar=metavar, help=help, **must)
+        self._outputs[flag.removeprefix("--").replace("-", "_")] = flag, endings
+
+    def check_outputs(self, arguments: argparse.Namespace) -> None:
+        """Check the files to write against the other arguments that name files or folders.
+
+        Raises:
+            UsageError: see :func:`check_output`.
+        """
+        values = {name: value for name, value in vars(arguments).items() if name not in {*self._outputs, *_NO_INPUTS}}
+        each = [item for value in values.values() for item in (value if isinstance(value, list) else [value])]
+        taken = [item for item in each if isinstance(item, str | Path)]
+        for name, (flag, endings) in self._outputs.items():
+            if (path := getattr(arguments, name)) is not None:
+                check_output(flag, path, endings, taken)
+                taken.append(path)
 
     def format_help(self) -> str:
         """Format the help; options that every command has come last."""
@@ -126,6 +158,8 @@ def run_command(
     except SystemExit as ended:  # argparse's own: help was shown, or a flag not understood
         return int(ended.code or 0)
     try:
+        if isinstance(parser, Parser):
+            parser.check_outputs(arguments)
         return run(arguments) or 0
     except V2VError as error:
         if arguments.debug:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.write_aside import write_aside_and_rename
 
 
 def write_json(file: str | os.PathLike[str], records: Sequence[Mapping[str, Any]]) -> None:
@@ -18,6 +19,7 @@ def write_json(file: str | os.PathLike[str], records: Sequence[Mapping[str, Any]
         UsageError: the file cannot be written.
     """
     try:
-        Path(file).write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+        with write_aside_and_rename(Path(file)) as partial:
+            partial.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         raise UsageError(f"--json {os.fspath(file)}: cannot be written: {error.strerror or error}") from error

@@ -22,7 +22,7 @@ from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_client.tools.schedule_check import ScheduleCheck
-from v2v_protocol.command import INTERRUPTED, Parser, run_command
+from v2v_protocol.command import INTERRUPTED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
@@ -259,7 +259,7 @@ def _parser() -> Parser:
         metavar="S",
         help="silence after which the server counts as lost (default 60)",
     )
-    measuring.add_argument("--json", metavar="FILE", help="write the records to this file")
+    parser.add_output("Measuring", "--json", JSON, "write the records to this file")
     return parser
 
 

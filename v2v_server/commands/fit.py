@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         ],
         "Forms of recordings:\n" + "\n".join(f"  {name:14s} {form.title}" for name, form in FORMS.items()),
     )  # fmt: skip
-    recording, out = parser.group("Recording"), parser.group("Output")
+    recording = parser.group("Recording")
     recording.add_argument("recording", nargs="?", metavar="RECORDING", help="file or folder with events; frames help")
     recording.add_argument("--static", action="store_true", help="nothing moved: all events are noise")
     recording.add_argument("--size", metavar="WxH", help="size of the sensor in px, if the recording does not state it")
@@ -44,8 +44,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     recording.add_argument("--camera", choices=("left", "right"), default="left", help="camera of a stereo recording")
     recording.add_argument("--events-topic", metavar="TOPIC", help="topic of events, for a bag with several")
     recording.add_argument("--images-topic", metavar="TOPIC", help="topic of pictures, for a bag with several")
-    out.add_argument("--out", metavar="FILE.yaml", help="recipe to write; --recipe of the other commands reads it")
-    out.add_argument("--picture", metavar="FILE.png", help="also draw measured against simulated statistics")
+    parser.add_output(
+        "Output", "--out", (".yaml", ".yml"), "recipe to write (.yaml); --recipe of the other commands reads it"
+    )
+    parser.add_output("Output", "--picture", (".png",), "also draw measured against simulated statistics")
     check = parser.group("Check")
     check.add_argument("--check", metavar="RECIPE", help="measure this recipe: a preset's name or a YAML file")
     check.add_argument("--sheet", metavar="FILE.yaml", help="figures to show in the table, by its row names")
@@ -81,9 +83,7 @@ def _fit(arguments: argparse.Namespace) -> FittedCamera:
         events_topic=arguments.events_topic,
         images_topic=arguments.images_topic,
     )
-    source, out = Path(arguments.recording), Path(arguments.out)
-    if out.suffix not in (".yaml", ".yml"):
-        raise UsageError(f"--out {out}: give a name that ends in .yaml, as --recipe expects")
+    source, out = Path(arguments.recording), arguments.out
     with Progress(source.name, "%") as progress:
         fitted = fit(source, static=arguments.static, options=options, progress=progress)
     print("\n".join(report_lines(fitted, source.name)))
@@ -92,7 +92,7 @@ def _fit(arguments: argparse.Namespace) -> FittedCamera:
     except OSError as error:
         raise UsageError(f"--out {out}: {error.strerror or error}") from error
     if arguments.picture is not None:
-        write_png(Path(arguments.picture), draw_fit(fitted, source.name))
+        write_png(arguments.picture, draw_fit(fitted, source.name))
     return fitted
 
 

@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     videos.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
     videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     out = parser.group("Output")
-    out.add_argument("--out", required=True, metavar="FILE", help=f"picture, film or page: {', '.join(KINDS)}")
+    parser.add_output("Output", "--out", KINDS, f"picture, film or page: {', '.join(KINDS)}", required=True)
     out.add_argument(
         "--moments", type=int, default=1, metavar="N", help="number of voxel grids of each camera (default 1)"
     )
@@ -71,7 +71,7 @@ def _run(arguments: argparse.Namespace) -> None:
         what += ", chosen where something moves"
     preview(
         arguments.source,
-        Path(arguments.out),
+        arguments.out,
         looks,
         # Recipes are compared on one clip, so the order must not depend on how many sequences each admits.
         {"shuffle": False} if arguments.compare else {},

@@ -14,7 +14,8 @@ from typing import Any
 
 import cv2
 
-from v2v_protocol.command import FAILED, Parser, run_command
+from v2v_pictures.files import write
+from v2v_protocol.command import FAILED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
 from v2v_protocol.spec import StreamSpec
@@ -75,10 +76,9 @@ def _parser() -> Parser:
     wish = wishes.add_mutually_exclusive_group()
     wish.add_argument("--target-rate", type=float, metavar="X", help="samples a core second to reach")
     wish.add_argument("--max-error", type=float, metavar="X", help="largest voxel error, for example 0.05")
-    out = parser.group("Output")
-    out.add_argument("--preset-out", type=Path, metavar="FILE.yaml", help="write the best setting for v2v-serve")
-    out.add_argument("--json", type=Path, metavar="FILE", help="write the records")
-    out.add_argument("--plot", type=Path, metavar="FILE.png", help="draw speed against error (needs matplotlib)")
+    parser.add_output("Output", "--preset-out", (".yaml", ".yml"), "write the best setting for v2v-serve (.yaml)")
+    parser.add_output("Output", "--json", JSON, "write the records")
+    parser.add_output("Output", "--plot", (".png", ".pdf", ".svg"), "draw speed against error (needs matplotlib)")
     return parser
 
 
@@ -86,8 +86,6 @@ def _check(asked: argparse.Namespace) -> None:
     wishes = [wish for wish in (asked.target_rate, asked.max_error) if wish is not None]
     if asked.preset_out is not None and not wishes:
         raise UsageError("--preset-out without a wish: give --target-rate or --max-error too")
-    if asked.preset_out is not None and not asked.preset_out.parent.is_dir():
-        raise UsageError(f"--preset-out {asked.preset_out}: there is no folder {asked.preset_out.parent}")
     if not 0 < asked.budget_minutes < math.inf:
         raise UsageError(f"--budget-minutes {asked.budget_minutes:g}: give a finite number above 0")
     for flag, value in (("--places", asked.places), ("--clips", asked.clips)):
@@ -207,7 +205,7 @@ def choose(records: Sequence[Mapping[str, Any]], compared: Sequence[ServeSetting
     print(f"best: {record['name']}: {why}")
     if asked.preset_out is not None:
         (chosen,) = (setting for setting in compared if setting.name == record["name"])
-        asked.preset_out.write_text(chosen.yaml(asked.rows, why), encoding="utf-8")
+        write(asked.preset_out, chosen.yaml(asked.rows, why))
     return 0
 
 

@@ -25,6 +25,7 @@ from v2v_protocol.progress import Progress
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, sidecar_endings
 from v2v_protocol.spec import StreamSpec
+from v2v_protocol.write_aside import check_output
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.motion.prediction import Prediction
 from v2v_server.offline.motion import WholePictures, describe_loss, moving_seeds, predicted_loss, quiet_voxels
@@ -91,10 +92,7 @@ def preview(
         CorpusError: no video can be used, even with short clips and small crops.
         SampleUnavailable, VideoUnreadable: see :func:`v2v_server.offline.remake.remake`.
     """
-    if out.suffix not in KINDS:
-        raise UsageError(f"--out {out}: unknown ending; give a name that ends in {', '.join(KINDS)}")
-    if not out.parent.is_dir():  # before any work
-        raise UsageError(f"--out {out}: there is no folder {out.parent}; create it first")
+    check_output("--out", out, KINDS, [source])  # before any work
     catalogue = open_shown(source, list_file=list_file, rows=rows, cache_dir=cache_dir)
     cameras: list[Camera] = []
     loss, notes = Prediction(), dict[str, list[str]]()
@@ -113,11 +111,11 @@ def preview(
         whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
     finally:
         catalogue.close()
-    _check_sizes(cameras, out.suffix)
+    _check_sizes(cameras, out.suffix.lower())
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
     say(describe_loss(loss))
-    write(out, _content(out.suffix, whole, cameras, title, moments))
+    write(out, _content(out.suffix.lower(), whole, cameras, title, moments))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
 
 

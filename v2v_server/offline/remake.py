@@ -20,6 +20,7 @@ from v2v_protocol.progress import Progress
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.sample import DEFAULT_ARRAYS, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
+from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.broker.candidates import next_candidate
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
@@ -230,7 +231,8 @@ def simulate_to_file(
     provenance = sample.provenance.to_dict()
     content: Mapping[str, Any] = {**sample.arrays, "provenance": json.dumps(provenance)}
     try:
-        np.savez_compressed(out, **content)
+        with write_aside_and_rename(out) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **content)
         if picture is not None:
             camera = Camera.of(sample.arrays, sample.provenance, f"index {index}", stream.recipe)
             write_png(picture, draw_sheet([camera], f"seed {seed}, epoch {epoch}", moments=_MOMENTS))
