@@ -3,22 +3,34 @@ and none is answered with a traceback."""
 
 from __future__ import annotations
 
+import copy
 import hashlib
+import pickle
 import resource
 import shlex
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from tests.clips import panned_luma, write_clip
-from tests.test_commands import MODULES
+from tests.test_commands import MODULES, flags_of
+from trainer.config import StreamConfig
+from v2v_client import Batch, V2VStreamDataset
+from v2v_client.options import Options
 from v2v_pictures.files import write_png
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
+from v2v_protocol.recipe import PRESETS
 from v2v_protocol.records import write_json
+from v2v_protocol.settings import settings_of
+from v2v_protocol.spec import StreamSpec
+from v2v_protocol.spec_flags import recipe_setting
+from v2v_server.config import ServeConfig
 from v2v_server.offline.event_files import FORMS, write_events
 
 OUTPUTS = [
@@ -150,3 +162,118 @@ def test_outputs_replace_older_ones_and_follow_links(tmp_path: Path) -> None:
         write_json(tmp_path / "named.json", [{"key": text}])
     assert (tmp_path / "named.json").is_symlink()
     assert '"b"' in (tmp_path / "target.json").read_text()
+
+
+WRONG = [
+    # what a command does not take, and the flag that it means
+    ("v2v-serve clips", "--videos clips"),
+    ("v2v-loadtest clips", "--videos clips"),
+    ("v2v-doctor clips", "--videos clips"),
+    ("v2v-tradeoff clips --plot x.png", "--videos clips"),
+    ("v2v-train clips", "v2v-train NAME --videos clips"),
+    ("v2v-train finetune --videos clips", "did you mean 'finetune-cpu'"),
+    ("v2v-train e2vd --videos clips", "did you mean 'e2vid'"),
+    ("v2v-preview a.mp4 --output x.png", "did you mean '--out'"),
+    ("v2v-preview --videos clips --out x.png", "without a flag"),
+    ("v2v-simulate --video a.mp4 --out x.npz", "without a flag"),
+    # recipes, presets and stream settings in each other's place
+    ("v2v-preview a.mp4 --out x.png --set crop=64", "'crop_height_px' or 'crop_width_px'"),
+    ("v2v-preview a.mp4 --out x.png --set substep_px=1", "--substep-px 1 instead of --set"),
+    ("v2v-simulate a.mp4 --out x.npz --set scene=auto", "--scene auto instead of --set"),
+    ("v2v-serve --videos clips --set tolerance=0.1", "--tolerance 0.1 instead of --set"),
+    ("v2v-loadtest --connect tcp://127.0.0.1:9 --set tolerance=0.1", "--tolerance 0.1 instead of --set"),
+    ("v2v-fit --check paper --set substep_px=1", "--substep-px 1 instead of --set"),
+    ("v2v-tradeoff --videos clips --set shuffle=false", "a setting of the stream"),
+    ("v2v-serve --videos clips --preset davis346", "--recipe davis346"),
+    ("v2v-preview a.mp4 --out x.png --preset c.yaml", "--recipe c.yaml"),
+    ("v2v-serve --videos clips --preset natual", "did you mean 'natural'"),
+    ("v2v-serve --videos clips --recipe natural", "--preset natural"),
+    ("v2v-preview a.mp4 --out x.png --recipe dvs346", "did you mean 'davis346'"),
+    ("v2v-preview a.mp4 --out x.png --recipe none.yaml", "none.yaml: No such file"),
+    ("v2v-serve --videos clips --set bins", "write KEY=VALUE"),
+    ("v2v-serve --videos clips --set bins=0", "from 1 to 1024"),
+    ("v2v-preview a.mp4 --out x.png --scene on", "choose one of off, auto"),
+    # videos
+    ("v2v-preview nowhere.mp4 --out x.png", "nowhere.mp4"),
+    ("v2v-preview e.dat --out x.png", "e.dat"),
+    ("v2v-serve --videos run", "run"),
+    ("v2v-preview a.mp4 --out x.png --rows top:2", "0 <= top < bottom <= 1"),
+    ("v2v-simulate a.mp4 --out x.npz --arrays voxel", "voxels"),
+    ("v2v-simulate a.mp4 --out x.npz", "voxels_per_clip at most 5"),
+    # numbers and addresses
+    ("v2v-serve --videos clips --workers many", "give a whole number"),
+    ("v2v-serve --videos clips --bind 127.0.0.1:5555", "tcp://HOST:PORT"),
+    ("v2v-serve --videos clips --bind tcp://0.0.0.0:5555", "--insecure"),
+    ("v2v-loadtest --connect 127.0.0.1:5555", "tcp://"),
+    ("v2v-fit", "RECORDING"),
+    ("v2v-fit e.dat --out c.yaml --set bins=3", "--set needs --check"),
+    ("v2v-eval --data nowhere", "no such folder"),
+    ("v2v-convert nowhere --out h5", "nowhere"),
+]  # fmt: skip
+"""Words that a command does not know, each with what the answer must name."""
+
+
+@pytest.mark.parametrize(("line", "word"), WRONG, ids=[line for line, _ in WRONG])
+def test_an_answer_names_what_to_type(line: str, word: str, desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents(desk)
+    said = answer(line, capsys)
+    assert word in said
+    assert contents(desk) == before
+
+
+IN_PYTHON: list[tuple[Callable[[], object], str]] = [
+    (lambda: dataset()[0], r"dataset\[0\]: a stream has no index; .* V2VDataset makes samples by index"),
+    (lambda: dataset().load_state_dict("last.pt"), r"'last.pt' is the name of a file"),  # type: ignore[arg-type]
+    (lambda: dataset().load_state_dict({"network": {}, "stream": dataset().state_dict()}), r"is in its \['stream'\]"),
+    (lambda: dataset().load_state_dict({"network": {}}), r"version None, expected \d+$"),
+    (lambda: dataset(bins=3), r"no argument 'bins': it belongs to the recipe, recipe={'bins': ...}"),
+    (lambda: dataset(substep=1), r"did you mean 'substep_px'"),
+    (lambda: dataset(recipe={"substep_px": 1}), r"give substep_px=1 beside the recipe"),
+    (lambda: dataset(recipe={"crop": 64}), r"did you mean 'crop_height_px' or 'crop_width_px'"),
+    (lambda: dataset(recipe="none.yaml"), r"none.yaml: No such file"),
+    (lambda: dataset(recipe="natural"), r"--preset natural"),
+    (lambda: dataset(preset="paper"), r"unknown preset 'paper'"),
+    (lambda: dataset(arrays="voxel"), r"voxels"),
+    (lambda: batch().voxel, r"a Batch has no 'voxel' \(did you mean 'voxels'\?\)"),
+    (lambda: batch()["frame"], r"this batch has voxels"),
+    (lambda: batch().flow, r"create the dataset with arrays=\('voxels', 'flow'\)"),
+]
+
+
+def dataset(**options: Any) -> V2VStreamDataset:
+    return V2VStreamDataset("tcp://127.0.0.1:9", **options)
+
+
+def batch() -> Batch:
+    return Batch({"voxels": torch.zeros(1, 1, 1, 2, 2)}, (0,), 0, (), {}, 0.0, 0.0, 1)
+
+
+@pytest.mark.parametrize("number", range(len(IN_PYTHON)))
+def test_mistakes_in_python_are_named(number: int) -> None:
+    mistake, words = IN_PYTHON[number]
+    with pytest.raises((UsageError, AttributeError, KeyError), match=words):
+        mistake()
+
+
+def test_a_batch_is_copied_and_pickled_although_it_names_unknown_attributes() -> None:
+    for made in (copy.copy(batch()), pickle.loads(pickle.dumps(batch()))):
+        assert made.voxels.shape == (1, 1, 1, 2, 2)
+
+
+def test_a_recipe_file_is_a_recipe_by_name_everywhere(tmp_path: Path) -> None:
+    file = tmp_path / "my.yaml"
+    file.write_text("preset: davis346\nbins: 3\n")
+    expected = PRESETS["davis346"].replace(bins=3)
+    asked = Options(("voxels",), recipe=str(file)).spec(None, "")["recipe"]
+    assert StreamSpec.from_dict({"recipe": asked}).recipe == expected
+    assert recipe_setting(str(file), []) == StreamConfig(recipe=str(file)).resolved_recipe == expected
+    assert ServeConfig.load(None, {"videos": "x", "recipe": str(file)}).spec.recipe == expected
+
+
+COMMANDS_OF_SAMPLES = ("v2v-serve", "v2v-preview", "v2v-simulate", "v2v-loadtest")
+
+
+@pytest.mark.parametrize("program", COMMANDS_OF_SAMPLES)
+def test_all_commands_that_make_samples_take_the_flags_of_the_stream(program: str) -> None:
+    flags = {"--preset", "--recipe", "--set", *(f"--{name.replace('_', '-')}" for name in settings_of(StreamSpec))}
+    assert flags <= flags_of(program)

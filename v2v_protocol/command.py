@@ -7,6 +7,7 @@ print one line on stderr; ``--debug`` shows the traceback.
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import textwrap
@@ -127,8 +128,13 @@ class Parser(argparse.ArgumentParser):
             if flag == "--":
                 break
             if flag.startswith("--") and flag not in known:
-                message = f"unknown flag {flag}{nearest(flag, known)}"
+                is_bare = flag in ("--video", "--videos") and "--videos" not in known
+                hint = ": give the videos without a flag" if is_bare else nearest(flag, known)
+                message = f"unknown flag {flag}{hint}"
                 break
+        else:
+            if (first := self._given[:1]) and os.path.exists(first[0]) and "--videos" in known:
+                message = f"{first[0]}: give the videos with a flag, --videos {first[0]}"
         self.exit(WRONG_USAGE, f"{self.prog}: {message}; {self.prog} --help shows all flags\n")
 
 

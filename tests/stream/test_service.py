@@ -124,7 +124,7 @@ def test_workers_do_not_outlive_a_killed_server(clips: Path, tmp_path: Path) -> 
 BAD_SETTINGS = [
     ([], "--videos is missing"),
     (["--videos", "{clips}", "--set", "tresholds=1"], "unknown recipe key 'tresholds' (did you mean 'threshold'?)"),
-    (["--videos", "{clips}", "--recipe", "papper"], "unknown recipe preset 'papper' (did you mean 'paper'?)"),
+    (["--videos", "{clips}", "--recipe", "papper"], "unknown recipe 'papper' (did you mean 'paper'?)"),
     (["--videos", "{clips}", "--bind", "tcp://0.0.0.0:5555"], "--insecure"),
     (["--videos", "{clips}", "--bind", "nonsense"], "--bind 'nonsense': write tcp://HOST:PORT"),
     (["--videos", "{clips}", "--config", "{clips}/none.yaml"], "--config"),

@@ -7,6 +7,7 @@ server of another stream is refused before the first batch.
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -90,11 +91,12 @@ class StreamIdentity:
             mine, offered = getattr(self, name), getattr(other, name)
             if mine != offered:
                 changed = differences(self.spec, other.spec) if name == "spec_digest" else ""
-                raise StateMismatch(f"{name}: {ours} has {mine}, {theirs} has {offered}{changed}; {remedy}")
+                digests = f"{name}: {ours} has {mine}, {theirs} has {offered}"
+                raise StateMismatch(f"{f'{ours} / {theirs}: {changed}' if changed else digests}; {remedy}")
 
 
 def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
-    """Return the fields in which two resolved specs differ, as text: `` (recipe.gamma: 2.2 / 1.8)``."""
+    """Return the fields in which two resolved specs differ, as text: ``recipe.gamma 2.2 / 1.8``."""
 
     def flat(spec: Mapping[str, Any]) -> dict[str, Any]:
         recipe = spec.get("recipe", {})
@@ -103,11 +105,11 @@ def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
 
     left, right = flat(ours), flat(theirs)
     found = [
-        f"{key}: {left.get(key)} / {right.get(key)}"
+        f"{key} {left.get(key)} / {right.get(key)}"
         for key in sorted(left.keys() | right.keys())
         if left.get(key) != right.get(key)
     ]
-    return f" ({', '.join(found[:5])}{', ...' if len(found) > 5 else ''})" if found else ""
+    return f"{', '.join(found[:5])}{', ...' if len(found) > 5 else ''}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,8 +189,16 @@ class ResumeState:
             UsageError: the values are not a state of this release.
         """
         if not isinstance(values, Mapping) or values.get("version") != STATE_VERSION:
+            if isinstance(values, str | os.PathLike):
+                raise UsageError(
+                    f"{os.fspath(values)!r} is the name of a file, not a state: give torch.load(...) of it, or the "
+                    "part of it that holds Batch.resume_state"
+                )
             version = values.get("version") if isinstance(values, Mapping) else type(values).__name__
-            raise UsageError(f"not a state of V2VStreamDataset: version {version!r}, expected {STATE_VERSION}")
+            parts = values.items() if isinstance(values, Mapping) else ()
+            inside = [f"[{key!r}]" for key, part in parts if isinstance(part, Mapping) and "spec_digest" in part]
+            hint = f"; the state is in its {inside[0]}" if inside else ""
+            raise UsageError(f"not a state of V2VStreamDataset: version {version!r}, expected {STATE_VERSION}{hint}")
         known = {"version", "seed", "epoch", "origin", "position", "world_size", "quarantine", "loader_worker"}
         known |= {field.name for field in dataclasses.fields(StreamIdentity)}
         if values.keys() | {"sidecars"} != known:

@@ -11,10 +11,10 @@ from v2v_pictures.files import write_png
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.progress import Progress
+from v2v_protocol.spec_flags import read_yaml_mapping, recipe_setting
 from v2v_recordings.forms import FORMS
 from v2v_recordings.items import ConvertOptions, SensorSize
 from v2v_recordings.text_events import NS_PER_UNIT
-from v2v_server.config import read_yaml_mapping, recipe_setting
 from v2v_server.fit.fit import FittedCamera, fit
 from v2v_server.fit.lab import camera_of, measure, table
 from v2v_server.fit.report import draw_fit, report_lines, write_recipe
@@ -49,7 +49,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_output("Output", "--picture", (".png",), "also draw measured against simulated statistics")
     check = parser.group("Check")
-    check.add_argument("--check", metavar="RECIPE", help="measure this recipe: a preset's name or a YAML file")
+    check.add_argument("--check", metavar="RECIPE", help="measure this recipe: its name or a YAML file")
+    check.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="with --check: change one recipe field"
+    )
     check.add_argument("--sheet", metavar="FILE.yaml", help="figures to show in the table, by its row names")
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="interrupted; no recipe was written")
 
@@ -59,15 +62,16 @@ def _run(arguments: argparse.Namespace) -> None:
         raise UsageError("nothing to do: give a RECORDING and --out, or --check RECIPE")
     if (arguments.recording is None) != (arguments.out is None):
         raise UsageError("a RECORDING and --out belong together: give both, or neither with --check")
-    if arguments.sheet is not None and arguments.check is None:
-        raise UsageError("--sheet needs --check")
+    for flag, value in (("--sheet", arguments.sheet), ("--set", arguments.set)):
+        if value and arguments.check is None:
+            raise UsageError(f"{flag} needs --check")
     for flag in ("--static", "--size", "--time-unit", "--picture"):
         if arguments.recording is None and getattr(arguments, flag[2:].replace("-", "_")):
             raise UsageError(f"{flag} needs a RECORDING")
     fitted = None if arguments.recording is None else _fit(arguments)
     if arguments.check is None:
         return
-    columns = {"recipe": measure(camera_of(recipe_setting(arguments.check, ())))}
+    columns = {"recipe": measure(camera_of(recipe_setting(arguments.check, arguments.set)))}
     if fitted is not None:
         columns["recording"] = measure({"log_eps": 1e-3, "gamma": 2.2, **_thresholds(fitted)})
     if arguments.sheet is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_server.config import recipe_setting
+from v2v_protocol.spec_flags import add_spec, recipe_setting, spec_fields
 from v2v_server.offline.preview import KINDS, Shot, preview
 
 _MOST_CAMERAS = 32
@@ -26,8 +26,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         ],
     )  # fmt: skip
     cameras = parser.group("Virtual cameras")
-    cameras.add_argument("--recipe", metavar="NAME", help="preset or YAML file of recipe fields (default paper)")
-    cameras.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field")
     cameras.add_argument("--seeds", type=int, metavar="N", help="virtual cameras to draw (default 4)")
     cameras.add_argument(
         "--seed", type=int, metavar="S",
@@ -47,6 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--moments", type=int, default=1, metavar="N", help="number of voxel grids of each camera (default 1)"
     )
     out.add_argument("--no-flow", action="store_true", help="leave optical flow out")
+    add_spec(parser)
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="interrupted; nothing was written")
 
 
@@ -74,7 +73,7 @@ def _run(arguments: argparse.Namespace) -> None:
         arguments.out,
         looks,
         # Recipes are compared on one clip, so the order must not depend on how many sequences each admits.
-        {"shuffle": False} if arguments.compare else {},
+        spec_fields(arguments) | ({"shuffle": False} if arguments.compare else {}),
         title=f"{Path(arguments.source).name}: {what}",
         find_motion=arguments.seed is None,
         list_file=arguments.list,

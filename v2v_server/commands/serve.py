@@ -9,8 +9,8 @@ from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
+from v2v_protocol.spec_flags import add_spec
 from v2v_protocol.write_aside import check_output
-from v2v_server.commands.spec_flags import add_spec
 from v2v_server.config import SERVE_KEYS, ServeConfig, recipe_setting
 from v2v_server.supervise.standby import start_ahead
 from v2v_server.system.log import report_errors
@@ -24,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         [
             "v2v-serve --videos clips/ --workers 8",
             "v2v-serve --videos webvid10k/ --rows top:0.54 --preset fast --scene auto",
-            "v2v-serve --videos clips/ --recipe davis346 --set voxels_per_clip=20 --set threshold=[0.2,0.4]",
+            "v2v-serve --videos clips/ --recipe davis346 --set voxels_per_clip=20 --set 'threshold=[0.2,0.4]'",
             "v2v-serve --config serve.yaml",
         ],
     )  # fmt: skip

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
-from v2v_server.commands.spec_flags import add_spec, spec_fields
-from v2v_server.config import recipe_setting
+from v2v_protocol.spec_flags import add_spec, recipe_setting, spec_fields
 from v2v_server.offline.event_files import FORMS
 from v2v_server.offline.remake import simulate_to_file
 

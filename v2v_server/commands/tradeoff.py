@@ -19,7 +19,7 @@ from v2v_protocol.command import FAILED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
 from v2v_protocol.spec import StreamSpec
-from v2v_server.config import recipe_setting
+from v2v_protocol.spec_flags import add_recipe, recipe_setting
 from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, Prediction
 from v2v_server.simulation.variants import warm_up
 from v2v_server.system.process import keep_freed_memory
@@ -55,8 +55,7 @@ def _parser() -> Parser:
     videos.add_argument("--rows", default="top:0.54", help="rows to use (default top:0.54, as for WebVid)")
     videos.add_argument("--clips", type=int, default=4, metavar="N", help="different clips to take (default 4)")
     videos.add_argument("--places", type=int, default=8, metavar="N", help="sequences to sample (default 8)")
-    videos.add_argument("--recipe", default="paper", metavar="NAME", help="preset or YAML file (default paper)")
-    videos.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field")
+    add_recipe(parser, "Videos")
     work = parser.group("Work")
     work.add_argument(
         "--vary", action="append", default=[], metavar="KEY=VALUE,VALUE",
@@ -105,7 +104,7 @@ def _run(asked: argparse.Namespace) -> int:
     _check(asked)
     budget = 60.0 * asked.budget_minutes
     rows = Rows.parse(asked.rows)
-    spec = StreamSpec.from_dict({"recipe": recipe_setting(asked.recipe, asked.set)})
+    spec = StreamSpec.from_dict({"recipe": recipe_setting(asked.recipe or "paper", asked.set)})
     compared = settings(asked.forms, spec, axes(asked.vary))
     cv2.setNumThreads(1)
     keep_freed_memory()

@@ -92,7 +92,7 @@ def describe_loss(found: Prediction) -> str:
     off, on = (max(5, 5 * round(20 * found.errors(setting).lost)) for setting in ("linear", "divided"))
     return (
         f"fast motion: {found.px_per_frame:.2g} px a frame at the median of what moves; about {off} % of the events "
-        f"are lost within steps, {on} % with substep_px = {SUBSTEP_PX:g} "
+        f"are lost between frames, {on} % with --substep-px {SUBSTEP_PX:g} "
         "(prediction; motion blur hides further losses)"
     )
 

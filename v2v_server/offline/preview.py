@@ -93,7 +93,8 @@ def preview(
         SampleUnavailable, VideoUnreadable: see :func:`v2v_server.offline.remake.remake`.
     """
     check_output("--out", out, KINDS, [source])  # before any work
-    catalogue = open_shown(source, list_file=list_file, rows=rows, cache_dir=cache_dir)
+    scene = StreamSpec.from_dict({**spec, "recipe": shots[0].recipe}).scene != "off"
+    catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
     cameras: list[Camera] = []
     loss, notes = Prediction(), dict[str, list[str]]()
     try:
