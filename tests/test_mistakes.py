@@ -5,10 +5,16 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import os
 import pickle
 import resource
 import shlex
+import socket
+import subprocess
+import sys
+import threading
 from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -18,12 +24,12 @@ import pytest
 import torch
 
 from tests.clips import panned_luma, write_clip
-from tests.test_commands import MODULES, flags_of
+from tests.test_commands import MODULES, ROOT, flags_of
 from trainer.config import StreamConfig
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.options import Options
 from v2v_pictures.files import write_png
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.events import EventList
 from v2v_protocol.recipe import PRESETS
 from v2v_protocol.records import write_json
@@ -277,3 +283,38 @@ COMMANDS_OF_SAMPLES = ("v2v-serve", "v2v-preview", "v2v-simulate", "v2v-loadtest
 def test_all_commands_that_make_samples_take_the_flags_of_the_stream(program: str) -> None:
     flags = {"--preset", "--recipe", "--set", *(f"--{name.replace('_', '-')}" for name in settings_of(StreamSpec))}
     assert flags <= flags_of(program)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "words"),
+    [
+        ("tcp://127.0.0.1:{free}", "nothing listens there"),
+        ("tcp://no-such-host.invalid:5555", "host name cannot be resolved"),
+        ("tcp://127.0.0.1:{page}", "another program listens there, or the server's page"),
+    ],
+)
+def test_an_address_without_a_server_is_explained_in_the_log_and_in_the_error(
+    scheme: str, words: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("v2v_client.session.connection._REPORT_SECONDS", 0.2)
+    with HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as page, socket.create_server(("127.0.0.1", 0)) as unused:
+        threading.Thread(target=page.serve_forever, args=(0.01,), daemon=True).start()
+        free = unused.getsockname()[1]
+        unused.close()
+        address = scheme.format(free=free, page=page.server_port)
+        with pytest.raises(ServerLost, match=words):
+            next(iter(V2VStreamDataset(address, timeout_seconds=0.6)))
+        page.shutdown()
+    (reported,) = caplog.messages
+    assert words in reported
+
+
+@pytest.mark.slow
+def test_a_script_without_a_main_guard_gets_one_short_message_the_first_time_too(desk: Path) -> None:
+    (desk / "script.py").write_text("from v2v_client import V2VDataset\nV2VDataset('clips')\n")
+    done = subprocess.run(
+        [sys.executable, "script.py"], env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    assert done.returncode == 1
+    assert done.stderr.count("Traceback") == 1
+    assert 'below `if __name__ == "__main__":`' in done.stderr

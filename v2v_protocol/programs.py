@@ -5,8 +5,10 @@ starts run from the same installation.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -26,8 +28,13 @@ def _program(name: str, module: str, function: str, extra: str) -> Program:
     """
 
     def run() -> int | None:
+        before = signal.getsignal(signal.SIGINT)
+        if before is signal.default_int_handler:
+            signal.signal(signal.SIGINT, partial(_end_at_once, name))
         try:
-            status: int | None = getattr(import_module(module), function)()
+            main = getattr(import_module(module), function)
+            signal.signal(signal.SIGINT, before or signal.SIG_DFL)
+            status: int | None = main()
         except ModuleNotFoundError as error:
             package = (error.name or "").partition(".")[0]
             if package in _OURS:
@@ -41,6 +48,12 @@ def _program(name: str, module: str, function: str, extra: str) -> Program:
         return status
 
     return run
+
+
+def _end_at_once(name: str, *_: object) -> None:
+    """Answer a Ctrl-C while modules are imported: an error would be raised in the middle of one of them."""
+    os.write(2, f"{name}: interrupted\n".encode())
+    os._exit(128 + signal.SIGINT)
 
 
 def environment() -> dict[str, str]:
