@@ -14,6 +14,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from importlib import import_module
 from pathlib import Path
@@ -318,3 +319,24 @@ def test_a_script_without_a_main_guard_gets_one_short_message_the_first_time_too
     assert done.returncode == 1
     assert done.stderr.count("Traceback") == 1
     assert 'below `if __name__ == "__main__":`' in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        ("--bind tcp://127.0.0.1:{taken}", "--bind tcp://127.0.0.1:{taken}: Address already in use; give another port"),
+        ("--bind tcp://127.0.0.1:* --page {taken}", "--page {taken} at 127.0.0.1: Address already in use"),
+        ("--bind tcp://127.0.0.1:* --keys nowhere", "v2v-keys init"),
+        ("--bind tcp://127.0.0.1:* --cache a.mp4", "--cache"),
+        ("--bind tcp://192.0.2.1:5555 --insecure", "give an address of this host"),
+    ],
+)
+def test_a_server_checks_its_addresses_and_folders_before_the_videos(
+    flags: str, words: str, desk: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("v2v_server.serve.load_catalogue", lambda _: pytest.fail("the videos were catalogued"))
+    monkeypatch.setattr("v2v_server.commands.serve.start_ahead", lambda _: nullcontext([]))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        said = answer(f"v2v-serve --videos clips {flags.format(taken=port)}", capsys)
+    assert words.format(taken=port) in said

@@ -29,6 +29,10 @@ _HELP_WIDTH = 100
 JSON = (".json",)
 """Endings of ``--json FILE``."""
 _GENERAL = "General"
+COMPLETION = "V2V_COMPLETION"
+"""Variable of the environment that asks for a shell's completion script in place of the command."""
+_FILES = ("FILE", "DIR", "VIDEO", "SRC", "DST", "PATH", "CONFIG", "RECORDING")
+"""Words in the placeholder of an argument that names a file or folder."""
 _NO_INPUTS = frozenset({"out", "destination", "cache_dir", "copies"})
 """Arguments that name a folder to write to."""
 
@@ -159,6 +163,8 @@ def run_command(
     Returns:
         what ``run`` returned, 1 or 2 after an error, or 130 after a Ctrl-C.
     """
+    if shell := os.environ.get(COMPLETION):
+        return _complete(parser, shell)
     try:
         arguments = parser.parse_args(argv)
     except SystemExit as ended:  # argparse's own: help was shown, or a flag not understood
@@ -178,6 +184,20 @@ def run_command(
         if interrupted:
             print(f"{parser.prog}: {interrupted}", file=sys.stderr)
         return INTERRUPTED
+
+
+def _complete(parser: argparse.ArgumentParser, shell: str) -> int:
+    """Print the script with which a shell completes a command; return the exit status."""
+    try:
+        import shtab
+    except ModuleNotFoundError:
+        print("v2v: completion needs the Python package shtab: pip install shtab", file=sys.stderr)
+        return WRONG_USAGE
+    for action in parser._actions:
+        if action.type is Path or any(word in str(action.metavar) for word in _FILES):
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
+    print(shtab.complete(parser, shell))
+    return 0
 
 
 def version_of(name: str) -> str:

@@ -57,6 +57,22 @@ def _flush(path: Path) -> None:
         os.close(descriptor)
 
 
+def write_file(path: Path, content: bytes | str, flag: str = "") -> None:
+    """Write a file that a user asked for: all of it, or nothing.
+
+    Args:
+        flag: names the file in the message of an error.
+
+    Raises:
+        UsageError: it cannot be written.
+    """
+    try:
+        with write_aside_and_rename(path) as partial:
+            partial.write_bytes(content.encode() if isinstance(content, str) else content)
+    except OSError as error:
+        raise UsageError(f"{flag} {path}: cannot be written: {error.strerror or error}".lstrip()) from error
+
+
 def check_output(
     flag: str, path: Path, endings: Collection[str], inputs: Iterable[str | os.PathLike[str]] = ()
 ) -> None:

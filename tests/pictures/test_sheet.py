@@ -272,7 +272,7 @@ def test_files_read_back(tmp_path: Path) -> None:
     page = html_page("a <b> & c", image, film, 10.0)
     assert "a &lt;b&gt; &amp; c" in page
     assert "data:video/mp4;base64," in page
-    with pytest.raises(UsageError, match=r"picture\.png: No such file or directory"):
+    with pytest.raises(UsageError, match=r"picture\.png: cannot be written: No such file or directory"):
         write_png(tmp_path / "nowhere" / "picture.png", image)
 
 

@@ -6,6 +6,7 @@ Memory: ZeroMQ keeps at most MOST_UNREAD whole messages from a peer, and at most
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import time
@@ -159,7 +160,9 @@ class Router:
         try:
             self.socket.bind(address)
         except zmq.ZMQError as error:
-            raise UsageError(f"{flag} {address}: {error.strerror or error}") from error
+            is_port = error.errno in (errno.EADDRINUSE, errno.EACCES)
+            remedy = "another port, or tcp://127.0.0.1:* for a free one" if is_port else "an address of this host"
+            raise UsageError(f"{flag} {address}: {os.strerror(error.errno or 0)}; give {remedy}") from error
         return self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
     def receive(self) -> Received | None:

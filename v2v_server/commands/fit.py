@@ -91,10 +91,7 @@ def _fit(arguments: argparse.Namespace) -> FittedCamera:
     with Progress(source.name, "%") as progress:
         fitted = fit(source, static=arguments.static, options=options, progress=progress)
     print("\n".join(report_lines(fitted, source.name)))
-    try:
-        write_recipe(out, fitted, source.name)
-    except OSError as error:
-        raise UsageError(f"--out {out}: {error.strerror or error}") from error
+    write_recipe(out, fitted, source.name)
     if arguments.picture is not None:
         write_png(arguments.picture, draw_fit(fitted, source.name))
     return fitted

@@ -18,7 +18,7 @@ _MOST_CAMERAS = 32
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
     parser = Parser(
-        "v2v-preview", "VIDEO|DIR --out FILE [flags]",
+        "v2v-preview", "VIDEO|DIR [VIDEO ...] --out FILE [flags]",
         "Show the effect of a recipe on your videos: frames, events, flow, activity.",
         [
             "v2v-preview clips/ --out sheet.png --recipe davis346",
@@ -35,7 +35,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--compare", nargs="+", metavar="NAME", help="show the same clip under these recipes instead, one camera each"
     )
     videos = parser.group("Videos")
-    videos.add_argument("source", metavar="VIDEO|DIR", help="a video, a folder of videos, or a list file")
+    videos.add_argument(
+        "sources", nargs="+", metavar="VIDEO|DIR",
+        help="a video, a folder of videos, or a list file; of several, each gets a FILE with its name",
+    )  # fmt: skip
     videos.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
     videos.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
     videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
@@ -68,20 +71,25 @@ def _run(arguments: argparse.Namespace) -> None:
         what = f'virtual cameras drawn from the recipe "{Path(arguments.recipe or "paper").stem}"'
     if arguments.seed is None:
         what += ", chosen where something moves"
-    preview(
-        arguments.source,
-        arguments.out,
-        looks,
-        # Recipes are compared on one clip, so the order must not depend on how many sequences each admits.
-        spec_fields(arguments) | ({"shuffle": False} if arguments.compare else {}),
-        title=f"{Path(arguments.source).name}: {what}",
-        find_motion=arguments.seed is None,
-        list_file=arguments.list,
-        rows=arguments.rows,
-        with_flow=not arguments.no_flow,
-        moments=arguments.moments,
-        cache_dir=arguments.cache_dir,
-    )
+    out = arguments.out
+    named = {out.with_stem(f"{out.stem}-{Path(source).stem}"): source for source in arguments.sources}
+    if len(named) < len(arguments.sources):
+        raise UsageError("two of the videos have the same name: preview them one at a time")
+    for path, source in named.items():
+        preview(
+            source,
+            path if len(named) > 1 else out,
+            looks,
+            # Recipes are compared on one clip, so the order must not depend on how many sequences each admits.
+            spec_fields(arguments) | ({"shuffle": False} if arguments.compare else {}),
+            title=f"{Path(source).name}: {what}",
+            find_motion=arguments.seed is None,
+            list_file=arguments.list,
+            rows=arguments.rows,
+            with_flow=not arguments.no_flow,
+            moments=arguments.moments,
+            cache_dir=arguments.cache_dir,
+        )
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     which.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
     out = parser.group("Output")
     parser.add_output(
-        "Output", "--out", (".npz", ""), "output file (.npz) for the arrays and the provenance (JSON)", required=True
+        "Output", "--out", (".npz",), "output file for the arrays and the provenance (JSON)", required=True
     )
     parser.add_output("Output", "--picture", (".png",), "also write a picture of frames and voxels")
     parser.add_output("Output", "--events", tuple(FORMS), f"also write the events with their times: {', '.join(FORMS)}")

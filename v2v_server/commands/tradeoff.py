@@ -14,12 +14,12 @@ from typing import Any
 
 import cv2
 
-from v2v_pictures.files import write
 from v2v_protocol.command import FAILED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_recipe, recipe_setting
+from v2v_protocol.write_aside import write_file
 from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, Prediction
 from v2v_server.simulation.variants import warm_up
 from v2v_server.system.process import keep_freed_memory
@@ -204,7 +204,7 @@ def choose(records: Sequence[Mapping[str, Any]], compared: Sequence[ServeSetting
     print(f"best: {record['name']}: {why}")
     if asked.preset_out is not None:
         (chosen,) = (setting for setting in compared if setting.name == record["name"])
-        write(asked.preset_out, chosen.yaml(asked.rows, why))
+        write_file(asked.preset_out, chosen.yaml(asked.rows, why), "--preset-out")
     return 0
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_pictures.camera import Camera
-from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write
+from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes
 from v2v_pictures.film import FRAMES_PER_SECOND, draw_film
 from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, UsageError
@@ -25,7 +25,7 @@ from v2v_protocol.progress import Progress
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, sidecar_endings
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.write_aside import check_output
+from v2v_protocol.write_aside import check_output, write_file
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.motion.prediction import Prediction
 from v2v_server.offline.motion import WholePictures, describe_loss, moving_seeds, predicted_loss, quiet_voxels
@@ -116,7 +116,7 @@ def preview(
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
     say(describe_loss(loss))
-    write(out, _content(out.suffix.lower(), whole, cameras, title, moments))
+    write_file(out, _content(out.suffix.lower(), whole, cameras, title, moments))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
 
 

@@ -201,7 +201,7 @@ def simulate_to_file(
 
     Args:
         source, list_file, rows: the corpus, as for a server.
-        out: the .npz file; the ending is added if it is missing.
+        out: the .npz file.
         picture: a .png file for a picture of the sample, or None.
         spec: fields of the StreamSpec; None in any takes the default.
         arrays, seed, epoch, index: see :func:`remake`.
@@ -226,8 +226,6 @@ def simulate_to_file(
         print(f"cannot be used: {refusal}")
     remade = Remaker(catalogue, stream, arrays, quarantine, snapshot).made(seed, epoch, index)
     sample = remade.sample
-    if not out.name.endswith(".npz"):
-        out = Path(f"{out}.npz")  # as numpy would, without saying so
     provenance = sample.provenance.to_dict()
     content: Mapping[str, Any] = {**sample.arrays, "provenance": json.dumps(provenance)}
     try:
