@@ -78,9 +78,8 @@ def require_arguments(function: Callable[..., Any], options: Mapping[str, Any]) 
     known = [*named, *SpecOptions.__annotations__]
     for name in options:
         if name not in SpecOptions.__annotations__:
-            is_recipes = name in settings_of(Recipe)
-            hint = f": it belongs to the recipe, recipe={{{name!r}: ...}}" if is_recipes else nearest(name, known)
-            raise UsageError(f"no argument {name!r}{hint}; known: {', '.join(known)}")
+            hint = f": it belongs to the recipe, recipe={{{name!r}: ...}}" if name in settings_of(Recipe) else ""
+            raise UsageError(f"no argument {name!r}{hint or nearest(name, known)}; known: {', '.join(known)}")
 
 
 def check_labels(labels: str) -> bool:

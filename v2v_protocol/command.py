@@ -107,8 +107,8 @@ class Parser(argparse.ArgumentParser):
             UsageError: see :func:`check_output`.
         """
         values = {name: value for name, value in vars(arguments).items() if name not in {*self._outputs, *_NO_INPUTS}}
-        each = [item for value in values.values() for item in (value if isinstance(value, list) else [value])]
-        taken = [item for item in each if isinstance(item, str | Path)]
+        lists = (value if isinstance(value, list) else [value] for value in values.values())
+        taken = [item for each in lists for item in each if isinstance(item, str | Path)]
         for name, (flag, endings) in self._outputs.items():
             if (path := getattr(arguments, name)) is not None:
                 check_output(flag, path, endings, taken)

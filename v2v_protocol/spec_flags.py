@@ -46,11 +46,11 @@ def add_spec(parser: Parser) -> None:
 
 
 def _stream_preset(name: str) -> str:
-    if name in STREAM_PRESETS:
-        return name
-    is_recipe = name in PRESETS or name.endswith(_RECIPE_FILES)
-    remedy = f"it is a recipe: give --recipe {name}" if is_recipe else f"choose one of {', '.join(STREAM_PRESETS)}"
-    raise argparse.ArgumentTypeError(f"{name!r}: {remedy}{'' if is_recipe else nearest(name, STREAM_PRESETS)}")
+    if name not in STREAM_PRESETS:
+        is_recipe = name in PRESETS or name.endswith(_RECIPE_FILES)
+        hint = f", or give --recipe {name}" if is_recipe else nearest(name, STREAM_PRESETS)
+        raise argparse.ArgumentTypeError(f"{name!r}: choose one of {', '.join(STREAM_PRESETS)}{hint}")
+    return name
 
 
 def spec_fields(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -83,7 +83,7 @@ def check_output(
 
     Args:
         flag: names the file in messages.
-        endings: the endings that the command can write, in lower case; "" is a name without one.
+        endings: the endings that the command can write, in lower case.
         inputs: what the command reads; what does not exist is skipped.
 
     Raises:
@@ -96,8 +96,7 @@ def check_output(
         if _is_stream(path):
             return
         if path.suffix.lower() not in endings:
-            known = ", ".join(filter(None, endings))
-            raise UsageError(f"{named}: unknown ending; give a name that ends in {known}")
+            raise UsageError(f"{named}: unknown ending; give a name that ends in {', '.join(endings)}")
         if not path.parent.is_dir():
             raise UsageError(f"{named}: there is no folder {path.parent}; create it first")
         locked = next((at for at in (path, path.parent) if at.exists() and not os.access(at, os.W_OK)), None)

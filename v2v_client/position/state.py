@@ -7,7 +7,6 @@ server of another stream is refused before the first batch.
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 from v2v_protocol.errors import ProtocolError, StateMismatch, UsageError
 from v2v_protocol.messages import Welcome
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_INDEX, LARGEST_SEED
-from v2v_protocol.settings import require_whole
+from v2v_protocol.settings import format_value, require_whole
 from v2v_protocol.spec import StreamSpec
 
 STATE_VERSION = 1
@@ -189,16 +188,11 @@ class ResumeState:
             UsageError: the values are not a state of this release.
         """
         if not isinstance(values, Mapping) or values.get("version") != STATE_VERSION:
-            if isinstance(values, str | os.PathLike):
-                raise UsageError(
-                    f"{os.fspath(values)!r} is the name of a file, not a state: give torch.load(...) of it, or the "
-                    "part of it that holds Batch.resume_state"
-                )
-            version = values.get("version") if isinstance(values, Mapping) else type(values).__name__
-            parts = values.items() if isinstance(values, Mapping) else ()
-            inside = [f"[{key!r}]" for key, part in parts if isinstance(part, Mapping) and "spec_digest" in part]
-            hint = f"; the state is in its {inside[0]}" if inside else ""
-            raise UsageError(f"not a state of V2VStreamDataset: version {version!r}, expected {STATE_VERSION}{hint}")
+            found = f"version {values.get('version')!r}" if isinstance(values, Mapping) else format_value(values)
+            raise UsageError(
+                f"not a state of V2VStreamDataset: {found}, expected version {STATE_VERSION}. Give the saved "
+                "Batch.resume_state itself, for instance torch.load('last.pt')['stream']"
+            )
         known = {"version", "seed", "epoch", "origin", "position", "world_size", "quarantine", "loader_worker"}
         known |= {field.name for field in dataclasses.fields(StreamIdentity)}
         if values.keys() | {"sidecars"} != known:

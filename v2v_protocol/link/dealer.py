@@ -306,8 +306,7 @@ def diagnose(address: str) -> str:
     except gaierror:
         return "the host name cannot be resolved: correct it, or give an IP address"
     except (OSError, ValueError) as error:
-        text = getattr(error, "strerror", None) or error
-        return f"nothing listens there ({text}): start v2v-serve, or correct host and port"
+        return f"nothing listens there ({error}): start v2v-serve, or correct host and port"
     if greeting[:1] == b"\xff":
         return "a server listens there, and does not answer yet"
     return "another program listens there, or the server's page: give the address that v2v-serve calls ready"

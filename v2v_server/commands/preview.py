@@ -71,14 +71,14 @@ def _run(arguments: argparse.Namespace) -> None:
         what = f'virtual cameras drawn from the recipe "{Path(arguments.recipe or "paper").stem}"'
     if arguments.seed is None:
         what += ", chosen where something moves"
-    out = arguments.out
-    named = {out.with_stem(f"{out.stem}-{Path(source).stem}"): source for source in arguments.sources}
+    stem = arguments.out.stem
+    named = {arguments.out.with_stem(f"{stem}-{Path(source).stem}"): source for source in arguments.sources}
     if len(named) < len(arguments.sources):
         raise UsageError("two of the videos have the same name: preview them one at a time")
     for path, source in named.items():
         preview(
             source,
-            path if len(named) > 1 else out,
+            path if len(named) > 1 else arguments.out,
             looks,
             # Recipes are compared on one clip, so the order must not depend on how many sequences each admits.
             spec_fields(arguments) | ({"shuffle": False} if arguments.compare else {}),

@@ -176,7 +176,8 @@ class WholePictures:
         seconds = index.seconds(sequence.start_frame, count)[::stride]
         clip = DecodedClip(frames, seconds, codec="", bit_exact=False, signal=signal)
         sample = make_sample(lease, Decoded(plan, clip))
-        return Camera.of(sample.arrays, sample.provenance, f"threshold {THRESHOLD:g}, no noise", recipe)
+        camera = Camera.of(sample.arrays, sample.provenance, f"threshold {THRESHOLD:g}, no noise", recipe)
+        return replace(camera, step_seconds=stride / video.frames_per_second)
 
     def estimate(self, sequence: VideoSequence, seed: int) -> CropEstimate:
         """Estimate what the camera of a seed sees of a sequence.

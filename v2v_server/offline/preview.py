@@ -201,7 +201,9 @@ def _camera(
     camera = Camera.of(made.sample.arrays, provenance, title, stream.recipe, whole)
     quiet_grids = quiet_voxels(made).reshape(-1, *camera.voxels.shape[1:])
     quiet = dataclasses.replace(camera, voxels=quiet_grids[camera.lead_voxels :])
-    return dataclasses.replace(camera, quiet=quiet.rates), predicted_loss(made)
+    rate = _sequence_of(catalogue, provenance).video.frames_per_second
+    timed = dataclasses.replace(camera, quiet=quiet.rates, step_seconds=stream.recipe.frame_stride / rate)
+    return timed, predicted_loss(made)
 
 
 def _signal_note(catalogue: Catalogue, provenance: Provenance, recipe: Recipe) -> str:

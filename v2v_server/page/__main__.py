@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import socket
 import sys
 from collections.abc import Sequence
@@ -15,9 +14,6 @@ from v2v_server.page.silent import BoundedProtocol
 from v2v_server.page.source import Source
 from v2v_server.status.client import StatusClient
 from v2v_server.system.process import die_with_parent
-
-_NICE = 10
-"""Niceness of the page's process, so that it takes no time from the server and its workers."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,7 +27,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--names", default="", help="host names to accept, separated by commas")
     arguments = parser.parse_args(argv)
     die_with_parent(arguments.parent_pid)
-    os.nice(_NICE)
     # No key: this address admits the server's own user, see v2v_server.page.child.
     source = Source(StatusClient(arguments.connect, keys=""))
     config = uvicorn.Config(
