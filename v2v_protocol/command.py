@@ -96,7 +96,7 @@ class Parser(argparse.ArgumentParser):
             endings: see :func:`check_output`; the first one is shown in the help if it is the only one.
         """
         metavar = f"FILE{endings[0]}" if len(endings) == 1 and endings != JSON else "FILE"
-        must = {"required": True} if required else {}
+        must: dict[str, Any] = {"required": True} if required else {}
         self.group(group).add_argument(flag, type=Path, metavar=metavar, help=help, **must)
         self._outputs[flag.removeprefix("--").replace("-", "_")] = flag, endings
 

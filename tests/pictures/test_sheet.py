@@ -310,7 +310,7 @@ def test_png_of_a_view_that_is_not_contiguous() -> None:
 
 
 def test_the_strip_states_the_time_of_the_clip() -> None:
-    made = camera()
+    made = camera(np.zeros((10, 3, 32, 32), np.int8))
     assert made.timing == dataclasses.replace(made, step_seconds=float("nan")).timing == ""
     grids, bins = made.voxels.shape[:2]
     for rate, shown in ((240, "240"), (30_000 / 1001, "30")):
