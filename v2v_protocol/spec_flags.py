@@ -12,7 +12,7 @@ from typing import Any
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.presets import STREAM_PRESETS
-from v2v_protocol.recipe import PRESETS, Recipe
+from v2v_protocol.recipe import PRESETS
 from v2v_protocol.safe_yaml import YamlError, parse_yaml, read_yaml
 from v2v_protocol.settings import nearest, settings_of
 from v2v_protocol.spec import StreamSpec
@@ -58,7 +58,7 @@ def spec_fields(arguments: argparse.Namespace) -> dict[str, Any]:
     return {name: getattr(arguments, name) for name in ("preset", *settings_of(StreamSpec))}
 
 
-def recipe_setting(recipe: str | None, settings: Sequence[str], configured: Any = None) -> Recipe | None:
+def recipe_setting(recipe: str | None, settings: Sequence[str], configured: Any = None) -> Any:
     """Return the recipe of :func:`recipe_changes`, with all its fields; None if nothing was given.
 
     Raises:
