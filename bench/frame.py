@@ -13,9 +13,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from v2v_protocol.command import Parser
+from v2v_protocol.command import JSON, Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
+from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.tradeoff.report import format_table
 
 if TYPE_CHECKING:
@@ -48,9 +49,9 @@ def parser_of(name: str, bench: ModuleType) -> Parser:
     parser = Parser(f"python -m bench {name}", "[flags]", first, [])
     parser.epilog = rest
     bench.add_flags(parser)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the records to this file")
+    parser.add_output("Output", "--json", JSON, "write the records to this file")
     if hasattr(bench, "plot"):
-        parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the records")
+        parser.add_output("Output", "--plot", (".png",), "draw the records")
     return parser
 
 
@@ -116,7 +117,8 @@ def panels(file: Path, count: int, *, title: str, height_inches: float = 4.0) ->
         figure.suptitle(title)
         yield list(axes[0])
         figure.tight_layout()
-        figure.savefig(file, dpi=110)
+        with write_aside_and_rename(file) as partial:
+            figure.savefig(partial, dpi=110, format="png")
     finally:
         pyplot.close(figure)
 

@@ -105,7 +105,9 @@ def test_the_packages_have_modules_to_check(package: str) -> None:
 
 @pytest.mark.parametrize("path", modules("v2v_protocol"), ids=lambda path: path.name)
 def test_the_protocol_needs_only_light_packages(path: Path) -> None:
-    may = PROTOCOL_MAY | {"safe_yaml.py": {"yaml"}, "progress.py": {"rich"}}.get(path.name, set())
+    may = PROTOCOL_MAY | {"safe_yaml.py": {"yaml"}, "progress.py": {"rich"}, "command.py": {"shtab"}}.get(
+        path.name, set()
+    )
     may = may | {"zmq"} if path.parent.name == "link" else may
     assert imported(path) - may == set()
 

@@ -23,6 +23,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_SEED
 from v2v_protocol.settings import Setting, format_value, nearest, of_type, settings_of
 from v2v_protocol.spec import StreamSpec
+from v2v_protocol.spec_flags import read_recipe
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +49,7 @@ class StreamConfig:
         address: of a running server, or of several, separated by commas; empty: start one here, on ``videos``.
         videos, list, rows, workers: for that server, see ``v2v-serve --help``.
         batch_size: samples of one rank's batch.
-        recipe: preset name, or recipe fields (with ``preset`` to start from); never the server's default.
+        recipe: its name, its YAML file, or recipe fields (with ``preset`` to start from); never the server's default.
         seed: of all draws and of the order.
         spec: other fields of :class:`v2v_protocol.spec.StreamSpec`; missing ones have the server's default.
         loader_workers: processes of each rank that receive batches; 0: the training process receives them.
@@ -74,8 +75,8 @@ class StreamConfig:
         Raises:
             RecipeError: an unknown preset or field, or a value outside its limits.
         """
-        named = self.recipe if isinstance(self.recipe, Mapping) else {"preset": self.recipe}
-        return Recipe.from_dict(named)
+        recipe = read_recipe(self.recipe)
+        return StreamSpec.from_dict({"recipe": recipe if isinstance(recipe, Mapping) else {"preset": recipe}}).recipe
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,6 +10,7 @@ from typing import Any
 from trainer.config import TrainConfig
 from v2v_protocol.errors import UsageError
 from v2v_protocol.safe_yaml import YamlError, format_yaml, parse_yaml, read_yaml
+from v2v_protocol.settings import nearest
 
 EXTENDS = "extends"
 
@@ -51,7 +52,9 @@ def _read(file: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
     try:
         values = read_yaml(path)
     except OSError as error:
-        raise UsageError(f"{file}: {error.strerror}; shipped configurations: {', '.join(shipped())}") from error
+        videos = f"; give the videos after a configuration: v2v-train NAME --videos {file}" if path.is_dir() else ""
+        hint = videos or nearest(file, shipped())
+        raise UsageError(f"{file}: {error.strerror}{hint}; shipped configurations: {', '.join(shipped())}") from error
     except YamlError as error:
         raise UsageError(f"{file}: not YAML: {error}") from error
     values = {} if values is None else values

@@ -19,6 +19,7 @@ from trainer.loop import Diverged, train
 from trainer.run.checkpoint import LAST, Checkpoint, load_checkpoint, require_fresh, require_same_run, require_writable
 from trainer.run.distributed import Ranks, ranks
 from trainer.run.interruption import StopRequest
+from trainer.run.reporting import CONFIGURATION
 from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
@@ -138,6 +139,8 @@ def run(arguments: argparse.Namespace) -> int:
         config = obeying_weights(config)
         out = Path(config.run.out or f"runs/{Path(arguments.config).stem}")
         require_fresh(out)
+        if (out / CONFIGURATION).resolve() == Path(arguments.config).resolve():
+            raise UsageError(f"--out {out}: the run would replace {arguments.config}; give another folder")
     else:
         # Not the default folder of the configuration, which may hold another run.
         begun_in = Path(arguments.resume).parent

@@ -6,14 +6,15 @@ import dataclasses
 import os
 from collections.abc import KeysView, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Never
 
 import torch
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from v2v_client import notebook
 from v2v_protocol.errors import UsageError
-from v2v_protocol.sample import BOX_COLUMNS, Provenance
+from v2v_protocol.sample import ARRAYS, BOX_COLUMNS, Provenance
+from v2v_protocol.settings import nearest
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.tables import html_table
 
@@ -238,6 +239,14 @@ class Batch:
     def labelled(self) -> tuple[bool, ...]:
         """Return, for each sample, whether it has all boxes and masks that were requested."""
         return tuple(origin.labelled for origin in self.provenance)
+
+    def __getattr__(self, name: str) -> Never:
+        """Name the nearest attribute.
+
+        Raises:
+            AttributeError: always.
+        """
+        raise AttributeError(f"a Batch has no {name!r}{nearest(name, (*ARRAYS, *dir(type(self))))}")
 
     def _array(self, name: str) -> torch.Tensor:
         if name not in self.arrays:

@@ -10,7 +10,7 @@ import warnings
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from typing import Any, Self, Unpack
+from typing import Any, Never, Self, Unpack
 
 from torch.utils.data import IterableDataset, get_worker_info
 
@@ -33,6 +33,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED
 from v2v_protocol.settings import require_whole
 from v2v_protocol.spec import SpecOptions, StreamSpec
+from v2v_protocol.spec_flags import read_recipe
 from v2v_protocol.tables import html_table
 
 _NOT_SHARED = (
@@ -85,8 +86,9 @@ class V2VStreamDataset(IterableDataset[Batch]):
             and loader workers inherit; "" uses no key.
         timeout_seconds: silence after which the server counts as lost.
         patience: the other timeouts; None for the defaults. Its ``timeout_seconds`` is not used.
-        options: ``preset`` ("exact", "balanced", "fast" or "natural", see :data:`v2v_protocol.spec.SPEED_PRESETS`) and
-            fields of :class:`v2v_protocol.spec.StreamSpec`, which override the preset; None takes the server's.
+        options: ``preset`` ("exact", "balanced", "fast" or "natural", see
+            :data:`v2v_protocol.presets.STREAM_PRESETS`) and fields of :class:`v2v_protocol.spec.StreamSpec`, which
+            override the preset; None takes the server's.
 
     Each sample is requested for its position in the order; samples that a crash or disconnect loses are requested
     again. So each sample arrives exactly once relative to the saved state, whichever process died in between.
@@ -193,7 +195,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
             ServerLost: the server does not start.
         """
         require_arguments(cls.local, options)
-        resolved = recipe if isinstance(recipe, Recipe) else StreamSpec.from_dict({"recipe": recipe}).recipe
+        resolved = StreamSpec.from_dict({"recipe": read_recipe(recipe)}).recipe
         scene = StreamSpec.from_dict({key: options.get(key) for key in ("preset", "scene")}).scene
         asked = [*recipe_flags(resolved), *(() if scene == "off" else ("--scene", scene)), *flags]
         server = LocalServer(videos, workers=workers, flags=asked).__enter__()
@@ -353,6 +355,17 @@ class V2VStreamDataset(IterableDataset[Batch]):
         if loaded.stream is not None:
             self._connector.options.spec(loaded.stream, "the state")
         self._position.load(loaded, self._consumer)
+
+    def __getitem__(self, index: Any) -> Never:
+        """Refuse an index.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError(
+            f"dataset[{index!r}]: a stream has no index; iterate, or take a batch by next(iter(dataset)). A V2VDataset "
+            "makes samples by index"
+        )
 
     def __iter__(self) -> Iterator[Batch]:
         self._require_open()

@@ -25,6 +25,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample
 from v2v_protocol.settings import require_whole
 from v2v_protocol.spec import SpecOptions, StreamSpec
+from v2v_protocol.spec_flags import read_recipe
 from v2v_protocol.tables import html_table
 
 
@@ -110,7 +111,7 @@ class V2VDataset(Dataset[Sample]):
         self.seed = require_whole("seed", seed, 0, LARGEST_SEED)
         self.epoch = require_whole("epoch", epoch, 0, LARGEST_EPOCH)
         self._needs_labels = check_labels(labels)
-        self.spec = StreamSpec.from_dict({**options, "recipe": recipe})
+        self.spec = StreamSpec.from_dict({**options, "recipe": read_recipe(recipe)})
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
         self._source = (os.fspath(videos), rows, list_file, cache_dir)
         self._maker: Any = None

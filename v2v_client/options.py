@@ -11,8 +11,9 @@ from v2v_client.position.state import StreamIdentity
 from v2v_protocol.errors import SampleUnavailable, UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, array_layout
-from v2v_protocol.settings import nearest
+from v2v_protocol.settings import nearest, settings_of
 from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, SpecOptions, StreamSpec
+from v2v_protocol.spec_flags import read_recipe
 
 Labels = Literal["required", "optional"]
 # Fields left to the server may have any value, so an option that fits at least one of them is accepted here.
@@ -77,7 +78,8 @@ def require_arguments(function: Callable[..., Any], options: Mapping[str, Any]) 
     known = [*named, *SpecOptions.__annotations__]
     for name in options:
         if name not in SpecOptions.__annotations__:
-            raise UsageError(f"no argument {name!r}{nearest(name, known)}; known: {', '.join(known)}")
+            hint = f": it belongs to the recipe, recipe={{{name!r}: ...}}" if name in settings_of(Recipe) else ""
+            raise UsageError(f"no argument {name!r}{hint or nearest(name, known)}; known: {', '.join(known)}")
 
 
 def check_labels(labels: str) -> bool:
@@ -109,6 +111,7 @@ def require_labels(provenances: Sequence[Provenance]) -> None:
 
 def _plain(recipe: Any) -> Any:
     """Copy a recipe into plain values, because the caller may change a mapping for the next dataset."""
+    recipe = read_recipe(recipe)
     if isinstance(recipe, Recipe):
         return recipe.to_dict()
     if not isinstance(recipe, Mapping):

@@ -58,6 +58,7 @@ class Camera:
         quiet: as ``rates``, of the same draw without noise, or None: not measured.
         boxes: [T, n, 7], see ``v2v_protocol.sample.BOX_COLUMNS``, or None.
         masks: [T, H, W] uint8, classes, or None.
+        step_seconds: time between two frames that the pixels see; 0 or NaN where it is unknown.
     """
 
     voxels: npt.NDArray[Any]
@@ -71,6 +72,7 @@ class Camera:
     quiet: npt.NDArray[np.float64] | None = None
     boxes: npt.NDArray[Any] | None = None
     masks: npt.NDArray[np.uint8] | None = None
+    step_seconds: float = 0.0
 
     @classmethod
     def of(
@@ -134,6 +136,16 @@ class Camera:
         # A bin holds several steps, or a step several bins.
         parts = [np.repeat(steps, bins).reshape(bins, -1).all(axis=1) for steps in np.split(still, ends[:-1])]
         return np.concatenate(parts)[self.lead_voxels * bins :]
+
+    @property
+    def timing(self) -> str:
+        """Duration of the clip, frame rate, and mean duration of a bin, in words; "" where they are unknown."""
+        if not self.step_seconds > 0.0:
+            return ""
+        grids, bins = self.voxels.shape[:2]
+        steps = self.provenance.params.grid_steps[-grids:] or (self.steps_per_frame,) * grids
+        seconds = sum(steps) * self.step_seconds
+        return f"{seconds:.2g} s, {1 / self.step_seconds:.3g} frames/s, {1e3 * seconds / (grids * bins):.2g} ms a bin"
 
     def moments(self, count: int) -> list[int]:
         """Choose voxel grids to show: the most active one of each of ``count`` equal stretches of time.

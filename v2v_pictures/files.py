@@ -15,7 +15,7 @@ from PIL import Image as Pictures
 
 from v2v_pictures import canvas
 from v2v_pictures.colours import BRIGHTER, DARKER, Image
-from v2v_protocol.errors import UsageError
+from v2v_protocol.write_aside import write_file
 
 _GIF_COLOURS, _GIF_COMMON, _GIF_STEP = 96, 24, 8
 _GIF_EXACT = (canvas.PAPER, canvas.INK, canvas.SOFT, canvas.LINE, canvas.MARK, canvas.PAUSED, BRIGHTER, DARKER)
@@ -83,22 +83,10 @@ def html_page(title: str, sheet: Image, film: Sequence[Image], frames_per_second
     )
 
 
-def write(path: Path, content: bytes | str) -> None:
-    """Write a file.
-
-    Raises:
-        UsageError: the folder is missing or cannot be written.
-    """
-    try:
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from error
-
-
 def write_png(path: Path, image: Image) -> None:
     """Write a picture as PNG.
 
     Raises:
         UsageError: the folder is missing or cannot be written.
     """
-    write(path, png_bytes(image))
+    write_file(path, png_bytes(image))

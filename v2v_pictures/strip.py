@@ -40,7 +40,7 @@ def draw_strip(
         cursor: a bin to draw a line at, for films.
     """
     rates, middle = camera.rates, top + height / 2
-    x = page.text(left, top - LABEL_PX, "events over the whole clip")
+    x = page.text(left, top - LABEL_PX, f"events over {camera.timing or 'the whole clip'}")
     page.text(x + 12, top - LABEL_PX, f"full bar: {highest:.2g} or more a pixel and bin", colour=canvas.SOFT)
     count = rates.shape[1]
     at = [left + width * number / count for number in range(count + 1)]

@@ -7,24 +7,33 @@ print one line on stderr; ``--debug`` shows the traceback.
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import textwrap
 import traceback
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Never
 
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION, __version__
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_protocol.programs import open_standard_streams, show
+from v2v_protocol.programs import COMPLETION, open_standard_streams, show
 from v2v_protocol.settings import Setting, nearest, settings_of
+from v2v_protocol.write_aside import check_output
 
 FAILED = 1
 WRONG_USAGE = 2
 INTERRUPTED = 128 + signal.SIGINT
 _LONGEST_CHOICE = 30
 _HELP_WIDTH = 100
+JSON = (".json",)
+"""Endings of ``--json FILE``."""
 _GENERAL = "General"
+_FILES = ("FILE", "DIR", "VIDEO", "SRC", "DST", "PATH", "CONFIG", "RECORDING")
+"""Words in the placeholder of an argument that names a file or folder."""
+_NO_INPUTS = frozenset({"out", "destination", "cache_dir", "copies"})
+"""Arguments that name a folder to write to."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -50,6 +59,7 @@ class Parser(argparse.ArgumentParser):
             add_help=False,
         )
         self._given: list[str] = []
+        self._outputs: dict[str, tuple[str, Sequence[str]]] = {}
         self._groups: dict[str, argparse._ArgumentGroup] = {}
         general = self.group(_GENERAL)
         general.add_argument("-h", "--help", action="help", help="show this help and exit")
@@ -78,6 +88,31 @@ class Parser(argparse.ArgumentParser):
                     flag, type=_reader(setting), metavar=_metavar(setting), help=_help(setting), **bare
                 )
 
+    def add_output(self, group: str, flag: str, endings: Sequence[str], help: str, required: bool = False) -> None:
+        """Add a flag for a file that the command writes. Before the work, :func:`run_command` checks the file.
+
+        Args:
+            endings: see :func:`check_output`; the first one is shown in the help if it is the only one.
+        """
+        metavar = f"FILE{endings[0]}" if len(endings) == 1 and endings != JSON else "FILE"
+        must: dict[str, Any] = {"required": True} if required else {}
+        self.group(group).add_argument(flag, type=Path, metavar=metavar, help=help, **must)
+        self._outputs[flag.removeprefix("--").replace("-", "_")] = flag, endings
+
+    def check_outputs(self, arguments: argparse.Namespace) -> None:
+        """Check the files to write against the other arguments that name files or folders.
+
+        Raises:
+            UsageError: see :func:`check_output`.
+        """
+        values = {name: value for name, value in vars(arguments).items() if name not in {*self._outputs, *_NO_INPUTS}}
+        lists = (value if isinstance(value, list) else [value] for value in values.values())
+        taken = [item for each in lists for item in each if isinstance(item, str | Path)]
+        for name, (flag, endings) in self._outputs.items():
+            if (path := getattr(arguments, name)) is not None:
+                check_output(flag, path, endings, taken)
+                taken.append(path)
+
     def format_help(self) -> str:
         """Format the help; options that every command has come last."""
         self._action_groups.sort(key=lambda group: group.title == _GENERAL)
@@ -96,8 +131,13 @@ class Parser(argparse.ArgumentParser):
             if flag == "--":
                 break
             if flag.startswith("--") and flag not in known:
-                message = f"unknown flag {flag}{nearest(flag, known)}"
+                is_bare = flag in ("--video", "--videos") and "--videos" not in known
+                hint = ": give the videos without a flag" if is_bare else nearest(flag, known)
+                message = f"unknown flag {flag}{hint}"
                 break
+        else:
+            if (first := self._given[:1]) and os.path.exists(first[0]) and "--videos" in known:
+                message = f"{first[0]}: give the videos with a flag, --videos {first[0]}"
         self.exit(WRONG_USAGE, f"{self.prog}: {message}; {self.prog} --help shows all flags\n")
 
 
@@ -123,11 +163,15 @@ def run_command(
         what ``run`` returned, 1 or 2 after an error, or 130 after a Ctrl-C.
     """
     open_standard_streams()
+    if shell := os.environ.get(COMPLETION):
+        return _complete(parser, shell)
     try:
         arguments = parser.parse_args(argv)
     except SystemExit as ended:  # argparse's own: help was shown, or a flag not understood
         return int(ended.code or 0)
     try:
+        if isinstance(parser, Parser):
+            parser.check_outputs(arguments)
         return run(arguments) or 0
     except V2VError as error:
         if arguments.debug:
@@ -140,6 +184,20 @@ def run_command(
         if interrupted:
             print(f"{parser.prog}: {interrupted}", file=sys.stderr)
         return INTERRUPTED
+
+
+def _complete(parser: argparse.ArgumentParser, shell: str) -> int:
+    """Print the script with which a shell completes a command; return the exit status."""
+    try:
+        import shtab
+    except ModuleNotFoundError:
+        print("v2v: completion needs the Python package shtab: pip install shtab", file=sys.stderr)
+        return WRONG_USAGE
+    for action in parser._actions:
+        if action.type is Path or any(word in str(action.metavar) for word in _FILES):
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
+    print(shtab.complete(parser, shell))
+    return 0
 
 
 def version_of(name: str) -> str:

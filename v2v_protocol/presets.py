@@ -1,6 +1,7 @@
-"""Named recipes, each stated as its changes to the fields' defaults, which are those of the paper.
+"""Recipes by name, each stated as its changes to the fields' defaults, which are those of the paper; and presets of the
+stream's other settings.
 
-:data:`v2v_protocol.recipe.PRESETS` holds them as recipes.
+:data:`v2v_protocol.recipe.PRESETS` holds the recipes.
 """
 
 from __future__ import annotations
@@ -56,3 +57,13 @@ PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
         "hot_pixel_sigma": (0.0, 20.0),
     },
 }
+
+STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "exact": {"samples_per_decode": 1},
+    "balanced": {"samples_per_decode": 2},
+    "fast": {"samples_per_decode": 4},
+    "natural": {"samples_per_decode": 1, "scene": "auto", "moving_share": 0.75},
+}
+"""Spec fields that each preset sets. The first three trade accuracy for speed (`docs/accuracy.md`); "natural" is for
+videos as they are: what spoils events is left out, and most crops show something that moves (`docs/scene.md`).
+"""

@@ -7,16 +7,22 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TextIO
+
+from v2v_protocol.settings import nearest
 
 _OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_client", "trainer"})
 
 Program = Callable[[], int | None]
 """A function that returns the exit status; None is success."""
+COMPLETION = "V2V_COMPLETION"
+"""Variable of the environment that asks for a shell's completion script in place of the command."""
 
 
 # C0 and C1 controls, separators of lines, what changes the direction of text (Unicode 16, UAX 9), and surrogates that
@@ -59,8 +65,13 @@ def _program(name: str, module: str, function: str, extra: str) -> Program:
     """
 
     def run() -> int | None:
+        before = signal.getsignal(signal.SIGINT)
+        if before is signal.default_int_handler:
+            signal.signal(signal.SIGINT, partial(_end_at_once, name))
         try:
-            status: int | None = getattr(import_module(module), function)()
+            main = getattr(import_module(module), function)
+            signal.signal(signal.SIGINT, before or signal.SIG_DFL)
+            status: int | None = main()
         except ModuleNotFoundError as error:
             package = (error.name or "").partition(".")[0]
             if package in _OURS:
@@ -76,6 +87,12 @@ def _program(name: str, module: str, function: str, extra: str) -> Program:
     return run
 
 
+def _end_at_once(name: str, *_: object) -> None:
+    """Answer a Ctrl-C while modules are imported: an error would be raised in the middle of one of them."""
+    os.write(2, f"{name}: interrupted\n".encode())
+    os._exit(128 + signal.SIGINT)
+
+
 def environment() -> dict[str, str]:
     """Return the environment in which one of our processes starts another by ``python -m``.
 
@@ -89,19 +106,65 @@ def environment() -> dict[str, str]:
     return dict(os.environ) if is_home else os.environ | {"PYTHONSAFEPATH": "1"}
 
 
-serve = _program("v2v-serve", "v2v_server.commands.serve", "main", "server")
-worker = _program("v2v-worker", "v2v_server.commands.worker", "main", "server")
-simulate = _program("v2v-simulate", "v2v_server.commands.simulate", "main", "server")
-preview = _program("v2v-preview", "v2v_server.commands.preview", "main", "server")
-prepare = _program("v2v-prepare", "v2v_server.commands.prepare", "main", "server")
-top = _program("v2v-top", "v2v_server.commands.top", "main", "server")
-catalogue = _program("v2v-catalogue", "v2v_server.commands.catalogue", "main", "server")
-quarantine = _program("v2v-quarantine", "v2v_server.commands.quarantine", "main", "server")
-doctor = _program("v2v-doctor", "v2v_server.commands.doctor", "main", "server")
-keys = _program("v2v-keys", "v2v_server.commands.keys", "main", "server")
-tradeoff = _program("v2v-tradeoff", "v2v_server.commands.tradeoff", "main", "server")
-fit = _program("v2v-fit", "v2v_server.commands.fit", "main", "server")
-loadtest = _program("v2v-loadtest", "v2v_client.tools.loadtest", "main", "client")
-train = _program("v2v-train", "trainer.train", "main", "trainer")
-evaluate = _program("v2v-eval", "trainer.evaluation.cli", "main", "trainer")
-convert = _program("v2v-convert", "trainer.convert.cli", "main", "convert")
+def __getattr__(name: str) -> Program:
+    """Return a program by its name, with ``evaluate`` for ``v2v-eval``."""
+    name = {"evaluate": "eval"}.get(name, name)
+    if name not in COMMANDS:
+        raise AttributeError(f"there is no program {name!r}")
+    module, extra, _ = COMMANDS[name]
+    return _program(f"v2v-{name}", module, "main", extra)
+
+
+def v2v() -> int | None:
+    """Run ``v2v``: list the commands, run one of them, or print completions for a shell."""
+    name, *rest = sys.argv[1:] or ["--help"]
+    if name in COMMANDS:
+        sys.argv = [f"v2v-{name}", *rest]
+        return __getattr__(name)()
+    if name == "completion" and rest in (["bash"], ["zsh"]):
+        os.environ[COMPLETION] = rest[0]
+        return max(__getattr__(each)() or 0 for each in COMMANDS)
+    if name in ("-h", "--help"):
+        print(_USAGE)
+        return 0
+    print(f"v2v: unknown command {name!r}{nearest(name, COMMANDS)}; v2v --help lists the commands", file=sys.stderr)
+    return 2
+
+
+_GROUPS: dict[str, dict[str, tuple[str, str, str]]] = {
+    "Look at videos": {
+        "preview": ("v2v_server.commands.preview", "server", "draw what a recipe makes of videos"),
+        "simulate": ("v2v_server.commands.simulate", "server", "write one sample to a file, its events too"),
+        "doctor": ("v2v_server.commands.doctor", "server", "check installation, machine and videos"),
+        "fit": ("v2v_server.commands.fit", "server", "fit a virtual camera to a recording, or measure one"),
+    },
+    "Stream": {
+        "serve": ("v2v_server.commands.serve", "server", "stream samples to trainers"),
+        "worker": ("v2v_server.commands.worker", "server", "work for a server on another host"),
+        "top": ("v2v_server.commands.top", "server", "show a running server on a terminal"),
+        "loadtest": ("v2v_client.tools.loadtest", "client", "measure how fast a server feeds a trainer"),
+    },
+    "Manage a corpus": {
+        "prepare": ("v2v_server.commands.prepare", "server", "decode videos once, into a store that reads fast"),
+        "tradeoff": ("v2v_server.commands.tradeoff", "server", "compare speed, disk space and accuracy"),
+        "catalogue": ("v2v_server.commands.catalogue", "server", "catalogue videos ahead of time"),
+        "quarantine": ("v2v_server.commands.quarantine", "server", "list what crashed workers, or clear the list"),
+        "keys": ("v2v_server.commands.keys", "server", "create and revoke the keys of a server"),
+    },
+    "Train": {
+        "train": ("trainer.train", "trainer", "train a network on the stream"),
+        "eval": ("trainer.evaluation.cli", "trainer", "score a network on recordings"),
+        "convert": ("trainer.convert.cli", "convert", "convert recordings for v2v-eval"),
+    },
+}
+COMMANDS = {name: command for group in _GROUPS.values() for name, command in group.items()}
+"""Module, extra of the distribution that installs its imports, and purpose of each ``v2v-NAME``."""
+_USAGE = "\n".join([
+    "usage: v2v COMMAND [flags]   or   v2v-COMMAND [flags];   v2v COMMAND --help explains one",
+    *(
+        line
+        for title, group in _GROUPS.items()
+        for line in (f"\n{title}:", *(f"  {name:12s}{says}" for name, (_, _, says) in group.items()))
+    ),
+    "\nTab completion: eval \"$(v2v completion bash)\", or zsh",
+])  # fmt: skip

@@ -34,7 +34,7 @@ import numpy.typing as npt
 
 from v2v_protocol.bounds import LARGEST_EVENTS, most_events, pixel_thresholds
 from v2v_protocol.errors import RecipeError
-from v2v_protocol.presets import DEFAULT_PRESET, PRESET_FIELDS
+from v2v_protocol.presets import DEFAULT_PRESET, PRESET_FIELDS, STREAM_PRESETS
 from v2v_protocol.settings import (
     Setting,
     check_settings,
@@ -395,5 +395,6 @@ def preset(name: object) -> Recipe:
     """
     if not isinstance(name, str) or name not in PRESETS:
         near, known = nearest(name, PRESETS), ", ".join(PRESETS)
-        raise RecipeError(f"unknown recipe preset {format_value(name)}{near}; known: {known}")
+        near = f": it is a preset of the stream, --preset {name}" if str(name) in STREAM_PRESETS else near
+        raise RecipeError(f"unknown recipe {format_value(name)}{near}; known: {known}, or a file that ends in .yaml")
     return PRESETS[name]

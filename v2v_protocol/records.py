@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from v2v_protocol.errors import UsageError
+from v2v_protocol.write_aside import write_file
 
 
 def write_json(file: str | os.PathLike[str], records: Sequence[Mapping[str, Any]]) -> None:
@@ -17,7 +17,4 @@ def write_json(file: str | os.PathLike[str], records: Sequence[Mapping[str, Any]
     Raises:
         UsageError: the file cannot be written.
     """
-    try:
-        Path(file).write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"--json {os.fspath(file)}: cannot be written: {error.strerror or error}") from error
+    write_file(Path(file), json.dumps(records, indent=1) + "\n", "--json")

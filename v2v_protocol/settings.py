@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import re
 import typing
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -249,8 +250,14 @@ def nearest(key: object, known: Iterable[str]) -> str:
     """Return a hint, " (did you mean 'bins'?)", or "" if no known key is similar. A longer key is compared in part: the
     time grows with its length, and a peer may send one of 60 kB.
     """
-    close = difflib.get_close_matches(str(key)[:_LONGEST_SHOWN], list(known), n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""
+    names, word = list(known), str(key)[:_LONGEST_SHOWN]
+    close = difflib.get_close_matches(word, names, n=1) or [name for name in names if _is_part(word, name)]
+    return f" (did you mean {' or '.join(map(repr, close[:3]))}?)" if close else ""
+
+
+def _is_part(word: str, name: str) -> bool:
+    """Return whether a name has a word as one of its words: crop of crop_width_px, finetune of finetune-cpu."""
+    return bool(word) and word in re.split("[^a-z0-9]+", name.lower())
 
 
 def format_value(value: object) -> str:

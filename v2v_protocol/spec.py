@@ -11,7 +11,8 @@ from functools import lru_cache
 from typing import Any, Literal, TypedDict, get_args
 
 from v2v_protocol.bounds import LARGEST_EVENTS
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import RecipeError, UsageError
+from v2v_protocol.presets import STREAM_PRESETS
 from v2v_protocol.recipe import LARGEST_SIDE_PX, Recipe, preset
 from v2v_protocol.recipe import LATER_FIELDS as LATER_RECIPE_FIELDS
 from v2v_protocol.settings import (
@@ -191,7 +192,7 @@ class StreamSpec:
         Args:
             values: fields by name; ``recipe`` is a preset's name or a mapping of recipe fields (see
                 :meth:`Recipe.from_dict`); a missing or None field takes the value of ``default``. ``preset`` names one
-                of :data:`SPEED_PRESETS`, which the other fields may change.
+                of :data:`STREAM_PRESETS`, which the other fields may change.
             default: the server's own spec; the paper's if None.
 
         Raises:
@@ -261,27 +262,16 @@ def _digest(spec: StreamSpec) -> str:
     return hashlib.sha256(b"v2v spec 1\n" + _canonical(spec)).hexdigest()[:32]
 
 
-SPEED_PRESETS: dict[str, dict[str, Any]] = {
-    "exact": {"samples_per_decode": 1},
-    "balanced": {"samples_per_decode": 2},
-    "fast": {"samples_per_decode": 4},
-    "natural": {"samples_per_decode": 1, "scene": "auto", "moving_share": 0.75},
-}
-"""Spec fields that each preset sets. The first three trade accuracy for speed (`docs/accuracy.md`); "natural" is for
-videos as they are: what spoils events is left out, and most crops show something that moves (`docs/scene.md`).
-"""
-
-
 def speed_preset(name: object, base: StreamSpec) -> StreamSpec:
-    """Return ``base`` with the settings of a speed preset.
+    """Return ``base`` with the settings of a preset.
 
     Raises:
         UsageError: there is no such preset.
     """
-    if not isinstance(name, str) or name not in SPEED_PRESETS:
-        near, known = nearest(name, SPEED_PRESETS), ", ".join(SPEED_PRESETS)
+    if not isinstance(name, str) or name not in STREAM_PRESETS:
+        near, known = nearest(name, STREAM_PRESETS), ", ".join(STREAM_PRESETS)
         raise UsageError(f"unknown preset {format_value(name)}{near}; known: {known}")
-    return dataclasses.replace(base, sibling_spacing=0, **SPEED_PRESETS[name])
+    return dataclasses.replace(base, sibling_spacing=0, **STREAM_PRESETS[name])
 
 
 def _recipe(value: object, base: Recipe) -> Recipe:
@@ -289,6 +279,12 @@ def _recipe(value: object, base: Recipe) -> Recipe:
         return value
     if isinstance(value, Mapping):
         named = {str(key): item for key, item in value.items()}
+        for key in settings_of(StreamSpec).keys() & named.keys():
+            flag = f"--{key.replace('_', '-')}"
+            raise RecipeError(
+                f"recipe key {key!r} is a setting of the stream: give {key}={format_value(named[key])} beside the "
+                f"recipe, or {flag} {named[key]} instead of --set on a command line"
+            )
         is_complete = settings_of(Recipe).keys() - set(LATER_RECIPE_FIELDS) <= named.keys()
         return Recipe.from_dict(named) if "preset" in named or is_complete else base.replace(**named)
     return preset(value)

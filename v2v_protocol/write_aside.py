@@ -1,18 +1,26 @@
-"""Write files so that their name holds either the old content or the complete new one."""
+"""Write files so that their name holds either the old content or the complete new one, and never replace an input."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
+
+from v2v_protocol.errors import UsageError
+
+_LISTS = frozenset({".txt", ".csv", ".lst"})
+"""Endings of files that may name the videos beside them."""
+_STREAMS = frozenset({"/dev", "/dev/fd"})
+"""Folders whose files, such as /dev/stdout, are written in place."""
 
 
 @contextlib.contextmanager
 def write_aside_and_rename(path: Path, *, partial: Path | None = None, durable: bool = False) -> Iterator[Path]:
     """Yield the path of a temporary file, which replaces ``path`` at the end of the block.
 
-    After an error, in the block or here, ``path`` is unchanged and the temporary file is removed.
+    After an error, in the block or here, ``path`` is unchanged and the temporary file is removed. The target of a link
+    is replaced, not the link. A pipe or a device is yielded itself.
 
     Args:
         path: the final name.
@@ -22,6 +30,10 @@ def write_aside_and_rename(path: Path, *, partial: Path | None = None, durable: 
     Raises:
         OSError: the file cannot be flushed or renamed.
     """
+    if _is_stream(path):
+        yield path
+        return
+    path = path.resolve()
     partial = partial or path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield partial
@@ -43,3 +55,77 @@ def _flush(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def write_file(path: Path, content: bytes | str, flag: str = "") -> None:
+    """Write a file that a user asked for: all of it, or nothing.
+
+    Args:
+        flag: names the file in the message of an error.
+
+    Raises:
+        UsageError: it cannot be written.
+    """
+    try:
+        with write_aside_and_rename(path) as partial:
+            partial.write_bytes(content.encode() if isinstance(content, str) else content)
+    except OSError as error:
+        raise UsageError(f"{flag} {path}: cannot be written: {error.strerror or error}".lstrip()) from error
+
+
+def check_output(
+    flag: str, path: Path, endings: Collection[str], inputs: Iterable[str | os.PathLike[str]] = ()
+) -> None:
+    """Check, before any work, that a command may write a file.
+
+    It may not be one of the inputs under any name, or hold labels of a video. An existing file in a folder of inputs
+    (or beside a list file) is also refused where other files of its ending lie beside it: it may be an input like them.
+
+    Args:
+        flag: names the file in messages.
+        endings: the endings that the command can write, in lower case.
+        inputs: what the command reads; what does not exist is skipped.
+
+    Raises:
+        UsageError: it may not be written, or its folder is missing or write-protected.
+    """
+    named = f"{flag} {path}"
+    try:
+        if path.is_dir():
+            raise UsageError(f"{named}: it is a folder; give the name of a file")
+        if _is_stream(path):
+            return
+        if path.suffix.lower() not in endings:
+            raise UsageError(f"{named}: unknown ending; give a name that ends in {', '.join(endings)}")
+        if not path.parent.is_dir():
+            raise UsageError(f"{named}: there is no folder {path.parent}; create it first")
+        locked = next((at for at in (path, path.parent) if at.exists() and not os.access(at, os.W_OK)), None)
+        if locked is not None:
+            raise UsageError(f"{named}: {locked} is write-protected; give another name, or allow writing")
+        if why := _input_reason(path.resolve(), inputs):
+            raise UsageError(f"{named}: {why}; give another name")
+    except (OSError, ValueError) as error:  # too long a name, a NUL in it, a share that has gone
+        raise UsageError(f"{named}: {getattr(error, 'strerror', None) or error}") from error
+
+
+def _input_reason(path: Path, inputs: Iterable[str | os.PathLike[str]]) -> str:
+    """Return why a resolved path is an input; "" if it is none."""
+    from v2v_protocol.sample import ARRAYS, sidecar_endings  # takes NumPy, which a command's --help does without
+
+    labels = sidecar_endings(tuple(ARRAYS))
+    if path.name.endswith(labels) or any(f"{each.name}/".endswith(labels) for each in path.parents):
+        return "it has the name of a video's labels"
+    for given in filter(os.fspath, inputs):
+        read = Path(given).resolve()
+        if read == path or (path.exists() and read.exists() and read.samefile(path)):
+            return f"it is {given}, which this command also reads or writes"
+        folder = read.parent if read.suffix.lower() in _LISTS and read.is_file() else read
+        if path.exists() and folder.is_dir() and path.is_relative_to(folder):
+            alike = (each.name for each in path.parent.iterdir() if each.suffix.lower() == path.suffix.lower())
+            if any(name != path.name for name in alike):
+                return f"it exists, beside other {path.suffix} files, in {folder}, which this command reads"
+    return ""
+
+
+def _is_stream(path: Path) -> bool:
+    return os.fspath(path.parent) in _STREAMS or (path.exists() and not path.is_file() and not path.is_dir())

@@ -11,10 +11,10 @@ from typing import Any
 from v2v_protocol.addresses import is_loopback
 from v2v_protocol.command import flag_of
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe
-from v2v_protocol.safe_yaml import YamlError, parse_yaml, read_yaml
+from v2v_protocol.presets import STREAM_PRESETS
 from v2v_protocol.settings import bounds, check_settings, number, require_known, settings_of, switch, text, whole, word
-from v2v_protocol.spec import SPEC_KEYS, SPEED_PRESETS, StreamSpec
+from v2v_protocol.spec import SPEC_KEYS, StreamSpec
+from v2v_protocol.spec_flags import read_recipe, read_yaml_mapping, recipe_setting
 from v2v_server.system.log import LOG_FORMATS
 from v2v_server.video.rows import Rows
 
@@ -189,73 +189,18 @@ class ServeConfig:
                 raise UsageError(f"--config {file}: {name} appears twice, with dashes and with underscores; keep one")
             values[name] = value
         require_known(values, SERVE_KEYS, f"key in --config {file}:")
-        if asked := SPEED_PRESETS.get(flags.get("preset") or ""):  # a flag wins over the fields that it sets
+        if asked := STREAM_PRESETS.get(flags.get("preset") or ""):  # a flag wins over the fields that it sets
             values = {name: value for name, value in values.items() if name not in {*asked, "sibling_spacing"}}
         values |= {name: value for name, value in flags.items() if value is not None}
-        recipe = values.get("recipe")
-        if isinstance(recipe, str) and recipe.endswith(_RECIPE_FILES):
-            values["recipe"] = read_yaml_mapping("recipe:", recipe)
+        values |= {"recipe": read_recipe(values["recipe"])} if "recipe" in values else {}
         if settings:
             values["recipe"] = recipe_setting(None, settings, values.get("recipe"))
         fields = {name: values.pop(name) for name in SPEC_KEYS if name in values}
         return cls(**values, spec=StreamSpec.from_dict(fields))
 
 
-_RECIPE_FILES = (".yaml", ".yml")
 SERVE_KEYS = (*settings_of(ServeConfig), *SPEC_KEYS)
 """Keys of a YAML file for ``v2v-serve --config``."""
-
-
-def recipe_setting(recipe: str | None, settings: Sequence[str], configured: Any = None) -> Any:
-    """Combine `--recipe` and any number of `--set KEY=VALUE`.
-
-    Args:
-        recipe: a preset's name, a YAML file of recipe fields (it may name its ``preset``), or None.
-        settings: "key=value" texts, values in YAML ("[0.2, 0.5]", "true", "3").
-        configured: recipe of a configuration file, used without ``recipe``: a preset's name or a mapping of fields.
-
-    Returns:
-        None if nothing was given, otherwise a value that ``StreamSpec.from_dict`` accepts as ``recipe``.
-
-    Raises:
-        UsageError: the file cannot be read, or a setting is not "key=value".
-    """
-    if recipe is None and not settings:
-        return None
-    fields: dict[str, Any] = {}
-    if recipe is not None:
-        is_file = recipe.endswith(_RECIPE_FILES)
-        fields = read_yaml_mapping("--recipe", recipe) if is_file else {"preset": recipe}
-    elif configured is not None:
-        fields = dict(configured) if isinstance(configured, Mapping) else {"preset": configured}
-    for setting in settings:
-        key, equals, text = setting.partition("=")
-        if not equals:
-            raise UsageError(f"--set {setting}: write KEY=VALUE, for instance --set voxels_per_clip=5")
-        try:
-            fields[key.strip()] = parse_yaml(text)
-        except YamlError as error:
-            raise UsageError(f"--set {setting}: {text!r} is not a value") from error
-    return Recipe.from_dict(fields)
-
-
-def read_yaml_mapping(flag: str, file: str) -> dict[str, Any]:
-    """Read a YAML file that holds a mapping.
-
-    Raises:
-        UsageError: it cannot be read, has a key twice, or holds something else; the message names the flag.
-    """
-    try:
-        values = read_yaml(file)
-    except OSError as error:
-        raise UsageError(f"{flag} {file}: {error.strerror}") from error
-    except YamlError as error:
-        raise UsageError(f"{flag} {file}: not YAML: {error}") from error
-    if values is None:
-        return {}
-    if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
-        raise UsageError(f"{flag} {file}: expected keys and values, found {type(values).__name__}")
-    return values
 
 
 def _check_address(flag: str, address: str, *, is_safe: bool) -> None:

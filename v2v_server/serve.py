@@ -117,8 +117,43 @@ def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None
     """
     keep_freed_memory()
     open_many_files()
-    log = Log(is_json=config.log_format == "json")
     times.mark("imports")
+    log, label = Log(is_json=config.log_format == "json"), f"w{secrets.token_hex(4)}"
+    # All that may be refused comes before the videos, which can take minutes to catalogue.
+    keys = KeyFolder(Path(config.keys)) if config.keys else None
+    if config.cache:
+        make_cache(Path(config.cache).absolute())
+    with contextlib.ExitStack() as opened:
+        page = None
+        if config.page:
+            page = PageProcess(
+                config.page_host, config.page, config.page_names, config.log_format, is_insecure=config.insecure
+            )
+            opened.callback(page.stop)
+        is_open = bool(keys or config.insecure or sys.platform != "linux")
+        sockets = Sockets(
+            config.bind,
+            config.worker_bind or _private_address(label),
+            most_connections=most_connections(_FILES_A_WORKER * config.workers_in_all),
+            keys=keys,
+            local_bind=_private_address(label),
+            admits=None if is_open else OwnUser(_OWN_USER_RULE, log.say).admits,
+        )
+        opened.callback(sockets.close)
+        _serve(config, times, standbys, sockets, page, keys, label)
+
+
+def _serve(
+    config: ServeConfig,
+    times: StartTimes,
+    standbys: list[Standby] | None,
+    sockets: Sockets,
+    page: PageProcess | None,
+    keys: KeyFolder | None,
+    label: str,
+) -> None:
+    """Open the catalogue and run the loop. Errors: see :func:`serve`."""
+    log = Log(is_json=config.log_format == "json")
     catalogue = load_catalogue(config)
     times.mark("catalogue")
     table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
@@ -146,31 +181,13 @@ def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None
     # Workers of this host use an address that requires no key.
     worker_flags = [*(["--keys", ""] if config.engine == "local" else []), "--log-format", config.log_format]
     if config.cache:
-        folder = Path(config.cache).absolute()
-        make_cache(folder)
-        worker_flags += ["--cache", str(folder), "--cache-gib", str(config.cache_gib)]
+        worker_flags += ["--cache", str(Path(config.cache).absolute()), "--cache-gib", str(config.cache_gib)]
     worker_flags += ["--cache-raw"] * config.cache_raw + ["--debug"] * times.is_logged
     worker_flags += catalogue.source.worker_flags()
-    label = f"w{secrets.token_hex(4)}"
-    keys = KeyFolder(Path(config.keys)) if config.keys else None
-    is_open = bool(keys or config.insecure or sys.platform != "linux")
     stop = threading.Event()
+    sockets.has_session = dispatcher.has_session
     with stop_on_signals(stop):
         pool = make_pool(config, catalogue.source, label, worker_flags, keys, standbys)
-        sockets = Sockets(
-            config.bind,
-            config.worker_bind or _private_address(label),
-            most_connections=most_connections(_FILES_A_WORKER * config.workers_in_all),
-            has_session=dispatcher.has_session,
-            keys=keys,
-            local_bind=_private_address(label),
-            admits=None if is_open else OwnUser(_OWN_USER_RULE, log.say).admits,
-        )
-        page = None
-        if config.page:
-            page = PageProcess(
-                config.page_host, config.page, config.page_names, config.log_format, is_insecure=config.insecure
-            )
         server = Server(
             config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file, page=page, times=times
         )

@@ -9,7 +9,7 @@ the ratios within a turn, so that a drift of the machine cancels. Bars are on ra
                 on the source clips
     decode      decodes the frames that the stream's samples need (open, seek and crop included) and nothing else: the
                 limit of every loader that decodes each sample by itself; each corpus has its own
-    a preset    the stream under one of `v2v_protocol.spec.SPEED_PRESETS`, from server to batch
+    a preset    the stream under one of `v2v_protocol.presets.STREAM_PRESETS`, from server to batch
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_client.tools import loadtest
 from v2v_protocol.command import Parser
-from v2v_protocol.spec import SPEED_PRESETS, StreamSpec
+from v2v_protocol.presets import STREAM_PRESETS
+from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.system.process import usable_cores
 from v2v_server.worker.produce import decode_for
@@ -124,7 +125,7 @@ class Contender:
 
 def line_up(source: Corpus, prepared: list[Corpus], presets: Sequence[str]) -> list[Contender]:
     """Return all contenders, the baseline first; each corpus has its own decode limit."""
-    names = [LIMIT, *(name for name in SPEED_PRESETS if name in presets)]
+    names = [LIMIT, *(name for name in STREAM_PRESETS if name in presets)]
     return [Contender(BASELINE, source)] + [Contender(name, corpus) for corpus in (source, *prepared) for name in names]
 
 
@@ -236,7 +237,9 @@ def add_flags(parser: Parser) -> None:
         "--prepared", action="append", default=[], type=_prepared, metavar="NAME=DIR",
         help="the same clips, prepared; may be repeated",
     )  # fmt: skip
-    parser.add_argument("--presets", default=",".join(SPEED_PRESETS), metavar="A,B", help="speed presets (default all)")
+    parser.add_argument(
+        "--presets", default=",".join(STREAM_PRESETS), metavar="A,B", help="of the stream (default all)"
+    )
     add_positive(parser, "--seconds", 20.0, "of each contender in each turn")
     add_whole(parser, "--workers", min(2, usable_cores()), "processes of each contender")
     add_whole(parser, "--batch-size", 12, "samples of a batch")
@@ -250,7 +253,7 @@ def measure(asked: argparse.Namespace) -> Report:
     Raises:
         UsageError: an unknown preset.
     """
-    presets = chosen(asked.presets, SPEED_PRESETS, "--presets")
+    presets = chosen(asked.presets, STREAM_PRESETS, "--presets")
     contenders = line_up(Corpus("source", asked.videos, asked.rows), asked.prepared, presets)
     records = compare(contenders, asked)
     return Report(records, [(records, _COLUMNS)], missed=missed(records))

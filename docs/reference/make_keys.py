@@ -8,10 +8,10 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from v2v_protocol.presets import PRESET_FIELDS
+from v2v_protocol.presets import PRESET_FIELDS, STREAM_PRESETS
 from v2v_protocol.recipe import EFFECTS, Recipe
 from v2v_protocol.settings import Setting, settings_of
-from v2v_protocol.spec import SPEED_PRESETS, StreamSpec
+from v2v_protocol.spec import StreamSpec
 from v2v_server.config import ServeConfig
 
 HEAD = """# All keys
@@ -71,11 +71,11 @@ def page() -> str:
         *_section("Server", ServeConfig),
         *_section("Stream", StreamSpec),
         "### Stream presets: `preset`\n",
-        *_presets(SPEED_PRESETS),
+        *_presets(STREAM_PRESETS),
         *_section("Recipe", Recipe),
         *_sources(),
-        "### Recipe presets: `preset`\n",
-        *_presets(PRESET_FIELDS),
+        "### Recipes by name\n",
+        *_presets(PRESET_FIELDS, "recipe"),
     ])  # fmt: skip
 
 
@@ -121,8 +121,8 @@ def _value(value: Any) -> str:
     return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
 
 
-def _presets(presets: Any) -> Iterator[str]:
-    yield "| preset | what it sets |\n|---|---|"
+def _presets(presets: Any, kind: str = "preset") -> Iterator[str]:
+    yield f"| {kind} | what it sets |\n|---|---|"
     for name, fields in presets.items():
         yield f"| `{name}` | {', '.join(f'{key} {_value(value)}' for key, value in fields.items()) or 'the defaults'} |"
     yield ""

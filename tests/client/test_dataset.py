@@ -406,7 +406,7 @@ def test_a_state_restores_the_spec_when_none_is_given(server):
 
 def test_a_state_of_another_spec_seed_or_nothing_is_refused(server):
     state = next(iter(dataset(server))).resume_state
-    with pytest.raises(StateMismatch, match=r"gamma: 1.5 / 2.2"):
+    with pytest.raises(StateMismatch, match=r"gamma 1.5 / 2.2"):
         dataset(server, recipe={"gamma": 1.5}).load_state_dict(state)
     with pytest.raises(StateMismatch, match="seed: the state has 5, this dataset 6"):
         dataset(server, seed=6).load_state_dict(state)

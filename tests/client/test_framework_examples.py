@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from torch.utils.data import DataLoader
 from torchdata.stateful_dataloader import StatefulDataLoader
 
@@ -20,6 +19,9 @@ from v2v_client import Batch, V2VStreamDataset
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "guides" / "frameworks.md"
+(FIRST_LINES,) = re.findall(
+    r"follows these lines.*?```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S
+)
 EXAMPLES = re.findall(r"^## (.+?)\n\n```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
 
 
@@ -30,6 +32,13 @@ OURS = {name: text for name, text in EXAMPLES if name not in OTHERS}
 
 class Crash(Exception):
     pass
+
+
+def names_for(server: FakeServer, train: Callable[[Batch], None]) -> dict[str, Any]:
+    """The names of the page's first lines, with the address of a server and a training step of the test."""
+    names: dict[str, Any] = {}
+    exec(FIRST_LINES, names)
+    return names | {"ADDRESS": server.address, "train": train}
 
 
 def of_two_bins(text: str) -> str:
@@ -52,16 +61,12 @@ def test_an_example_resumes_where_it_was(text: str) -> None:
         taken.extend(batch.indices)
 
     with FakeServer(sequences=23, credit=8) as server:
-        names = {"ADDRESS": server.address, "train": train, "V2VStreamDataset": V2VStreamDataset}
-        exec(text, names | {"DataLoader": DataLoader, "StatefulDataLoader": StatefulDataLoader})
+        exec(text, names_for(server, train))
     assert taken == list(range(20))
 
 
 RANK = """
-import os
-import torch
 from pathlib import Path
-from v2v_client import V2VStreamDataset
 
 ADDRESS = {address!r}
 trained = 0
@@ -87,7 +92,7 @@ def test_the_example_of_torchrun_resumes_where_it_was(tmp_path: Path) -> None:
     text = dict(EXAMPLES)["torchrun"]
     (command,) = re.findall(r"^ {4}torchrun (.*)$", PAGE.read_text(encoding="utf-8"), re.M)
     with FakeServer(sequences=23, credit=8) as server:
-        (tmp_path / "train.py").write_text(RANK.format(address=server.address) + text, encoding="utf-8")
+        (tmp_path / "train.py").write_text(FIRST_LINES + RANK.format(address=server.address) + text, encoding="utf-8")
         (tmp_path / "first").touch()
         first = torchrun(command, tmp_path)
         (tmp_path / "first").unlink()
@@ -111,13 +116,9 @@ def torchrun(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # theirs, of each other and of torch
 def test_the_example_of_accelerate_resumes_where_it_was() -> None:
-    accelerate = importlib.import_module("accelerate")  # slow to import, and without types
     taken: list[int] = []
     with FakeServer(sequences=23, credit=8) as server:
-        names = {"ADDRESS": server.address, "train": lambda batch: taken.extend(batch.indices), "torch": torch}
-        exec(
-            of_two_bins(dict(EXAMPLES)["accelerate"]), names | {"V2VStreamDataset": V2VStreamDataset} | vars(accelerate)
-        )
+        exec(of_two_bins(dict(EXAMPLES)["accelerate"]), names_for(server, lambda batch: taken.extend(batch.indices)))
     assert taken == list(range(20))
 
 
@@ -128,8 +129,6 @@ def test_the_example_of_accelerate_resumes_where_it_was() -> None:
 )
 def test_the_example_of_lightning_resumes_where_its_checkpoint_was(tmp_path: Path, kind: Any, workers: int) -> None:
     """The checkpoint is written after two batches; the crash is in the fourth."""
-    lightning = importlib.import_module("lightning")
-    callbacks = importlib.import_module("lightning.pytorch.callbacks")
     taken: list[int] = []
 
     def train(batch: Batch) -> None:
@@ -143,11 +142,10 @@ def test_the_example_of_lightning_resumes_where_its_checkpoint_was(tmp_path: Pat
 
     crashed: list[int] = []
     quiet = {"accelerator": "cpu", "logger": False, "enable_progress_bar": False, "enable_model_summary": False}
-    first, second = of_two_bins(dict(EXAMPLES)["Lightning"]).split("  # a crash\n")
+    text = of_two_bins(dict(EXAMPLES)["Lightning"]).replace("max_epochs=1,", "max_epochs=1, **QUIET,")
+    first, second = text.replace('"runs/lightning"', repr(str(tmp_path))).split("  # a crash\n")
     with FakeServer(sequences=23, credit=8) as server:
-        names = {"ADDRESS": server.address, "train": train, "DataLoader": loader, "FOLDER": str(tmp_path)}
-        names |= {"V2VStreamDataset": V2VStreamDataset}
-        names |= {"lightning": lightning, "torch": torch, "QUIET": quiet, "ModelCheckpoint": callbacks.ModelCheckpoint}
+        names = names_for(server, train) | {"DataLoader": loader, "QUIET": quiet}
         with pytest.raises(Crash):
             exec(first, names)
         assert taken == list(range(12))

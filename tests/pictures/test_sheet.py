@@ -272,7 +272,7 @@ def test_files_read_back(tmp_path: Path) -> None:
     page = html_page("a <b> & c", image, film, 10.0)
     assert "a &lt;b&gt; &amp; c" in page
     assert "data:video/mp4;base64," in page
-    with pytest.raises(UsageError, match=r"picture\.png: No such file or directory"):
+    with pytest.raises(UsageError, match=r"picture\.png: cannot be written: No such file or directory"):
         write_png(tmp_path / "nowhere" / "picture.png", image)
 
 
@@ -307,3 +307,13 @@ def test_a_long_description_keeps_its_beginning() -> None:
 def test_png_of_a_view_that_is_not_contiguous() -> None:
     image = np.zeros((8, 8, 3), np.uint8)
     assert png_bytes(image[:, ::2]) == png_bytes(image[:, ::2].copy())
+
+
+def test_the_strip_states_the_time_of_the_clip() -> None:
+    made = camera(np.zeros((10, 3, 32, 32), np.int8))
+    assert made.timing == dataclasses.replace(made, step_seconds=float("nan")).timing == ""
+    grids, bins = made.voxels.shape[:2]
+    for rate, shown in ((240, "240"), (30_000 / 1001, "30")):
+        seconds = grids * made.steps_per_frame / rate
+        timed = dataclasses.replace(made, step_seconds=1 / rate)
+        assert timed.timing == f"{seconds:.2g} s, {shown} frames/s, {1e3 * seconds / (grids * bins):.2g} ms a bin"

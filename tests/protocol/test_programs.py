@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import runpy
+import signal
 import subprocess
 import sys
 import tomllib
@@ -19,7 +20,7 @@ from v2v_server.system.log import Log
 
 HOME = Path(__file__).parents[2]
 PROJECT = tomllib.loads((HOME / "pyproject.toml").read_text("utf-8"))["project"]
-SCRIPTS = PROJECT["scripts"]
+SCRIPTS = {name: entry for name, entry in PROJECT["scripts"].items() if name != "v2v"}
 
 
 @pytest.mark.parametrize("name", sorted(SCRIPTS))
@@ -162,3 +163,50 @@ def test_the_null_device_takes_the_place_of_a_closed_stream() -> None:
     command = ["sh", "-c", f'exec "{sys.executable}" -c "$0" 2>&-', script]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False, cwd=HOME)
     assert (done.returncode, done.stdout) == (0, f"{os.devnull} True True\n")
+
+
+def test_ctrl_c_while_modules_are_imported_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "slow.py").write_text("print('importing', flush=True)\nimport time\ntime.sleep(60)\n")
+    script = "from v2v_protocol import programs; programs._program('v2v-x', 'slow', 'main', 'server')()"
+    with subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": f"{HOME}{os.pathsep}{tmp_path}"},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"importing\n"
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert (process.returncode, said) == (130, b"v2v-x: interrupted\n")
+
+
+def run_v2v(*given: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["v2v", *given])
+    status = programs.v2v() or 0
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+def test_one_door_lists_all_commands_and_runs_them(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    status, listed, _ = run_v2v(capsys=capsys, monkeypatch=monkeypatch)
+    assert status == 0
+    assert {f"v2v-{name}" for name in programs.COMMANDS} == set(SCRIPTS)
+    assert all(re.search(rf"^  {name} +\w", listed, re.M) for name in programs.COMMANDS)
+    assert run_v2v("serve", "--version", capsys=capsys, monkeypatch=monkeypatch)[1].startswith("v2v-serve ")
+    status, _, said = run_v2v("serv", capsys=capsys, monkeypatch=monkeypatch)
+    assert status == 2
+    assert "did you mean 'serve'" in said
+
+
+def test_shells_complete_the_flags(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("shtab")
+    monkeypatch.setenv(programs.COMPLETION, "")
+    status, script, _ = run_v2v("completion", "bash", capsys=capsys, monkeypatch=monkeypatch)
+    assert status == 0
+    for name in programs.COMMANDS:
+        assert f"v2v-{name}\n" in script
+    assert subprocess.run(["bash", "-n"], input=script, text=True, check=False).returncode == 0

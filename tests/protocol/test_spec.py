@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 from tests.protocol.recipes import specs
 from v2v_protocol.errors import RecipeError, UsageError
+from v2v_protocol.presets import STREAM_PRESETS
 from v2v_protocol.recipe import PRESETS, Recipe, preset
 from v2v_protocol.settings import settings_of
-from v2v_protocol.spec import SPEC_KEYS, SPEED_PRESETS, SpecOptions, SpeedPreset, StreamSpec
+from v2v_protocol.spec import SPEC_KEYS, SpecOptions, SpeedPreset, StreamSpec
 
 OTHER_RECIPE_VALUES: dict[str, Any] = {
     "voxels_per_clip": 41,
@@ -117,7 +118,7 @@ def test_the_options_of_a_dataset_are_the_fields_of_a_spec() -> None:
     assert tuple(options) == tuple(key for key in SPEC_KEYS if key != "recipe")
     fields = get_type_hints(StreamSpec) | {"preset": SpeedPreset}
     assert options == {name: fields[name] | None for name in options}
-    assert get_args(SpeedPreset) == tuple(SPEED_PRESETS)
+    assert get_args(SpeedPreset) == tuple(STREAM_PRESETS)
     for name, setting in settings_of(StreamSpec).items():
         assert setting.words == get_args(fields[name])
 
@@ -215,8 +216,8 @@ def test_odd_recipe_keys_are_refused_as_such(recipe: Any) -> None:
         ({"max_sequences_per_video": True}, "max_sequences_per_video = True"),
         ({"max_sequences_per_video": 1.0}, "max_sequences_per_video = 1.0"),
         ({"max_sequences_per_video": 1_000_001}, "from 1 to 1000000"),
-        ({"recipe": 5}, "unknown recipe preset 5"),
-        ({"recipe": ["paper"]}, "unknown recipe preset"),
+        ({"recipe": 5}, "unknown recipe 5"),
+        ({"recipe": ["paper"]}, "unknown recipe"),
     ],
 )
 def test_refusals(values: Any, message: str) -> None:

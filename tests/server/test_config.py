@@ -111,7 +111,7 @@ def test_a_named_recipe_of_the_file_is_changed_too_and_without_one_the_papers(tm
     assert ServeConfig.load(str(file), {}, ["bins=3"]).spec.recipe == preset("clean").replace(bins=3)
     assert ServeConfig.load(None, {"videos": "a"}, ["bins=3"]).spec.recipe == Recipe(bins=3)
     file.write_text("videos: a\nrecipe: 5\n")
-    with pytest.raises(RecipeError, match="unknown recipe preset 5"):
+    with pytest.raises(RecipeError, match="unknown recipe 5"):
         ServeConfig.load(str(file), {}, ["bins=3"])
 
 
@@ -175,7 +175,7 @@ def test_an_empty_file_says_nothing(tmp_path: Path) -> None:
         ("voxel_dtype: int32", "voxel_dtype = 'int32'"),
         ("on_bad_video: skip", "on_bad_video = 'skip'"),
         ("max_sequences_per_video: 0", "max_sequences_per_video = 0"),
-        ("recipe: papr", r"unknown recipe preset 'papr' \(did you mean 'paper'\?\)"),
+        ("recipe: papr", r"unknown recipe 'papr' \(did you mean 'paper'\?\)"),
         ("recipe: {self: 1}", "unknown recipe key 'self'"),
         ("recipe: {1: 2}", "unknown recipe key '1'"),
         ("recipe: {threshold: [1]}", r"recipe threshold = \[1\]"),
@@ -345,7 +345,7 @@ def test_settings_change_the_named_preset(tmp_path: Path) -> None:
         ("bins=yes", "recipe bins = True"),
         ("gamma=.nan", "recipe gamma = nan"),
         ("threshold=0.2,0.5", r"threshold = '0.2,0.5': give one number, or a pair \[lowest, highest\]"),
-        ("preset=papr", "unknown recipe preset"),
+        ("preset=papr", "unknown recipe"),
     ],
 )
 def test_settings_that_make_no_sense(setting: str, message: str) -> None:
@@ -354,7 +354,7 @@ def test_settings_that_make_no_sense(setting: str, message: str) -> None:
 
 
 def test_an_unknown_preset() -> None:
-    with pytest.raises(RecipeError, match="unknown recipe preset 'papr'"):
+    with pytest.raises(RecipeError, match="unknown recipe 'papr'"):
         recipe_setting("papr", [])
 
 

@@ -124,7 +124,7 @@ def test_workers_do_not_outlive_a_killed_server(clips: Path, tmp_path: Path) -> 
 BAD_SETTINGS = [
     ([], "--videos is missing"),
     (["--videos", "{clips}", "--set", "tresholds=1"], "unknown recipe key 'tresholds' (did you mean 'threshold'?)"),
-    (["--videos", "{clips}", "--recipe", "papper"], "unknown recipe preset 'papper' (did you mean 'paper'?)"),
+    (["--videos", "{clips}", "--recipe", "papper"], "unknown recipe 'papper' (did you mean 'paper'?)"),
     (["--videos", "{clips}", "--bind", "tcp://0.0.0.0:5555"], "--insecure"),
     (["--videos", "{clips}", "--bind", "nonsense"], "--bind 'nonsense': write tcp://HOST:PORT"),
     (["--videos", "{clips}", "--config", "{clips}/none.yaml"], "--config"),
@@ -180,7 +180,7 @@ def test_a_port_file_that_cannot_be_written_is_one_line_and_leaves_nothing(
     flags = ["--videos", "{clips}", "--workers", "0", "--bind", "tcp://127.0.0.1:*", "--port-file", "{folder}"]
     assert serve(_filled_in(flags, clips=clips, folder=folder)) == 2
     assert capsys.readouterr().err.endswith(
-        f"v2v-serve: --port-file {folder}: Is a directory; give a file in a folder that you can write\n"
+        f"v2v-serve: --port-file {folder}: it is a folder; give the name of a file\n"
     )
     assert list(tmp_path.iterdir()) == [folder]
 

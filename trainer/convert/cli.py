@@ -12,7 +12,7 @@ from pathlib import Path
 
 from trainer.convert.conversion import Converted, convert, default_name
 from trainer.evaluation import layout
-from v2v_protocol.command import Parser, run_command
+from v2v_protocol.command import JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     recordings.add_argument("--events-topic", metavar="TOPIC", help="topic of events, for a bag with several")
     recordings.add_argument("--images-topic", metavar="TOPIC", help="topic of pictures, for a bag with several")
     out.add_argument("--overwrite", action="store_true", help="replace files that exist")
-    out.add_argument("--json", metavar="FILE", help="also write a record of each recording to this file")
+    parser.add_output("Output", "--json", JSON, "also write a record of each recording to this file")
     interrupted = "interrupted; no incomplete file is left"
     return run_command(parser, _run, argv, interrupted=interrupted)
 

@@ -27,7 +27,7 @@ from trainer.evaluation.tables import records, table, write_frames
 from trainer.evaluation.voxelise import Kind, Span, VoxelSettings
 from trainer.models import NETWORKS
 from trainer.weights import SHIPPED, load_network
-from v2v_protocol.command import Parser, run_command
+from v2v_protocol.command import JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
@@ -128,8 +128,8 @@ def _parser() -> Parser:
     out.add_argument("--out", metavar="DIR", help="folder to write a picture of each sequence to")
     out.add_argument("--rows", type=int, default=6, metavar="N", help="rows of each picture (default 6)")
     out.add_argument("--video", action="store_true", help="also write a video of each sequence to --out")
-    out.add_argument("--json", metavar="FILE", help="also write the scores as flat records to this file")
-    out.add_argument("--per-frame", metavar="FILE.csv", help="also write the scores of every window to this file")
+    parser.add_output("Output", "--json", JSON, "also write the scores as flat records to this file")
+    parser.add_output("Output", "--per-frame", (".csv",), "also write the scores of every window to this file")
     return parser
 
 
@@ -137,10 +137,6 @@ def _run(arguments: argparse.Namespace) -> int:
     data = Path(arguments.data)
     if not data.exists():
         raise UsageError(f"--data {data}: no such folder or file")
-    if arguments.per_frame is not None and not Path(arguments.per_frame).parent.is_dir():
-        raise UsageError(f"--per-frame {arguments.per_frame}: no folder {Path(arguments.per_frame).parent}")
-    if arguments.json is not None and not Path(arguments.json).parent.is_dir():
-        raise UsageError(f"--json {arguments.json}: cannot be written: no folder {Path(arguments.json).parent}")
     if arguments.config is not None:
         return _evaluate(arguments, data, read_config(arguments.config))
     size = None if arguments.size is None else SensorSize.parse(arguments.size)
@@ -172,7 +168,7 @@ def _evaluate(arguments: argparse.Namespace, data: Path, config: EvaluationConfi
         raise UsageError(f"--data {data} holds no sequence of {wanted}; create the files with v2v-convert")
     _print(config, scores)
     if arguments.per_frame is not None:
-        write_frames(Path(arguments.per_frame), scores)
+        write_frames(arguments.per_frame, scores)
     if arguments.json is not None:
         settings = {
             "model": model,

@@ -14,6 +14,7 @@ from trainer.evaluation import paper
 from trainer.evaluation.data_sets import DataSet
 from trainer.evaluation.score import SequenceScore, mean_over_sequences
 from v2v_protocol.errors import UsageError
+from v2v_protocol.write_aside import write_aside_and_rename
 
 TITLES = {
     "mse": "MSE",
@@ -69,7 +70,7 @@ def write_frames(file: Path, scores_by_set: Mapping[str, Sequence[SequenceScore]
         UsageError: the file cannot be written.
     """
     try:
-        with file.open("w", newline="", encoding="utf-8") as out:
+        with write_aside_and_rename(file) as partial, partial.open("w", newline="", encoding="utf-8") as out:
             lines: Any = None
             for name, scores in scores_by_set.items():
                 for score in scores:

@@ -28,6 +28,8 @@ def export(checkpoints: Sequence[Path], file: Path) -> int:
         UsageError: no such checkpoint, not one of a training run, or of another network than the first; or ``file``
             cannot be written.
     """
+    if file.resolve() in {checkpoint.resolve() for checkpoint in checkpoints}:
+        raise UsageError(f"{file}: it is one of the checkpoints; give another FILE")
     steps, networks, weights = 0, [], []
     for checkpoint in checkpoints:
         found = load_checkpoint(checkpoint)

@@ -14,7 +14,7 @@ from typing import Any
 from v2v_protocol.errors import ProtocolError, StateMismatch, UsageError
 from v2v_protocol.messages import Welcome
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_INDEX, LARGEST_SEED
-from v2v_protocol.settings import require_whole
+from v2v_protocol.settings import format_value, require_whole
 from v2v_protocol.spec import StreamSpec
 
 STATE_VERSION = 1
@@ -90,11 +90,12 @@ class StreamIdentity:
             mine, offered = getattr(self, name), getattr(other, name)
             if mine != offered:
                 changed = differences(self.spec, other.spec) if name == "spec_digest" else ""
-                raise StateMismatch(f"{name}: {ours} has {mine}, {theirs} has {offered}{changed}; {remedy}")
+                digests = f"{name}: {ours} has {mine}, {theirs} has {offered}"
+                raise StateMismatch(f"{f'{ours} / {theirs}: {changed}' if changed else digests}; {remedy}")
 
 
 def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
-    """Return the fields in which two resolved specs differ, as text: `` (recipe.gamma: 2.2 / 1.8)``."""
+    """Return the fields in which two resolved specs differ, as text: ``recipe.gamma 2.2 / 1.8``."""
 
     def flat(spec: Mapping[str, Any]) -> dict[str, Any]:
         recipe = spec.get("recipe", {})
@@ -103,11 +104,11 @@ def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
 
     left, right = flat(ours), flat(theirs)
     found = [
-        f"{key}: {left.get(key)} / {right.get(key)}"
+        f"{key} {left.get(key)} / {right.get(key)}"
         for key in sorted(left.keys() | right.keys())
         if left.get(key) != right.get(key)
     ]
-    return f" ({', '.join(found[:5])}{', ...' if len(found) > 5 else ''})" if found else ""
+    return f"{', '.join(found[:5])}{', ...' if len(found) > 5 else ''}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,8 +188,11 @@ class ResumeState:
             UsageError: the values are not a state of this release.
         """
         if not isinstance(values, Mapping) or values.get("version") != STATE_VERSION:
-            version = values.get("version") if isinstance(values, Mapping) else type(values).__name__
-            raise UsageError(f"not a state of V2VStreamDataset: version {version!r}, expected {STATE_VERSION}")
+            found = f"version {values.get('version')!r}" if isinstance(values, Mapping) else format_value(values)
+            raise UsageError(
+                f"not a state of V2VStreamDataset: {found}, expected version {STATE_VERSION}. Give the saved "
+                "Batch.resume_state itself, for instance torch.load('last.pt')['stream']"
+            )
         known = {"version", "seed", "epoch", "origin", "position", "world_size", "quarantine", "loader_worker"}
         known |= {field.name for field in dataclasses.fields(StreamIdentity)}
         if values.keys() | {"sidecars"} != known:

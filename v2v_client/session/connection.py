@@ -25,13 +25,15 @@ from v2v_client.session.liveness import ListeningClock, Patience
 from v2v_client.session.states import Event, State
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ServerLost, UsageError
-from v2v_protocol.link.dealer import Dealer
+from v2v_protocol.link.dealer import Dealer, diagnose
 from v2v_protocol.messages import Hello, SampleHeader
 from v2v_protocol.sample import Layout, Provenance
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames, decode, encode, largest_frame_bytes
 
 _GOODBYE_LINGER_MS = 250
 """Time that closing may spend on sending the Goodbye. Without it the server would go on making requested samples."""
+_REPORT_SECONDS = 5.0
+"""A server that does not answer a Hello is reported after this time."""
 _NO_SLOTS: Mapping[int, Slot] = {}
 
 _log = logging.getLogger(__name__)
@@ -160,8 +162,15 @@ class Connection:
 
     def _await_welcome(self) -> None:
         self._conversation.handle_event(Event.OPENED, self._now())
+        is_reported = False
         while self._conversation.state is not State.WELCOMED:
-            self._step(wait=True)
+            if not is_reported and self._conversation.silence(self._now()) >= _REPORT_SECONDS:
+                is_reported, limit = True, self._patience.timeout_seconds
+                _log.warning("%s: %s; giving up after %g s", self._address, diagnose(self._address), limit)
+            try:
+                self._step(wait=True)
+            except ServerLost as lost:
+                raise ServerLost(f"{lost}; {diagnose(self._address)}") from lost
 
     def _leave(self, link: Transport) -> None:
         """Send Goodbye, without waiting for a silent server."""

@@ -22,13 +22,13 @@ from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_client.tools.schedule_check import ScheduleCheck
-from v2v_protocol.command import INTERRUPTED, Parser, run_command
+from v2v_protocol.command import INTERRUPTED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
-from v2v_protocol.safe_yaml import YamlError, parse_yaml
 from v2v_protocol.sample import DEFAULT_ARRAYS
-from v2v_protocol.spec import SPEED_PRESETS, StreamSpec
+from v2v_protocol.spec import StreamSpec
+from v2v_protocol.spec_flags import add_spec, recipe_changes, spec_fields
 
 _RSS_EVERY_SECONDS = 0.5
 _LEAST_WIDTH = 110
@@ -243,14 +243,6 @@ def _parser() -> Parser:
         metavar="NAME,NAME",
         help="arrays to receive (default %(default)s)",
     )
-    stream.add_argument("--preset", choices=tuple(SPEED_PRESETS), help="speed preset (default: the server's)")
-    stream.add_argument(
-        "--samples-per-decode", type=int, metavar="K", help="samples per decoded clip (default: the preset's)"
-    )
-    stream.add_argument("--recipe", metavar="PRESET", help="recipe preset (default: the server's)")
-    stream.add_argument(
-        "--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help="change a field of the recipe"
-    )
     stream.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the stream (default 0)")
     measuring.add_argument(
         "--timeout-seconds",
@@ -259,7 +251,8 @@ def _parser() -> Parser:
         metavar="S",
         help="silence after which the server counts as lost (default 60)",
     )
-    measuring.add_argument("--json", metavar="FILE", help="write the records to this file")
+    parser.add_output("Measuring", "--json", JSON, "write the records to this file")
+    add_spec(parser)
     return parser
 
 
@@ -270,49 +263,27 @@ def _counts(text: str) -> list[int]:
     return counts
 
 
-def recipe_of(preset: str | None, changes: Sequence[str]) -> str | dict[str, Any] | None:
-    """Return the recipe that ``--recipe`` and ``--set`` describe; None for the server's.
-
-    Raises:
-        UsageError: a change is not KEY=VALUE with a YAML value.
-    """
-    if not changes:
-        return preset
-    recipe: dict[str, Any] = {} if preset is None else {"preset": preset}
-    for change in changes:
-        key, equals, text = change.partition("=")
-        try:
-            value = parse_yaml(text)
-        except YamlError as error:
-            raise UsageError(f"--set {change}: the value is not YAML") from error
-        if not equals or not key or value is None:
-            raise UsageError(f"--set {change}: give KEY=VALUE, for example --set threshold='[0.1, 0.5]'")
-        recipe[key] = value
-    return recipe
-
-
 def _dataset(arguments: argparse.Namespace, address: str) -> V2VStreamDataset:
     return V2VStreamDataset(
         address,
         batch_size=arguments.batch_size,
         arrays=tuple(arguments.arrays.split(",")),
-        preset=arguments.preset,
-        samples_per_decode=arguments.samples_per_decode,
-        recipe=recipe_of(arguments.recipe, arguments.changes),
+        recipe=recipe_changes(arguments.recipe, arguments.set),
         seed=arguments.seed,
         rank=0,
         world_size=1,
         timeout_seconds=arguments.timeout_seconds,
         keys=None if arguments.connect else "",  # a local server needs no key
+        **spec_fields(arguments),
     )
 
 
 def _server_flags(arguments: argparse.Namespace) -> list[str]:
     # The server checks with its own recipe which videos are long enough, so it gets the stream's.
-    scene = StreamSpec.from_dict({"preset": arguments.preset}).scene
+    scene = StreamSpec.from_dict({"preset": arguments.preset, "scene": arguments.scene}).scene
     settings = {"--rows": arguments.rows, "--recipe": arguments.recipe, "--scene": "" if scene == "off" else scene}
     flags = [part for flag, value in settings.items() if value for part in (flag, value)]
-    return [*flags, *(part for change in arguments.changes for part in ("--set", change))]
+    return [*flags, *(part for change in arguments.set for part in ("--set", change))]
 
 
 def run(arguments: argparse.Namespace) -> int:

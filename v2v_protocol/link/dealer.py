@@ -16,8 +16,8 @@ import math
 import os
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from socket import create_connection
+from contextlib import contextmanager, suppress
+from socket import create_connection, gaierror
 from threading import Thread
 from typing import Any
 
@@ -268,13 +268,38 @@ def mechanism_of(address: str, seconds: float = 2.0) -> bytes:
     Returns:
         ``b"CURVE"`` or ``b"NULL"``; empty if no such server answers in time.
     """
-    host, _, port = address.removeprefix("tcp://").rpartition(":")
-    greeting = b""
     try:
-        with create_connection((host.strip("[]"), int(port)), timeout=seconds) as peer:
-            peer.sendall(_OUR_SIGNATURE)  # send no more: the side that has the whole greeting of the other decides
-            while len(greeting) < 64 and (piece := peer.recv(64 - len(greeting))):
-                greeting += piece
+        greeting = _greeting(address, seconds)
     except (OSError, ValueError):
         return b""
     return greeting[12:32].rstrip(b"\0") if greeting[:1] == b"\xff" else b""
+
+
+def diagnose(address: str) -> str:
+    """Return the likely reason why a server does not answer, from one more connection to it."""
+    if not address.startswith("tcp://"):
+        return "no server answers there"
+    try:
+        greeting = _greeting(address, 1.0)
+    except gaierror:
+        return "the host name cannot be resolved: correct it, or give an IP address"
+    except (OSError, ValueError) as error:
+        return f"nothing listens there ({error}): start v2v-serve, or correct host and port"
+    if greeting[:1] == b"\xff":
+        return "a server listens there, and does not answer yet"
+    return "another program listens there, or the server's page: give the address that v2v-serve calls ready"
+
+
+def _greeting(address: str, seconds: float) -> bytes:
+    """Return the greeting of a ZMTP server, or what another program sends in its place.
+
+    Raises:
+        OSError, ValueError: no connection.
+    """
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    greeting = b""
+    with create_connection((host.strip("[]"), int(port)), timeout=seconds) as peer, suppress(TimeoutError):
+        peer.sendall(_OUR_SIGNATURE)  # send no more: the side that has the whole greeting of the other decides
+        while len(greeting) < 64 and (piece := peer.recv(64 - len(greeting))):
+            greeting += piece
+    return greeting

@@ -12,6 +12,7 @@ further ones back, by the counts of :meth:`Router.take_in_flight`.
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import sys
@@ -173,7 +174,9 @@ class Router:
         try:
             self.socket.bind(address)
         except zmq.ZMQError as error:
-            raise UsageError(f"{flag} {address}: {error.strerror or error}") from error
+            is_port = error.errno in (errno.EADDRINUSE, errno.EACCES)
+            remedy = "another port, or tcp://127.0.0.1:* for a free one" if is_port else "an address of this host"
+            raise UsageError(f"{flag} {address}: {os.strerror(error.errno or 0)}; give {remedy}") from error
         return self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
     def receive(self, kind: type[R]) -> R | None:

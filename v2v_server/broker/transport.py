@@ -101,10 +101,12 @@ class Sockets:
         bind: address for consumers.
         worker_bind: address for workers.
         most_connections: largest number of consumer connections at a time, and of worker connections.
-        has_session: returns whether a peer's connection is kept when another needs its place; called by another thread.
         keys: keys of the peers that may connect over ``tcp://``; None admits all peers.
         local_bind: address for workers of this host, which have no key; used if ``worker_bind`` is for other hosts.
         admits: returns whether a connection that was just accepted may stay; None admits all.
+
+    Attributes:
+        has_session: returns whether a peer's connection is kept when another needs its place; called by another thread.
 
     Raises:
         UsageError: an address cannot be bound; the message names the flag.
@@ -117,13 +119,17 @@ class Sockets:
         worker_bind: str,
         *,
         most_connections: int = MOST_CONNECTIONS,
-        has_session: Callable[[bytes], bool] = lambda identity: False,
         keys: KeyStore | None = None,
         local_bind: str = "",
         admits: Callable[[socket.socket], bool] | None = None,
     ) -> None:
         self.waited_seconds = 0.0
+        self.has_session: Callable[[bytes], bool] = lambda identity: False
         self._routers = Routers(keys)
+
+        def has_session(identity: bytes) -> bool:
+            return self.has_session(identity)
+
         try:
             self._consumers = self._routers.open(
                 "consumer", LARGEST_REQUEST_BYTES, most_connections, has_session, admits

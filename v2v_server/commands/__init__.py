@@ -12,5 +12,4 @@ top         the state of a server on a terminal (v2v-top)
 doctor      check this machine and a corpus (v2v-doctor)
 keys        manage the keys of a server (v2v-keys)
 quarantine  v2v-quarantine
-spec_flags  the flags of a stream's spec
 """

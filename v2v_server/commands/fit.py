@@ -12,10 +12,10 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
+from v2v_protocol.spec_flags import read_yaml_mapping, recipe_setting
 from v2v_recordings.forms import FORMS
 from v2v_recordings.items import ConvertOptions, SensorSize
 from v2v_recordings.text_events import NS_PER_UNIT
-from v2v_server.config import read_yaml_mapping, recipe_setting
 from v2v_server.fit.fit import FittedCamera, fit
 from v2v_server.fit.lab import camera_of, measure, table
 from v2v_server.fit.report import draw_fit, report_lines, write_recipe
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         ],
         "Forms of recordings:\n" + "\n".join(f"  {name:14s} {form.title}" for name, form in FORMS.items()),
     )  # fmt: skip
-    recording, out = parser.group("Recording"), parser.group("Output")
+    recording = parser.group("Recording")
     recording.add_argument("recording", nargs="?", metavar="RECORDING", help="file or folder with events; frames help")
     recording.add_argument("--static", action="store_true", help="nothing moved: all events are noise")
     recording.add_argument("--size", metavar="WxH", help="size of the sensor in px, if the recording does not state it")
@@ -45,10 +45,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     recording.add_argument("--camera", choices=("left", "right"), default="left", help="camera of a stereo recording")
     recording.add_argument("--events-topic", metavar="TOPIC", help="topic of events, for a bag with several")
     recording.add_argument("--images-topic", metavar="TOPIC", help="topic of pictures, for a bag with several")
-    out.add_argument("--out", metavar="FILE.yaml", help="recipe to write; --recipe of the other commands reads it")
-    out.add_argument("--picture", metavar="FILE.png", help="also draw measured against simulated statistics")
+    parser.add_output(
+        "Output", "--out", (".yaml", ".yml"), "recipe to write (.yaml); --recipe of the other commands reads it"
+    )
+    parser.add_output("Output", "--picture", (".png",), "also draw measured against simulated statistics")
     check = parser.group("Check")
-    check.add_argument("--check", metavar="RECIPE", help="measure this recipe: a preset's name or a YAML file")
+    check.add_argument("--check", metavar="RECIPE", help="measure this recipe: its name or a YAML file")
+    check.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="with --check: change one recipe field"
+    )
     check.add_argument("--sheet", metavar="FILE.yaml", help="figures to show in the table, by its row names")
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="interrupted; no recipe was written")
 
@@ -58,15 +63,16 @@ def _run(arguments: argparse.Namespace) -> None:
         raise UsageError("nothing to do: give a RECORDING and --out, or --check RECIPE")
     if (arguments.recording is None) != (arguments.out is None):
         raise UsageError("a RECORDING and --out belong together: give both, or neither with --check")
-    if arguments.sheet is not None and arguments.check is None:
-        raise UsageError("--sheet needs --check")
+    for flag, value in (("--sheet", arguments.sheet), ("--set", arguments.set)):
+        if value and arguments.check is None:
+            raise UsageError(f"{flag} needs --check")
     for flag in ("--static", "--size", "--time-unit", "--picture"):
         if arguments.recording is None and getattr(arguments, flag[2:].replace("-", "_")):
             raise UsageError(f"{flag} needs a RECORDING")
     fitted = None if arguments.recording is None else _fit(arguments)
     if arguments.check is None:
         return
-    columns = {"recipe": measure(camera_of(recipe_setting(arguments.check, ())))}
+    columns = {"recipe": measure(camera_of(recipe_setting(arguments.check, arguments.set)))}
     if fitted is not None:
         columns["recording"] = measure({"log_eps": 1e-3, "gamma": 2.2, **_thresholds(fitted)})
     if arguments.sheet is not None:
@@ -82,18 +88,13 @@ def _fit(arguments: argparse.Namespace) -> FittedCamera:
         events_topic=arguments.events_topic,
         images_topic=arguments.images_topic,
     )
-    source, out = Path(arguments.recording), Path(arguments.out)
-    if out.suffix.lower() not in (".yaml", ".yml"):
-        raise UsageError(f"--out {out}: give a name that ends in .yaml, as --recipe expects")
+    source, out = Path(arguments.recording), arguments.out
     with Progress(source.name, "%") as progress:
         fitted = fit(source, static=arguments.static, options=options, progress=progress)
     show("\n".join(report_lines(fitted, source.name)))
-    try:
-        write_recipe(out, fitted, source.name)
-    except OSError as error:
-        raise UsageError(f"--out {out}: {error.strerror or error}") from error
+    write_recipe(out, fitted, source.name)
     if arguments.picture is not None:
-        write_png(Path(arguments.picture), draw_fit(fitted, source.name))
+        write_png(arguments.picture, draw_fit(fitted, source.name))
     return fitted
 
 

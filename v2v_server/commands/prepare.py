@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from v2v_protocol.command import FAILED, Parser, run_command
+from v2v_protocol.command import FAILED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
@@ -94,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="the same for the worst frame of a clip, dB "
         f"(default: {prepare.DEFAULT_FRAME_FLOOR_BELOW_DB:g} below --floor)",
     )  # fmt: skip
-    run.add_argument("--json", metavar="FILE", help="also write a record of each video")
+    parser.add_output("Run", "--json", JSON, "also write a record of each video")
     interrupted = "interrupted; run the same command to continue"
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted=interrupted)
 

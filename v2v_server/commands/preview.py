@@ -9,7 +9,7 @@ from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_server.config import recipe_setting
+from v2v_protocol.spec_flags import add_spec, recipe_setting, spec_fields
 from v2v_server.offline.preview import KINDS, Shot, preview
 
 _MOST_CAMERAS = 32
@@ -18,7 +18,7 @@ _MOST_CAMERAS = 32
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
     parser = Parser(
-        "v2v-preview", "VIDEO|DIR --out FILE [flags]",
+        "v2v-preview", "VIDEO|DIR [VIDEO ...] --out FILE [flags]",
         "Show the effect of a recipe on your videos: frames, events, flow, activity.",
         [
             "v2v-preview clips/ --out sheet.png --recipe davis346",
@@ -26,8 +26,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         ],
     )  # fmt: skip
     cameras = parser.group("Virtual cameras")
-    cameras.add_argument("--recipe", metavar="NAME", help="preset or YAML file of recipe fields (default paper)")
-    cameras.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field")
     cameras.add_argument("--seeds", type=int, metavar="N", help="virtual cameras to draw (default 4)")
     cameras.add_argument(
         "--seed", type=int, metavar="S",
@@ -37,16 +35,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--compare", nargs="+", metavar="NAME", help="show the same clip under these recipes instead, one camera each"
     )
     videos = parser.group("Videos")
-    videos.add_argument("source", metavar="VIDEO|DIR", help="a video, a folder of videos, or a list file")
+    videos.add_argument(
+        "sources", nargs="+", metavar="VIDEO|DIR",
+        help="a video, a folder of videos, or a list file; of several, each gets a FILE with its name",
+    )  # fmt: skip
     videos.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
     videos.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
     videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     out = parser.group("Output")
-    out.add_argument("--out", required=True, metavar="FILE", help=f"picture, film or page: {', '.join(KINDS)}")
+    parser.add_output("Output", "--out", KINDS, f"picture, film or page: {', '.join(KINDS)}", required=True)
     out.add_argument(
         "--moments", type=int, default=1, metavar="N", help="number of voxel grids of each camera (default 1)"
     )
     out.add_argument("--no-flow", action="store_true", help="leave optical flow out")
+    add_spec(parser)
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="interrupted; nothing was written")
 
 
@@ -69,20 +71,25 @@ def _run(arguments: argparse.Namespace) -> None:
         what = f'virtual cameras drawn from the recipe "{Path(arguments.recipe or "paper").stem}"'
     if arguments.seed is None:
         what += ", chosen where something moves"
-    preview(
-        arguments.source,
-        Path(arguments.out),
-        looks,
-        # Recipes are compared on one clip, so the order must not depend on how many sequences each admits.
-        {"shuffle": False} if arguments.compare else {},
-        title=f"{Path(arguments.source).name}: {what}",
-        find_motion=arguments.seed is None,
-        list_file=arguments.list,
-        rows=arguments.rows,
-        with_flow=not arguments.no_flow,
-        moments=arguments.moments,
-        cache_dir=arguments.cache_dir,
-    )
+    stem = arguments.out.stem
+    named = {arguments.out.with_stem(f"{stem}-{Path(source).stem}"): source for source in arguments.sources}
+    if len(named) < len(arguments.sources):
+        raise UsageError("two of the videos have the same name: preview them one at a time")
+    for path, source in named.items():
+        preview(
+            source,
+            path if len(named) > 1 else arguments.out,
+            looks,
+            # Recipes are compared on one clip, so the order must not depend on how many sequences each admits.
+            spec_fields(arguments) | ({"shuffle": False} if arguments.compare else {}),
+            title=f"{Path(source).name}: {what}",
+            find_motion=arguments.seed is None,
+            list_file=arguments.list,
+            rows=arguments.rows,
+            with_flow=not arguments.no_flow,
+            moments=arguments.moments,
+            cache_dir=arguments.cache_dir,
+        )
 
 
 if __name__ == "__main__":

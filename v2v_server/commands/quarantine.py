@@ -13,7 +13,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 
-from v2v_protocol.command import Parser, run_command
+from v2v_protocol.command import JSON, Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.records import write_json
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     what.add_argument("--videos", required=True, metavar="DIR", help="the corpus, as for v2v-serve")
     what.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     what.add_argument("--clear", action="store_true", help="start a new, empty snapshot; old ones stay available")
-    what.add_argument("--json", metavar="FILE", help="also write all entries to a file, and whether each is in force")
+    parser.add_output("Quarantine", "--json", JSON, "also write all entries to a file, and whether each is in force")
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
-from v2v_server.commands.spec_flags import add_spec
-from v2v_server.config import SERVE_KEYS, ServeConfig, recipe_setting
+from v2v_protocol.spec_flags import add_spec, recipe_setting
+from v2v_protocol.write_aside import check_output
+from v2v_server.config import SERVE_KEYS, ServeConfig
 from v2v_server.supervise.standby import start_ahead
 from v2v_server.system.log import report_errors
 from v2v_server.system.start_times import StartTimes
@@ -22,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         [
             "v2v-serve --videos clips/ --workers 8",
             "v2v-serve --videos webvid10k/ --rows top:0.54 --preset fast --scene auto",
-            "v2v-serve --videos clips/ --recipe davis346 --set voxels_per_clip=20 --set threshold=[0.2,0.4]",
+            "v2v-serve --videos clips/ --recipe davis346 --set voxels_per_clip=20 --set 'threshold=[0.2,0.4]'",
             "v2v-serve --config serve.yaml",
         ],
     )  # fmt: skip
@@ -42,6 +44,10 @@ def _run(arguments: argparse.Namespace) -> None:
     with report_errors(lambda: arguments.log_format):
         config = ServeConfig.load(arguments.config, flags, settings)
         arguments.log_format = config.log_format  # the file may ask for JSON
+        if config.port_file:
+            port_file = Path(config.port_file)
+            read = [config.videos, config.list, arguments.config or ""]
+            check_output("--port-file", port_file, (port_file.suffix.lower(),), read)
         with start_ahead(config) as standbys:
             from v2v_server.serve import serve  # takes as long as the imports of a worker, which run meanwhile
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
-from v2v_server.commands.spec_flags import add_spec, spec_fields
-from v2v_server.config import recipe_setting
+from v2v_protocol.spec_flags import add_spec, recipe_setting, spec_fields
 from v2v_server.offline.event_files import FORMS
 from v2v_server.offline.remake import simulate_to_file
 
@@ -42,14 +40,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     which.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
     which.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
     out = parser.group("Output")
-    out.add_argument(
-        "--out", required=True, metavar="FILE.npz", help="output file for the arrays and the provenance (JSON)"
+    parser.add_output(
+        "Output", "--out", (".npz",), "output file for the arrays and the provenance (JSON)", required=True
     )
-    out.add_argument("--picture", metavar="FILE.png", help="also write a picture of frames and voxels")
-    out.add_argument(
-        "--events", metavar="FILE",
-        help=f"also write the events with their times: {', '.join(FORMS)}",
-    )  # fmt: skip
+    parser.add_output("Output", "--picture", (".png",), "also write a picture of frames and voxels")
+    parser.add_output("Output", "--events", tuple(FORMS), f"also write the events with their times: {', '.join(FORMS)}")
     out.add_argument(
         "--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME",
         help=f"of {', '.join(ARRAYS)} (default {','.join(DEFAULT_ARRAYS)})",
@@ -63,9 +58,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: argparse.Namespace) -> None:
     simulate_to_file(
         arguments.video,
-        out=Path(arguments.out),
-        picture=None if arguments.picture is None else Path(arguments.picture),
-        events=None if arguments.events is None else Path(arguments.events),
+        out=arguments.out,
+        picture=arguments.picture,
+        events=arguments.events,
         list_file=arguments.list,
         rows=arguments.rows,
         spec=spec_fields(arguments) | {"recipe": recipe_setting(arguments.recipe, arguments.set)},

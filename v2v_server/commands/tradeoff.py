@@ -14,11 +14,12 @@ from typing import Any
 
 import cv2
 
-from v2v_protocol.command import FAILED, Parser, run_command
+from v2v_protocol.command import FAILED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.records import write_json
 from v2v_protocol.spec import StreamSpec
-from v2v_server.config import recipe_setting
+from v2v_protocol.spec_flags import add_recipe, recipe_setting
+from v2v_protocol.write_aside import write_file
 from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, Prediction
 from v2v_server.simulation.variants import warm_up
 from v2v_server.system.process import keep_freed_memory
@@ -54,8 +55,7 @@ def _parser() -> Parser:
     videos.add_argument("--rows", default="top:0.54", help="rows to use (default top:0.54, as for WebVid)")
     videos.add_argument("--clips", type=int, default=4, metavar="N", help="different clips to take (default 4)")
     videos.add_argument("--places", type=int, default=8, metavar="N", help="sequences to sample (default 8)")
-    videos.add_argument("--recipe", default="paper", metavar="NAME", help="preset or YAML file (default paper)")
-    videos.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one recipe field")
+    add_recipe(parser, "Videos")
     work = parser.group("Work")
     work.add_argument(
         "--vary", action="append", default=[], metavar="KEY=VALUE,VALUE",
@@ -75,10 +75,9 @@ def _parser() -> Parser:
     wish = wishes.add_mutually_exclusive_group()
     wish.add_argument("--target-rate", type=float, metavar="X", help="samples a core second to reach")
     wish.add_argument("--max-error", type=float, metavar="X", help="largest voxel error, for example 0.05")
-    out = parser.group("Output")
-    out.add_argument("--preset-out", type=Path, metavar="FILE.yaml", help="write the best setting for v2v-serve")
-    out.add_argument("--json", type=Path, metavar="FILE", help="write the records")
-    out.add_argument("--plot", type=Path, metavar="FILE.png", help="draw speed against error (needs matplotlib)")
+    parser.add_output("Output", "--preset-out", (".yaml", ".yml"), "write the best setting for v2v-serve (.yaml)")
+    parser.add_output("Output", "--json", JSON, "write the records")
+    parser.add_output("Output", "--plot", (".png", ".pdf", ".svg"), "draw speed against error (needs matplotlib)")
     return parser
 
 
@@ -86,8 +85,6 @@ def _check(asked: argparse.Namespace) -> None:
     wishes = [wish for wish in (asked.target_rate, asked.max_error) if wish is not None]
     if asked.preset_out is not None and not wishes:
         raise UsageError("--preset-out without a wish: give --target-rate or --max-error too")
-    if asked.preset_out is not None and not asked.preset_out.parent.is_dir():
-        raise UsageError(f"--preset-out {asked.preset_out}: there is no folder {asked.preset_out.parent}")
     if not 0 < asked.budget_minutes < math.inf:
         raise UsageError(f"--budget-minutes {asked.budget_minutes:g}: give a finite number above 0")
     for flag, value in (("--places", asked.places), ("--clips", asked.clips)):
@@ -107,7 +104,7 @@ def _run(asked: argparse.Namespace) -> int:
     _check(asked)
     budget = 60.0 * asked.budget_minutes
     rows = Rows.parse(asked.rows)
-    spec = StreamSpec.from_dict({"recipe": recipe_setting(asked.recipe, asked.set)})
+    spec = StreamSpec.from_dict({"recipe": recipe_setting(asked.recipe or "paper", asked.set)})
     compared = settings(asked.forms, spec, axes(asked.vary))
     cv2.setNumThreads(1)
     keep_freed_memory()
@@ -207,7 +204,7 @@ def choose(records: Sequence[Mapping[str, Any]], compared: Sequence[ServeSetting
     print(f"best: {record['name']}: {why}")
     if asked.preset_out is not None:
         (chosen,) = (setting for setting in compared if setting.name == record["name"])
-        asked.preset_out.write_text(chosen.yaml(asked.rows, why), encoding="utf-8")
+        write_file(asked.preset_out, chosen.yaml(asked.rows, why), "--preset-out")
     return 0
 
 

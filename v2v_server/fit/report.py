@@ -12,7 +12,7 @@ from v2v_pictures.comparison import Curves, draw_comparison
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.safe_yaml import format_yaml
 from v2v_protocol.settings import settings_of
-from v2v_protocol.write_aside import write_aside_and_rename
+from v2v_protocol.write_aside import write_file
 from v2v_server.fit.fit import FittedCamera
 from v2v_server.fit.interval import Doubles, Estimate
 from v2v_server.fit.statistics import BRIGHTNESS_EDGES, COUNT_EDGES, INTERVAL_EDGES_US, Panels, per_second
@@ -55,11 +55,10 @@ def write_recipe(path: Path, fitted: FittedCamera, source: str) -> None:
     """Write the recipe file, with the report as comments.
 
     Raises:
-        OSError: the file cannot be written.
+        UsageError: the file cannot be written.
     """
     comments = "".join(f"# {line}\n" for line in report_lines(fitted, source))
-    with write_aside_and_rename(path) as aside:
-        aside.write_text(comments + format_yaml(recipe_fields(fitted)), encoding="utf-8")
+    write_file(path, comments + format_yaml(recipe_fields(fitted)), "--out")
 
 
 def report_lines(fitted: FittedCamera, source: str) -> list[str]:

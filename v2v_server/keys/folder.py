@@ -60,6 +60,8 @@ class KeyFolder:
             KeyRefused: there are no keys, other users can read them, or other users can write to the folder and so add
                 keys.
         """
+        if not self._server.exists():
+            raise KeyRefused(f"no keys in {self.path}: create them with v2v-keys init --dir {self.path}")
         text = read_private(self._server)
         for folder in (self.path, *(self.path / side for side in SIDES)):
             mode = stat.S_IMODE(folder.stat().st_mode) if folder.is_dir() else 0

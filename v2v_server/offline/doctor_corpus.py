@@ -17,7 +17,7 @@ from v2v_protocol.errors import CorpusError, V2VError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
-from v2v_server.config import recipe_setting
+from v2v_protocol.spec_flags import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
 from v2v_server.labels.formats import READERS

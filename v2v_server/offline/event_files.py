@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import io
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import numpy as np
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
+from v2v_protocol.write_aside import write_aside_and_rename
 
 _NOTE = "simulated from video frames: log intensity is linear in time between frames"
 
@@ -27,9 +30,12 @@ def write_events(path: Path, events: EventList) -> None:
     """
     check_event_file(path)
     try:
-        FORMS[path.suffix.lower()](path, events)
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror or error}") from error
+        # The package faery tells the format by the ending.
+        aside = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix.lower()}")
+        with write_aside_and_rename(path, partial=aside) as partial:
+            FORMS[path.suffix.lower()](partial, events)
+    except (OSError, RuntimeError) as error:  # the latter is faery's, for instance for a full disk
+        raise UsageError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
 
 
 def check_event_file(path: Path) -> None:
@@ -56,13 +62,15 @@ def _npz(path: Path, events: EventList) -> None:
 def _hdf5(path: Path, events: EventList) -> None:
     last_ms = int(events.t[-1]) // 1000 if len(events) else 0
     first_of_ms = np.searchsorted(events.t, np.arange(last_ms + 2) * 1000)
-    with _package("h5py", path).File(path, "w") as file:
+    content = io.BytesIO()  # HDF5 crashes the process on a full disk
+    with _package("h5py", path).File(content, "w") as file:
         file.attrs.update(width=events.width_px, height=events.height_px, note=_NOTE)
         columns = {"x": events.x, "y": events.y, "t": events.t, "p": events.p.astype(np.uint8)}
         for name, column in columns.items():
             file.create_dataset(f"events/{name}", data=column, compression="gzip", compression_opts=1)
         file["ms_to_idx"] = first_of_ms.astype(np.uint64)
         file["t_offset"] = np.int64(0)
+    path.write_bytes(content.getbuffer())
 
 
 def _faery(path: Path, events: EventList) -> None:
@@ -71,7 +79,10 @@ def _faery(path: Path, events: EventList) -> None:
     table["t"], table["x"], table["y"], table["on"] = events.t, events.x, events.y, events.p
     stream = faery.events_stream_from_array(table, (events.width_px, events.height_px))
     kind = {".raw": "evt", ".aedat4": "aedat"}.get(path.suffix.lower(), path.suffix.lower().lstrip("."))
-    stream.to_file(path, zero_t0=False, file_type=kind)  # faery does not know endings in capitals
+    try:
+        stream.to_file(path, zero_t0=False, file_type=kind)  # faery does not know endings in capitals
+    finally:
+        path.with_name(f"{path.name}.write").unlink(missing_ok=True)  # faery's own temporary file
 
 
 FORMS: dict[str, Callable[[Path, EventList], None]] = {

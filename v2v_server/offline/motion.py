@@ -101,7 +101,7 @@ def describe_loss(found: Prediction, defects: Sequence[Defect] = ()) -> str:
     off, on = (max(5, 5 * round(20 * found.errors(setting).lost)) for setting in ("linear", "divided"))
     return (
         f"fast motion: {found.px_per_frame:.2g} px a frame at the median of what moves; about {off} % of the events "
-        f"are lost within steps, {on} % with substep_px = {SUBSTEP_PX:g} "
+        f"are lost between frames, {on} % with --substep-px {SUBSTEP_PX:g} "
         "(prediction; motion blur hides further losses)"
     )
 
@@ -185,7 +185,8 @@ class WholePictures:
         seconds = index.seconds(sequence.start_frame, count)[::stride]
         clip = DecodedClip(frames, seconds, codec="", bit_exact=False, signal=signal)
         sample = make_sample(lease, Decoded(plan, clip))
-        return Camera.of(sample.arrays, sample.provenance, f"threshold {THRESHOLD:g}, no noise", recipe)
+        camera = Camera.of(sample.arrays, sample.provenance, f"threshold {THRESHOLD:g}, no noise", recipe)
+        return replace(camera, step_seconds=stride / video.frames_per_second)
 
     def estimate(self, sequence: VideoSequence, seed: int) -> CropEstimate:
         """Estimate what the camera of a seed sees of a sequence.

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_pictures.camera import Camera
-from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write
+from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes
 from v2v_pictures.film import FRAMES_PER_SECOND, draw_film
 from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, UsageError
@@ -25,6 +25,7 @@ from v2v_protocol.progress import Progress
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, sidecar_endings
 from v2v_protocol.spec import StreamSpec
+from v2v_protocol.write_aside import check_output, write_file
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.motion.prediction import Prediction
 from v2v_server.offline.doctor_pictures import defects_of_video
@@ -93,11 +94,9 @@ def preview(
         CorpusError: no video can be used, even with short clips and small crops.
         SampleUnavailable, VideoUnreadable: see :func:`v2v_server.offline.remake.remake`.
     """
-    if out.suffix not in KINDS:
-        raise UsageError(f"--out {out}: unknown ending; give a name that ends in {', '.join(KINDS)}")
-    if not out.parent.is_dir():  # before any work
-        raise UsageError(f"--out {out}: there is no folder {out.parent}; create it first")
-    catalogue = open_shown(source, list_file=list_file, rows=rows, cache_dir=cache_dir)
+    check_output("--out", out, KINDS, [source])  # before any work
+    scene = StreamSpec.from_dict({**spec, "recipe": shots[0].recipe}).scene != "off"
+    catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
     cameras: list[Camera] = []
     loss, notes = Prediction(), dict[str, list[str]]()
     try:
@@ -117,11 +116,11 @@ def preview(
         defects = [each for id in shown for each in defects_of_video(catalogue, id)]
     finally:
         catalogue.close()
-    _check_sizes(cameras, out.suffix)
+    _check_sizes(cameras, out.suffix.lower())
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
     say(describe_loss(loss, defects))
-    write(out, _content(out.suffix, whole, cameras, title, moments))
+    write_file(out, _content(out.suffix.lower(), whole, cameras, title, moments))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
 
 
@@ -207,7 +206,9 @@ def _camera(
     camera = Camera.of(made.sample.arrays, provenance, title, stream.recipe, whole)
     quiet_grids = quiet_voxels(made).reshape(-1, *camera.voxels.shape[1:])
     quiet = dataclasses.replace(camera, voxels=quiet_grids[camera.lead_voxels :])
-    return dataclasses.replace(camera, quiet=quiet.rates), predicted_loss(made)
+    rate = _sequence_of(catalogue, provenance).video.frames_per_second
+    timed = dataclasses.replace(camera, quiet=quiet.rates, step_seconds=stream.recipe.frame_stride / rate)
+    return timed, predicted_loss(made)
 
 
 def _signal_note(catalogue: Catalogue, provenance: Provenance, recipe: Recipe) -> str:

@@ -21,6 +21,7 @@ from v2v_protocol.progress import Progress
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.sample import DEFAULT_ARRAYS, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
+from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.broker.candidates import next_candidate
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
@@ -201,7 +202,7 @@ def simulate_to_file(
 
     Args:
         source, list_file, rows: the corpus, as for a server.
-        out: the .npz file; the ending is added if it is missing.
+        out: the .npz file.
         picture: a .png file for a picture of the sample, or None.
         spec: fields of the StreamSpec; None in any takes the default.
         arrays, seed, epoch, index: see :func:`remake`.
@@ -226,12 +227,11 @@ def simulate_to_file(
         show(f"cannot be used: {refusal}")
     remade = Remaker(catalogue, stream, arrays, quarantine, snapshot).made(seed, epoch, index)
     sample = remade.sample
-    if not out.name.endswith(".npz"):
-        out = Path(f"{out}.npz")  # as numpy would, without saying so
     provenance = sample.provenance.to_dict()
     content: Mapping[str, Any] = {**sample.arrays, "provenance": json.dumps(provenance)}
     try:
-        np.savez_compressed(out, **content)
+        with write_aside_and_rename(out) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **content)
         if picture is not None:
             camera = Camera.of(sample.arrays, sample.provenance, f"index {index}", stream.recipe)
             write_png(picture, draw_sheet([camera], f"seed {seed}, epoch {epoch}", moments=_MOMENTS))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import socket
 import sys
 from collections.abc import Sequence
@@ -19,8 +18,6 @@ from v2v_server.status.client import StatusClient
 from v2v_server.system.log import Log
 from v2v_server.system.process import die_with_parent
 
-_NICE = 10
-"""Niceness of the page's process, so that it takes no time from the server and its workers."""
 _RULE = "the page serves only root and the server's user; give --insecure to let every user of this host watch"
 
 
@@ -49,7 +46,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--insecure", action="store_true", help="serve every user")
     arguments = parser.parse_args(argv)
     die_with_parent(arguments.parent_pid)
-    os.nice(_NICE)
     # No key: this address admits the server's own user, see v2v_server.page.child.
     source = Source(StatusClient(arguments.connect, keys=""))
     is_open = arguments.insecure or sys.platform != "linux"

@@ -85,5 +85,5 @@ def _shorter_clips(table: SequenceTable) -> list[str]:
     if not longest:
         return []
     choices = dict.fromkeys((longest[(len(longest) - 1) // 2], longest[-1]))
-    shown = ", ".join(f"{choice} admits {sum(voxels >= choice for voxels in longest)}" for choice in choices)
-    return [f"  with --set voxels_per_clip=N (now the longest that fits is {longest[0]}): {shown} of them"]
+    each = (f"--set voxels_per_clip={n} admits {sum(voxels >= n for voxels in longest)} of them" for n in choices)
+    return [f"  The longest clip that fits has {longest[0]} voxel grids. Shorter clips: {', '.join(each)}"]

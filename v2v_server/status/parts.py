@@ -101,7 +101,7 @@ class ConsumerPart:
     state: str = states(
         "Consumers.",
         "consumers",
-        "stalled",  # it waits for samples a tenth of its time or more
+        "stalled",  # it waits for samples most of its time
         "taking",
         "idle",  # it has requested nothing
         "gone",  # its connection has ended; it may return for ten seconds

@@ -21,7 +21,7 @@ from v2v_server.broker.worker_registry import Member, clean_name
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.quarantine.snapshots import Quarantine
-from v2v_server.status.bottleneck import NOTICEABLE_SHARE, Bottleneck, Shares, find_bottleneck
+from v2v_server.status.bottleneck import Bottleneck, Shares, find_bottleneck
 from v2v_server.status.history import TimeWindow
 from v2v_server.status.parts import (
     STATUS_VERSION,
@@ -178,7 +178,7 @@ def _consumer(session: Session, window: TimeWindow) -> ConsumerPart:
     share, left = min(1.0, waited), session.schedule.count - session.position
     if session.left_at is not None:
         state = "gone"
-    elif share >= NOTICEABLE_SHARE:
+    elif share > 0.5:
         state = "stalled"
     else:
         state = "taking" if session.unanswered or samples else "idle"

@@ -31,7 +31,7 @@ class StatusView:
         is_terminal = stream.isatty() and os.environ.get("TERM") != "dumb" and not log.is_json
         self._console = Console(file=stream, highlight=False) if is_terminal else None
         self._next = 0.0
-        self._lines = 0
+        self._lines, self._text = 0, ""
 
     def is_due(self, now: float) -> bool:
         """Return whether it is time to show the status again."""
@@ -43,7 +43,9 @@ class StatusView:
         if self._log.is_json:
             self._log.say(status["waiting"]["sentence"], **_for_programs(status))
         elif self._console is None:
-            write(self._stream, figures(status) + "\n")
+            before, self._text = self._text, figures(status)
+            if self._text != before:  # an idle server says so once
+                write(self._stream, self._text + "\n")
         else:
             text = _drawn(self._console, status)
             write(self._stream, self._clearing() + text)

@@ -53,7 +53,7 @@ _EXIT_SECONDS = 5.0
 _LONGEST_WAIT_SECONDS = 10.0
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 _NO_START = (
-    "a process that reads videos ended during its start ({how}); its own message is above. In a script, open "
+    "a process that reads videos ended during its start ({how}). In a script, open "
     'videos below `if __name__ == "__main__":`, because each such process imports the script again'
 )
 
@@ -130,6 +130,8 @@ def run_isolated(
     if processes == 0:
         yield from ((job, function(job)) for job in jobs)
         return
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise SystemExit(1)  # this is such a process, and imports a script without a main guard: its parent says so
     left = iter(jobs)
     lanes: list[_Lane[J, R]] = []
     try:

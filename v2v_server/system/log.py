@@ -48,6 +48,8 @@ class Log:
         """
         if self.is_json:
             text = json.dumps({"time": self._wall_clock(), "level": level, "text": text, **about}, default=str)
+        elif sys.stderr.isatty():
+            text = f"{datetime.now():%H:%M:%S} {text}"
         write(sys.stderr, printable(text) + "\n")
 
 

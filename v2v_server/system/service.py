@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
-from v2v_protocol.errors import UsageError
-from v2v_protocol.write_aside import write_aside_and_rename
+from v2v_protocol.write_aside import write_file
 
 
 @contextlib.contextmanager
@@ -38,11 +37,7 @@ def write_port_file(file: str, address: str) -> None:
     Raises:
         UsageError: the file cannot be written.
     """
-    try:
-        with write_aside_and_rename(Path(file)) as partial:
-            partial.write_text(address + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"--port-file {file}: {error.strerror}; give a file in a folder that you can write") from error
+    write_file(Path(file), address + "\n", "--port-file")
 
 
 def utc_now() -> str:

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.tradeoff.errors import Tally
 from v2v_server.tradeoff.front import dominators
 from v2v_server.tradeoff.settings import SAMPLES_PER_DECODE
@@ -174,7 +175,8 @@ def plot(records: Sequence[Record], file: Path) -> None:
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, title="worth: independent samples", loc="upper left", bbox_to_anchor=(1.0, 1.0))
         figure.tight_layout()
-        figure.savefig(file, dpi=110)
+        with write_aside_and_rename(file) as partial:
+            figure.savefig(partial, dpi=110, format=file.suffix[1:].lower())
     except OSError as error:
         raise UsageError(f"--plot {file}: cannot be written: {error.strerror or error}") from error
     finally:

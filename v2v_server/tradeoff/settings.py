@@ -11,7 +11,7 @@ from typing import Any
 from v2v_protocol.errors import UsageError
 from v2v_protocol.safe_yaml import format_yaml, parse_yaml
 from v2v_protocol.spec import StreamSpec
-from v2v_server.config import recipe_setting
+from v2v_protocol.spec_flags import recipe_setting
 from v2v_server.tradeoff.forms import ENCODINGS, SOURCE
 
 SAMPLES_PER_DECODE = (1, 2, 4)

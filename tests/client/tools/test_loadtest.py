@@ -6,6 +6,7 @@ import pytest
 from tests.client.fake_server import FakeServer
 from v2v_client.tools import loadtest
 from v2v_protocol.errors import UsageError
+from v2v_protocol.spec_flags import recipe_changes
 
 KEYS = {
     "workers", "batches_per_second", "samples_per_second", "p50_ms", "p99_ms", "cpu_seconds_per_batch",
@@ -130,16 +131,16 @@ def test_no_server_is_status_2(capsys):
 
 
 def test_changes_to_the_recipe_are_yaml():
-    assert loadtest.recipe_of(None, []) is None
-    assert loadtest.recipe_of("paper", []) == "paper"
-    assert loadtest.recipe_of("paper", ["threshold=[0.1, 0.5]", "bins=3"]) == {
+    assert recipe_changes(None, []) is None
+    assert recipe_changes("paper", []) == {"preset": "paper"}
+    assert recipe_changes("paper", ["threshold=[0.1, 0.5]", "bins=3"]) == {
         "preset": "paper",
         "threshold": [0.1, 0.5],
         "bins": 3,
     }
     for change in ("bins={", "gamma=2001-99-99"):
-        with pytest.raises(UsageError, match="not YAML"):
-            loadtest.recipe_of(None, [change])
+        with pytest.raises(UsageError, match="not a value"):
+            recipe_changes(None, [change])
 
 
 @pytest.mark.parametrize(("share", "value"), [(0.5, 50), (0.99, 99), (0.0, 1), (1.0, 100), (0.001, 1)])

@@ -39,8 +39,9 @@ PROJECT = Path(__file__).resolve().parents[3]
 def serve() -> Iterator[Callable[..., Sockets]]:
     opened: list[Sockets] = []
 
-    def start(**limits: Any) -> Sockets:
+    def start(has_session: Callable[[bytes], bool] = lambda identity: False, **limits: Any) -> Sockets:
         opened.append(Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*", **limits))
+        opened[-1].has_session = has_session
         return opened[-1]
 
     yield start

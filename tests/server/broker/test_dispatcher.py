@@ -180,7 +180,7 @@ def test_want_without_a_session() -> None:
     ("spec", "arrays", "batch_size", "text"),
     [
         ({"colour": 1}, ("voxels",), 4, "unknown spec key 'colour'"),
-        ({"recipe": "papers"}, ("voxels",), 4, "unknown recipe preset"),
+        ({"recipe": "papers"}, ("voxels",), 4, "unknown recipe"),
         ({"recipe": {"self": 1}}, ("voxels",), 4, "unknown recipe key 'self'"),
         ({"recipe": {"bins": 1.5}}, ("voxels",), 4, "recipe bins = 1.5"),
         ({}, (), 4, "arrays"),

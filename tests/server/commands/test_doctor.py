@@ -234,7 +234,7 @@ def test_the_loss_of_fast_motion_is_predicted(tmp_path: Path, capsys: pytest.Cap
     assert re.search(r"\nok    motion        0 px .*substep_px would change little; .* middle of 1 videos\n", said)
     write_clip(tmp_path / "fast.mp4", panned_luma(21, 140, 160, step=(3, 4)))
     _, said = told(capsys, *flags)
-    assert re.search(r"\nnote  motion        fast motion: 5.* px a frame .* lost within steps, .* of 2 videos\n", said)
+    assert re.search(r"\nnote  motion        fast motion: 5.* px a frame .* lost between frames, .* 2 videos\n", said)
     assert "so does substep_px: 1 in the spec" in said
 
 

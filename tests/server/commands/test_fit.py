@@ -49,7 +49,7 @@ def test_a_recording_of_events_becomes_a_recipe_and_a_picture(
         (["{events}", "--out", "camera.yaml", "--size", "7x8"], "an event lies outside 7x8 px"),
         (["{events}", "--out", "camera.yaml", "--size", "8x7"], "an event lies outside 8x7 px"),
         (["missing.raw", "--out", "camera.yaml"], "no file or folder missing.raw"),
-        (["--check", "no-such-preset"], "unknown recipe preset"),
+        (["--check", "no-such-preset"], "unknown recipe"),
         (["--check", "paper", "--static"], "--static needs a RECORDING"),
         (["{events}", "--out", "camera.yaml", "--sheet", "sheet.yaml"], "--sheet needs --check"),
     ],

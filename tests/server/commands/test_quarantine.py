@@ -146,7 +146,7 @@ def test_failures_end_in_one_line_and_a_status(
     assert captured.err.startswith("v2v-quarantine: ")
     assert text in captured.err
     assert len(captured.err.splitlines()) == 1
-    assert ("snapshot 1 holds 1 entries" in captured.out) == (damage == "json is a folder")
+    assert captured.out == ""
     if damage == "unwritable":
         monkeypatch.undo()
         assert read_quarantine(file).latest == 1

@@ -208,7 +208,7 @@ def test_a_preview_says_what_fast_motion_costs(tmp_path: Path) -> None:
     fast = rendered_scene("coffee", 96, 96, 180.0).frames(30.0, 20)
     line = _said(write_clip(tmp_path / "fast.mp4", fast), tmp_path)
     found = re.match(
-        r"fast motion: ([\d.]+) px a frame .*; about (\d+) % .* lost .*, (\d+) % with substep_px = 1", line
+        r"fast motion: ([\d.]+) px a frame .*; about (\d+) % .* lost .*, (\d+) % with --substep-px 1", line
     )
     assert found is not None, line
     assert 4.0 < float(found[1]) < 8.0

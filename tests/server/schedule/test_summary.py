@@ -59,7 +59,7 @@ def test_refusals_name_reason_and_remedy() -> None:
         "  short.mp4: 4 frames, the recipe needs 5; would admit it: voxels_per_clip at most 1",
         "  small.mp4: picture 16x5 after rows full, the crop is 8x8; "
         "would admit it: resize_scale up to 1.6, or a smaller crop",
-        "  with --set voxels_per_clip=N (now the longest that fits is 1): 1 admits 1 of them",
+        "  The longest clip that fits has 1 voxel grids. Shorter clips: --set voxels_per_clip=1 admits 1 of them",
     ]
 
 
@@ -72,7 +72,10 @@ def test_many_refusals_are_counted_and_a_length_of_clip_named_that_admits_them()
     assert said[-2] == "  ... and 3 more: --list-refused names all"
     assert len(said) == 2 + 5 + 2
     # The middle one of those seven has room for three voxel grids, and all of them for two.
-    assert said[-1] == "  with --set voxels_per_clip=N (now the longest that fits is 7): 3 admits 6, 2 admits 7 of them"
+    assert said[-1] == (
+        "  The longest clip that fits has 7 voxel grids. Shorter clips: --set voxels_per_clip=3 admits 6 of them, "
+        "--set voxels_per_clip=2 admits 7 of them"
+    )
 
 
 def test_files_that_cannot_be_used_are_named() -> None:

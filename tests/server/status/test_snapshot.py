@@ -104,6 +104,19 @@ def test_the_servers_own_workers_have_a_number_of_restarts() -> None:
     assert (state.worker_processes, state.worker_count) == (2, 2)
 
 
+def test_a_consumer_is_stalled_that_waits_most_of_its_time() -> None:
+    at = peers()
+    service = published(at)
+    hello(at)
+    at.consumer_says(b"c", Want(3, (10,), waited_seconds=0.0))
+    service.pass_seconds(10.0)
+    at.consumer_says(b"c", Want(3, (), waited_seconds=8.0))
+    service.pass_seconds(1.0)
+    (consumer,) = service.view().consumers
+    assert consumer.waiting_share > 0.6
+    assert consumer.state == "stalled"
+
+
 def test_a_row_says_where_a_consumer_is_in_its_epoch() -> None:
     at = peers()
     service = published(at)
@@ -121,7 +134,7 @@ def test_a_row_says_where_a_consumer_is_in_its_epoch() -> None:
     assert (consumer.epoch, consumer.position, consumer.sequences) == (3, 21, 50)
     assert (consumer.in_flight, consumer.waiting, consumer.served, consumer.batch_size) == (2, 0, 5, 2)
     assert consumer.waiting_share == pytest.approx(0.2)
-    assert (consumer.state, consumer.waited_seconds, consumer.seed) == ("stalled", 2.0, 7)
+    assert (consumer.state, consumer.waited_seconds, consumer.seed) == ("taking", 2.0, 7)
     assert consumer.eta_seconds == pytest.approx((50 - 21) / 1.1, rel=0.01)  # it began at 10
     assert service.view().specs[consumer.spec] == at.dispatcher.sessions.get(b"c").spec.to_dict()  # type: ignore[union-attr]
 

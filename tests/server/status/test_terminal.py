@@ -59,6 +59,19 @@ def test_a_log_gets_a_line_every_ten_seconds_without_control_sequences() -> None
     assert out.getvalue() == said(status) + "\n"
 
 
+def test_an_idle_server_says_so_once_in_a_log() -> None:
+    at = peers()
+    service = published(at)
+    stream = io.StringIO()
+    view = StatusView(Log(), stream)
+    for now in (0.0, 10.0, 20.0):
+        view.show(now, service.status())
+    assert stream.getvalue().count("\n") == 1
+    at.join()
+    view.show(30.0, service.status())
+    assert stream.getvalue().count("\n") == 2
+
+
 def test_programs_get_the_same_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     status = published(peers()).status()
     StatusView(Log(is_json=True), Terminal()).show(0.0, status)

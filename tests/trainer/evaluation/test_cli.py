@@ -242,7 +242,7 @@ def test_recordings_without_pictures_need_a_rate(tmp_path: Path, weights: Path) 
         (["--data", "{data}", "--device", "gpu"], "--device gpu: PyTorch cannot compute there"),
         (["--data", "{data}", "--device", "cuda:99"], "--device cuda:99: PyTorch cannot compute there"),
         (["--data", "{data}", "--device", "meta"], "--device meta: PyTorch cannot compute there"),
-        (["--data", "{data}/a.h5", "--json", "{data}/none/a.json"], "cannot be written"),
+        (["--data", "{data}/a.h5", "--json", "{data}/none/a.json"], "there is no folder"),
     ],
 )
 def test_mistakes_end_with_status_2(
@@ -257,7 +257,7 @@ def test_mistakes_end_with_status_2(
     ("arguments", "message"),
     [
         ((), "holds only that range, give --cuts none"),
-        (("--cuts", "none", "--json", "{data}/none/a.json"), "none/a.json: cannot be written: no folder"),
+        (("--cuts", "none", "--json", "{data}/none/a.json"), "none/a.json: there is no folder"),
     ],
 )
 def test_bad_recordings_are_refused_before_any_evaluation(

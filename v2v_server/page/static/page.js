@@ -122,6 +122,11 @@ function remember(name, values) {
   });
 }
 
+function lastMinute() {
+  const now = Date.now() / 1000;
+  return [now - 60, now];
+}
+
 function chart(name, lines, isShare) {
   const box = at(name);
   const axis = { stroke: hexOf("--quiet"), grid: { stroke: hexOf("--line"), width: 1 }, ticks: { show: false } };
@@ -132,7 +137,8 @@ function chart(name, lines, isShare) {
       height: 190,
       legend: { show: false },
       cursor: { show: false },
-      scales: { y: { range: isShare ? [0, 1] : (_, __, most) => [0, Math.max(most * 1.1, 0.1)] } },
+      // Without data the axis of time would be an arbitrary one: show the last minute at least.
+      scales: { x: { range: (_, from, to) => (from === null ? lastMinute() : [Math.min(from, to - 60), to]) }, y: { range: isShare ? [0, 1] : (_, __, most) => [0, Math.max(most * 1.1, 0.1)] } },
       axes: [axis, { ...axis, values, size: 55 }],
       series: [{}, ...lines.map(([colour, dash]) => ({ stroke: hexOf(colour), width: 2, dash, points: { show: false } }))],
     },
@@ -201,8 +207,8 @@ function tiles(state) {
     ["samples a second", number(state.samples_per_second), `${totals.samples.toLocaleString("en")} in total`],
     ["bytes a second", bytes(state.bytes_per_second), `${bytes(totals.bytes)} in total`],
     ["decodes a second", number(state.decodes_per_second), `${totals.decodes.toLocaleString("en")} in total`],
-    ["queued", String(state.queue), "samples without a worker"],
-    ["faults", String(totals.faults), "handled"],
+    ["queued", String(state.queue), "samples requested that no worker has begun"],
+    ["faults", String(totals.faults), "handled: workers or videos that failed"],
     ["videos", state.video_count.toLocaleString("en"), `${state.unusable_count} cannot be used`],
   ];
   if (state.cache) {
@@ -217,7 +223,7 @@ function tiles(state) {
 function consumer(each) {
   return [
     each.host ? `${each.name || each.id.slice(0, 8)} on ${each.host}` : each.name || each.id.slice(0, 8),
-    { text: each.state, kind: `state ${each.state}` },
+    { text: each.state === "stalled" ? `waits ${share(each.waiting_share)}` : each.state, kind: `state ${each.state}` },
     each.epoch,
     { part: each.epoch_share, text: `${each.position} of ${each.sequences}` },
     seconds(each.eta_seconds),

@@ -1,0 +1,341 @@
+"""Mistakes that people make with the commands, and the words that each answer must contain. No mistake costs a file,
+and none is answered with a traceback."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import os
+import pickle
+import resource
+import shlex
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import nullcontext
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.clips import panned_luma, write_clip
+from tests.test_commands import MODULES, ROOT, flags_of
+from trainer.config import StreamConfig
+from v2v_client import Batch, V2VStreamDataset
+from v2v_client.options import Options
+from v2v_pictures.files import write_png
+from v2v_protocol.errors import ServerLost, UsageError
+from v2v_protocol.events import EventList
+from v2v_protocol.recipe import PRESETS
+from v2v_protocol.records import write_json
+from v2v_protocol.settings import settings_of
+from v2v_protocol.spec import StreamSpec
+from v2v_protocol.spec_flags import recipe_setting
+from v2v_server.config import ServeConfig
+from v2v_server.offline.event_files import FORMS, write_events
+
+OUTPUTS = [
+    ("v2v-preview a.mp4 --out a.mp4", ["--out a.mp4", "also reads"]),
+    ("v2v-preview a.mp4 --out ./a.mp4", ["also reads"]),
+    ("v2v-preview a.mp4 --out link.mp4", ["link.mp4", "it is a.mp4"]),
+    ("v2v-preview link.mp4 --out a.mp4", ["it is link.mp4"]),
+    ("v2v-preview hard.mp4 --out a.mp4", ["it is hard.mp4"]),
+    ("v2v-preview clips --out clips/b.mp4", ["beside other .mp4 files"]),
+    ("v2v-preview clips --out linked/b.mp4", ["beside other .mp4 files"]),
+    ("v2v-preview clips/list.txt --out clips/b.mp4", ["beside other .mp4 files"]),
+    ("v2v-preview clips --out clips", ["it is a folder"]),
+    ("v2v-preview a.mp4 --out sheet.bmp", ["unknown ending", ".png"]),
+    ("v2v-preview a.mp4 --out nowhere/sheet.png", ["there is no folder nowhere"]),
+    ("v2v-preview a.mp4 --out locked.png", ["locked.png is write-protected"]),
+    ("v2v-simulate a.mp4 --out s.npz --picture a.mp4", ["--picture a.mp4", ".png"]),
+    ("v2v-simulate a.mp4 --out a.boxes.json", ["--out a.boxes.json", ".npz"]),
+    ("v2v-simulate a.mp4 --out s.npz --events s.npz", ["--events s.npz", "it is s.npz"]),
+    ("v2v-simulate a.mp4 --out s.npz --picture b.masks/0.png", ["name of a video's labels"]),
+    ("v2v-fit e.dat --out c.yaml --picture e.dat", ["--picture e.dat", ".png"]),
+    ("v2v-fit e.yaml --out e.yaml", ["it is e.yaml"]),
+    ("v2v-fit e.dat --out c.txt", [".yaml"]),
+    ("v2v-fit e.dat --out c.yaml --check c.yaml", ["it is c.yaml"]),
+    ("v2v-tradeoff --videos clips --plot a.mp4", ["--plot a.mp4", ".png"]),
+    ("v2v-tradeoff --videos clips --recipe c.yaml --target-rate 1 --preset-out c.yaml", ["it is c.yaml"]),
+    ("v2v-tradeoff --videos clips --json clips/b.boxes.json", ["name of a video's labels"]),
+    ("v2v-prepare clips store --json clips/b.boxes.json", ["name of a video's labels"]),
+    ("v2v-prepare clips store --json a.mp4", ["--json a.mp4", ".json"]),
+    ("v2v-quarantine --videos a.mp4 --json a.mp4", [".json"]),
+    ("v2v-loadtest --videos a.mp4 --json a.mp4", [".json"]),
+    ("v2v-loadtest --connect tcp://127.0.0.1:9 --json nowhere/x.json", ["there is no folder nowhere"]),
+    ("v2v-convert e.dat --out h5 --json e.dat", [".json"]),
+    ("v2v-convert e.dat --out e.dat", ["e.dat"]),
+    ("v2v-eval --data e.h5 --per-frame e.h5", ["--per-frame e.h5", ".csv"]),
+    ("v2v-eval --data e.h5 --json nowhere/x.json", ["there is no folder nowhere"]),
+    ("v2v-serve --videos a.mp4 --port-file a.mp4", ["--port-file a.mp4", "it is a.mp4"]),
+    ("v2v-serve --videos clips --port-file clips/b.mp4", ["--port-file", "beside other .mp4 files"]),
+    ("v2v-train run/config.yaml --videos clips --out run", ["--out run", "would replace run/config.yaml"]),
+]  # fmt: skip
+"""Outputs that would destroy an input, or cannot be written: refused before the work."""
+
+
+@pytest.fixture
+def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a clip under several names, a corpus, labels, and files of other kinds."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path / "cache"))
+    write_clip(tmp_path / "a.mp4", panned_luma(30, 64, 64))
+    (tmp_path / "link.mp4").symlink_to("a.mp4")
+    (tmp_path / "hard.mp4").hardlink_to("a.mp4")
+    for folder in ("clips", "b.masks", "run"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "linked").symlink_to("clips")
+    for name in ("b", "c"):
+        (tmp_path / "clips" / f"{name}.mp4").write_bytes((tmp_path / "a.mp4").read_bytes())
+    (tmp_path / "clips" / "b.boxes.json").write_text("{}")
+    (tmp_path / "clips" / "list.txt").write_text("b.mp4 0.2 0.2\n")
+    for name in ("e.dat", "e.h5", "e.yaml", "c.yaml", "locked.png", "b.masks/0.png"):
+        (tmp_path / name).write_text("precious: 1\n")
+    (tmp_path / "run" / "config.yaml").write_text("network: {name: firenet}  # a comment\n")
+    (tmp_path / "locked.png").chmod(0o444)
+    return tmp_path
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Digests of all files below a folder, without the cache."""
+    files = (path for path in folder.rglob("*") if path.is_file() and "cache" not in path.parts)
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def answer(line: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """Run a command line in this process; return its error, after checking that it is one line with status 2."""
+    program, *given = shlex.split(line)
+    status = import_module(MODULES[program]).main(given)
+    said = capsys.readouterr().err
+    assert status == 2, said
+    assert "Traceback" not in said
+    assert len(said.strip().splitlines()) == 1, said
+    return said
+
+
+@pytest.mark.parametrize(("line", "words"), OUTPUTS, ids=[line for line, _ in OUTPUTS])
+def test_an_output_never_destroys_an_input(
+    line: str, words: list[str], desk: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Root may write anywhere, so the check itself is asked.
+    access = import_module("os").access
+    monkeypatch.setattr("os.access", lambda path, how: Path(path).name != "locked.png" and access(path, how))
+    before = contents(desk)
+    said = answer(line, capsys)
+    assert [word for word in words if word not in said] == [], said
+    assert contents(desk) == before
+
+
+def _events(path: Path) -> None:
+    rng, count = np.random.default_rng(1), 20_000
+    x, y = rng.integers(0, 64, (2, count)).astype(np.uint16)
+    write_events(path, EventList(x, y, np.sort(rng.integers(0, 10**6, count)), rng.random(count) < 0.5, 64, 64))
+
+
+def _noise(path: Path) -> None:
+    write_png(path, np.random.default_rng(1).integers(0, 255, (99, 99, 3), np.uint8))
+
+
+WRITERS: dict[str, Callable[[Path], None]] = {
+    ".png": _noise,
+    ".json": lambda path: write_json(path, [{"key": "x" * 5000}]),
+    **dict.fromkeys(FORMS, _events),
+}
+
+
+@pytest.mark.parametrize("ending", WRITERS)
+def test_a_full_disk_leaves_the_older_file(ending: str, tmp_path: Path) -> None:
+    path, limits = tmp_path / f"old{ending}", resource.getrlimit(resource.RLIMIT_FSIZE)
+    path.write_bytes(b"the older file")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        with pytest.raises(UsageError, match=path.name):
+            WRITERS[ending](path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == b"the older file"
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+
+
+def test_outputs_replace_older_ones_and_follow_links(tmp_path: Path) -> None:
+    (tmp_path / "named.json").symlink_to("target.json")
+    for text in ("a", "b"):
+        write_json(tmp_path / "named.json", [{"key": text}])
+    assert (tmp_path / "named.json").is_symlink()
+    assert '"b"' in (tmp_path / "target.json").read_text()
+
+
+WRONG = [
+    # what a command does not take, and the flag that it means
+    ("v2v-serve clips", "--videos clips"),
+    ("v2v-loadtest clips", "--videos clips"),
+    ("v2v-doctor clips", "--videos clips"),
+    ("v2v-tradeoff clips --plot x.png", "--videos clips"),
+    ("v2v-train clips", "v2v-train NAME --videos clips"),
+    ("v2v-train finetune --videos clips", "did you mean 'finetune-cpu'"),
+    ("v2v-train e2vd --videos clips", "did you mean 'e2vid'"),
+    ("v2v-preview a.mp4 --output x.png", "did you mean '--out'"),
+    ("v2v-preview --videos clips --out x.png", "without a flag"),
+    ("v2v-simulate --video a.mp4 --out x.npz", "without a flag"),
+    # recipes, presets and stream settings in each other's place
+    ("v2v-preview a.mp4 --out x.png --set crop=64", "'crop_height_px' or 'crop_width_px'"),
+    ("v2v-preview a.mp4 --out x.png --set substep_px=1", "--substep-px 1 instead of --set"),
+    ("v2v-simulate a.mp4 --out x.npz --set scene=auto", "--scene auto instead of --set"),
+    ("v2v-serve --videos clips --set tolerance=0.1", "--tolerance 0.1 instead of --set"),
+    ("v2v-loadtest --connect tcp://127.0.0.1:9 --set tolerance=0.1", "--tolerance 0.1 instead of --set"),
+    ("v2v-fit --check paper --set substep_px=1", "--substep-px 1 instead of --set"),
+    ("v2v-tradeoff --videos clips --set shuffle=false", "a setting of the stream"),
+    ("v2v-serve --videos clips --preset davis346", "--recipe davis346"),
+    ("v2v-preview a.mp4 --out x.png --preset c.yaml", "--recipe c.yaml"),
+    ("v2v-serve --videos clips --preset natual", "did you mean 'natural'"),
+    ("v2v-serve --videos clips --recipe natural", "--preset natural"),
+    ("v2v-preview a.mp4 --out x.png --recipe dvs346", "did you mean 'davis346'"),
+    ("v2v-preview a.mp4 --out x.png --recipe none.yaml", "none.yaml: No such file"),
+    ("v2v-serve --videos clips --set bins", "write KEY=VALUE"),
+    ("v2v-serve --videos clips --set bins=0", "from 1 to 1024"),
+    ("v2v-preview a.mp4 --out x.png --scene on", "choose one of off, auto"),
+    # videos
+    ("v2v-preview nowhere.mp4 --out x.png", "nowhere.mp4"),
+    ("v2v-preview e.dat --out x.png", "e.dat"),
+    ("v2v-serve --videos run", "run"),
+    ("v2v-preview a.mp4 --out x.png --rows top:2", "0 <= top < bottom <= 1"),
+    ("v2v-simulate a.mp4 --out x.npz --arrays voxel", "voxels"),
+    ("v2v-simulate a.mp4 --out x.npz", "voxels_per_clip at most 5"),
+    # numbers and addresses
+    ("v2v-serve --videos clips --workers many", "give a whole number"),
+    ("v2v-serve --videos clips --bind 127.0.0.1:5555", "tcp://HOST:PORT"),
+    ("v2v-serve --videos clips --bind tcp://0.0.0.0:5555", "--insecure"),
+    ("v2v-loadtest --connect 127.0.0.1:5555", "tcp://"),
+    ("v2v-fit", "RECORDING"),
+    ("v2v-fit e.dat --out c.yaml --set bins=3", "--set needs --check"),
+    ("v2v-eval --data nowhere", "no such folder"),
+    ("v2v-convert nowhere --out h5", "nowhere"),
+]  # fmt: skip
+"""Words that a command does not know, each with what the answer must name."""
+
+
+@pytest.mark.parametrize(("line", "word"), WRONG, ids=[line for line, _ in WRONG])
+def test_an_answer_names_what_to_type(line: str, word: str, desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents(desk)
+    said = answer(line, capsys)
+    assert word in said
+    assert contents(desk) == before
+
+
+IN_PYTHON: list[tuple[Callable[[], object], str]] = [
+    (lambda: dataset()[0], r"dataset\[0\]: a stream has no index; .* V2VDataset makes samples by index"),
+    (lambda: dataset().load_state_dict("last.pt"), r"'last.pt', .* Batch.resume_state itself"),  # type: ignore[arg-type]
+    (lambda: dataset().load_state_dict({"network": {}}), r"version None, expected version \d+. Give the saved"),
+    (lambda: dataset(bins=3), r"no argument 'bins': it belongs to the recipe, recipe={'bins': ...}"),
+    (lambda: dataset(substep=1), r"did you mean 'substep_px'"),
+    (lambda: dataset(recipe={"substep_px": 1}), r"give substep_px=1 beside the recipe"),
+    (lambda: dataset(recipe={"crop": 64}), r"did you mean 'crop_height_px' or 'crop_width_px'"),
+    (lambda: dataset(recipe="none.yaml"), r"none.yaml: No such file"),
+    (lambda: dataset(recipe="natural"), r"--preset natural"),
+    (lambda: dataset(preset="paper"), r"unknown preset 'paper'"),
+    (lambda: dataset(arrays="voxel"), r"voxels"),
+    (lambda: batch().voxel, r"a Batch has no 'voxel' \(did you mean 'voxels'\?\)"),
+    (lambda: batch()["frame"], r"this batch has voxels"),
+    (lambda: batch().flow, r"create the dataset with arrays=\('voxels', 'flow'\)"),
+]
+
+
+def dataset(**options: Any) -> V2VStreamDataset:
+    return V2VStreamDataset("tcp://127.0.0.1:9", **options)
+
+
+def batch() -> Batch:
+    return Batch({"voxels": torch.zeros(1, 1, 1, 2, 2)}, (0,), 0, (), {}, 0.0, 0.0, 1)
+
+
+@pytest.mark.parametrize("number", range(len(IN_PYTHON)))
+def test_mistakes_in_python_are_named(number: int) -> None:
+    mistake, words = IN_PYTHON[number]
+    with pytest.raises((UsageError, AttributeError, KeyError), match=words):
+        mistake()
+
+
+def test_a_batch_is_copied_and_pickled_although_it_names_unknown_attributes() -> None:
+    for made in (copy.copy(batch()), pickle.loads(pickle.dumps(batch()))):
+        assert made.voxels.shape == (1, 1, 1, 2, 2)
+
+
+def test_a_recipe_file_is_a_recipe_by_name_everywhere(tmp_path: Path) -> None:
+    file = tmp_path / "my.yaml"
+    file.write_text("preset: davis346\nbins: 3\n")
+    expected = PRESETS["davis346"].replace(bins=3)
+    asked = Options(("voxels",), recipe=str(file)).spec(None, "")["recipe"]
+    assert StreamSpec.from_dict({"recipe": asked}).recipe == expected
+    assert recipe_setting(str(file), []) == StreamConfig(recipe=str(file)).resolved_recipe == expected
+    assert ServeConfig.load(None, {"videos": "x", "recipe": str(file)}).spec.recipe == expected
+
+
+COMMANDS_OF_SAMPLES = ("v2v-serve", "v2v-preview", "v2v-simulate", "v2v-loadtest")
+
+
+@pytest.mark.parametrize("program", COMMANDS_OF_SAMPLES)
+def test_all_commands_that_make_samples_take_the_flags_of_the_stream(program: str) -> None:
+    flags = {"--preset", "--recipe", "--set", *(f"--{name.replace('_', '-')}" for name in settings_of(StreamSpec))}
+    assert flags <= flags_of(program)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "words"),
+    [
+        ("tcp://127.0.0.1:{free}", "nothing listens there"),
+        ("tcp://no-such-host.invalid:5555", "host name cannot be resolved"),
+        ("tcp://127.0.0.1:{page}", "another program listens there, or the server's page"),
+    ],
+)
+def test_an_address_without_a_server_is_explained_in_the_log_and_in_the_error(
+    scheme: str, words: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("v2v_client.session.connection._REPORT_SECONDS", 0.2)
+    with HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as page, socket.create_server(("127.0.0.1", 0)) as unused:
+        threading.Thread(target=page.serve_forever, args=(0.01,), daemon=True).start()
+        free = unused.getsockname()[1]
+        unused.close()
+        address = scheme.format(free=free, page=page.server_port)
+        with pytest.raises(ServerLost, match=words):
+            next(iter(V2VStreamDataset(address, timeout_seconds=0.6)))
+        page.shutdown()
+    (reported,) = caplog.messages
+    assert words in reported
+
+
+@pytest.mark.slow
+def test_a_script_without_a_main_guard_gets_one_short_message_the_first_time_too(desk: Path) -> None:
+    (desk / "script.py").write_text("from v2v_client import V2VDataset\nV2VDataset('clips')\n")
+    done = subprocess.run(
+        [sys.executable, "script.py"], env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    assert done.returncode == 1
+    assert done.stderr.count("Traceback") == 1
+    assert 'below `if __name__ == "__main__":`' in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        ("--bind tcp://127.0.0.1:{taken}", "--bind tcp://127.0.0.1:{taken}: Address already in use; give another port"),
+        ("--bind tcp://127.0.0.1:* --page {taken}", "--page {taken} at 127.0.0.1: Address already in use"),
+        ("--bind tcp://127.0.0.1:* --keys nowhere", "v2v-keys init"),
+        ("--bind tcp://127.0.0.1:* --cache a.mp4", "--cache"),
+        ("--bind tcp://192.0.2.1:5555 --insecure", "give an address of this host"),
+    ],
+)
+def test_a_server_checks_its_addresses_and_folders_before_the_videos(
+    flags: str, words: str, desk: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("v2v_server.serve.load_catalogue", lambda _: pytest.fail("the videos were catalogued"))
+    monkeypatch.setattr("v2v_server.commands.serve.start_ahead", lambda _: nullcontext([]))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        said = answer(f"v2v-serve --videos clips {flags.format(taken=port)}", capsys)
+    assert words.format(taken=port) in said
