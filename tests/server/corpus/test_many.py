@@ -43,8 +43,8 @@ def corpus(tmp_path: Path) -> Path:
                 29.97,
                 "h264",
                 False,
-                "",
                 None,
+                "",
                 b"index",
             )
         )

@@ -25,7 +25,7 @@ CHUNK = 4096
 _LARGEST_RATE = 1e9
 _NUMBER_TYPES = "qqqqiidb"
 """Types of size, mtime, ctime, frames, width, height, rate and interlaced, in the letters of :mod:`array` and NumPy."""
-_UNREADABLE = (-1, 0, 0, "", 0, 0, 0, None, "", 0, "", "the index lost its record; start again to probe it", None)
+_UNREADABLE = (-1, 0, 0, "", 0, 0, 0, None, "", 0, "the index lost its record; start again to probe it", "", None)
 """The columns after the id where the index has no sound row. No file has a size of -1, so it is probed."""
 
 
@@ -192,7 +192,7 @@ def _columns(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
     """
     columns = tuple(zip(*rows, strict=True))
     ids, sizes, mtimes, ctimes, fingerprints, frames, widths, heights, rates = columns[:9]
-    codecs, interlaced, remarks, problems, summaries = columns[9:]
+    codecs, interlaced, problems, remarks, summaries = columns[9:]
     if None in rates:
         rates = tuple(math.nan if rate is None else rate for rate in rates)
     values = sizes, mtimes, ctimes, frames, widths, heights, rates, interlaced

@@ -112,8 +112,8 @@ class IndexRow:
     frames_per_second: float | None = None
     codec: str = ""
     interlaced: bool = False
-    remark: str = ""
     problem: str | None = None
+    remark: str = ""
     frame_index: bytes | None = None
 
     @property
