@@ -38,7 +38,6 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.refresh import index_path
 from v2v_server.prepare.prepare import prepare
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.encoding import Encoding
 from v2v_server.video.rows import Rows
 
 FOLDER = Path(__file__).parent / f"numerics-{NUMERICS_VERSION}"
@@ -174,7 +173,7 @@ def _make_planes(scratch: Path) -> Path:
         cache = Cache(fixture / "cache", 1 << 30, least_free_bytes=0)
         streams = plane_digests(catalogue, cache)
         planes = ("motion", "chroma")
-        prepare(catalogue, fixture / "store", Encoding.of("lossless"), processes=0, scene=True, planes=planes)
+        prepare(catalogue, fixture / "store", processes=0, scene=True, planes=planes)
         shutil.copy(index_path(catalogue.folder, None), fixture / "index.sqlite3")
         expected = {
             "release": __version__,

@@ -28,7 +28,6 @@ from v2v_server.prepare.prepare import prepare
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.encoding import Encoding
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import decode_for, make_sample
 from v2v_server.worker.sidecars import open_sidecars
@@ -190,7 +189,7 @@ class Ways:
     def _prepare(self, size: str) -> None:
         planes = ("chroma",) if size == "fast" else ("motion", "chroma")
         store = self.folder / size
-        prepare(self.catalogue("videos"), store, Encoding.of("lossless", size), processes=0, scene=True, planes=planes)
+        prepare(self.catalogue("videos"), store, size, processes=0, scene=True, planes=planes)
         for sidecar in self.videos.glob("*.boxes.json"):
             shutil.copy(sidecar, store)
         shutil.copytree(self.videos / "a.masks", store / "a.masks", dirs_exist_ok=True)

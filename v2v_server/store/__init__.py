@@ -9,7 +9,6 @@ depth     levels of more than 8 bits
 motion    the plane of motion: made, read, or computed from the pixels
 writer    write a file, frame by frame
 reader    read a crop of some frames
-encoding  how a prepared corpus stores its pictures
 quota     a folder that many processes fill up to a limit: the cache, and copies of videos in object storage
 cache     a folder of pieces that are stored when they are first decoded
 clips     the pixels of a video, decoded or read from the store

@@ -54,19 +54,13 @@ class SceneCollection:
     @property
     def kind(self) -> FigureKind:
         """Distinguish analyses of one file."""
-        made = ""
-        if self.manifest is not None and not self.manifest.lossless:
-            made = f"prepared {self.manifest.header.rows}, "
-        elif self.manifest is not None and not self._is_stated:
-            made = "part of prepared, "
+        made = "part of prepared, " if self.manifest is not None and not self._is_stated else ""
         return FigureKind("scene", f"{made}{self.rows}{_ENDING}")
 
     @property
     def _is_stated(self) -> bool:
         """Whether the manifest's scenes are of the rows of the corpus."""
-        return self.manifest is not None and (
-            not self.manifest.lossless or Rows.parse(self.manifest.header.rows) == self.rows
-        )
+        return self.manifest is not None and Rows.parse(self.manifest.header.rows) == self.rows
 
     def collect(
         self,
