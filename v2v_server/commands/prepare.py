@@ -24,9 +24,9 @@ from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
 from v2v_server.prepare.report import Report
-from v2v_server.store.chroma import CHROMA
-from v2v_server.store.motion import MADE_PLANES
 from v2v_server.store.packing import DEFAULT_SIZE, SIZES
+from v2v_server.store.planes.chroma import CHROMA
+from v2v_server.store.planes.motion import MADE_PLANES
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 

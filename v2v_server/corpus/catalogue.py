@@ -31,8 +31,8 @@ from v2v_server.corpus.sources.listfile import ListEntry
 from v2v_server.corpus.sources.sidecar import sidecar_id
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, State, VideoSource, open_source
 from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos, has_chroma
-from v2v_server.store.clips import STORE_FORMAT
 from v2v_server.store.format import PIECE_FRAMES
+from v2v_server.store.video_file import STORE_FORMAT
 from v2v_server.system.process import without_collections
 from v2v_server.system.status_fields import gauge, text
 from v2v_server.video.frame_index import FrameIndex, unseekable

@@ -12,7 +12,7 @@ from typing import TypeVar
 from v2v_protocol.errors import VideoError, VideoUnreadable
 from v2v_server.corpus.index.file import IndexRow
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.clips import facts_of
+from v2v_server.store.video_file import facts_of
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.probe import VideoFacts

@@ -15,8 +15,8 @@ from v2v_server.corpus.index.columns import CHUNK, NO_STRINGS, VideoTable
 from v2v_server.corpus.scenes.pieces import SplitVideos
 from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.chroma import CHROMA
 from v2v_server.store.format import is_store_file
+from v2v_server.store.planes.chroma import CHROMA
 from v2v_server.store.reader import has_planes
 from v2v_server.video.rows import Rows
 

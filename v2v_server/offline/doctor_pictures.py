@@ -30,8 +30,8 @@ from v2v_server.corpus.scenes.findings import (
 )  # fmt: skip
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.corpus.videos import VideoEntry
-from v2v_server.store.clips import pictures_of, signal_of
 from v2v_server.store.format import is_store_file
+from v2v_server.store.video_file import pictures_of, signal_of
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.system.process import usable_cores

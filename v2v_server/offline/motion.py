@@ -24,9 +24,9 @@ from v2v_server.offline.remake import RemadeSample, Remaker
 from v2v_server.schedule.sequences import VideoSequence
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.view import apply_view, without_margin
-from v2v_server.store.clips import signal_of
 from v2v_server.store.format import is_store_file
 from v2v_server.store.reader import StoreFile
+from v2v_server.store.video_file import signal_of
 from v2v_server.system.opencv import cv2
 from v2v_server.video.decode import DecodedClip, stream_luma
 from v2v_server.video.frame_index import FrameIndex

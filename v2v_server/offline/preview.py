@@ -31,7 +31,7 @@ from v2v_server.offline.motion import WholePictures, describe_loss, moving_seeds
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.simulation.intensity import tone_table
-from v2v_server.store.clips import clips_of, signal_of
+from v2v_server.store.video_file import clips_of, signal_of
 from v2v_server.video.collect import Cut
 from v2v_server.video.luma import SDR
 

@@ -32,9 +32,9 @@ from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.report import Report
 from v2v_server.prepare.resume import has_failed, known_records, locked, refuse_overlap, standing_files
 from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode
-from v2v_server.store.chroma import CHROMA
-from v2v_server.store.motion import MADE_PLANES
 from v2v_server.store.packing import DEFAULT_SIZE, SIZES
+from v2v_server.store.planes.chroma import CHROMA
+from v2v_server.store.planes.motion import MADE_PLANES
 from v2v_server.store.reader import has_planes
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
@@ -73,7 +73,7 @@ def prepare(
         processes: number of parallel transcoding processes, spawned; 0 transcodes in this process.
         scene: also compute the scene statistics; for a video prepared without them they are computed from its source,
             and its file stays.
-        planes: names of the planes to store (:data:`v2v_server.store.motion.MADE_PLANES`); a video prepared without one
+        planes: names of the planes to store (:data:`v2v_server.store.planes.motion.MADE_PLANES`); a video prepared without one
             of them is prepared again, and keeps its others.
         single: the source is one video, so the destination may lie in its folder.
         progress: called at the start, after each video whose file was checked, and after each that was done.

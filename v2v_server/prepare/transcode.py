@@ -22,13 +22,13 @@ from v2v_protocol.errors import VideoError
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.scenes.analysis import SceneAnalysis
 from v2v_server.corpus.scenes.scene import MOST_FRAMES, Scene
-from v2v_server.store.chroma import matrix_of, whole_chroma
-from v2v_server.store.clips import stored_arrays, stored_pictures
-from v2v_server.store.depth import detail_planes, grey_of, same_transfer
 from v2v_server.store.format import Head, group_frames_for
-from v2v_server.store.motion import with_planes
 from v2v_server.store.packing import SIZES
+from v2v_server.store.planes.chroma import matrix_of, whole_chroma
+from v2v_server.store.planes.detail import detail_planes, grey_of, same_transfer
+from v2v_server.store.planes.motion import with_planes
 from v2v_server.store.reader import StoreFile
+from v2v_server.store.video_file import stored_arrays, stored_pictures
 from v2v_server.store.writer import StoreWriter
 from v2v_server.video.collect import LastFrame
 from v2v_server.video.decode import BIT_EXACT_CODECS, stream_decoded, stream_luma
@@ -58,7 +58,7 @@ class Transcoding:
         root: the folder that the target must not leave, resolved.
         target: the file to write; its folder is created if missing.
         scene: whether to compute the scene statistics.
-        planes: names of the planes to store beside the luma, of :data:`v2v_server.store.motion.MADE_PLANES`.
+        planes: names of the planes to store beside the luma, of :data:`v2v_server.store.planes.motion.MADE_PLANES`.
     """
 
     video: str

@@ -28,11 +28,11 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnreadable
-from v2v_server.store.chroma import CHROMA, chroma_planes, matrix_of, whole_chroma, with_chroma
-from v2v_server.store.depth import detail_planes, read_levels, same_transfer
 from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
-from v2v_server.store.motion import MOTION, read_motion, wants_motion, with_motion, with_planes
 from v2v_server.store.packing import QUICK, RAW, Packing
+from v2v_server.store.planes.chroma import CHROMA, chroma_planes, matrix_of, whole_chroma, with_chroma
+from v2v_server.store.planes.detail import detail_planes, read_levels, same_transfer
+from v2v_server.store.planes.motion import MOTION, read_motion, wants_motion, with_motion, with_planes
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
 from v2v_server.store.reader import StoreFile, has_planes
 from v2v_server.store.writer import StoreWriter

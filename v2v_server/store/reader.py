@@ -24,7 +24,7 @@ from v2v_server.store.format import (
     unpack_record,
 )
 from v2v_server.store.packing import UnpackingError, unpack
-from v2v_server.store.planes import PLANES, PlanePlace, read_footer
+from v2v_server.store.planes.plane import PLANES, PlanePlace, read_footer
 from v2v_server.video.orientation import Window
 
 _REMEDY = "re-create it with v2v-prepare"
@@ -91,7 +91,7 @@ class BlockReader:
 
     def _read_group(self, group: int, first: int, stride: int, window: Window, out: npt.NDArray[np.uint8]) -> bool:
         # Import lazily: listing files must not load numba.
-        from v2v_server.store.pixels import from_differences
+        from v2v_server.store.differences import from_differences
 
         head, (top, left, height, width) = self.head, window
         record = self._record(group)

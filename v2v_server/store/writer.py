@@ -17,7 +17,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_server.store.format import BLOCK_COLUMNS, BLOCK_ROWS, Head, block_check, pack_record
 from v2v_server.store.packing import Packing
-from v2v_server.store.planes import PLANES, PlanePlace, pack_footer
+from v2v_server.store.planes.plane import PLANES, PlanePlace, pack_footer
 
 
 class _BlockWriter:
@@ -57,7 +57,7 @@ class _BlockWriter:
 
     def _write_group(self, frames: npt.NDArray[np.uint8]) -> None:
         # Import lazily: listing files must not load numba.
-        from v2v_server.store.pixels import to_differences
+        from v2v_server.store.differences import to_differences
 
         group, head = len(self._table), self._head
         blocks: list[bytes] = []
@@ -106,7 +106,7 @@ class StoreWriter:
         path: the file; overwritten.
         head: describes what is written.
         packing: compression; its method is the head's.
-        planes: names of the planes to write, of :data:`v2v_server.store.planes.PLANES`.
+        planes: names of the planes to write, of :data:`v2v_server.store.planes.plane.PLANES`.
 
     Raises:
         OSError: the file cannot be written; every call may raise it.

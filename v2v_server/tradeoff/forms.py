@@ -17,7 +17,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.prepare.prepare import prepare
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.store.motion import MADE_PLANES
+from v2v_server.store.planes.motion import MADE_PLANES
 from v2v_server.video.rows import Rows
 
 SOURCE, BESIDE = "source", "beside"

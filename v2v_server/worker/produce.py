@@ -45,8 +45,8 @@ from v2v_server.simulation.variants import Variant, variants
 from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache
-from v2v_server.store.clips import clips_of
 from v2v_server.store.format import is_store_file
+from v2v_server.store.video_file import clips_of
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR

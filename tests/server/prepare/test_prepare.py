@@ -22,8 +22,8 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.manifest import MANIFEST_NAME, read_manifest
 from v2v_server.prepare.prepare import prepare
 from v2v_server.prepare.report import Report
-from v2v_server.store.clips import facts_of, stored_pictures
 from v2v_server.store.reader import StoreFile
+from v2v_server.store.video_file import facts_of, stored_pictures
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.fingerprint import fingerprint, is_same_file
 from v2v_server.video.probe import probe

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from tests.server.store.test_store_file import PACKINGS, head_of, in_folder, written
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.store import planes
 from v2v_server.store.packing import QUICK, Packing
-from v2v_server.store.planes import PLANES, PlaneKind
+from v2v_server.store.planes import plane as planes
+from v2v_server.store.planes.plane import PLANES, PlaneKind
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter
 
@@ -30,7 +30,7 @@ KINDS = {
 
 @pytest.fixture(autouse=True)
 def kinds(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("planes", "reader", "writer"):
+    for module in ("planes.plane", "reader", "writer"):
         monkeypatch.setattr(f"v2v_server.store.{module}.PLANES", KINDS)
 
 

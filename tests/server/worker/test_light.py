@@ -31,7 +31,7 @@ from v2v_server.offline.preview import _signal_note
 from v2v_server.offline.remake import Remaker
 from v2v_server.simulation.intensity import light_table
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.depth import detail_of, levels_of
+from v2v_server.store.planes.detail import detail_of, levels_of
 from v2v_server.tradeoff.accuracy import Places, seen, simulated
 from v2v_server.video.luma import Signal, range_table
 from v2v_server.worker.decode_cache import Clips

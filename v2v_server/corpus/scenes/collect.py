@@ -27,7 +27,7 @@ from v2v_server.corpus.scenes.pieces import SplitVideos, encoded_pieces
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_FRAMES, PIECE, Scene
 from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.clips import pictures_of
+from v2v_server.store.video_file import pictures_of
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.frame_index import FrameIndex

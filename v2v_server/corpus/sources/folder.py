@@ -21,7 +21,7 @@ from v2v_server.corpus.sources.listfile import LIST_SUFFIXES, ListEntry, read_li
 from v2v_server.corpus.sources.names import UNPRINTABLE, count_left_out, is_video_name
 from v2v_server.corpus.sources.sidecar import check_local, is_sidecar, local_state, sidecar_id
 from v2v_server.corpus.sources.source import GONE, NO_STATE, SourceOptions, State, VideoSource
-from v2v_server.store.clips import check_file
+from v2v_server.store.video_file import check_file
 from v2v_server.video.fingerprint import unreadable
 
 PSEUDO_FILE_SYSTEMS = frozenset({

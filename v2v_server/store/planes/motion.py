@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.store.chroma import CHROMA, chroma_of
-from v2v_server.store.depth import DETAIL, detail_of, grey_of
+from v2v_server.store.planes.chroma import CHROMA, chroma_of
+from v2v_server.store.planes.detail import DETAIL, detail_of, grey_of
 from v2v_server.store.reader import StoreFile
 from v2v_server.video.collect import Cut, DecodedFrame, LastFrame
 from v2v_server.video.decode import DecodedClip

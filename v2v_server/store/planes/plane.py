@@ -118,7 +118,7 @@ PLANES: Mapping[str, PlaneKind] = MappingProxyType(
     {
         # Motion to each frame from the one before (v2v_server.motion), x and y; zero for the first frame of the file.
         "motion": PlaneKind(version=1, dtype="<i2", values=2, cell_px=4),
-        # What 8 bits lack of the levels of deeper luma (v2v_server.store.depth).
+        # What 8 bits lack of the levels of deeper luma (v2v_server.store.planes.detail).
         "detail": PlaneKind(version=1, dtype="i1", values=1, cell_px=1),
         # Cb and Cr (v2v_server.video.colour.chroma).
         "chroma": PlaneKind(version=1, dtype="i1", values=2, cell_px=CELL_PX),

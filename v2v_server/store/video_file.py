@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, VideoError
-from v2v_server.store.chroma import with_chroma
-from v2v_server.store.depth import DETAIL, detail_planes, read_levels
 from v2v_server.store.format import is_store_file
-from v2v_server.store.motion import MotionWatch, read_motion, with_motion, without_still_margins
-from v2v_server.store.planes import PLANES
+from v2v_server.store.planes.chroma import with_chroma
+from v2v_server.store.planes.detail import DETAIL, detail_planes, read_levels
+from v2v_server.store.planes.motion import MotionWatch, read_motion, with_motion, without_still_margins
+from v2v_server.store.planes.plane import PLANES
 from v2v_server.store.reader import StoreFile
 from v2v_server.video.collect import Cut
 from v2v_server.video.decode import DecodedClip, decode_cuts, stream_luma
