@@ -149,7 +149,7 @@ def prepared(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
             top, bottom = catalogue.rows.bounds(video.height_px)
             index = catalogue.frame_index(video.id).to_bytes()
             job = Transcoding(
-                video.id, catalogue.path(video.id), video.fingerprint, video.codec, index, video.frames_per_second,
+                video.id, catalogue.path(video.id), video.fingerprint, index, video.frames_per_second,
                 (top, 0, bottom - top, video.width_px), DEFAULT_SIZE, root, root / "made",
             )  # fmt: skip
             fastest = {"prepare_cpu_seconds": math.inf, "prepare_scene_cpu_seconds": math.inf}

@@ -25,8 +25,7 @@ from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
 from v2v_server.prepare.report import Report
 from v2v_server.store.packing import DEFAULT_SIZE, SIZES
-from v2v_server.store.planes.chroma import CHROMA
-from v2v_server.store.planes.motion import MADE_PLANES
+from v2v_server.store.planes import OPTIONAL, PLANES
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 
@@ -65,9 +64,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         "not compressed, reads fastest from memory",
     )  # fmt: skip
     stored.add_argument(
-        "--planes", choices=(*MADE_PLANES, CHROMA), action="append", default=[],
-        help="also store the motion between frames, which streams with substep_px then need not find, or "
-        "chroma, for frames_rgb; a video prepared without it is prepared again",
+        "--planes", choices=OPTIONAL, action="append", default=[],
+        help="also store what some streams read or else find again: "
+        f"{', '.join(f'{name} (for {PLANES[name].serves})' for name in OPTIONAL)}; a video prepared without it is "
+        "prepared again",
     )  # fmt: skip
     run = parser.group("Run")
     run.add_argument(

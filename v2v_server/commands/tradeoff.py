@@ -27,7 +27,7 @@ from v2v_server.tradeoff.diversity import diversity
 from v2v_server.tradeoff.forms import BESIDE, DEFAULT_FORMS, SOURCE, STORES, CorpusForm, forms
 from v2v_server.tradeoff.front import best
 from v2v_server.tradeoff.report import ERROR_KEY, error_fields, name_dominated, plot, tables
-from v2v_server.tradeoff.settings import ServeSetting, axes, full_model, settings
+from v2v_server.tradeoff.settings import ServeSetting, axes, full_model, planes_for, settings
 from v2v_server.tradeoff.speed import leases_of, making, measure
 from v2v_server.video.rows import Rows
 
@@ -120,7 +120,7 @@ def _run(asked: argparse.Namespace) -> int:
     warm_up()
     with tempfile.TemporaryDirectory(prefix="v2v-tradeoff-") as folder, forms(
         asked.videos, rows, spec, asked.forms, beside=asked.beside,
-        motion=any(setting.spec.substep_px for setting in compared), most_clips=asked.clips, folder=Path(folder),
+        planes=planes_for(setting.spec for setting in compared), most_clips=asked.clips, folder=Path(folder),
         until=begun + _FORMS_SHARE * budget, tell=_tell,
     ) as corpus:  # fmt: skip
         compared = [setting for setting in compared if setting.form in corpus]

@@ -25,7 +25,7 @@ from v2v_server.corpus.index.file import IndexRow
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.names import UNPRINTABLE
 from v2v_server.store.packing import SIZES
-from v2v_server.store.video_file import STORE_FORMAT
+from v2v_server.store.reader import STORE_FORMAT
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 from v2v_server.video.rows import Rows
 

@@ -33,8 +33,7 @@ from v2v_server.prepare.report import Report
 from v2v_server.prepare.resume import has_failed, known_records, locked, refuse_overlap, standing_files
 from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode
 from v2v_server.store.packing import DEFAULT_SIZE, SIZES
-from v2v_server.store.planes.chroma import CHROMA
-from v2v_server.store.planes.motion import MADE_PLANES
+from v2v_server.store.planes import OPTIONAL
 from v2v_server.store.reader import has_planes
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
@@ -73,8 +72,8 @@ def prepare(
         processes: number of parallel transcoding processes, spawned; 0 transcodes in this process.
         scene: also compute the scene statistics; for a video prepared without them they are computed from its source,
             and its file stays.
-        planes: names of the planes to store (:data:`v2v_server.store.planes.motion.MADE_PLANES`); a video prepared without one
-            of them is prepared again, and keeps its others.
+        planes: names of the planes to store (:data:`v2v_server.store.planes.OPTIONAL`); a video prepared without one of
+            them is prepared again, and keeps its others.
         single: the source is one video, so the destination may lie in its folder.
         progress: called at the start, after each video whose file was checked, and after each that was done.
 
@@ -254,14 +253,14 @@ def _outcomes(
             id = job.video.id
             keeps_scene = job.standing is not None and job.standing.scene != ""
             # A file that is made again for one plane keeps its others.
-            more = [name for name in (*MADE_PLANES, CHROMA) if job.lacks_planes and has_planes(target / id, (name,))]
+            more = [name for name in OPTIONAL if job.lacks_planes and has_planes(target / id, (name,))]
             try:
                 index = catalogue.frame_index(id).to_bytes()
             except VideoError as error:
                 changed.append((job, error.reason))
                 continue
             yield job, Transcoding(
-                id, catalogue.path(id), job.video.fingerprint, job.video.codec, index, job.video.frames_per_second,
+                id, catalogue.path(id), job.video.fingerprint, index, job.video.frames_per_second,
                 job.window, size, target, target / id, scene or keeps_scene,
                 tuple(dict.fromkeys((*planes, *more))),
             )  # fmt: skip

@@ -17,7 +17,6 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.prepare.prepare import prepare
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.store.planes.motion import MADE_PLANES
 from v2v_server.video.rows import Rows
 
 SOURCE, BESIDE = "source", "beside"
@@ -43,7 +42,7 @@ class CorpusForm:
 
 @contextlib.contextmanager
 def forms(
-    videos: Path, rows: Rows, spec: StreamSpec, names: Sequence[str], *, beside: Path | None, motion: bool,
+    videos: Path, rows: Rows, spec: StreamSpec, names: Sequence[str], *, beside: Path | None, planes: Sequence[str],
     most_clips: int, folder: Path, until: float, tell: Callable[[str], None],
 ) -> Iterator[dict[str, CorpusForm]]:  # fmt: skip
     """Make the forms.
@@ -54,7 +53,7 @@ def forms(
         spec: decides which clips are long and large enough.
         names: keys of STORES, in order.
         beside: a folder that has each clip under the same name, in another encoding; None: there is none.
-        motion: whether stores hold the motion between frames.
+        planes: of the stores.
         most_clips: number of clips to take: the first different ones.
         folder: an empty folder for all files.
         until: reading of ``time.monotonic`` after which no further form is made.
@@ -90,8 +89,7 @@ def forms(
                 continue
             tell(f"preparing {len(source.videos)} clips as {name}")
             into = folder / name.replace(" ", "-")
-            planes = tuple(MADE_PLANES) if motion else ()
-            failed = prepare(source, into, STORES[name], processes=0, planes=planes).failed
+            failed = prepare(source, into, STORES[name], processes=0, planes=tuple(planes)).failed
             if failed:
                 raise CorpusError(f"{failed[0].id} could not be prepared as {name}: {failed[0].problem}")
             clips = opened(into)

@@ -12,6 +12,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.safe_yaml import format_yaml, parse_yaml
 from v2v_protocol.spec import StreamSpec
 from v2v_server.config import recipe_setting
+from v2v_server.store.planes import OPTIONAL, PLANES
 from v2v_server.tradeoff.forms import BESIDE, SOURCE, STORES
 
 SAMPLES_PER_DECODE = (1, 2, 4)
@@ -56,13 +57,19 @@ class ServeSetting:
         if self.form == BESIDE:
             lines += ["# Serve the folder of --beside."]
         elif self.form != SOURCE:
-            planes = " --planes motion" if self.spec.substep_px else ""
+            planes = "".join(f" --planes {name}" for name in planes_for([self.spec]))
             flags = f"--rows {rows} --size {STORES[self.form]}{planes}"
             lines += [f"# Prepare the corpus first: v2v-prepare SOURCE PREPARED {flags}", "# and serve PREPARED."]
         plain, usual = self.spec.to_dict(), StreamSpec().to_dict()
         recipe = _different(plain.pop("recipe"), usual.pop("recipe"))
         chosen = {"rows": rows, "samples_per_decode": self.spec.samples_per_decode, **_different(plain, usual)}
         return "\n".join([*lines, format_yaml(chosen | ({"recipe": recipe} if recipe else {}))])
+
+
+def planes_for(specs: Iterable[StreamSpec]) -> tuple[str, ...]:
+    """Return the planes of a store that these streams read."""
+    specs = tuple(specs)
+    return tuple(name for name in OPTIONAL if any(getattr(spec, PLANES[name].serves, 0) for spec in specs))
 
 
 def _different(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:

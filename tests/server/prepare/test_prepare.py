@@ -20,10 +20,11 @@ from v2v_protocol.errors import CorpusError, UsageError
 from v2v_server.commands.prepare import main as prepare_main
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.manifest import MANIFEST_NAME, read_manifest
+from v2v_server.corpus.probe import facts_of
 from v2v_server.prepare.prepare import prepare
 from v2v_server.prepare.report import Report
 from v2v_server.store.reader import StoreFile
-from v2v_server.store.video_file import facts_of, stored_pictures
+from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.fingerprint import fingerprint, is_same_file
 from v2v_server.video.probe import probe
@@ -40,7 +41,8 @@ def whole(path: Path) -> npt.NDArray[np.uint8]:
 def stored_whole(path: Path) -> npt.NDArray[np.uint8]:
     with StoreFile(path) as stored:
         head = stored.head
-        return np.stack([*stored_pictures(stored, (head.top, 0, head.rows, head.width_px))])
+        cut = Cut(head.count, (head.top, 0, head.rows, head.width_px))
+        return np.stack([each.grey for each in stored.pictures(ClipRequest(stored.facts().index, 0, (cut,)))])
 
 
 def run(

@@ -147,7 +147,10 @@ def test_a_prepared_folder_with_chroma_gives_the_same_colour(tmp_path: Path, rec
     expected = samples_of(source, recipe)
     assert samples_of(prepared, recipe) == expected
     assert samples_of(whole, recipe) == expected
-    with pytest.raises(UsageError, match=r"frames_rgb needs colour, .*: prepare them again with v2v-prepare --planes"):
+    with pytest.raises(
+        UsageError,
+        match=r"frames_rgb needs the plane chroma, .*: prepare .* with v2v-prepare --planes chroma, or serve",
+    ):
         samples_of(grey, recipe)
 
 

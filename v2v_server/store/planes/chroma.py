@@ -1,77 +1,63 @@
-"""The colour of a clip, read beside its pixels."""
+"""The colour of a clip, Cb and Cr (:mod:`v2v_server.video.colour.chroma`)."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import VideoError
-from v2v_server.store.reader import StoreFile
-from v2v_server.video.collect import Cut, LastFrame
-from v2v_server.video.colour.chroma import CELL_PX, DEFAULT_MATRIX, Chroma, ChromaCut
+from v2v_server.store.planes.plane import Files, Plane
+from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
+from v2v_server.video.colour.chroma import CELL_PX, Chroma, ChromaCut
 from v2v_server.video.decode import DecodedClip
-from v2v_server.video.orientation import Window
-
-CHROMA = "chroma"
-"""Name of the plane."""
+from v2v_server.video.luma import Signal
 
 
-def chroma_planes(cuts: Sequence[Cut]) -> list[str]:
-    """Return the names of the planes that the colour of cuts needs."""
-    return [CHROMA] if any(cut.chroma is not None for cut in cuts) else []
+class Colour(Plane):
+    """The colour of clips whose cuts ask for it."""
+
+    def is_wanted(self, request: ClipRequest, signal: Signal) -> bool:
+        """Return whether a cut asks for colour."""
+        return any(cut.chroma is not None for cut in request.cuts)
+
+    def asked(self, cut: Cut) -> Cut:
+        """Return the cut of whole pictures with its colour."""
+        assert cut.window is not None
+        return replace(cut, chroma=ChromaCut((), cut.window, (cut.window[0], cut.window[2])))
+
+    def maker(self) -> Callable[[DecodedPicture], npt.NDArray[np.int8]]:
+        """Return a function that returns the colour of a picture."""
+
+        def colour(picture: DecodedPicture) -> npt.NDArray[np.int8]:
+            assert picture.colour is not None
+            return picture.colour
+
+        return colour
+
+    def read(self, files: Files, request: ClipRequest) -> list[Chroma | None]:
+        """Return the colour of the frames that each cut names."""
+        return [None if cut.chroma is None else _read(cut.chroma, files, request) for cut in request.cuts]
+
+    def added(self, clip: DecodedClip, value: Chroma | None) -> DecodedClip:
+        """Return the clip with this colour."""
+        return replace(clip, chroma=value)
 
 
-def whole_chroma(planes: Collection[str], picture: Window) -> ChromaCut | None:
-    """Return what to decode for the plane of a usable picture; None without the plane."""
-    return ChromaCut((), picture, (picture[0], picture[2])) if CHROMA in planes else None
+PLANE = Colour(
+    version=1, dtype="i1", values=2, cell_px=CELL_PX, serves="frames_rgb",
+    remedy="prepare it with v2v-prepare --planes chroma",
+)  # fmt: skip
 
 
-def matrix_of(stream: LastFrame) -> str:
-    """Return the matrix of a decoded frame's colour; the default if none was collected."""
-    return DEFAULT_MATRIX if stream.colour is None else stream.colour[1]
-
-
-def chroma_of(stream: LastFrame) -> npt.NDArray[np.int8]:
-    """Return the plane's array of the last decoded frame, [2, rows, columns]."""
-    assert stream.colour is not None
-    return stream.colour[0]
-
-
-def with_chroma(
-    clips: Sequence[DecodedClip], cuts: Sequence[Cut], files: Sequence[tuple[StoreFile, range]], start: int, stride: int
-) -> tuple[DecodedClip, ...]:
-    """Return the clips with the colour that their cuts ask for.
-
-    Args:
-        files: open store files that together hold the clip, and the frames of it that each one holds.
-        start, stride: see :func:`v2v_server.video.decode.decode_cuts`.
-
-    Raises:
-        VideoError: a file lacks the plane, or it is damaged.
-    """
-    return tuple(
-        clip if cut.chroma is None else replace(clip, chroma=_read(cut.chroma, files, start, stride))
-        for clip, cut in zip(clips, cuts, strict=True)
-    )
-
-
-def _read(cut: ChromaCut, files: Sequence[tuple[StoreFile, range]], start: int, stride: int) -> Chroma:
-    parts = []
+def _read(cut: ChromaCut, files: Files, request: ClipRequest) -> Chroma:
+    parts, (top, left, rows, columns) = [], cut.cells
     for stored, held in files:
-        if CHROMA not in stored.planes:
-            raise VideoError(stored.head.video, None, "lacks colour: prepare it with v2v-prepare --planes chroma")
         frames = np.array([frame for frame in cut.frames if frame in held], np.int64)
         if len(frames):
-            first = start + int(frames[0]) * stride
-            count = int(frames[-1] - frames[0]) * stride + 1
-            parts.append(stored.plane(CHROMA, first, count, _cells_in(stored, cut), (frames - frames[0]) * stride))
+            first = request.start + int(frames[0]) * request.stride
+            wanted = (frames - frames[0]) * request.stride
+            cells = top - stored.head.top // CELL_PX, left, rows, columns  # cells begin at the file's own first row
+            parts.append(stored.plane("chroma", first, int(wanted[-1]) + 1, cells, wanted))
     return Chroma(np.concatenate(parts), files[0][0].head.matrix)
-
-
-def _cells_in(stored: StoreFile, cut: ChromaCut) -> Window:
-    """Return the cells of a cut in the plane of a file, whose cells begin at its own first row."""
-    top, left, rows, columns = cut.cells
-    return top - stored.head.top // CELL_PX, left, rows, columns
