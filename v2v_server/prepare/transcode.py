@@ -21,12 +21,12 @@ from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.scenes.analysis import SceneAnalysis
 from v2v_server.corpus.scenes.scene import MOST_FRAMES, Scene
 from v2v_server.store.packing import SIZES
+from v2v_server.store.pixels import open_pixels
 from v2v_server.store.planes import whole_cut
 from v2v_server.store.reader import StoreFile
-from v2v_server.store.video_file import VideoFile
 from v2v_server.store.writer import StoreWriter, head_of, planes_of, write_pictures
 from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
-from v2v_server.video.fingerprint import check_fingerprint, fingerprint
+from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import MOST_BITS
 from v2v_server.video.orientation import Window
@@ -87,7 +87,6 @@ def transcode(job: Transcoding) -> Made:
             give the same frames.
         OSError: the target cannot be written.
     """
-    check_fingerprint(job.source, job.fingerprint)
     index = FrameIndex.from_bytes(job.index)
     if not job.target.parent.resolve().is_relative_to(job.root):
         raise VideoError(os.fspath(job.source), None, f"{job.target.parent} is a link out of the destination")
@@ -95,9 +94,10 @@ def transcode(job: Transcoding) -> Made:
     # Hidden, so that no catalogue includes it; hashed, so that the suffix fits even with the longest names.
     name = hashlib.sha256(os.fsencode(job.target.name)).hexdigest()[:16]
     hidden = job.target.with_name(f".{name}{PARTIAL_SUFFIX}")
-    with write_aside_and_rename(job.target, partial=hidden) as partial:
+    with open_pixels(job.source) as source, write_aside_and_rename(job.target, partial=hidden) as partial:
+        source.check(job.fingerprint)
         analysis = SceneAnalysis()
-        pictures = _decoded(job, index, job.planes)
+        pictures = source.pictures(_request(job, index, job.planes))
         if job.scene:
             pictures = _watched(pictures, analysis)
         made = _stored(job, index, partial, pictures)
@@ -110,10 +110,11 @@ def look_again(job: Transcoding) -> Scene:
     Raises:
         VideoError: the source is not the catalogued file, or a frame of it does not decode.
     """
-    check_fingerprint(job.source, job.fingerprint)
     analysis = SceneAnalysis()
-    for picture in islice(_decoded(job, FrameIndex.from_bytes(job.index)), MOST_FRAMES):
-        analysis.add(picture.grey)
+    with open_pixels(job.source) as source:
+        source.check(job.fingerprint)
+        for picture in islice(source.pictures(_request(job, FrameIndex.from_bytes(job.index))), MOST_FRAMES):
+            analysis.add(picture.grey)
     return analysis.scene()
 
 
@@ -125,10 +126,8 @@ def _watched(pictures: Iterable[DecodedPicture], analysis: SceneAnalysis) -> Ite
         yield picture
 
 
-def _decoded(job: Transcoding, index: FrameIndex, planes: Iterable[str] = ()) -> Iterator[DecodedPicture]:
-    return VideoFile(job.source).pictures(
-        ClipRequest(index, 0, (whole_cut(len(index), job.window, planes),), most_bits=MOST_BITS)
-    )
+def _request(job: Transcoding, index: FrameIndex, planes: Iterable[str] = ()) -> ClipRequest:
+    return ClipRequest(index, 0, (whole_cut(len(index), job.window, planes),), most_bits=MOST_BITS)
 
 
 def _stored(job: Transcoding, index: FrameIndex, made: Path, pictures: Iterator[DecodedPicture]) -> Made:

@@ -263,7 +263,7 @@ class StoreFile(BlockReader):
             grey = np.empty((min(GROUP_FRAMES, cut.count - done), *request.window(cut)[2:]), np.uint8)
             self.read(request.start + done * request.stride, request.stride, request.window(cut), grey)
             for picture in grey:
-                yield DecodedPicture(picture, picture, SDR, self.head.codec)
+                yield DecodedPicture(picture, picture, SDR, self.head.codec, self.head.bit_exact)
 
     def signal(self, index: FrameIndex) -> Signal:
         """Return what the levels of the source mean."""

@@ -20,7 +20,6 @@ from v2v_server.store.packing import Packing
 from v2v_server.store.planes import PLANES
 from v2v_server.store.planes.plane import PlanePlace, pack_footer
 from v2v_server.video.collect import DecodedPicture
-from v2v_server.video.decode import BIT_EXACT_CODECS
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import Window
 
@@ -231,6 +230,6 @@ def head_of(
     return Head(
         video=video, fingerprint=fingerprint, height_px=index.height_px, width_px=width, top=top, rows=rows,
         first=first, count=count, frames=first + count, frames_per_second=frames_per_second, codec=picture.codec,
-        bit_exact=picture.codec in BIT_EXACT_CODECS, group=group_frames_for(rows, width), packing=packing.method,
+        bit_exact=picture.bit_exact, group=group_frames_for(rows, width), packing=packing.method,
         index=stored_index, bits=picture.signal.bits, transfer=picture.signal.transfer, matrix=picture.matrix,
     )  # fmt: skip

@@ -106,7 +106,8 @@ class DecodedPicture:
         luma: [h, w] levels, upright and in full range, of the signal's dtype.
         grey: the same in 8 bits.
         signal: what the levels mean.
-        codec: FFmpeg's name of the format that it was decoded from.
+        codec: name of the format that it was decoded from.
+        bit_exact: whether every host decodes these very bytes.
         colour: [2, rows, columns] int8, Cb and Cr; None if they were not asked for.
         matrix: of the colour (:class:`v2v_server.video.colour.chroma.Chroma`).
     """
@@ -115,6 +116,7 @@ class DecodedPicture:
     grey: npt.NDArray[np.uint8]
     signal: Signal
     codec: str
+    bit_exact: bool
     colour: npt.NDArray[np.int8] | None = None
     matrix: str = DEFAULT_MATRIX
 
@@ -151,14 +153,14 @@ class DecodedFrame(NamedTuple):
         upright: npt.NDArray[Any] = self.orientation.upright(part)[0]
         return upright
 
-    def picture(self, window: Window, chroma: ChromaCut | None, codec: str) -> DecodedPicture:
-        """Return a window of the picture, with the colour of a cut."""
+    def picture(self, window: Window, chroma: ChromaCut | None, *format: Any) -> DecodedPicture:
+        """Return a window of the picture, with the colour of a cut, and codec and bit_exact as given."""
         luma = self.part(window, self.signal)
         grey = self.part(window) if self.signal.bits > SDR.bits else luma
         if chroma is None:
-            return DecodedPicture(luma, grey, self.signal, codec)
+            return DecodedPicture(luma, grey, self.signal, *format)
         stack = ChromaStack(chroma, self.orientation, self.height_px, self.width_px)
-        return DecodedPicture(luma, grey, self.signal, codec, *stack.cells_of(self.frame))
+        return DecodedPicture(luma, grey, self.signal, *format, *stack.cells_of(self.frame))
 
 
 Watch = Callable[[], Callable[[DecodedFrame], object]]

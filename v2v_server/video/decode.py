@@ -148,7 +148,7 @@ def stream_pictures(path: str | os.PathLike[str], request: ClipRequest) -> Gener
     shown: list[DecodedPicture] = []
 
     def see(frame: DecodedFrame) -> None:
-        shown[:] = [frame.picture(request.window(cut), cut.chroma, stack.codec)]
+        shown[:] = [frame.picture(request.window(cut), cut.chroma, stack.codec, stack.codec in BIT_EXACT_CODECS)]
 
     for frames_of in (_from_keyframe_on, _from_beginning):
         stack = Stack(os.fspath(path), request, lambda: see, collects=False)

@@ -291,7 +291,7 @@ def sample_context(
     plan = decoded.plan
     params, recipe = plan.params, plan.spec.recipe
     frames, signal, flow, levels = decoded.clip.frames, decoded.clip.signal, None, None
-    if plan.flow is not None and into:  # events need no flow
+    if plan.flow is not None and into and "flow" not in decoded.clip.arrays:  # events need no flow
         methods = () if plan.flow_plan is None else plan.flow_plan.methods
         part = without_margin(frames, params, recipe, plan.margin_px, plan.flow.margin_px)
         flow = flow_for(
