@@ -153,14 +153,14 @@ class DecodedFrame(NamedTuple):
         upright: npt.NDArray[Any] = self.orientation.upright(part)[0]
         return upright
 
-    def picture(self, window: Window, chroma: ChromaCut | None, *format: Any) -> DecodedPicture:
-        """Return a window of the picture, with the colour of a cut, and codec and bit_exact as given."""
+    def picture(self, window: Window, chroma: ChromaCut | None, codec: str, bit_exact: bool) -> DecodedPicture:
+        """Return a window of the picture, with the colour of a cut."""
         luma = self.part(window, self.signal)
         grey = self.part(window) if self.signal.bits > SDR.bits else luma
         if chroma is None:
-            return DecodedPicture(luma, grey, self.signal, *format)
+            return DecodedPicture(luma, grey, self.signal, codec, bit_exact)
         stack = ChromaStack(chroma, self.orientation, self.height_px, self.width_px)
-        return DecodedPicture(luma, grey, self.signal, *format, *stack.cells_of(self.frame))
+        return DecodedPicture(luma, grey, self.signal, codec, bit_exact, *stack.cells_of(self.frame))
 
 
 Watch = Callable[[], Callable[[DecodedFrame], object]]
