@@ -14,10 +14,11 @@ import pytest
 from tests.digests.clips import zooming
 from tests.digests.make import TABLE, Table
 from tests.digests.rows import OF_THIS_HOST, PORTABLE, Ways, compared
+from v2v_protocol.presets import STREAM_PRESETS
 from v2v_protocol.recipe import PRESETS, Recipe
 from v2v_protocol.sample import ARRAYS
 from v2v_protocol.settings import settings_of
-from v2v_protocol.spec import SPEED_PRESETS, StreamSpec
+from v2v_protocol.spec import StreamSpec
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
 
@@ -37,7 +38,7 @@ def ways(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ways]:
 def test_the_table_has_every_preset_and_array() -> None:
     rows = Table(TABLE).rows
     assert rows.keys() == PORTABLE.keys()
-    assert rows.keys() >= PRESETS.keys() | SPEED_PRESETS.keys() - UNCHANGED
+    assert rows.keys() >= PRESETS.keys() | STREAM_PRESETS.keys() - UNCHANGED
     assert {array for row in rows.values() for array in row["arrays"]} == ARRAYS.keys() - OF_OPENCV
 
 
