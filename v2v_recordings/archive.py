@@ -1,4 +1,4 @@
-"""Read a zip file or a folder of files through the same interface."""
+"""Read a zip file, a folder of files, or a single text through the same interface."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import contextlib
 import posixpath
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -18,8 +18,14 @@ from v2v_protocol.errors import UsageError
 from v2v_recordings.items import SensorSize
 
 
+TEXT_SUFFIXES = (".txt", ".csv")
+
+
 class Archive:
     """Give access to the members of a zip file or folder by their paths, with / as separator.
+
+    A single text is its own only member. The ``._name`` files that macOS adds for each file, in zips and on other
+    disks, are no members.
 
     Attributes:
         bytes_of: size of each member by its path.
@@ -30,20 +36,21 @@ class Archive:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._zip: zipfile.ZipFile | None = None
+        self._folder, self._zip = path, None
         if path.is_dir():
             files = sorted(file for file in path.rglob("*") if file.is_file())
-            self.bytes_of = _without_hidden({file.relative_to(path).as_posix(): file.stat().st_size for file in files})
-            return
-        try:
-            self._zip = zipfile.ZipFile(path)
-        except (OSError, zipfile.BadZipFile) as error:
-            raise UsageError(
-                f"{path} is neither a folder nor a complete zip file: {error}; if it was cut, load it again"
-            ) from error
-        self.bytes_of = _without_hidden(
-            {entry.filename: entry.file_size for entry in self._zip.infolist() if not entry.is_dir()}
-        )
+            found = {file.relative_to(path).as_posix(): file.stat().st_size for file in files}
+        elif is_text(path):
+            self._folder, found = path.parent, {path.name: path.stat().st_size}
+        else:
+            try:
+                self._zip = zipfile.ZipFile(path)
+            except (OSError, zipfile.BadZipFile) as error:
+                raise UsageError(
+                    f"{path} is neither a folder nor a complete zip file: {error}; if it was cut, load it again"
+                ) from error
+            found = {entry.filename: entry.file_size for entry in self._zip.infolist() if not entry.is_dir()}
+        self.bytes_of = {name: size for name, size in found.items() if not posixpath.basename(name).startswith("._")}
 
     def __enter__(self) -> Archive:
         return self
@@ -99,11 +106,12 @@ class Archive:
             with self._open(member) as stream:
                 yield stream
         except (OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise UsageError(f"{self.path}: {member} cannot be read: {error}") from error
+            reason = getattr(error, "strerror", None) or error
+            raise UsageError(f"{self.path}: {member} cannot be read: {reason}") from error
 
     def _open(self, member: str) -> IO[bytes]:
         if self._zip is None:
-            return (self.path / member).open("rb")
+            return (self._folder / member).open("rb")
         try:
             return self._zip.open(member)
         except RuntimeError as error:  # encrypted, or compressed by a method that Python lacks: Windows's Deflate64
@@ -130,6 +138,22 @@ class Archive:
         return SensorSize(width, height)
 
 
-def _without_hidden(bytes_of: dict[str, int]) -> dict[str, int]:
-    """Drop the ``._name`` files that macOS adds for each file, in zips (under ``__MACOSX``) and on other disks."""
-    return {member: size for member, size in bytes_of.items() if not posixpath.basename(member).startswith("._")}
+def is_text(path: Path) -> bool:
+    """Return whether the path is a single file that is named as a text."""
+    return path.is_file() and path.suffix.lower() in TEXT_SUFFIXES
+
+
+def holds(path: Path, check: Callable[[Archive], Any], suffix: str = ".zip") -> bool:
+    """Return whether the path is a folder, or a file with this suffix, whose members pass a check."""
+    if not (path.is_dir() or (path.is_file() and path.suffix.lower() == suffix)):
+        return False
+    with Archive(path) as archive:
+        return bool(check(archive))
+
+
+def starts_with(path: Path, magic: bytes) -> bool:
+    """Return whether the path is a file that starts with these bytes."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(magic)) == magic

@@ -27,7 +27,7 @@ from v2v_protocol.errors import UsageError
 from v2v_recordings import hdf5
 from v2v_recordings.archive import Archive
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, Progress, SensorSize, to_ns
-from v2v_recordings.text_events import NS_PER_UNIT
+from v2v_recordings.items import NS_PER_UNIT
 
 FOLDER = ("events_ts.npy", "events_xy.npy", "events_p.npy")
 NPZ = ("t.npy", "x.npy", "y.npy", "p.npy")
