@@ -1,4 +1,4 @@
-"""Read a zip file, a folder of files, or a single text through the same interface."""
+"""Read a zip file, a folder of files, or a single file through the same interface."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_recordings.items import SensorSize
 
-
-TEXT_SUFFIXES = (".txt", ".csv")
+ZIPS = (".zip", ".npz")
 
 
 class Archive:
     """Give access to the members of a zip file or folder by their paths, with / as separator.
 
-    A single text is its own only member. The ``._name`` files that macOS adds for each file, in zips and on other
+    Any other file is its own only member. The ``._name`` files that macOS adds for each file, in zips and on other
     disks, are no members.
 
     Attributes:
+        folder: where the members are, unless they are in a zip file.
+        is_single: whether the path is the only member.
         bytes_of: size of each member by its path.
 
     Raises:
@@ -36,12 +37,13 @@ class Archive:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._folder, self._zip = path, None
+        self.folder, self._zip = path, None
+        self.is_single = path.is_file() and path.suffix.lower() not in ZIPS and not zipfile.is_zipfile(path)
         if path.is_dir():
             files = sorted(file for file in path.rglob("*") if file.is_file())
             found = {file.relative_to(path).as_posix(): file.stat().st_size for file in files}
-        elif is_text(path):
-            self._folder, found = path.parent, {path.name: path.stat().st_size}
+        elif self.is_single:
+            self.folder, found = path.parent, {path.name: path.stat().st_size}
         else:
             try:
                 self._zip = zipfile.ZipFile(path)
@@ -111,7 +113,7 @@ class Archive:
 
     def _open(self, member: str) -> IO[bytes]:
         if self._zip is None:
-            return (self._folder / member).open("rb")
+            return (self.folder / member).open("rb")
         try:
             return self._zip.open(member)
         except RuntimeError as error:  # encrypted, or compressed by a method that Python lacks: Windows's Deflate64
@@ -136,11 +138,6 @@ class Archive:
         """Return the size of a picture; raises as :meth:`picture`."""
         height, width = self.picture(member).shape
         return SensorSize(width, height)
-
-
-def is_text(path: Path) -> bool:
-    """Return whether the path is a single file that is named as a text."""
-    return path.is_file() and path.suffix.lower() in TEXT_SUFFIXES
 
 
 def holds(path: Path, check: Callable[[Archive], Any], suffix: str = ".zip") -> bool:

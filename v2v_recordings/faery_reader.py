@@ -156,8 +156,10 @@ def _header(path: Path) -> bytes:
     """Return the lines of the header, which begin with %; the last one may be ``% end``."""
     header = b""
     with path.open("rb") as file:
-        while not header.endswith(b"% end\n") and (line := file.readline(LONGEST_LINE_BYTES)).startswith(b"%"):
+        while (line := file.readline(LONGEST_LINE_BYTES)).startswith(b"%"):
             header += line
+            if line.strip() == b"% end":
+                break
     return header
 
 

@@ -18,11 +18,13 @@ from v2v_recordings.text_events import read_texts
 
 EVENTS = "events.txt"
 IMAGES = "images.txt"
+TEXT_SUFFIXES = (".txt", ".csv")
 
 
 def recognises(path: Path) -> bool:
     """Return whether the path is a text file, or an archive with ``events.txt``."""
-    return archives.is_text(path) or archives.holds(path, lambda archive: archive.named(EVENTS))
+    is_text = path.is_file() and path.suffix.lower() in TEXT_SUFFIXES
+    return is_text or archives.holds(path, lambda archive: archive.named(EVENTS))
 
 
 def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
@@ -32,7 +34,7 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
         UsageError: a part is missing or malformed.
     """
     with Archive(path) as archive:
-        events = path.name if archives.is_text(path) else archive.find(EVENTS)
+        events = path.name if archive.is_single else archive.find(EVENTS)
         pictures = _listed_pictures(archive)
         if pictures:
             yield archive.size(pictures[0][1])

@@ -12,8 +12,7 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.progress import Progress
 from v2v_recordings.forms import FORMS
-from v2v_recordings.items import ConvertOptions, SensorSize
-from v2v_recordings.items import NS_PER_UNIT
+from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, SensorSize
 from v2v_server.config import read_yaml_mapping, recipe_setting
 from v2v_server.fit.fit import FittedCamera, fit
 from v2v_server.fit.lab import camera_of, measure, table
