@@ -81,6 +81,10 @@ class Archive:
         """Return all members of this name, which is in small letters."""
         return [member for member in self.bytes_of if posixpath.basename(member).lower() == name]
 
+    def where(self, member: str) -> str:
+        """Return the name of a member for messages."""
+        return str(self.path) if self.is_single else f"{self.path}: {member}"
+
     def integers(self, member: str) -> list[int]:
         """Read the numbers of a text, rounded.
 
@@ -92,7 +96,7 @@ class Archive:
         try:
             return [round(float(word)) for word in words]
         except (ValueError, OverflowError) as error:
-            raise UsageError(f"{self.path}: {member} holds text that is not a number: {error}") from None
+            raise UsageError(f"{self.where(member)} holds text that is not a number: {error}") from None
 
     @contextlib.contextmanager
     def open(self, member: str) -> Iterator[IO[bytes]]:
@@ -109,7 +113,7 @@ class Archive:
                 yield stream
         except (OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             reason = getattr(error, "strerror", None) or error
-            raise UsageError(f"{self.path}: {member} cannot be read: {reason}") from error
+            raise UsageError(f"{self.where(member)} cannot be read: {reason}") from error
 
     def _open(self, member: str) -> IO[bytes]:
         if self._zip is None:
@@ -118,7 +122,7 @@ class Archive:
             return self._zip.open(member)
         except RuntimeError as error:  # encrypted, or compressed by a method that Python lacks: Windows's Deflate64
             raise UsageError(
-                f"{self.path}: {member} cannot be read: {error}; unpack the file, and give the folder"
+                f"{self.where(member)} cannot be read: {error}; unpack the file, and give the folder"
             ) from error
 
     def picture(self, member: str) -> npt.NDArray[np.uint8]:
@@ -131,7 +135,7 @@ class Archive:
             data = np.frombuffer(stream.read(), np.uint8)
         pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
         if pixels is None:
-            raise UsageError(f"{self.path}: {member} is not a readable picture")
+            raise UsageError(f"{self.where(member)} is not a readable picture")
         return np.asarray(pixels, np.uint8)
 
     def size(self, member: str) -> SensorSize:

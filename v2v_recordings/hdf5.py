@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,8 +48,9 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
         with _h5py(path).File(path, "r") as file:
             require_self_contained(file, path)
             yield file
-    except (OSError, RuntimeError, KeyError, ValueError) as error:  # h5py's errors, for truncated or damaged files
-        hint = f"; its filter may be in the package {_PLUGIN}" if "filter" in str(error) else ""
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
+        # h5py's errors for damaged files, and Python's where a group is in place of a dataset.
+        hint = f"; its filter may be in the package {_PLUGIN}" if re.search("filter|plugin", str(error)) else ""
         raise UsageError(f"{path} cannot be read as HDF5: {error}{hint}") from error
 
 
@@ -67,14 +69,17 @@ def events(
     Raises:
         UsageError: a column is missing, is not [N] numbers, or has another length.
     """
-    shapes = [getattr(column, "shape", ("no",)) for column in columns.values()]
-    found = [column for column in columns.values() if column is not None and column.dtype.kind in "iufb"]
-    if len(found) < len(columns) or len(set(shapes)) > 1 or len(shapes[0]) != 1:
+    found = list(columns.values())
+    shapes = [getattr(column, "shape", None) or ("no",) for column in found]
+    dtypes = [getattr(column, "dtype", np.dtype("V")) for column in found]
+    is_numbers = [dtype.kind in kinds for dtype, kinds in zip(dtypes, ("iufb", "iu", "iu", "iufb"), strict=True)]
+    if not all(is_numbers) or len(set(shapes)) > 1 or len(shapes[0]) != 1:
         listed = ", ".join(" x ".join(map(str, shape)) for shape in shapes)
         raise UsageError(
-            f"{where}: columns of {', '.join(columns)} have {listed} entries; they must be numbers, and as many"
+            f"{where}: columns of {', '.join(columns)} have {listed} entries of {', '.join(map(str, dtypes))}; they "
+            "must be numbers, as many in each; x and y must be integers"
         )
-    (count,) = found[0].shape
+    (count,) = shapes[0]
     for start in range(0, count, READ_EVENTS):
         parts = [column[start : start + READ_EVENTS] for column in found]
         end = start + min(map(len, parts))

@@ -52,13 +52,13 @@ def _listed_pictures(archive: Archive) -> list[tuple[int, str]]:
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
-        where = f"{archive.path}: {listing}, line {number}"
+        where = f"{archive.where(listing)}, line {number}"
         seconds, _, name = line.strip().partition(" ")
         try:
             t_ns = int(to_ns(np.array([float(seconds)]), where)[0])
         except ValueError:
             raise UsageError(f"{where}: {line!r} is not `seconds path`") from None
-        member = listing[: -len(IMAGES)] + name.strip()
+        member = listing[: -len(IMAGES)] + name.strip().replace("\\", "/")
         if member not in archive.bytes_of:
             raise UsageError(f"{where} names {name.strip()}, which does not exist")
         pictures.append((t_ns, member))

@@ -71,7 +71,7 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
 
 def _column(archive: Archive, files: contextlib.ExitStack, name: str, number: int | None = None) -> _Column:
     member = archive.find(name) or name
-    return _Column(files.enter_context(archive.open(member)), f"{archive.path}: {member}", number)
+    return _Column(files.enter_context(archive.open(member)), archive.where(member), number)
 
 
 class _Column:
@@ -86,7 +86,8 @@ class _Column:
             raise UsageError(f"{where} is not an array of NumPy: {error}") from error
         count, *row = shape or (1,)
         if (number is not None and row != [2]) or (is_fortran and number is None and len(shape) > 1):
-            raise UsageError(f"{where} is {list(shape)}{' in the order of Fortran' * is_fortran}, which is not read")
+            order = " in the order of Fortran" if is_fortran else ""
+            raise UsageError(f"{where} is {list(shape)}{order}: save events_xy as [N, 2], and others in the order of C")
         self._stream, self._begin = stream, stream.tell()
         if is_fortran and number is not None:  # columns lie one after the other
             self._begin += number * count * self.dtype.itemsize
@@ -109,5 +110,5 @@ def _metadata_size(archive: Archive, member: str) -> SensorSize:
         try:
             stated = json.loads(stream.read(1 << 16))["sensor_resolution"]
         except (ValueError, LookupError, TypeError) as error:
-            raise UsageError(f"{archive.path}: {member} states no sensor_resolution: {error!r}") from error
+            raise UsageError(f"{archive.where(member)} states no sensor_resolution: {error!r}") from error
     return hdf5.sensor_size(stated, archive.path / member)

@@ -22,6 +22,8 @@ LATE_NS = 10_000_000
 """Events that are earlier than others before them by at most this are late in any case."""
 MOST_LATE_EVENTS = 1 << 17
 """A longer run of earlier events is no late packet."""
+FEW_EVENTS = 8
+"""At most this many earlier events at the very end of a recording are late ones."""
 GAP_NS = 1000
 """Time that stands for the unknown one between the last event before a reset and the first one after it."""
 
@@ -90,7 +92,8 @@ class _Clock:
                     return
                 step_ns = self._newest_ns - int(rest.t_ns[0])
                 jumps_back = end < len(rest) and rest.t_ns[end] - rest.t_ns[end - 1] > step_ns // 4
-                count = end if jumps_back and end <= MOST_LATE_EVENTS else 0
+                is_few = end == len(rest) <= FEW_EVENTS
+                count = end if is_few or (jumps_back and end <= MOST_LATE_EVENTS) else 0
             if not count:
                 back = f"the times step back by {step_ns * 1e-9:.6g} s: the clock was reset"
                 self._reset = f"at event {self._passed} {back}"

@@ -40,7 +40,7 @@ def read_texts(
     done, total = 0, sum(archive.bytes_of.get(member, 0) for member in (*events, *(name for _, name in pictures)))
     for member in events:
         with archive.open(member) as stream:
-            for item in read_text_events(stream, f"{archive.path}: {member}", time_unit=time_unit):
+            for item in read_text_events(stream, archive.where(member), time_unit=time_unit):
                 progress(done + stream.tell(), total)
                 yield item
         done += archive.bytes_of[member]
