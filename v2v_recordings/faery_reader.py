@@ -233,12 +233,10 @@ def _faery() -> ModuleType:
 def _errors_of_faery(path: Path) -> Iterator[None]:
     try:
         yield
-    except (RuntimeError, OSError, ValueError, IndexError) as error:
-        text = str(error)
-        hint = "; give --size WIDTHxHEIGHT" if "size" in text else ""
-        raise UsageError(f"{path} cannot be decoded: {text}{hint}") from error
     except BaseException as error:
-        # A Rust panic on unexpected bytes. Its class cannot be imported, and is not a subclass of Exception.
-        if type(error).__name__ != "PanicException":
+        # A Rust panic on unexpected bytes cannot be imported, and is not a subclass of Exception.
+        is_panic = type(error).__name__ == "PanicException"
+        if not is_panic and not isinstance(error, (RuntimeError, OSError, ValueError, IndexError)):
             raise
-        raise UsageError(f"{path} cannot be decoded: {error}") from error
+        hint = "; give --size WIDTHxHEIGHT" if "size" in str(error) else ""
+        raise UsageError(f"{path} cannot be decoded: {error}{hint}") from error
