@@ -65,19 +65,17 @@ def read_aedat4(path: Path, options: ConvertOptions, progress: Progress) -> Iter
         UsageError: the file is damaged or has no events, or its frames are not 8-bit or not of the whole sensor.
     """
     with _errors_of_faery(path), _faery().aedat.Decoder(path) as decoder:
-        tracks = decoder.tracks()
-        events = next((track for track in tracks if track.data_type == "events"), None)
-        frames = next((track for track in tracks if track.data_type == "frame"), None)
-        if events is None:
+        first = {track.data_type: track for track in reversed(decoder.tracks())}
+        if "events" not in first:
             raise UsageError(f"{path} has no stream of events")
-        chosen = {track.id for track in (events, frames) if track is not None}
-        size = SensorSize(*events.dimensions)
+        size = SensorSize(*first["events"].dimensions)
         yield size
         total, number = len(decoder.file_data_definitions()) or None, 0
         try:
             for number, (track, packet) in enumerate(decoder, start=1):
-                if track.id in chosen:
-                    yield _events(packet) if track.data_type == "events" else _frame(packet, size, path)
+                kind = track.data_type if track.id == first[track.data_type].id else ""
+                if kind in ("events", "frame"):
+                    yield _events(packet) if kind == "events" else _frame(packet, size, path)
                 progress(number, total)
         except RuntimeError as error:
             if not number or CUT_PACKET not in str(error):

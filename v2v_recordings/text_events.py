@@ -6,8 +6,8 @@ Spaces, tabs or commas separate values. Lines that begin with ``#`` are comments
 from __future__ import annotations
 
 import codecs
+import io
 import re
-import warnings
 from collections.abc import Iterator
 from typing import IO
 
@@ -114,25 +114,15 @@ def _sensor_size(line: bytes, name: str) -> SensorSize:
 
 
 def _numbers(block: bytes) -> npt.NDArray[np.float64] | None:
-    """Parse a block to [N, 4]; None unless it is N lines of four finite numbers with integer coordinates."""
-    with warnings.catch_warnings():
-        # For text that it cannot parse to the end, NumPy warns in some releases and raises in others.
-        warnings.simplefilter("error", DeprecationWarning)
-        try:
-            values = np.fromstring(block, np.float64, sep=" ")
-        except (ValueError, DeprecationWarning):
-            return None
-    if len(values) != 4 * (block.count(b"\n") + (not block.endswith(b"\n"))):
-        # Blank lines are allowed.
-        kept = [line for line in block.splitlines() if line.strip()]
-        if len(values) != 4 * len(kept) or not all(len(line.split()) == 4 for line in kept):
-            return None
-    table: npt.NDArray[np.float64] = values.reshape(-1, 4)
-    coordinates, signs = table[:, 1:3], table[:, 3]
-    is_event = (
-        np.isfinite(table).all() and (coordinates == np.rint(coordinates)).all() and np.isin(signs, (-1, 0, 1)).all()
-    )
-    return table if is_event else None
+    """Parse a block to [N, 4]; None unless its lines are four finite numbers with integer coordinates, or blank."""
+    try:
+        table = np.loadtxt(io.StringIO(block.decode("latin-1")), ndmin=2)
+    except ValueError:
+        return None
+    if table.shape[1] != 4 or not np.isfinite(table).all():
+        return None
+    is_whole = (table[:, 1:3] == np.rint(table[:, 1:3])).all()
+    return table if is_whole and np.isin(table[:, 3], (-1, 0, 1)).all() else None
 
 
 def _shown(line: bytes) -> str:
@@ -141,6 +131,6 @@ def _shown(line: bytes) -> str:
 
 def _first_bad_line(block: bytes, name: str, lines_before: int) -> str:
     for number, line in enumerate(block.splitlines(), start=lines_before + 1):
-        if line.strip() and (len(line.split()) != 4 or _numbers(line) is None):
+        if line.strip() and _numbers(line) is None:
             return f"{name}, line {number}: {_shown(line)} is not `t x y p` with whole x and y and p of -1, 0 or 1"
     return f"{name}: the lines after {lines_before} are not `t x y p`"
