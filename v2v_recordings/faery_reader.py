@@ -28,7 +28,7 @@ CUT_PACKET = "failed to fill whole buffer"
 """Error of faery where a packet of aedat4 is longer than the file."""
 EVT_LINE = re.compile(rb"^% *(evt|format) ", re.MULTILINE)
 """Line of a header that only EVT has."""
-WORDS = {"evt2": np.dtype("<u4"), "evt3": np.dtype("<u2")}
+WORDS: dict[str, np.dtype[Any]] = {"evt2": np.dtype("<u4"), "evt3": np.dtype("<u2")}
 """Words of the versions that are decoded: for another one that it recognises, EVT 2.1, faery up to 0.7.1 panics."""
 DAT_WORD = np.dtype("<u8")
 """An event of DAT; the lower half is its time, us."""
@@ -103,7 +103,7 @@ def read_prophesee(path: Path, options: ConvertOptions, progress: Progress) -> I
         if decoder.dimensions is None:
             raise UsageError(f"{path}: its header states no size of the sensor; give --size")
         yield SensorSize(*decoder.dimensions)
-        word = WORDS[decoder.version] if is_evt else DAT_WORD
+        word: np.dtype[Any] = WORDS[decoder.version] if is_evt else DAT_WORD
     # DAT's header ends with two bytes of its own.
     begin = len(header) if is_evt else len(header) + 2
     first_us, resets = _clock(path, word, begin)
@@ -194,8 +194,8 @@ def _parts(path: Path, edges: list[int], folder: Path) -> Iterator[Path]:
     content, part = np.memmap(path, np.uint8, "r"), folder / "part.raw"
     for begin, end in itertools.pairwise([*edges, len(content)]):
         with part.open("wb") as copy:
-            copy.write(content[: edges[0]])
-            copy.write(content[begin:end])
+            copy.write(content[: edges[0]].data)
+            copy.write(content[begin:end].data)
         yield part
 
 

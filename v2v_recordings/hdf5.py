@@ -62,7 +62,7 @@ A slice has fewer rows than asked for if the file is cut.
 
 
 def events(
-    columns: Mapping[str, Column | None], where: str, progress: Progress, *, ns_per_unit: float, offset_ns: int = 0
+    columns: Mapping[str, Column], where: str, progress: Progress, *, ns_per_unit: float, offset_ns: int = 0
 ) -> Iterator[EventChunk | Note]:
     """Yield events whose times, x, y and polarities (above 0 for brighter) are in columns, in this order.
 
@@ -70,7 +70,7 @@ def events(
         UsageError: a column is missing, is not [N] numbers, or has another length.
     """
     found = list(columns.values())
-    shapes = [getattr(column, "shape", None) or ("no",) for column in found]
+    shapes: list[Any] = [getattr(column, "shape", None) or ("no",) for column in found]
     dtypes = [getattr(column, "dtype", np.dtype("V")) for column in found]
     is_numbers = [dtype.kind in kinds for dtype, kinds in zip(dtypes, ("iufb", "iu", "iu", "iufb"), strict=True)]
     if not all(is_numbers) or len(set(shapes)) > 1 or len(shapes[0]) != 1:

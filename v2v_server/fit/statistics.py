@@ -73,14 +73,15 @@ def panels_of(recording: Recorded, light: Doubles, begin_us: int, end_us: int) -
     number = np.searchsorted(INTERVAL_EDGES_US, gaps[0], side="right") - 1
     totals = np.searchsorted(COUNT_EDGES, np.bincount(events, minlength=count), side="right") - 1
     noise = np.concatenate([still.off.sum(axis=1), still.on.sum(axis=1)])
-    return {
-        "rates": np.bincount(8 * recording.p[inside] + bright[events], minlength=16).astype(np.float64),
+    sums = {
+        "rates": np.bincount(8 * recording.p[inside] + bright[events], minlength=16),
         "exposure": np.bincount(bright, minlength=8) * (end_us - begin_us) * 1e-6,
         "still": np.bincount(np.concatenate([bright, 8 + bright]), noise, 16),
         "still_exposure": np.bincount(bright, still.seconds.sum(axis=1), 8),
-        "pixels": np.bincount(totals, minlength=9).astype(np.float64),
-        "intervals": np.bincount(number + 22 * (gaps[1] < 0.5), minlength=44).astype(np.float64),
+        "pixels": np.bincount(totals, minlength=9),
+        "intervals": np.bincount(number + 22 * (gaps[1] < 0.5), minlength=44),
     }
+    return {name: column.astype(np.float64) for name, column in sums.items()}
 
 
 def per_second(events: Doubles, exposure: Doubles) -> Doubles:
