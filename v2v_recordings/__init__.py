@@ -12,6 +12,6 @@ npy_columns.py   EVREAL's folders, and .npz
 bag.py           ROS 1 bags
 faery_reader.py  aedat4, EVT 2 and 3, DAT, Event Stream, by the package faery
 text_events.py   text files of events
-archive.py       a zip file or a folder, through one interface
-hdf5.py          open HDF5 files; refuse those that refer to other files
+archive.py       a zip file, a folder or a single file, through one interface
+hdf5.py          open HDF5 files, refuse those that refer to other files; read columns of events, and pictures
 """

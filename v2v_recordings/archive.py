@@ -1,4 +1,4 @@
-"""Read a zip file or a folder of files through the same interface."""
+"""Read a zip file, a folder of files, or a single file through the same interface."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import contextlib
 import posixpath
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -17,11 +17,18 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_recordings.items import SensorSize
 
+ZIPS = (".zip", ".npz")
+
 
 class Archive:
     """Give access to the members of a zip file or folder by their paths, with / as separator.
 
+    Any other file is its own only member. The ``._name`` files that macOS adds for each file, in zips and on other
+    disks, are no members.
+
     Attributes:
+        folder: where the members are, unless they are in a zip file.
+        is_single: whether the path is the only member.
         bytes_of: size of each member by its path.
 
     Raises:
@@ -30,20 +37,22 @@ class Archive:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._zip: zipfile.ZipFile | None = None
+        self.folder, self._zip = path, None
+        self.is_single = path.is_file() and path.suffix.lower() not in ZIPS and not zipfile.is_zipfile(path)
         if path.is_dir():
             files = sorted(file for file in path.rglob("*") if file.is_file())
-            self.bytes_of = _without_hidden({file.relative_to(path).as_posix(): file.stat().st_size for file in files})
-            return
-        try:
-            self._zip = zipfile.ZipFile(path)
-        except (OSError, zipfile.BadZipFile) as error:
-            raise UsageError(
-                f"{path} is neither a folder nor a complete zip file: {error}; if it was cut, load it again"
-            ) from error
-        self.bytes_of = _without_hidden(
-            {entry.filename: entry.file_size for entry in self._zip.infolist() if not entry.is_dir()}
-        )
+            found = {file.relative_to(path).as_posix(): file.stat().st_size for file in files}
+        elif self.is_single:
+            self.folder, found = path.parent, {path.name: path.stat().st_size}
+        else:
+            try:
+                self._zip = zipfile.ZipFile(path)
+            except (OSError, zipfile.BadZipFile) as error:
+                raise UsageError(
+                    f"{path} is neither a folder nor a complete zip file: {error}; if it was cut, load it again"
+                ) from error
+            found = {entry.filename: entry.file_size for entry in self._zip.infolist() if not entry.is_dir()}
+        self.bytes_of = {name: size for name, size in found.items() if not posixpath.basename(name).startswith("._")}
 
     def __enter__(self) -> Archive:
         return self
@@ -72,6 +81,10 @@ class Archive:
         """Return all members of this name, which is in small letters."""
         return [member for member in self.bytes_of if posixpath.basename(member).lower() == name]
 
+    def where(self, member: str) -> str:
+        """Return the name of a member for messages."""
+        return str(self.path) if self.is_single else f"{self.path}: {member}"
+
     def integers(self, member: str) -> list[int]:
         """Read the numbers of a text, rounded.
 
@@ -83,7 +96,7 @@ class Archive:
         try:
             return [round(float(word)) for word in words]
         except (ValueError, OverflowError) as error:
-            raise UsageError(f"{self.path}: {member} holds text that is not a number: {error}") from None
+            raise UsageError(f"{self.where(member)} holds text that is not a number: {error}") from None
 
     @contextlib.contextmanager
     def open(self, member: str) -> Iterator[IO[bytes]]:
@@ -99,16 +112,17 @@ class Archive:
             with self._open(member) as stream:
                 yield stream
         except (OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise UsageError(f"{self.path}: {member} cannot be read: {error}") from error
+            reason = getattr(error, "strerror", None) or error
+            raise UsageError(f"{self.where(member)} cannot be read: {reason}") from error
 
     def _open(self, member: str) -> IO[bytes]:
         if self._zip is None:
-            return (self.path / member).open("rb")
+            return (self.folder / member).open("rb")
         try:
             return self._zip.open(member)
         except RuntimeError as error:  # encrypted, or compressed by a method that Python lacks: Windows's Deflate64
             raise UsageError(
-                f"{self.path}: {member} cannot be read: {error}; unpack the file, and give the folder"
+                f"{self.where(member)} cannot be read: {error}; unpack the file, and give the folder"
             ) from error
 
     def picture(self, member: str) -> npt.NDArray[np.uint8]:
@@ -121,7 +135,7 @@ class Archive:
             data = np.frombuffer(stream.read(), np.uint8)
         pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
         if pixels is None:
-            raise UsageError(f"{self.path}: {member} is not a readable picture")
+            raise UsageError(f"{self.where(member)} is not a readable picture")
         return np.asarray(pixels, np.uint8)
 
     def size(self, member: str) -> SensorSize:
@@ -130,6 +144,17 @@ class Archive:
         return SensorSize(width, height)
 
 
-def _without_hidden(bytes_of: dict[str, int]) -> dict[str, int]:
-    """Drop the ``._name`` files that macOS adds for each file, in zips (under ``__MACOSX``) and on other disks."""
-    return {member: size for member, size in bytes_of.items() if not posixpath.basename(member).startswith("._")}
+def holds(path: Path, check: Callable[[Archive], Any], suffix: str = ".zip") -> bool:
+    """Return whether the path is a folder, or a file with this suffix, whose members pass a check."""
+    if not (path.is_dir() or (path.is_file() and path.suffix.lower() == suffix)):
+        return False
+    with Archive(path) as archive:
+        return bool(check(archive))
+
+
+def starts_with(path: Path, magic: bytes) -> bool:
+    """Return whether the path is a file that starts with these bytes."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(magic)) == magic

@@ -6,6 +6,7 @@ Images are ``sensor_msgs/Image``. This module parses the serialised messages its
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 import tempfile
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
+from v2v_recordings.archive import starts_with
 from v2v_recordings.faery_reader import read_prophesee
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, Progress, SensorSize
 
@@ -32,10 +34,7 @@ COLOURS = {"bgr8": cv2.COLOR_BGR2GRAY, "rgb8": cv2.COLOR_RGB2GRAY}
 
 def recognises(path: Path) -> bool:
     """Return whether the file starts with a bag's first bytes."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(9) == b"#ROSBAG V"
+    return starts_with(path, b"#ROSBAG V")
 
 
 def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
@@ -54,13 +53,11 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
         ) from error
     try:
         with Reader(path) as bag:
-            connections = list(bag.connections)
-            events = _events_topic(connections, options.events_topic, path)
-            images = _images_topic(connections, events, options.images_topic, path)
-            if any(connection.topic == events and connection.msgtype == EVENT_PACKETS for connection in connections):
-                yield from _read_packets(bag, events, images, path, progress)
-            else:
-                yield from _read_arrays(bag, events, images, path, progress)
+            events = _events_topic(bag.connections, options.events_topic, path)
+            images = _images_topic(bag.connections, events, options.images_topic, path)
+            is_packets = any(each.topic == events and each.msgtype == EVENT_PACKETS for each in bag.connections)
+            read_messages = _read_packets if is_packets else _read_arrays
+            yield from read_messages(_messages(bag, (events, images), progress), events, path)
     except (ReaderError, struct.error, OSError) as error:
         raise UsageError(
             f"{path}: the bag cannot be read: {error}; if it was cut, `rosbag reindex` repairs it"
@@ -69,14 +66,12 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
         raise UsageError(f"{path}: the bag is damaged and cannot be read: {error!r}") from error
 
 
-def _read_arrays(bag: Any, events: str, images: str | None, path: Path, progress: Progress) -> Iterator[Item]:
+def _read_arrays(messages: Messages, events: str, path: Path) -> Iterator[Item]:
     size = None
-    for number, connection, raw in _messages(bag, (events, images), progress):
-        del number
-        if connection.topic == images:
-            yield _picture(raw, path)
+    for topic, message in messages:
+        if topic != events:
+            yield _picture(message, path)
             continue
-        message = _Message(raw)
         message.skip_header()
         height, width, count = message.unpack("<III")
         # Some drivers write 0 here.
@@ -88,49 +83,44 @@ def _read_arrays(bag: Any, events: str, images: str | None, path: Path, progress
         yield EventChunk(t_ns, records["x"], records["y"], records["polarity"] > 0)
 
 
-def _read_packets(bag: Any, events: str, images: str | None, path: Path, progress: Progress) -> Iterator[Item]:
+def _read_packets(messages: Messages, events: str, path: Path) -> Iterator[Item]:
     """Concatenate the packets in a temporary file and decode it: they are pieces of a single stream of words."""
-    first_stamp_ns: int | None = None
+    first_stamp_ns = offset_ns = None
     encoding = ""
     with tempfile.TemporaryDirectory() as folder:
         raw_file = Path(folder) / "packets.raw"
         with raw_file.open("wb") as stream:
-            for _, _, raw in _messages(bag, (events,), progress):
-                message = _Message(raw)
+            for topic, message in messages:
+                if topic != events:
+                    yield _picture(message, path)
+                    continue
                 stamp_ns = message.skip_header()
                 height, width, _, _ = message.unpack("<IIQQ")
                 this_encoding = message.text()
                 _, count = message.unpack("<BI")
-                if first_stamp_ns is None:
+                if this_encoding not in EVT_HEADERS or encoding not in ("", this_encoding):
+                    raise UsageError(
+                        f"{path}: a packet on {events} is in encoding {this_encoding!r}; supported is one of "
+                        f"{', '.join(EVT_HEADERS)} for all packets"
+                    )
+                if not encoding:
                     first_stamp_ns, encoding = stamp_ns, this_encoding
-                    if encoding not in EVT_HEADERS:
-                        raise UsageError(
-                            f"{path}: packets on {events} are in encoding {encoding!r}; supported are "
-                            f"{', '.join(EVT_HEADERS)}"
-                        )
                     stream.write(f"{EVT_HEADERS[encoding]}\n% geometry {width}x{height}\n% end\n".encode())
-                elif this_encoding != encoding:
-                    raise UsageError(f"{path}: packets on {events} change from {encoding} to {this_encoding}")
                 stream.write(message.array(np.dtype("u1"), count).tobytes())
-        offset_ns: int | None = None
         for item in read_prophesee(raw_file, ConvertOptions(), lambda _done, _total: None):
-            if not isinstance(item, EventChunk):
-                yield item
-            elif len(item):
+            if isinstance(item, EventChunk) and len(item):
                 if offset_ns is None:
                     offset_ns = (first_stamp_ns or 0) - int(item.t_ns[0])
-                yield EventChunk(item.t_ns + offset_ns, item.x, item.y, item.p)
-    if images is not None:
-        for _, _, raw in _messages(bag, (images,), progress):
-            yield _picture(raw, path)
+                item = dataclasses.replace(item, t_ns=item.t_ns + offset_ns)
+            yield item
 
 
-def _messages(bag: Any, topics: tuple[str | None, ...], progress: Progress) -> Iterator[tuple[int, Any, bytes]]:
+def _messages(bag: Any, topics: tuple[str | None, ...], progress: Progress) -> Messages:
     wanted = [connection for connection in bag.connections if connection.topic in topics]
     total = sum(connection.msgcount for connection in wanted)
-    for number, (connection, _, raw) in enumerate(bag.messages(connections=wanted)):
-        yield number, connection, bytes(raw)
-        progress(number + 1, total)
+    for number, (connection, _, raw) in enumerate(bag.messages(connections=wanted), start=1):
+        yield connection.topic, _Message(bytes(raw))
+        progress(number, total)
 
 
 class _Message:
@@ -163,8 +153,11 @@ class _Message:
         return values
 
 
-def _picture(raw: bytes, path: Path) -> Picture:
-    message = _Message(raw)
+Messages = Iterator[tuple[str, _Message]]
+"""Topic and content."""
+
+
+def _picture(message: _Message, path: Path) -> Picture:
     t_ns = message.skip_header()
     height, width = message.unpack("<II")
     encoding = message.text()
@@ -192,16 +185,10 @@ def _events_topic(connections: list[Any], wanted: str | None, path: Path) -> str
 
 def _images_topic(connections: list[Any], events: str, wanted: str | None, path: Path) -> str | None:
     """Return the requested topic, else ``image_raw`` next to the events, else the only one; None without pictures."""
-    topics = {connection.topic for connection in connections if connection.msgtype == IMAGE}
-    if wanted is not None:
-        if wanted not in topics:
-            raise UsageError(
-                f"{path}: no pictures on {wanted}; topics with pictures: {', '.join(sorted(topics)) or '-'}"
-            )
-        return wanted
+    found = sorted({connection.topic for connection in connections if connection.msgtype == IMAGE})
     beside = f"{events.rpartition('/')[0]}/image_raw"
-    if beside in topics:
-        return beside
-    if len(topics) > 1:
-        raise UsageError(f"{path}: pictures on {', '.join(sorted(topics))}; choose one with --images-topic")
-    return str(topics.pop()) if topics else None
+    if wanted is not None and wanted not in found:
+        raise UsageError(f"{path}: no pictures on {wanted}; topics with pictures: {', '.join(found) or '-'}")
+    if wanted is None and beside not in found and len(found) > 1:
+        raise UsageError(f"{path}: pictures on {', '.join(found)}; choose one with --images-topic")
+    return wanted or (beside if beside in found else next(iter(found), None))

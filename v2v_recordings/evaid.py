@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from v2v_protocol.errors import UsageError
+from v2v_recordings import archive as archives
 from v2v_recordings.archive import Archive
-from v2v_recordings.items import ConvertOptions, Item, Picture, Progress, SensorSize
-from v2v_recordings.text_events import NS_PER_UNIT, read_text_events
+from v2v_recordings.items import ConvertOptions, Item, Progress, SensorSize
+from v2v_recordings.text_events import read_texts
 
 TIMES = "timestamps.txt"
 SHAPE = "shape.txt"
@@ -18,10 +19,7 @@ PICTURES = (".png", ".jpg", ".jpeg")
 
 def recognises(path: Path) -> bool:
     """Return whether the path is an archive with ``timestamps.txt`` and a folder ``event``."""
-    if not (path.is_dir() or path.suffix.lower() == ".zip"):
-        return False
-    with Archive(path) as archive:
-        return bool(_members(archive, "event", (".txt",))) and archive.find(TIMES) is not None
+    return archives.holds(path, lambda archive: archive.named(TIMES) and _members(archive, "event", (".txt",)))
 
 
 def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
@@ -31,8 +29,8 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
         UsageError: a part is missing or malformed.
     """
     with Archive(path) as archive:
-        events, pictures = _members(archive, "event", (".txt",)), _members(archive, "gt", PICTURES)
         times_us = archive.integers(archive.find(TIMES) or TIMES)
+        events, pictures = _members(archive, "event", (".txt",)), _members(archive, "gt", PICTURES)
         if len(times_us) != len(pictures):
             raise UsageError(f"{path}: {len(pictures)} pictures in gt/, but {len(times_us)} times in {TIMES}")
         if (stated := archive.find(SHAPE)) is not None:
@@ -42,22 +40,8 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
             yield SensorSize(*shape)
         elif pictures:
             yield archive.size(pictures[0])
-        total = sum(archive.bytes_of[member] for member in events + pictures)
-        done = 0
-
-        def advance(count: int) -> None:
-            nonlocal done
-            done += count
-            progress(done, total)
-
-        for member in events:
-            with archive.open(member) as stream:
-                yield from read_text_events(
-                    stream, f"{path}: {member}", time_unit=options.time_unit or "us", advance=advance
-                )
-        for time_us, member in zip(times_us, pictures, strict=True):
-            yield Picture(round(time_us * NS_PER_UNIT["us"]), archive.picture(member))
-            advance(archive.bytes_of[member])
+        timed = [(1000 * time_us, member) for time_us, member in zip(times_us, pictures, strict=True)]
+        yield from read_texts(archive, events, timed, options.time_unit or "us", progress)
 
 
 def _members(archive: Archive, folder: str, suffixes: tuple[str, ...]) -> list[str]:

@@ -6,6 +6,8 @@ A file that ends within an event or packet is read up to it.
 from __future__ import annotations
 
 import contextlib
+import itertools
+import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,22 +19,19 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
+from v2v_recordings.archive import starts_with
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, Progress, SensorSize
 
-AEDAT4_MAGIC, ES_MAGIC = b"#!AER-DAT4", b"Event Stream"
 ES_HEAD_BYTES, ES_EVENT_BYTES, ES_LONGEST_STEP_US = 20, 5, 127
 """Bytes before the first event and of an event; a longer time between two events is bytes of 0xff of this length."""
 CUT_PACKET = "failed to fill whole buffer"
 """Error of faery where a packet of aedat4 is longer than the file."""
+EVT_LINE = re.compile(rb"^% *(evt|format) ", re.MULTILINE)
+"""Line of a header that only EVT has."""
+WORDS: dict[str, np.dtype[Any]] = {"evt2": np.dtype("<u4"), "evt3": np.dtype("<u2")}
+"""Words of the versions that are decoded: for another one that it recognises, EVT 2.1, faery up to 0.7.1 panics."""
 DAT_WORD = np.dtype("<u8")
 """An event of DAT; the lower half is its time, us."""
-EVT_WORDS: dict[str, np.dtype[Any]] = {
-    **dict.fromkeys(("2.0", "EVT2"), np.dtype("<u4")),
-    **dict.fromkeys(("3.0", "EVT3"), np.dtype("<u2")),
-}
-"""Dtype of a word by the version in the header."""
-NOT_DECODED = "2.1"
-"""A version that faery up to 0.7.1 recognises but does not implement: it panics. It does not recognise "EVT21"."""
 TIME_HIGH = 0x8
 """Value of the four upper bits of a word whose other bits are the upper bits of a time."""
 TIME_HIGH_US = {8: 1, 4: 64, 2: 4096}
@@ -40,24 +39,23 @@ TIME_HIGH_US = {8: 1, 4: 64, 2: 4096}
 LATEST_US = 10_000
 """The upper bits may step back by at most this without a reset."""
 LOOKED_THROUGH_WORDS = 1 << 20
-COPIED_BYTES = 1 << 22
 LONGEST_LINE_BYTES = 1 << 12
 GREY = {"RGB": cv2.COLOR_RGB2GRAY, "RGBA": cv2.COLOR_RGBA2GRAY}
 
 
 def recognises_aedat4(path: Path) -> bool:
     """Return whether the file starts with aedat4's first bytes."""
-    return _head(path).startswith(AEDAT4_MAGIC)
+    return starts_with(path, b"#!AER-DAT4")
 
 
 def recognises_prophesee(path: Path) -> bool:
     """Return whether the path is a ``.raw`` or ``.dat`` file whose header lines begin with %."""
-    return path.suffix.lower() in (".raw", ".dat") and _head(path).startswith(b"%")
+    return path.suffix.lower() in (".raw", ".dat") and starts_with(path, b"%")
 
 
 def recognises_es(path: Path) -> bool:
     """Return whether the file starts with Event Stream's first bytes."""
-    return _head(path).startswith(ES_MAGIC)
+    return starts_with(path, b"Event Stream")
 
 
 def read_aedat4(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
@@ -67,33 +65,22 @@ def read_aedat4(path: Path, options: ConvertOptions, progress: Progress) -> Iter
         UsageError: the file is damaged or has no events, or its frames are not 8-bit or not of the whole sensor.
     """
     with _errors_of_faery(path), _faery().aedat.Decoder(path) as decoder:
-        tracks = decoder.tracks()
-        events = next((track for track in tracks if track.data_type == "events"), None)
-        frames = next((track for track in tracks if track.data_type == "frame"), None)
-        if events is None:
+        first = {track.data_type: track for track in reversed(decoder.tracks())}
+        if "events" not in first:
             raise UsageError(f"{path} has no stream of events")
-        chosen = {track.id for track in (events, frames) if track is not None}
-        size = SensorSize(*events.dimensions)
+        size = SensorSize(*first["events"].dimensions)
         yield size
-        parts = decoder.file_data_definitions()
-        total, done = sum(part.size for part in parts) or None, 0
-        packet_number, packets = 0, iter(decoder)
-        while True:
-            try:
-                track, packet = next(packets)
-            except StopIteration:
-                return
-            except RuntimeError as error:
-                if packet_number and CUT_PACKET in str(error):
-                    yield Note(f"cut: packet {packet_number + 1} is incomplete; the {packet_number} before it are read")
-                    return
+        total, number = len(decoder.file_data_definitions()) or None, 0
+        try:
+            for number, (track, packet) in enumerate(decoder, start=1):
+                kind = track.data_type if track.id == first[track.data_type].id else ""
+                if kind in ("events", "frame"):
+                    yield _events(packet) if kind == "events" else _frame(packet, size, path)
+                progress(number, total)
+        except RuntimeError as error:
+            if not number or CUT_PACKET not in str(error):
                 raise
-            if packet_number < len(parts):
-                done += parts[packet_number].size
-            packet_number += 1
-            if track.id in chosen:
-                yield _events(packet) if track.data_type == "events" else _frame(packet, size, path)
-            progress(done, total)
+            yield Note(f"cut: packet {number + 1} is incomplete; the {number} before it are read")
 
 
 def read_prophesee(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
@@ -106,28 +93,33 @@ def read_prophesee(path: Path, options: ConvertOptions, progress: Progress) -> I
     Raises:
         UsageError: the file is damaged, does not state the size, or has a version that faery does not decode.
     """
-    faery = _faery()
     fallback = None if options.size is None else (options.size.width, options.size.height)
-    version, head = _header(path)
-    is_evt = bool(version) or path.suffix.lower() != ".dat"
+    header = _header(path)
+    is_evt = path.suffix.lower() != ".dat" or EVT_LINE.search(header) is not None
+    decode = _faery().evt.Decoder if is_evt else _faery().dat.Decoder
+    with _errors_of_faery(path), decode(path, fallback, None) as decoder:
+        if is_evt and decoder.version not in WORDS:
+            raise UsageError(f"{path} is in EVT 2.1, which is not supported; EVT 2, EVT 3 and DAT are")
+        if decoder.dimensions is None:
+            raise UsageError(f"{path}: its header states no size of the sensor; give --size")
+        yield SensorSize(*decoder.dimensions)
+        word: np.dtype[Any] = WORDS[decoder.version] if is_evt else DAT_WORD
     # DAT's header ends with two bytes of its own.
-    word, head = (EVT_WORDS.get(version), head) if is_evt else (DAT_WORD, head + 2)
-    module = faery.evt if is_evt else faery.dat
+    begin = len(header) if is_evt else len(header) + 2
+    first_us, resets = _clock(path, word, begin)
+    is_timeless = True
     with tempfile.TemporaryDirectory() as folder:
-        for number, part in enumerate(_parts(path, word, head, Path(folder))):
-            with _errors_of_faery(path), module.Decoder(part, fallback, None) as decoder:
-                if version == NOT_DECODED:
-                    raise UsageError(f"{path} is in EVT 2.1, which is not supported; EVT 2, EVT 3 and DAT are")
-                if decoder.dimensions is None:
-                    raise UsageError(f"{path}: its header states no size of the sensor; give --size")
-                yield SensorSize(*decoder.dimensions)
-                timeless = _events_without_time(path, module, fallback, word, head) if is_evt and not number else 0
-                for events in _event_packets(decoder):
+        for part in _parts(path, [begin, *resets], Path(folder)):
+            with _errors_of_faery(path), decode(part, fallback, None) as decoder:
+                for packet in decoder:
                     progress(0, None)
-                    left_out = min(timeless, len(events))
-                    timeless -= left_out
-                    yield _events(events[left_out:])
-    yield from _cut_note(path, head, word.itemsize if word is not None else 1)
+                    events = packet.get("events", ()) if isinstance(packet, dict) else packet
+                    if is_timeless and len(events):
+                        has_time = events["t"] >= first_us
+                        events, is_timeless = events[has_time.argmax() :] if has_time.any() else (), not has_time.any()
+                    if len(events):
+                        yield _events(events)
+    yield from _cut_note(path, begin, word.itemsize)
 
 
 def read_es(path: Path, _options: ConvertOptions, progress: Progress) -> Iterator[Item]:
@@ -158,82 +150,53 @@ def _cut_note(path: Path, begin: int, item_bytes: int) -> Iterator[Item]:
         yield Note(f"cut: the last {over} bytes are an incomplete event and left out")
 
 
-def _parts(path: Path, word: np.dtype[Any] | None, head: int, folder: Path) -> Iterator[Path]:
+def _header(path: Path) -> bytes:
+    """Return the lines of the header, which begin with %; the last one may be ``% end``."""
+    header = b""
+    with path.open("rb") as file:
+        while (line := file.readline(LONGEST_LINE_BYTES)).startswith(b"%"):
+            header += line
+            if line.strip() == b"% end":
+                break
+    return header
+
+
+def _clock(path: Path, word: np.dtype[Any], begin: int) -> tuple[int, list[int]]:
+    """Return the first (upper bits of a) time, us, and the bytes at which the time steps back and does not go round."""
+    bits = 32 if word == DAT_WORD else 8 * word.itemsize - 4
+    unit_us, first, last, resets = TIME_HIGH_US[word.itemsize], 0, None, list[int]()
+    for start in range(begin, path.stat().st_size, LOOKED_THROUGH_WORDS * word.itemsize):
+        words = np.fromfile(path, word, LOOKED_THROUGH_WORDS, offset=start)
+        times = np.flatnonzero((words >> bits == TIME_HIGH) | (word == DAT_WORD))
+        if not len(times):
+            continue
+        highs = (words[times] & ((1 << bits) - 1)).astype(np.int64)
+        if last is None:
+            first = last = int(highs[0])
+        steps = np.diff(highs, prepend=last)
+        is_back = (-steps * unit_us > LATEST_US) & (steps % (1 << bits) > 1 << (bits - 2))
+        resets += (start + word.itemsize * times[is_back]).tolist()
+        last = int(highs[-1])
+    return first * unit_us, resets
+
+
+def _parts(path: Path, edges: list[int], folder: Path) -> Iterator[Path]:
     """Yield the file; or, if the sensor's clock is reset in it, a file in ``folder`` for each stretch of one clock.
 
     faery takes a clock that steps back for one that went round.
+
+    Args:
+        edges: bytes at which the stretches begin; the header is before the first.
     """
-    edges, whole_bytes = [head, *_resets(path, word, head)], path.stat().st_size
     if len(edges) == 1:
         yield path
         return
-    with path.open("rb") as file:
-        header = file.read(head)
-        for begin, end in zip(edges, [*edges[1:], whole_bytes], strict=True):
-            part = folder / "part.raw"
-            with part.open("wb") as copy:
-                copy.write(header)
-                for start in range(begin, end, COPIED_BYTES):
-                    copy.write(file.read(min(COPIED_BYTES, end - start)))
-            yield part
-
-
-def _resets(path: Path, word: np.dtype[Any] | None, head: int) -> list[int]:
-    """Return the bytes at which the (upper bits of the) time step back, and do not go round."""
-    found: list[int] = []
-    if word is None:
-        return found
-    bits, last = 32 if word == DAT_WORD else 8 * word.itemsize - 4, None
-    for begin in range(head, path.stat().st_size, LOOKED_THROUGH_WORDS * word.itemsize):
-        words = np.fromfile(path, word, LOOKED_THROUGH_WORDS, offset=begin)
-        times = np.flatnonzero((words >> bits == TIME_HIGH) | (word == DAT_WORD))
-        highs = (words[times] & ((1 << bits) - 1)).astype(np.int64)
-        steps = np.diff(highs, prepend=highs[:1] if last is None else last)
-        is_back = (-steps * TIME_HIGH_US[word.itemsize] > LATEST_US) & (steps % (1 << bits) > 1 << (bits - 2))
-        found += (begin + word.itemsize * times[is_back]).tolist()
-        last = highs[-1:] if len(highs) else last
-    return found
-
-
-def _event_packets(decoder: Any) -> Iterator[npt.NDArray[Any]]:
-    for packet in decoder:
-        if not isinstance(packet, dict):
-            yield packet
-        elif "events" in packet:
-            yield packet["events"]
-
-
-def _events_without_time(
-    path: Path, module: Any, fallback: tuple[int, int] | None, word: np.dtype[Any] | None, head: int
-) -> int:
-    """Return the number of events of an EVT file before the first upper bits of a time, by decoding only that part."""
-    if word is None:
-        return 0
-    kinds = np.fromfile(path, word, LOOKED_THROUGH_WORDS, offset=head) >> (8 * word.itemsize - 4)
-    times = np.flatnonzero(kinds == TIME_HIGH)
-    if not len(times) or not times[0]:
-        return 0
-    with tempfile.TemporaryDirectory() as folder, path.open("rb") as file:
-        front = Path(folder) / "front.raw"
-        front.write_bytes(file.read(head + int(times[0]) * word.itemsize))
-        with module.Decoder(front, fallback, None) as decoder:
-            return sum(len(events) for events in _event_packets(decoder))
-
-
-def _header(path: Path) -> tuple[str, int]:
-    """Return the version that the header of an EVT file states ("" in DAT), and the first byte after the header."""
-    version = ""
-    with path.open("rb") as file:
-        while True:
-            begin = file.tell()
-            line = file.readline(LONGEST_LINE_BYTES)
-            if not line.startswith(b"%"):
-                return version, begin
-            key, _, value = line[1:].decode("ascii", "replace").strip().partition(" ")
-            if key in ("evt", "format"):
-                version = value.partition(";")[0]
-            elif key == "end":
-                return version, file.tell()
+    content, part = np.memmap(path, np.uint8, "r"), folder / "part.raw"
+    for begin, end in itertools.pairwise([*edges, len(content)]):
+        with part.open("wb") as copy:
+            copy.write(content[: edges[0]].data)
+            copy.write(content[begin:end].data)
+        yield part
 
 
 def _events(packet: npt.NDArray[Any]) -> EventChunk:
@@ -253,13 +216,6 @@ def _frame(frame: Any, size: SensorSize, path: Path) -> Picture:
     return Picture(int(frame.t) * 1000, pixels)
 
 
-def _head(path: Path) -> bytes:
-    if not path.is_file():
-        return b""
-    with path.open("rb") as file:
-        return file.read(len(ES_MAGIC))
-
-
 def _faery() -> ModuleType:
     try:
         import faery
@@ -275,12 +231,10 @@ def _faery() -> ModuleType:
 def _errors_of_faery(path: Path) -> Iterator[None]:
     try:
         yield
-    except (RuntimeError, OSError, ValueError, IndexError) as error:
-        text = str(error)
-        hint = "; give --size WIDTHxHEIGHT" if "size" in text else ""
-        raise UsageError(f"{path} cannot be decoded: {text}{hint}") from error
     except BaseException as error:
-        # A Rust panic on unexpected bytes. Its class cannot be imported, and is not a subclass of Exception.
-        if type(error).__name__ != "PanicException":
+        # A Rust panic on unexpected bytes cannot be imported, and is not a subclass of Exception.
+        is_panic = type(error).__name__ == "PanicException"
+        if not is_panic and not isinstance(error, (RuntimeError, OSError, ValueError, IndexError)):
             raise
-        raise UsageError(f"{path} cannot be decoded: {error}") from error
+        hint = "; give --size WIDTHxHEIGHT" if "size" in str(error) else ""
+        raise UsageError(f"{path} cannot be decoded: {error}{hint}") from error

@@ -1,18 +1,18 @@
-"""Open HDF5 files from untrusted sources: a file may refer to other files, which must not be read."""
+"""Open HDF5 files from untrusted sources, which may refer to other files; read columns of events, and pictures."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.items import Progress, SensorSize
+from v2v_recordings.items import EventChunk, Note, Picture, Progress, SensorSize, to_ns
 
 if TYPE_CHECKING:
     import h5py
@@ -48,29 +48,70 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
         with _h5py(path).File(path, "r") as file:
             require_self_contained(file, path)
             yield file
-    except (OSError, RuntimeError, KeyError, ValueError) as error:  # h5py's errors, for truncated or damaged files
-        hint = f"; its filter may be in the package {_PLUGIN}" if "filter" in str(error) else ""
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
+        # h5py's errors for damaged files, and Python's where a group is in place of a dataset.
+        hint = f"; its filter may be in the package {_PLUGIN}" if re.search("filter|plugin", str(error)) else ""
         raise UsageError(f"{path} cannot be read as HDF5: {error}{hint}") from error
 
 
-def columns(
-    group: h5py.Group, names: tuple[str, ...], path: Path, progress: Progress
-) -> Iterator[list[npt.NDArray[Any]]]:
-    """Yield parts of columns that have an entry for each event.
+Column = Any
+"""Rows of numbers in a file, with ``shape``, ``dtype`` and slices: an HDF5 dataset, or what reads a file of NumPy.
+
+A slice has fewer rows than asked for if the file is cut.
+"""
+
+
+def events(
+    columns: Mapping[str, Column], where: str, progress: Progress, *, ns_per_unit: float, offset_ns: int = 0
+) -> Iterator[EventChunk | Note]:
+    """Yield events whose times, x, y and polarities (above 0 for brighter) are in columns, in this order.
 
     Raises:
         UsageError: a column is missing, is not [N] numbers, or has another length.
     """
-    found = [group.get(name) for name in names]
-    forms = {getattr(column, "shape", None) for column in found}
-    if len(forms) > 1 or len(forms.pop() or ()) != 1 or any(column.dtype.kind not in "iufb" for column in found):
-        shapes = ", ".join(
-            f"{name} {getattr(column, 'shape', 'missing')}" for name, column in zip(names, found, strict=True)
+    found = list(columns.values())
+    shapes: list[Any] = [getattr(column, "shape", None) or ("no",) for column in found]
+    dtypes = [getattr(column, "dtype", np.dtype("V")) for column in found]
+    is_numbers = [dtype.kind in kinds for dtype, kinds in zip(dtypes, ("iufb", "iu", "iu", "iufb"), strict=True)]
+    if not all(is_numbers) or len(set(shapes)) > 1 or len(shapes[0]) != 1:
+        listed = ", ".join(" x ".join(map(str, shape)) for shape in shapes)
+        raise UsageError(
+            f"{where}: columns of {', '.join(columns)} have {listed} entries of {', '.join(map(str, dtypes))}; they "
+            "must be numbers, as many in each; x and y must be integers"
         )
-        raise UsageError(f"{path}: columns of events must be numbers and of one length, and are {shapes}")
-    for start in range(0, len(found[0]), READ_EVENTS):
-        yield [column[start : start + READ_EVENTS] for column in found]
-        progress(min(start + READ_EVENTS, len(found[0])), len(found[0]))
+    (count,) = shapes[0]
+    for start in range(0, count, READ_EVENTS):
+        parts = [column[start : start + READ_EVENTS] for column in found]
+        end = start + min(map(len, parts))
+        t, x, y, p = (part[: end - start] for part in parts)
+        yield EventChunk(to_ns(t, where, ns_per_unit) + offset_ns, x, y, p > 0)
+        progress(end, count)
+        if end < min(start + READ_EVENTS, count):
+            yield Note(f"cut: {end} of {count} events are there")
+            return
+
+
+def pictures(pixels: Column, times: Column, where: str, nearest: Column | None = None) -> Iterator[Picture | Note]:
+    """Yield pictures [M, H, W] whose times, s, are in a column.
+
+    Args:
+        nearest: number of the event that the published conversion pairs with each picture.
+
+    Raises:
+        UsageError: they are not uint8 [M, H, W], or there are more or fewer times.
+    """
+    count, *shape = pixels.shape
+    if len(shape) != 2 or pixels.dtype != np.uint8:
+        raise UsageError(f"{where} has {count} pictures, {pixels.dtype} {shape}, not uint8 [H, W]")
+    if any(column is not None and column.shape != (count,) for column in (times, nearest)):
+        raise UsageError(f"{where}: {count} pictures, but {times.shape[0]} times")
+    for number in range(count):
+        one = slice(number, number + 1)
+        if not (len(picture := pixels[one]) and len(time := times[one])):
+            yield Note(f"cut: {number} of {count} pictures are there")
+            return
+        event = None if nearest is None else max(0, int(nearest[one][0]))
+        yield Picture(int(to_ns(time, where)[0]), picture[0], event)
 
 
 def sensor_size(shape: Any, path: Path) -> SensorSize:

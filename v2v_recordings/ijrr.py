@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from v2v_protocol.errors import UsageError
+from v2v_recordings import archive as archives
 from v2v_recordings.archive import Archive
-from v2v_recordings.items import ConvertOptions, Item, Picture, Progress, to_ns
-from v2v_recordings.text_events import read_text_events
+from v2v_recordings.items import ConvertOptions, Item, Progress, to_ns
+from v2v_recordings.text_events import read_texts
 
 EVENTS = "events.txt"
 IMAGES = "images.txt"
@@ -22,12 +23,8 @@ TEXT_SUFFIXES = (".txt", ".csv")
 
 def recognises(path: Path) -> bool:
     """Return whether the path is a text file, or an archive with ``events.txt``."""
-    if path.is_file() and path.suffix.lower() in TEXT_SUFFIXES:
-        return True
-    if not (path.is_dir() or path.suffix.lower() == ".zip"):
-        return False
-    with Archive(path) as archive:
-        return archive.find(EVENTS) is not None
+    is_text = path.is_file() and path.suffix.lower() in TEXT_SUFFIXES
+    return is_text or archives.holds(path, lambda archive: archive.named(EVENTS))
 
 
 def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
@@ -36,44 +33,12 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
     Raises:
         UsageError: a part is missing or malformed.
     """
-    if path.is_file() and path.suffix.lower() in TEXT_SUFFIXES:
-        total, done = path.stat().st_size, 0
-
-        def advance(count: int) -> None:
-            nonlocal done
-            done += count
-            progress(done, total)
-
-        try:
-            with path.open("rb") as stream:
-                yield from read_text_events(stream, str(path), time_unit=options.time_unit, advance=advance)
-        except OSError as error:
-            raise UsageError(f"{path} cannot be read: {error.strerror or error}") from error
-        return
     with Archive(path) as archive:
-        yield from _read_archive(archive, options, progress)
-
-
-def _read_archive(archive: Archive, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
-    events = archive.find(EVENTS)
-    if events is None:
-        raise UsageError(f"{archive.path} has no {EVENTS}")
-    pictures = _listed_pictures(archive)
-    total = archive.bytes_of[events] + sum(archive.bytes_of[member] for _, member in pictures)
-    done = 0
-
-    def advance(count: int) -> None:
-        nonlocal done
-        done += count
-        progress(done, total)
-
-    if pictures:
-        yield archive.size(pictures[0][1])
-    with archive.open(events) as stream:
-        yield from read_text_events(stream, f"{archive.path}: {events}", time_unit=options.time_unit, advance=advance)
-    for t_ns, member in pictures:
-        yield Picture(t_ns, archive.picture(member))
-        advance(archive.bytes_of[member])
+        events = path.name if archive.is_single else archive.find(EVENTS)
+        pictures = _listed_pictures(archive)
+        if pictures:
+            yield archive.size(pictures[0][1])
+        yield from read_texts(archive, [events or EVENTS], pictures, options.time_unit, progress)
 
 
 def _listed_pictures(archive: Archive) -> list[tuple[int, str]]:
@@ -82,21 +47,19 @@ def _listed_pictures(archive: Archive) -> list[tuple[int, str]]:
     if listing is None:
         return []
     with archive.open(listing) as stream:
-        lines = stream.read().decode("utf-8", "replace").splitlines()
-    folder = listing[: -len(IMAGES)]
+        lines = stream.read().decode("utf-8-sig", "replace").splitlines()
     pictures = []
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
-        parts = line.split(maxsplit=1)
+        where = f"{archive.where(listing)}, line {number}"
+        seconds, _, name = line.strip().partition(" ")
         try:
-            seconds = float(parts[0])
+            t_ns = int(to_ns(np.array([float(seconds)]), where)[0])
         except ValueError:
-            seconds = np.nan
-        if len(parts) != 2 or not np.isfinite(seconds):
-            raise UsageError(f"{archive.path}: {listing}, line {number}: {line!r} is not `seconds path`")
-        member = folder + parts[1].strip()
+            raise UsageError(f"{where}: {line!r} is not `seconds path`") from None
+        member = listing[: -len(IMAGES)] + name.strip().replace("\\", "/")
         if member not in archive.bytes_of:
-            raise UsageError(f"{archive.path}: {listing}, line {number} names {parts[1].strip()}, which does not exist")
-        pictures.append((int(to_ns(np.array([seconds]), f"{archive.path}: {listing}, line {number}")[0]), member))
+            raise UsageError(f"{where} names {name.strip()}, which does not exist")
+        pictures.append((t_ns, member))
     return pictures

@@ -144,6 +144,7 @@ class ConvertOptions:
 
 
 LARGEST_NS = 2.0**63
+NS_PER_UNIT = {"s": 1e9, "us": 1e3, "ns": 1.0}
 
 
 def to_ns(times: npt.NDArray[Any], where: str, ns_per_unit: float = 1e9) -> npt.NDArray[np.int64]:

@@ -17,9 +17,7 @@ import numpy as np
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings import hdf5
-from v2v_recordings.items import ConvertOptions, EventChunk, FlowField, Item, Picture, Progress, to_ns
-
-COLUMNS = ("ts", "xs", "ys", "ps")
+from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, FlowField, Item, Picture, Progress, to_ns
 
 
 def recognises(path: Path) -> bool:
@@ -38,8 +36,8 @@ def read(path: Path, _options: ConvertOptions, progress: Progress) -> Iterator[I
         stated = file.attrs.get("sensor_resolution", file.get("sensor_resolution"))
         if stated is not None:
             yield hdf5.sensor_size(stated, path)
-        for ts, xs, ys, ps in hdf5.columns(file["events"], COLUMNS, path, progress):
-            yield EventChunk(to_ns(ts, str(path)) + origin_ns, xs, ys, ps > 0)
+        columns = {name: file.get(f"events/{name}") for name in ("ts", "xs", "ys", "ps")}
+        yield from hdf5.events(columns, str(path), progress, ns_per_unit=NS_PER_UNIT["s"], offset_ns=origin_ns)
         for kind in ("images", "flow"):
             for key in sorted(file.get(kind, ())):
                 item = file[f"{kind}/{key}"]

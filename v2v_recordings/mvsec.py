@@ -26,7 +26,7 @@ import numpy as np
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings import hdf5
-from v2v_recordings.items import ConvertOptions, EventChunk, FlowField, Item, Picture, Progress, SensorSize, to_ns
+from v2v_recordings.items import ConvertOptions, EventChunk, FlowField, Item, Progress, SensorSize, to_ns
 
 if TYPE_CHECKING:
     import h5py
@@ -48,43 +48,26 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
         UsageError: a part is missing, damaged or has another shape.
     """
     with hdf5.open_hdf5(path) as file:
-        yield from _read(file, path, options.camera, progress)
+        name = f"davis/{options.camera}"
+        group = file.get(name, {})
+        if "events" not in group:
+            raise UsageError(f"{path} has no {name}/events; its cameras: {', '.join(file.get('davis', ()))}")
+        events, pictures = group["events"], group.get("image_raw")
+        if events.ndim != 2 or events.shape[1] != 4:
+            raise UsageError(f"{path}: {name}/events is {list(events.shape)}, not [N, 4]")
+        if pictures is not None:
+            yield SensorSize(*pictures.shape[:0:-1])
+        for start in range(0, len(events), hdf5.READ_EVENTS):
+            x, y, t, p = events[start : start + hdf5.READ_EVENTS].T
+            yield EventChunk(to_ns(t, str(path)), x.astype(np.int32), y.astype(np.int32), p > 0)
+            progress(start + len(t), len(events))
+        if pictures is not None:
+            nearest = group.get("image_raw_event_inds")
+            yield from hdf5.pictures(pictures, group["image_raw_ts"], f"{path}: image_raw", nearest)
     truth = path.with_name(path.name.replace("_data", "_gt"))
     if truth != path and truth.is_file():
         with hdf5.open_hdf5(truth) as file:
             yield from _flow(file, truth, options.camera)
-
-
-def _read(file: h5py.File, path: Path, camera: str, progress: Progress) -> Iterator[Item]:
-    group = file.get(f"davis/{camera}")
-    if group is None or "events" not in group:
-        raise UsageError(f"{path} has no davis/{camera}/events; its cameras: {', '.join(file.get('davis', ()))}")
-    events, pictures = group["events"], group.get("image_raw")
-    if events.ndim != 2 or events.shape[1] != 4:
-        raise UsageError(f"{path}: davis/{camera}/events is {list(events.shape)}, not [N, 4]")
-    total = events.size * events.dtype.itemsize + (0 if pictures is None else pictures.size)
-    if pictures is not None:
-        if pictures.ndim != 3 or pictures.dtype != np.uint8:
-            raise UsageError(f"{path}: image_raw is {pictures.dtype} {list(pictures.shape)}, not uint8 [M, H, W]")
-        yield SensorSize(pictures.shape[2], pictures.shape[1])
-    done = 0
-    for start in range(0, len(events), hdf5.READ_EVENTS):
-        rows = events[start : start + hdf5.READ_EVENTS]
-        yield EventChunk(
-            to_ns(rows[:, 2], str(path)), rows[:, 0].astype(np.int32), rows[:, 1].astype(np.int32), rows[:, 3] > 0
-        )
-        done += rows.nbytes
-        progress(done, total)
-    if pictures is None:
-        return
-    times, nearest = group["image_raw_ts"][:], group.get("image_raw_event_inds")
-    if len(times) != len(pictures) or (nearest is not None and len(nearest) != len(pictures)):
-        raise UsageError(f"{path}: {len(pictures)} pictures, but {len(times)} times in image_raw_ts")
-    for index, t_ns in enumerate(to_ns(times, str(path))):
-        pixels = pictures[index]
-        yield Picture(int(t_ns), pixels, None if nearest is None else max(0, int(nearest[index])))
-        done += pixels.nbytes
-        progress(done, total)
 
 
 def _flow(file: h5py.File, path: Path, camera: str) -> Iterator[Item]:

@@ -14,6 +14,7 @@ Columns are read in parts from their streams, so a packed file takes no more mem
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import math
 from collections.abc import Iterator
@@ -24,10 +25,10 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
+from v2v_recordings import archive as archives
 from v2v_recordings import hdf5
 from v2v_recordings.archive import Archive
-from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, Progress, SensorSize, to_ns
-from v2v_recordings.text_events import NS_PER_UNIT
+from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, Progress, SensorSize
 
 FOLDER = ("events_ts.npy", "events_xy.npy", "events_p.npy")
 NPZ = ("t.npy", "x.npy", "y.npy", "p.npy")
@@ -36,11 +37,9 @@ METADATA, IMAGES, IMAGE_TIMES = "metadata.json", "images.npy", "images_ts.npy"
 
 def recognises(path: Path) -> bool:
     """Return whether the path is a folder or zip file with EVREAL's columns, or a ``.npz`` with x, y, t and p."""
-    is_npz = path.is_file() and path.suffix.lower() == ".npz"
-    if not (is_npz or path.is_dir() or (path.is_file() and path.suffix.lower() == ".zip")):
-        return False
-    with Archive(path) as archive:
-        return all(archive.find(name) is not None for name in (NPZ if is_npz else FOLDER))
+    return archives.holds(path, lambda archive: all(map(archive.named, FOLDER))) or (
+        path.is_file() and archives.holds(path, lambda archive: all(map(archive.named, NPZ)), suffix=".npz")
+    )
 
 
 def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
@@ -50,82 +49,66 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
         UsageError: a part is missing, damaged or has another shape.
     """
     with Archive(path) as archive, contextlib.ExitStack() as files:
-        is_npz = archive.find(NPZ[0]) is not None
+        column = functools.partial(_column, archive, files)
+        if archive.find(NPZ[0]):
+            columns = {name.removesuffix(".npy"): column(name) for name in NPZ}
+            if archive.find("width.npy") and archive.find("height.npy"):
+                yield hdf5.sensor_size([int(column(f"{side}.npy")[:1][0]) for side in ("height", "width")], path)
+        else:
+            times, xy, polarities = FOLDER
+            columns = {"t": column(times), "x": column(xy, 0), "y": column(xy, 1), "p": column(polarities)}
+        pictures = column(IMAGES) if archive.find(IMAGES) else None
+        if (member := archive.find(METADATA)) is not None:
+            yield _metadata_size(archive, member)
+        elif pictures is not None and len(pictures.shape) == 3:
+            yield SensorSize(*pictures.shape[:0:-1])
+        is_float = columns["t"].dtype.kind == "f"
+        unit = options.time_unit or ("s" if is_float else "us")
+        yield from hdf5.events(columns, str(path), progress, ns_per_unit=NS_PER_UNIT[unit])
+        if pictures is not None:
+            yield from hdf5.pictures(pictures, column(IMAGE_TIMES), f"{path}: {IMAGES}")
 
-        def column(name: str, number: int = 0) -> _Column:
-            member = archive.find(name)
-            if member is None:
-                raise UsageError(f"{path} has no {name}")
-            return _Column(files.enter_context(archive.open(member)), f"{path}: {member}", number)
 
-        if is_npz and archive.find("width.npy") and archive.find("height.npy"):
-            yield hdf5.sensor_size([int(column(f"{side}.npy").take(1)[0]) for side in ("height", "width")], path)
-        elif (member := archive.find(METADATA)) is not None:
-            with archive.open(member) as stream:
-                yield _metadata_size(stream, f"{path}: {member}")
-        t, p = column(NPZ[0] if is_npz else FOLDER[0]), column(NPZ[3] if is_npz else FOLDER[2])
-        x, y = (column("x.npy"), column("y.npy")) if is_npz else (column(FOLDER[1]), column(FOLDER[1], 1))
-        if len({each.count for each in (t, x, y, p)}) > 1 or {t.row_shape, x.row_shape, p.row_shape} - {(), (2,)}:
-            raise UsageError(f"{path}: columns of t, x, y, p have {t.count}, {x.count}, {y.count}, {p.count} entries")
-        unit = NS_PER_UNIT[options.time_unit or ("s" if t.is_float else "us")]
-        for start in range(0, t.count, hdf5.READ_EVENTS):
-            parts = [each.take(hdf5.READ_EVENTS) for each in (t, x, y, p)]
-            count = min(map(len, parts))
-            times, columns, rows, signs = (part[:count] for part in parts)
-            yield EventChunk(to_ns(times, str(path), unit), columns, rows, signs > 0)
-            progress(start + count, t.count)
-            if count < min(hdf5.READ_EVENTS, t.count - start):
-                yield Note(f"cut: {start + count} of {t.count} events are there")
-                break
-        if not is_npz and archive.find(IMAGES) is not None:
-            yield from _pictures(column(IMAGES), column(IMAGE_TIMES), path)
+def _column(archive: Archive, files: contextlib.ExitStack, name: str, number: int | None = None) -> _Column:
+    member = archive.find(name) or name
+    return _Column(files.enter_context(archive.open(member)), archive.where(member), number)
 
 
 class _Column:
-    """Read a .npy file of N rows from its stream; ``number`` chooses a column of [N, k]."""
+    """Read a .npy file of N rows from its stream; ``number`` chooses a column of [N, 2]."""
 
-    def __init__(self, stream: IO[bytes], where: str, number: int = 0) -> None:
+    def __init__(self, stream: IO[bytes], where: str, number: int | None) -> None:
         try:
             version = np.lib.format.read_magic(stream)
             read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
             shape, is_fortran, self.dtype = read_header[version](stream)
         except (ValueError, KeyError) as error:
             raise UsageError(f"{where} is not an array of NumPy: {error}") from error
-        if self.dtype.kind not in "iufb":
-            raise UsageError(f"{where} holds {self.dtype}, not numbers")
-        self.count, self.is_float = (shape[0] if shape else 1), self.dtype.kind == "f"
-        self.row_shape = tuple(side for side in shape[1:] if side > 1)
-        if is_fortran and len(shape) > 1:  # columns lie one after the other
-            stream.seek(number * self.count * self.dtype.itemsize, 1)
-            self.row_shape, number = (), 0
-        self._stream, self._number = stream, number
+        count, *row = shape or (1,)
+        if (number is not None and row != [2]) or (is_fortran and number is None and len(shape) > 1):
+            order = " in the order of Fortran" if is_fortran else ""
+            raise UsageError(f"{where} is {list(shape)}{order}: save events_xy as [N, 2], and others in the order of C")
+        self._stream, self._begin = stream, stream.tell()
+        if is_fortran and number is not None:  # columns lie one after the other
+            self._begin += number * count * self.dtype.itemsize
+            row, number = [], None
+        self._row, self._number = [side for side in row if side > 1], number
+        self.shape = (count, *self._row) if number is None else (count,)
 
-    def take(self, most: int) -> npt.NDArray[Any]:
-        """Return the next rows, at most this many: [n, ...] as in the file, or [n] of a chosen column."""
-        row_bytes = math.prod(self.row_shape) * self.dtype.itemsize
-        data = self._stream.read(min(most, self.count) * row_bytes)
-        rows = np.frombuffer(data[: len(data) // row_bytes * row_bytes], self.dtype).reshape(-1, *self.row_shape)
-        return rows[:, self._number] if rows.ndim == 2 else rows
-
-
-def _metadata_size(stream: IO[bytes], where: str) -> Any:
-    try:
-        stated = json.loads(stream.read(1 << 16))["sensor_resolution"]
-    except (ValueError, LookupError, TypeError) as error:
-        raise UsageError(f"{where} states no sensor_resolution: {error!r}") from error
-    return hdf5.sensor_size(stated, Path(where))
+    def __getitem__(self, part: slice) -> npt.NDArray[Any]:
+        """Return some rows."""
+        first, last, _ = part.indices(self.shape[0])
+        row_bytes = math.prod(self._row) * self.dtype.itemsize
+        self._stream.seek(self._begin + first * row_bytes)
+        data = self._stream.read((last - first) * row_bytes)
+        rows = np.frombuffer(data[: len(data) // row_bytes * row_bytes], self.dtype).reshape(-1, *self._row)
+        return rows if self._number is None else rows[:, self._number]
 
 
-def _pictures(pictures: _Column, times: _Column, path: Path) -> Iterator[Item]:
-    if len(pictures.row_shape) != 2 or times.row_shape or pictures.count != times.count or pictures.dtype != np.uint8:
-        raise UsageError(
-            f"{path}: {IMAGES} has {pictures.count} pictures, {pictures.dtype} {list(pictures.row_shape)}, and "
-            f"{IMAGE_TIMES} {times.count} times; they must be as many, and uint8 [H, W]"
-        )
-    SensorSize(*pictures.row_shape[::-1]).require_usable(f"{path}: {IMAGES}")
-    for number in range(pictures.count):
-        time, picture = times.take(1), pictures.take(1)
-        if not (len(time) and len(picture)):
-            yield Note(f"cut: {number} of {pictures.count} pictures are there")
-            return
-        yield Picture(int(to_ns(time, f"{path}: {IMAGE_TIMES}")[0]), picture[0])
+def _metadata_size(archive: Archive, member: str) -> SensorSize:
+    with archive.open(member) as stream:
+        try:
+            stated = json.loads(stream.read(1 << 16))["sensor_resolution"]
+        except (ValueError, LookupError, TypeError) as error:
+            raise UsageError(f"{archive.where(member)} states no sensor_resolution: {error!r}") from error
+    return hdf5.sensor_size(stated, archive.path / member)

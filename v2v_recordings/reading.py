@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings.forms import FORMS, recognise
@@ -21,6 +22,8 @@ LATE_NS = 10_000_000
 """Events that are earlier than others before them by at most this are late in any case."""
 MOST_LATE_EVENTS = 1 << 17
 """A longer run of earlier events is no late packet."""
+FEW_EVENTS = 8
+"""At most this many earlier events at the very end of a recording are late ones."""
 GAP_NS = 1000
 """Time that stands for the unknown one between the last event before a reset and the first one after it."""
 
@@ -57,10 +60,9 @@ class _Clock:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._newest_ns: int | None = None
-        self._offset_ns = 0
-        self._passed = 0
-        self._early: EventChunk | None = None
+        self._newest_ns = np.iinfo(np.int64).min // 2
+        self._offset_ns = self._passed = 0
+        self._early: list[EventChunk] = []
         self._has_others, self._reset = False, ""
 
     def check(self, is_timed: bool) -> None:
@@ -74,47 +76,42 @@ class _Clock:
 
     def pass_on(self, chunk: EventChunk | None) -> Iterator[Item]:
         """Yield what is certain once these events are known; None ends the recording."""
-        rest = _joined([self._early, None if chunk is None else _later(chunk, self._offset_ns)])
-        self._early = None
+        chunks = self._early if chunk is None else [*self._early, _later(chunk, self._offset_ns)]
+        if not chunks:
+            return
+        columns = ("t_ns", "x", "y", "p")
+        rest = EventChunk(*(np.concatenate([getattr(each, name) for each in chunks]) for name in columns))
+        self._early = []
         while len(rest):
-            newest = np.maximum.accumulate(rest.t_ns)
-            if self._newest_ns is not None:
-                newest = np.maximum(newest, self._newest_ns)
-            is_early = rest.t_ns < newest - LATE_NS
-            first = int(is_early.argmax()) if is_early.any() else len(rest)
-            self._newest_ns = int(newest[min(first, len(rest) - 1)])
-            yield from self._counted(rest.part(0, first))
-            rest = rest.part(first)
-            if not len(rest):
-                return
-            is_back = rest.t_ns >= self._newest_ns - LATE_NS
-            end = int(is_back.argmax()) if is_back.any() else len(rest)
-            if end == len(rest) <= MOST_LATE_EVENTS and chunk is not None:
-                self._early = rest
-                return
-            step_ns = self._newest_ns - int(rest.t_ns[0])
-            if end < len(rest) and end <= MOST_LATE_EVENTS and rest.t_ns[end] - rest.t_ns[end - 1] > step_ns // 4:
-                yield from self._counted(rest.part(0, end))
-                rest = rest.part(end)
+            newest = np.maximum.accumulate(np.maximum(rest.t_ns, self._newest_ns))
+            count = _first(rest.t_ns < newest - LATE_NS)
+            if not count:
+                end = _first(rest.t_ns >= self._newest_ns - LATE_NS)
+                if end == len(rest) <= MOST_LATE_EVENTS and chunk is not None:
+                    self._early = [rest]
+                    return
+                step_ns = self._newest_ns - int(rest.t_ns[0])
+                jumps_back = end < len(rest) and rest.t_ns[end] - rest.t_ns[end - 1] > step_ns // 4
+                is_few = end == len(rest) <= FEW_EVENTS
+                count = end if is_few or (jumps_back and end <= MOST_LATE_EVENTS) else 0
+            if not count:
+                back = f"the times step back by {step_ns * 1e-9:.6g} s: the clock was reset"
+                self._reset = f"at event {self._passed} {back}"
+                self.check(False)
+                yield Note(f"{self._reset}; a gap of unknown length, after which the events follow those before it")
+                self._offset_ns += step_ns + GAP_NS
+                rest = _later(rest, step_ns + GAP_NS)
                 continue
-            self._reset = f"at event {self._passed} the times step back by {step_ns * 1e-9:.6g} s: the clock was reset"
-            self.check(False)
-            yield Note(f"{self._reset}; a gap of unknown length, after which the events follow those before it")
-            self._offset_ns += step_ns + GAP_NS
-            rest = _later(rest, step_ns + GAP_NS)
-
-    def _counted(self, chunk: EventChunk) -> Iterator[Item]:
-        self._passed += len(chunk)
-        if len(chunk):
-            yield chunk
+            yield rest.part(0, count)
+            self._newest_ns = int(newest[count - 1])
+            self._passed += count
+            rest = rest.part(count)
 
 
-def _joined(chunks: list[EventChunk | None]) -> EventChunk:
-    found = [chunk for chunk in chunks if chunk is not None] or [EventChunk(*np.zeros((4, 0), np.int64))]
-    if len(found) == 1:
-        return found[0]
-    return EventChunk(*(np.concatenate([getattr(chunk, name) for chunk in found]) for name in ("t_ns", "x", "y", "p")))
+def _first(mask: npt.NDArray[np.bool_]) -> int:
+    """Return the first place at which a mask is true; its length if there is none."""
+    return int(mask.argmax()) if mask.any() else len(mask)
 
 
 def _later(chunk: EventChunk, ns: int) -> EventChunk:
-    return dataclasses.replace(chunk, t_ns=chunk.t_ns + ns) if ns else chunk
+    return dataclasses.replace(chunk, t_ns=chunk.t_ns + ns)

@@ -6,31 +6,52 @@ Spaces, tabs or commas separate values. Lines that begin with ``#`` are comments
 from __future__ import annotations
 
 import codecs
+import io
 import re
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import IO
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.items import EventChunk, Note, SensorSize, to_ns
+from v2v_recordings.archive import Archive
+from v2v_recordings.items import NS_PER_UNIT, EventChunk, Item, Note, Picture, Progress, SensorSize, to_ns
 
 BLOCK_BYTES = 1 << 22
 COMMENT = re.compile(rb"^[ \t]*#[^\r\n]*", re.MULTILINE)
 COMMA = re.compile(rb"(?<=[^\s,])[ \t]*,[ \t]*(?=[^\s,])")
-NS_PER_UNIT = {"s": 1e9, "us": 1e3, "ns": 1.0}
 TIME_WITH_A_FRACTION = re.compile(rb"^[ \t]*[-+\d]*(\.|[eE]-)", re.MULTILINE)
 """Matches a line whose first number has a decimal point, or a negative exponent without one (1e-06)."""
 
 
+def read_texts(
+    archive: Archive, events: list[str], pictures: list[tuple[int, str]], time_unit: str | None, progress: Progress
+) -> Iterator[Item]:
+    """Yield the events of an archive's texts, one text after the other, then its pictures.
+
+    Args:
+        pictures: times, ns, and members.
+        time_unit: see :func:`read_text_events`.
+
+    Raises:
+        UsageError: a member is missing or malformed.
+    """
+    done, total = 0, sum(archive.bytes_of.get(member, 0) for member in (*events, *(name for _, name in pictures)))
+    for member in events:
+        with archive.open(member) as stream:
+            for item in read_text_events(stream, archive.where(member), time_unit=time_unit):
+                progress(done + stream.tell(), total)
+                yield item
+        done += archive.bytes_of[member]
+    for t_ns, member in pictures:
+        yield Picture(t_ns, archive.picture(member))
+        done += archive.bytes_of[member]
+        progress(done, total)
+
+
 def read_text_events(
-    stream: IO[bytes],
-    name: str,
-    *,
-    time_unit: str | None = None,
-    advance: Callable[[int], None] = lambda _bytes: None,
+    stream: IO[bytes], name: str, *, time_unit: str | None = None
 ) -> Iterator[SensorSize | EventChunk | Note]:
     """Yield the sensor's size, if the file states it, and chunks of events. A last line that was cut is left out.
 
@@ -39,36 +60,39 @@ def read_text_events(
         name: name of the file, for messages.
         time_unit: "s", "us" or "ns"; None takes seconds if any time in the first block has a decimal point, else us.
             The first time alone is not enough: ``%g`` writes 0 and 1e-06.
-        advance: called with the size of each block in bytes.
 
     Raises:
         UsageError: a line is not four numbers (the message gives its number and text), or the times have another unit.
     """
     if time_unit is not None and time_unit not in NS_PER_UNIT:
         raise UsageError(f"time unit {time_unit!r}: give one of {', '.join(NS_PER_UNIT)}")
-    lines_before, rest, started, is_head = 0, b"", False, True
-    while block := stream.read(BLOCK_BYTES):
-        advance(len(block))
-        if is_head:
-            block, is_head = block.removeprefix(codecs.BOM_UTF8), False
-        whole, newline, rest = (rest + block).rpartition(b"\n")
+    lines_before, rest, has_begun = 0, stream.read(len(codecs.BOM_UTF8)).removeprefix(codecs.BOM_UTF8), False
+    while True:
+        read = stream.read(BLOCK_BYTES)
+        # All whole lines; the last one may have no end.
+        whole, newline, rest = (rest + read).rpartition(b"\n") if read else (rest, b"", b"")
         block = _plain(whole + newline)
-        if not started and (begun := block.lstrip()):
+        lines = block.count(b"\n")
+        if not has_begun and (begun := block.lstrip()):
+            has_begun = True
             first, _, after = begun.partition(b"\n")
-            started = True
             if len(first.split()) == 2:
                 yield _sensor_size(first, name)
-                lines_before += block.count(b"\n") - after.count(b"\n")
-                block = after
-        if time_unit is None:
-            time_unit = _time_unit(block)
-        yield from _chunk(block, name, lines_before, time_unit)
-        lines_before += block.count(b"\n")
-    rest = _plain(rest)
-    if lines_before and rest.strip() and _numbers(rest) is None:
-        yield Note(f"cut: line {lines_before + 1}, the last, is incomplete ({_shown(rest)}) and left out")
-        return
-    yield from _chunk(rest, name, lines_before, time_unit or _time_unit(rest) or "us")
+                lines_before += lines - after.count(b"\n")
+                block, lines = after, after.count(b"\n")
+        if block.strip():
+            time_unit = time_unit or ("s" if TIME_WITH_A_FRACTION.search(block) else "us")
+            values = _numbers(block)
+            if values is None and lines_before and not read:
+                yield Note(f"cut: line {lines_before + 1}, the last, is incomplete ({_shown(block)}) and left out")
+                return
+            if values is None:
+                raise UsageError(_first_bad_line(block, name, lines_before))
+            t, x, y, p = values.T
+            yield EventChunk(to_ns(t, name, NS_PER_UNIT[time_unit]), x.astype(np.int32), y.astype(np.int32), p > 0)
+        if not read:
+            return
+        lines_before += lines
 
 
 def _plain(block: bytes) -> bytes:
@@ -89,45 +113,16 @@ def _sensor_size(line: bytes, name: str) -> SensorSize:
     return SensorSize(width, height)
 
 
-def _time_unit(block: bytes) -> str | None:
-    """Return the time unit of the events in a block, "s" or "us"; None if the block has no events."""
-    if not block.strip():
-        return None
-    return "s" if TIME_WITH_A_FRACTION.search(block) else "us"
-
-
-def _chunk(block: bytes, name: str, lines_before: int, time_unit: str | None) -> Iterator[EventChunk]:
-    if not block.strip():
-        return
-    values = _numbers(block)
-    if values is None:
-        raise UsageError(_first_bad_line(block, name, lines_before))
-    t, x, y, p = values.T
-    yield EventChunk(to_ns(t, name, NS_PER_UNIT[time_unit or "us"]), x.astype(np.int32), y.astype(np.int32), p > 0)
-
-
 def _numbers(block: bytes) -> npt.NDArray[np.float64] | None:
-    """Parse a block to [N, 4]; None unless it is N lines of four finite numbers with integer coordinates."""
-    with warnings.catch_warnings():
-        # For text that it cannot parse to the end, NumPy warns in some releases and raises in others.
-        warnings.simplefilter("error", DeprecationWarning)
-        try:
-            values = np.fromstring(block, np.float64, sep=" ")
-        except (ValueError, DeprecationWarning):
-            return None
-    lines = block.count(b"\n") + (not block.endswith(b"\n"))
-    if len(values) != 4 * lines or not np.isfinite(values).all():
-        # Blank lines are allowed.
-        kept = [line for line in block.splitlines() if line.strip()]
-        if len(values) != 4 * len(kept) or not all(len(line.split()) == 4 for line in kept):
-            return None
-        if not np.isfinite(values).all():
-            return None
-    table: npt.NDArray[np.float64] = values.reshape(-1, 4)
-    coordinates = table[:, 1:3]
-    if (coordinates != np.rint(coordinates)).any() or not np.isin(table[:, 3], (-1, 0, 1)).all():
+    """Parse a block to [N, 4]; None unless its lines are four finite numbers with integer coordinates, or blank."""
+    try:
+        table = np.loadtxt(io.StringIO(block.decode("latin-1")), ndmin=2)
+    except ValueError:
         return None
-    return table
+    if table.shape[1] != 4 or not np.isfinite(table).all():
+        return None
+    is_whole = (table[:, 1:3] == np.rint(table[:, 1:3])).all()
+    return table if is_whole and np.isin(table[:, 3], (-1, 0, 1)).all() else None
 
 
 def _shown(line: bytes) -> str:
@@ -136,6 +131,6 @@ def _shown(line: bytes) -> str:
 
 def _first_bad_line(block: bytes, name: str, lines_before: int) -> str:
     for number, line in enumerate(block.splitlines(), start=lines_before + 1):
-        if line.strip() and (len(line.split()) != 4 or _numbers(line) is None):
+        if line.strip() and _numbers(line) is None:
             return f"{name}, line {number}: {_shown(line)} is not `t x y p` with whole x and y and p of -1, 0 or 1"
     return f"{name}: the lines after {lines_before} are not `t x y p`"

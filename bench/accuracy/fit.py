@@ -39,9 +39,10 @@ from tests.oracles.other_cameras import OTHERS, record_other
 from v2v_protocol.command import Parser
 from v2v_protocol.recipe import PRESETS, Recipe
 from v2v_server.fit.fit import fit
+from v2v_server.fit.interval import Doubles
 from v2v_server.fit.recording import Recorded, recorded
 from v2v_server.fit.regression import light_of
-from v2v_server.fit.statistics import distance, panels_of, simulate_recording
+from v2v_server.fit.statistics import panels_of, simulate_recording
 from v2v_server.simulation.draw import draw
 
 HEIGHT_PX, WIDTH_PX = 96, 128
@@ -116,7 +117,7 @@ def _outside() -> Report:
     for number, (name, camera) in enumerate(OTHERS.items()):
         film = rendered_film(SCENES[number], HEIGHT_PX, WIDTH_PX, 70.0)
         given = _recorded(record_other(film, camera, number))
-        is_even = given.blocks() % 2 == 0  # stripes of the sensor; the fit itself holds out half of the blocks
+        is_even = given.blocks() % 2 == 0  # stripes of the sensor
         fitted = fit(given.part(is_even))
         progress(f"{name}: told {', '.join(fitted.camera)}")
         other = given.part(~is_even)
@@ -151,13 +152,18 @@ def _apart(recording: Recorded, camera: Mapping[str, float]) -> tuple[float, ...
         panels_of(each, light_of(np.arange(256.0)), begin, end)
         for each in (recording, simulate_recording(recording, camera))
     ]
-    off, on = (np.array([panels["rates"].sum(axis=0)[part].sum() for panels in both]) for part in HALVES)
-    every = np.ones(len(both[0]["rates"]))
+    off, on = (np.array([panels["rates"][part].sum() for panels in both]) for part in HALVES)
     rates, ratios = np.log(on + off + 1.0), np.log((on + 1.0) / (off + 1.0))
     return (
         abs(rates[1] - rates[0]), abs(ratios[1] - ratios[0]),
-        *(distance(both[0], both[1], every, (name,)) for name in ("pixels", "intervals")),
+        *(_distance(both[0][name], both[1][name]) for name in ("pixels", "intervals")),
     )  # fmt: skip
+
+
+def _distance(mine: Doubles, other: Doubles) -> float:
+    """Return the squared distance of the square roots of two statistics, scaled alike."""
+    scale = max((mine.sum() + other.sum()) / 2, 1e-12)
+    return float(((np.sqrt(mine / scale) - np.sqrt(other / scale)) ** 2).sum())
 
 
 def _recorded(made: Mapping[str, Any]) -> Recorded:

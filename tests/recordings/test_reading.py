@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import io
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -374,3 +375,96 @@ def test_pictures_that_are_no_columns_are_refused(tmp_path: Path) -> None:
     items = read(tmp_path / "b")
     assert notes(items) == "cut: 4 of 5 pictures are there"
     assert sum(isinstance(item, Picture) for item in items) == 4
+
+
+def test_dsec_of_odd_offsets_cameras_and_columns(tmp_path: Path) -> None:
+    """An offset above 2^32 us counts from the clock of the frames; a broken part is named, without a traceback."""
+    raw_forms.write_dsec(tmp_path / "a", scene(), "right")
+    events = tmp_path / "a/events/right/events.h5"
+    later_us = 49_000_000_000
+    with h5py.File(events, "a") as file:
+        file["t_offset"][...] += later_us
+    stamps = tmp_path / "a/images/timestamps.txt"
+    stamps.write_bytes(b"".join(b"%d\r\n" % (t + later_us) for t in scene().picture_us))
+    with pytest.raises(UsageError, match=r"holds 0 recordings of the left camera; --camera"):
+        read(tmp_path / "a")
+    items = read(tmp_path / "a", ConvertOptions(camera="right"))
+    assert times_us(items)[0] == scene().t_us[0] + later_us
+    assert sum(isinstance(item, Picture) for item in items) == 5
+    for name, value, said in (
+        ("t_offset", np.zeros(0, np.int64), "index 0 is out of bounds"),
+        ("events/p", h5py.Empty("u1"), "columns of t, x, y, p have 28, 28, 28, no entries"),
+        ("events/p", None, "columns of t, x, y, p have 28, 28, 28, no entries"),
+    ):
+        with h5py.File(events, "a") as file:
+            del file[name]
+            if value is None:
+                file.create_group(name)
+            else:
+                file[name] = value
+        if name != "t_offset":
+            with h5py.File(events, "a") as file:
+                del file["t_offset"]
+                file["t_offset"] = 0
+        with pytest.raises(UsageError, match=said):
+            read(tmp_path / "a", ConvertOptions(camera="right"))
+
+
+def test_evreal_as_others_save_it(tmp_path: Path) -> None:
+    """Times of 1e9 s, xy in the order of C, polarities of -1 and 1, no metadata, nested, in capitals."""
+
+    def saved(values: np.ndarray) -> bytes:
+        stream = io.BytesIO()
+        np.save(stream, values)
+        return stream.getvalue()
+
+    made = scene()
+    members = raw_forms.evreal_members(made)
+    del members["metadata.json"]
+    members |= {
+        "events_ts.npy": saved(made.t_us / 1e6 + 1e9),
+        "events_xy.npy": saved(np.stack([made.x, made.y], axis=1).astype(np.uint16)),
+        "events_p.npy": saved(np.where(made.p, 1, -1).astype(np.int8)),
+        "images_ts.npy": saved(made.picture_us / 1e6 + 1e9),
+    }
+    raw_forms.write_folder(tmp_path / "a" / "Übung", {name.upper(): content for name, content in members.items()})
+    items = read(tmp_path / "a")
+    assert items[0] == SensorSize(WIDTH, HEIGHT)
+    chunks = [item for item in items if isinstance(item, EventChunk)]
+    np.testing.assert_array_equal(np.concatenate([chunk.x for chunk in chunks]), made.x)
+    np.testing.assert_array_equal(np.concatenate([chunk.y for chunk in chunks]), made.y)
+    np.testing.assert_array_equal(np.concatenate([chunk.p for chunk in chunks]), made.p)
+    assert np.abs(np.array(times_us(items)) - 1e15 - made.t_us).max() <= 1
+    for name, values, said in (
+        ("events_xy", np.stack([made.x, made.y]), r"events_xy.npy is \[2, 28\]: save events_xy as \[N, 2\]"),
+        ("events_p", np.array([None] * 28), "28 entries of float64, uint16, uint16, object"),
+        ("images", np.asfortranarray(made.pictures), "images.npy is .* in the order of Fortran"),
+    ):
+        raw_forms.write_folder(tmp_path / name, members | {f"{name}.npy": saved(values)})
+        with pytest.raises(UsageError, match=said):
+            read(tmp_path / name)
+
+
+def test_few_late_events_at_the_end_are_no_reset(tmp_path: Path) -> None:
+    times = [*range(0, 100 * MS, MS), 50 * MS, 51 * MS]
+    assert notes(passed(times, [30, 60])) == ""
+    assert notes(passed([*times, *range(52 * MS, 62 * MS, MS)], [30, 60])).startswith(
+        "at event 100 the times step back"
+    )
+
+
+def test_a_listing_of_windows_and_a_missing_filter(tmp_path: Path) -> None:
+    members = raw_forms.ijrr_members(scene())
+    listing = members["slow/images.txt"].replace(b"/", b"\\").replace(b"\n", b"\r\n")
+    raw_forms.write_folder(tmp_path / "a", members | {"slow/images.txt": b"\xef\xbb\xbf" + listing})
+    assert sum(isinstance(item, Picture) for item in read(tmp_path / "a")) == 5
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        for name in ("x", "y", "t", "p"):
+            file.create_dataset(f"events/{name}", data=np.arange(9), chunks=(9,), compression="gzip")
+    content = bytearray((tmp_path / "b.h5").read_bytes())
+    while (at := content.find(b"deflate")) >= 0:
+        struct.pack_into("<H", content, at - 8, 32_001)  # the number of Blosc
+        content[at : at + 7] = b"another"
+    (tmp_path / "b.h5").write_bytes(content)
+    with pytest.raises(UsageError, match="filter may be in the package hdf5plugin"):
+        read(tmp_path / "b.h5")

@@ -18,7 +18,7 @@ from v2v_protocol.progress import Progress
 from v2v_protocol.records import write_json
 from v2v_recordings import items
 from v2v_recordings.forms import FORMS
-from v2v_recordings.text_events import NS_PER_UNIT
+from v2v_recordings.items import NS_PER_UNIT
 
 
 def main(argv: Sequence[str] | None = None) -> int:

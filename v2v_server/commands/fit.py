@@ -14,8 +14,7 @@ from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec_flags import read_yaml_mapping, recipe_setting
 from v2v_recordings.forms import FORMS
-from v2v_recordings.items import ConvertOptions, SensorSize
-from v2v_recordings.text_events import NS_PER_UNIT
+from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, SensorSize
 from v2v_server.fit.fit import FittedCamera, fit
 from v2v_server.fit.lab import camera_of, measure, table
 from v2v_server.fit.report import draw_fit, report_lines, write_recipe

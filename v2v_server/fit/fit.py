@@ -1,4 +1,4 @@
-"""Fit a camera to a recording: estimate, match with the kernel, and keep the effects that evidence supports."""
+"""Fit a camera to a recording: estimate, match with the kernel, and keep the effects that the intervals show."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.recipe import effect_settings
 from v2v_recordings.items import ConvertOptions, Progress
 from v2v_server.fit import estimators, regression
 from v2v_server.fit.increments import Still, increments_of, intervals_us, still_time
 from v2v_server.fit.interval import Doubles, Estimate, unknown
 from v2v_server.fit.recording import Recorded, read_recording
-from v2v_server.fit.statistics import Panels, gain, panels_of, simulate_recording
+from v2v_server.fit.statistics import Panels, panels_of, simulate_recording
 
 LEAST_FRAMES = 3
 USUAL_THRESHOLD = 0.2
@@ -27,13 +26,6 @@ _GREY_OF_STATIC = 136
 """Grey level of a quarter of white's light: a static scene without frames."""
 _STATIC_LIGHT_DOUBT = 0.3
 _BLOCKS_SIDE = 8
-_NOISE_PANELS = {
-    "shot_noise_hz": ("still", "still_pixels"),
-    "leak_hz": ("still", "still_pixels"),
-    "hot_pixel_share": ("still_pixels",),
-    "dead_pixel_share": ("pixels",),
-}
-"""Statistics that decide about an effect; those of still pixels do not depend on the motion between frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,15 +78,13 @@ def fit(
     light = regression.light_of(np.arange(256.0))
     begin, end = _span(given)
     measured = panels_of(given, light, begin, end)
-    left_out = {name: made.note for name, made in estimates.items() if not made.told}
-    left_out |= {
-        name: f"at most {made.high:.3g}, too little to matter"
+    left_out = {
+        name: f"at most {made.high:.3g}, too little to matter" if made.told else made.note
         for name, made in estimates.items()
-        if made.is_absent and name in _switches()
+        if made.is_absent or not made.told
     }
     simulated = None
     if len(given.frames) >= LEAST_FRAMES and ("threshold_pos" in _values(estimates) or static):
-        left_out |= _without_evidence(given, estimates, left_out, light, is_blank=static and not has_frames)
         used = _values({name: made for name, made in estimates.items() if name not in left_out})
         simulated = panels_of(simulate_recording(given, _complete(used), 2), light, begin, end)
     facts = {
@@ -110,7 +100,7 @@ def _estimates(given: Recorded, is_blank: bool, static: bool = False) -> dict[st
     blocks, light = given.blocks(_BLOCKS_SIDE), regression.light_of(np.arange(256.0))
     period = estimators.refractory(intervals_us(given))
     has_frames = len(given.frames) >= LEAST_FRAMES
-    longest_us = 1e6 * _frame_seconds(given) if has_frames else 0.0
+    longest_us = float(np.median(np.diff(given.frame_us))) if has_frames else 0.0
     if has_frames and not period.told and math.isfinite(period.high) and not is_blank:
         period = regression.refractory_by_change(given, blocks, period, longest_us)
     made = {"refractory_seconds": period}
@@ -182,49 +172,6 @@ def _matched_leak(
     return made.moved(value, regression.SYSTEMATIC["leak_hz"] * value) if value > 0.0 else made
 
 
-def _without_evidence(
-    given: Recorded, estimates: Mapping[str, Estimate], left_out: Mapping[str, str], light: Doubles, *, is_blank: bool
-) -> dict[str, str]:
-    """Fit one half of the sensor and return the effects that bring the other half's statistics no closer."""
-    row, column = np.divmod(given.blocks(_BLOCKS_SIDE), _BLOCKS_SIDE)
-    seen = (row + column) % 2 == 0
-    held_out = (np.add.outer(np.arange(_BLOCKS_SIDE), np.arange(_BLOCKS_SIDE)) % 2 == 1).ravel()
-    one, other = given.part(seen), given.part(~seen)
-    # Half of the pixels may be too few for a narrow interval; the value counts all the same.
-    told = {name for name, made in estimates.items() if made.told and name not in left_out}
-    halves = {name: made for name, made in _estimates(one, is_blank).items() if name in told and made.value > 0.0}
-    fitted = _complete(
-        _values({name: dataclasses.replace(made, low=made.value, high=made.value) for name, made in halves.items()})
-    )
-    begin, end = _span(given)
-    measured = panels_of(other, light, begin, end)
-    full = panels_of(simulate_recording(other, fitted, 3), light, begin, end)
-    reasons = {}
-    for name in _switches():
-        if name in left_out or not estimates[name].told:
-            continue
-        if not fitted.get(name):
-            reasons[name] = "half of the sensor tells nothing of it"
-            continue
-        if name not in _NOISE_PANELS:
-            # The simulation between frames of a low rate is too smooth to judge these.
-            if halves[name].low <= 0.0:
-                reasons[name] = "half of the sensor does not show it"
-            continue
-        without = panels_of(simulate_recording(other, fitted | {name: 0.0}, 3), light, begin, end)
-        by, least = gain(measured, full, without, held_out, _NOISE_PANELS[name])
-        if least <= 0.0:
-            reasons[name] = f"does not bring the other half of the sensor closer ({by:+.2g}, at least {least:+.2g})"
-    if "hot_pixel_share" in reasons:
-        reasons["hot_pixel_sigma"] = reasons["hot_pixel_share"]
-    return reasons
-
-
-def _switches() -> tuple[str, ...]:
-    """Return the parameters that switch an effect on."""
-    return (*effect_settings(), "hot_pixel_share")
-
-
 def _values(estimates: Mapping[str, Estimate]) -> dict[str, float]:
     """Return the values that are told; the corner is estimated as 1 / Hz, and is off where that is negligible."""
     values = {name: made.value for name, made in estimates.items() if made.told}
@@ -240,10 +187,6 @@ def _values(estimates: Mapping[str, Estimate]) -> dict[str, float]:
 
 def _complete(values: Mapping[str, float]) -> dict[str, float]:
     return {"threshold_pos": USUAL_THRESHOLD, "threshold_neg": USUAL_THRESHOLD, "log_eps": 1e-3, **values}
-
-
-def _frame_seconds(given: Recorded) -> float:
-    return float(np.median(np.diff(given.frame_us))) * 1e-6
 
 
 def _span(given: Recorded) -> tuple[int, int]:

@@ -138,22 +138,21 @@ def read_recording(
         UsageError: the form is not known, the file is damaged or has no events, or its sensor's size is not known.
     """
     path, options = Path(path), options or ConvertOptions()
-    size, kept = options.size, None if options.size is None else _Kept(options.size)
-    notes = []
+    size, kept, notes = options.size, None, []
     for item in read_items(path, None, options, progress):
         if isinstance(item, Note):
             notes.append(item.text)
+            continue
+        if isinstance(item, Picture):
+            size = size or SensorSize(*item.pixels.shape[::-1])
         elif isinstance(item, SensorSize):
             size = size or item
-        elif isinstance(item, Picture):
-            size = size or SensorSize(item.pixels.shape[1], item.pixels.shape[0])
-        elif size is None:
+        if size is None:
             raise UsageError(f"{path} does not state the size of the sensor: give --size WIDTHxHEIGHT")
-        if size is not None:
-            kept = kept or _Kept(size)
-        if kept is not None and isinstance(item, Picture):
+        kept = kept or _Kept(size)
+        if isinstance(item, Picture):
             kept.add_frame(item, path)
-        elif kept is not None and isinstance(item, EventChunk) and len(item):
+        elif isinstance(item, EventChunk) and len(item):
             kept.add_events(item, path)
     if kept is None or not kept.event_count:
         raise UsageError(f"{path} has no events")

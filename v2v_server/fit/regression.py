@@ -132,26 +132,17 @@ def _least_squares(given: Increments, log_eps: float, turns: int = 7) -> _Fit:
     return _Fit(columns, change, variance, weight, residual, solved)
 
 
-def _log_likelihood(given: Increments, log_eps: float, residual: Doubles, variance: Doubles, scale: float) -> Doubles:
-    """Return the log likelihood of each increment's grey levels, [M]; their errors have long tails.
+def _likelihood(given: Increments, log_eps: float) -> Doubles:
+    """Return the log likelihood of each increment's grey levels at the best thresholds, [M]; errors have long tails.
 
     A larger epsilon makes all changes smaller, residuals included. So the likelihood is that of grey levels, not of log
     intensity: it has the derivative dL / dF as a factor.
     """
-    light = light_of(given.grey)
+    fit, light = _least_squares(given, log_eps, turns=5), light_of(given.grey)
+    scale = 1.4826 * float(np.median(np.abs(fit.residual) / np.sqrt(fit.variance)))
     derivative = np.log(light / (light + log_eps)).mean(axis=0)
-    tails = np.log1p(residual**2 / variance / scale**2 / 4)
-    return np.asarray(derivative - 0.5 * np.log(variance) - math.log(scale) - 2.5 * tails)
-
-
-def _likelihood(given: Increments, log_eps: float) -> Doubles:
-    """Return the log likelihood of each increment at the best thresholds, [M]."""
-    fit = _least_squares(given, log_eps, turns=5)
-    return _log_likelihood(given, log_eps, fit.residual, fit.variance, _scale(fit.residual, fit.variance))
-
-
-def _scale(residual: Doubles, variance: Doubles) -> float:
-    return 1.4826 * float(np.median(np.abs(residual) / np.sqrt(variance)))
+    tails = np.log1p(fit.residual**2 / fit.variance / scale**2 / 4)
+    return np.asarray(derivative - 0.5 * np.log(fit.variance) - math.log(scale) - 2.5 * tails)
 
 
 def _solve(normal: Doubles, right: Doubles) -> Doubles:

@@ -113,13 +113,14 @@ def draw_fit(fitted: FittedCamera, source: str) -> Image:
 
 
 def _curves(panels: Panels) -> list[Doubles]:
-    rates = per_second(panels["rates"].sum(axis=0), panels["exposure"].sum(axis=0))
-    still = per_second(panels["still"].sum(axis=0), panels["still_exposure"].sum(axis=0))
-    pixels, intervals = panels["pixels"].sum(axis=0), panels["intervals"].sum(axis=0)
+    rates, still = (
+        per_second(panels["rates"], panels["exposure"]),
+        per_second(panels["still"], panels["still_exposure"]),
+    )
+    pixels, intervals = (panels[name] / max(panels[name].sum(), 1.0) for name in ("pixels", "intervals"))
     off, on = rates[:8], rates[8:]
     share = np.divide(on, on + off, out=np.zeros_like(on), where=on + off > 0)
-    intervals = intervals / max(intervals.sum(), 1.0)
-    return [off, on, still[:8], still[8:], pixels / max(pixels.sum(), 1.0), share, intervals[:22], intervals[22:]]
+    return [off, on, still[:8], still[8:], pixels, share, intervals[:22], intervals[22:]]
 
 
 def _range(low: float, high: float) -> list[float]:
