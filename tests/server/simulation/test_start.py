@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from tests.oracles import noise
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import STARTS, Recipe, preset
-from v2v_server.simulation import noise
 from v2v_server.simulation.clip import simulate, simulate_log
 from v2v_server.simulation.draw import draw, noise_key_of_seed
 
