@@ -58,8 +58,10 @@ EFFECTS = "Effects beyond the paper's model; zero is off"
 """The group of fields that switch on an effect where the upper end of their range is above zero."""
 TIME_UNITS = ("Hz", "s")
 """An effect in one of these needs the time between frames."""
+STARTS = ("uniform", "triangular", "zero")
+"""How the residual of a pixel is drawn at the start of a clip (``v2v_server/simulation/pixel.py``)."""
 _LARGEST_FRAMES = 1_000_001
-LATER_FIELDS = ("grids_per_frame", "max_boxes", "light", "voxel_seconds")
+LATER_FIELDS = ("grids_per_frame", "max_boxes", "light", "voxel_seconds", "start", "rate_draw")
 """Fields that the plain form leaves out at their defaults, so that older digests hold."""
 MOST_STEPS_PER_GRID = 1024
 """Largest number of steps between video frames that a grid of ``voxel_seconds`` may span."""
@@ -135,6 +137,11 @@ class Recipe:
         "sample: new thresholds for every sample; video: the same for all samples of a video (those of the list file, "
         "if it states any)",
     )  # fmt: skip
+    start: str = word(
+        "uniform", STARTS,
+        "residual of each pixel at the start of a clip, between its thresholds: uniform, as in the paper's code; "
+        "triangular, as in a camera that has run for long; zero, as if each pixel had just fired",
+    )  # fmt: skip
     noise_sigma: Range = span(
         (0.0, 0.1), 0.0, 1e6, "standard deviation of the noise, per frame, or per square root of a second",
         unit="log units",
@@ -147,6 +154,11 @@ class Recipe:
     )  # fmt: skip
     noise_unit: str = word("frame", ("frame", "second"), "the time base of noise_sigma and hot_pixel_sigma")
 
+    rate_draw: str = word(
+        "uniform", ("uniform", "log"),
+        "draw effects in Hz uniformly from their range, or uniformly in the logarithm (as many below 1 as above 1 of "
+        "0.1 to 10)",
+    )  # fmt: skip
     threshold_mismatch_sigma: Range = span(
         (0.0, 0.0), 0.0, 1.0, "standard deviation of each pixel's thresholds, as a share of the nominal ones",
         group=EFFECTS,
@@ -178,6 +190,13 @@ class Recipe:
                     f"recipe {name} = {getattr(self, name)}: the duration of a grid is that of voxel_seconds "
                     f"({format_value(self.voxel_seconds)}): set {name} to {alone}, or voxel_seconds to 0"
                 )
+        for name in self.log_drawn:
+            low, high = getattr(self, name)
+            if low == 0.0 < high:
+                raise RecipeError(
+                    f"recipe {name} = {format_value((low, high))}: a range that is drawn in its logarithm begins above "
+                    "0: raise its lower end, or set rate_draw to uniform"
+                )
         if not self.is_timed and self.frames_needed > _LARGEST_FRAMES:
             raise RecipeError(
                 f"recipe needs {self.frames_needed} frames a sample (voxels_per_clip x bins x frames_per_bin x "
@@ -202,6 +221,12 @@ class Recipe:
         return any(
             getattr(self, name)[1] > 0.0 for name, setting in effect_settings().items() if setting.unit in TIME_UNITS
         )
+
+    @property
+    def log_drawn(self) -> tuple[str, ...]:
+        """Return the effects whose value is drawn uniformly in its logarithm."""
+        names = (name for name, setting in effect_settings().items() if setting.unit == "Hz")
+        return tuple(names) if self.rate_draw == "log" else ()
 
     @property
     def needs_seconds(self) -> bool:

@@ -93,6 +93,11 @@ PORTABLE: Mapping[str, Row] = {
     "noise per second": Row({"noise_unit": "second", "hot_pixel_share": 0.02}),
     "grids_per_frame": Row({"grids_per_frame": 2}, (*_EVENTS, "frames")),
     "voxel_seconds": Row({"voxel_seconds": (0.05, 0.2)}, (*_EVENTS, "frames")),
+    "start": Row(FINE | {"start": "triangular"}),
+    "start of effects": Row(
+        {"preset": "davis346", "start": "triangular", "rate_draw": "log", "shot_noise_hz": (0.1, 5.0)}, _EVENTS
+    ),
+    "start at zero": Row(FINE | {"start": "zero"}),
     "event_counts": Row(FINE, ("event_counts",)),
     "voxels_bilinear": Row(FINE, ("voxels_bilinear",)),
     "frames_rgb": Row({}, ("frames_rgb",)),

@@ -39,6 +39,8 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "gamma": 1.0,
     "log_eps": [0.002, 0.1],
     "light": "declared",
+    "start": "triangular",
+    "rate_draw": "log",
     "threshold": [0.05, 1.0],
     "threshold_ratio": [1.0, 1.6],
     "threshold_source": "video",

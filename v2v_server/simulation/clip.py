@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from v2v_protocol.bounds import most_events, pixel_thresholds
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import TIME_UNITS, Recipe, effect_settings
+from v2v_protocol.recipe import STARTS, TIME_UNITS, Recipe, effect_settings
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.settings import nearest, require_known
 from v2v_server.simulation.draw import noise_key_of_seed
@@ -48,6 +48,7 @@ def simulate(
     frames_per_second: float | None = None,
     bits: int = 8,
     transfer: str = "",
+    start: str = "uniform",
     **effects: float,
 ) -> Voxels:
     """Simulate an event camera that watches a clip.
@@ -61,8 +62,7 @@ def simulate(
         noise_sigma: standard deviation of the noise, log units per frame.
         hot_pixel_count: number of pixels that drift.
         hot_pixel_sigma: standard deviation of their drift, log units per frame.
-        start_residual: every pixel's residual before the first step, log units; None draws it uniformly between
-            -threshold_neg and threshold_pos, as the paper does.
+        start_residual: every pixel's residual before the first step, log units; None draws it as ``start`` says.
         bins: bins of a voxel grid.
         frames_per_bin: steps between frames in one bin.
         grids_per_frame: voxel grids in one step between frames; 0: a grid spans ``bins * frames_per_bin`` steps.
@@ -75,6 +75,8 @@ def simulate(
         frames_per_second: frame rate of the frames; needed for an effect in Hz or seconds.
         bits: 9 to 12 for frames of uint16 [n, H, W] with levels 0 .. 2**bits - 1.
         transfer: "pq", "hlg", "log100", "log316" or "linear" (``intensity.py``); "" uses gamma.
+        start: "uniform" draws the residuals between -threshold_neg and threshold_pos, as the paper's code does,
+            "triangular" as a camera that has run for long has them; "zero" starts them at 0.
         effects: values of effects beyond the paper's model, by the recipe's names (``leak_hz=0.1``); zero is off.
 
     Returns:
@@ -104,7 +106,7 @@ def simulate(
     return _simulate_array(
         frames, Intensity(gamma, log_eps, signal), threshold_pos, threshold_neg, noise_sigma, hot_pixel_count,
         hot_pixel_sigma, start_residual, bins, frames_per_bin, seed, dtype, precision, grids_per_frame, effects,
-        1.0 / (frames_per_second or 1.0),
+        1.0 / (frames_per_second or 1.0), start,
     )  # fmt: skip
 
 
@@ -123,6 +125,7 @@ def simulate_log(
     seed: int = 0,
     dtype: str = "int8",
     precision: str = AUTO,
+    start: str = "uniform",
 ) -> Voxels:
     """Simulate an event camera from log intensities.
 
@@ -139,7 +142,7 @@ def simulate_log(
         raise UsageError("log_frames: a value is NaN or infinite; give the logarithm of positive intensities")
     return _simulate_array(
         log_frames, None, threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma,
-        start_residual, bins, frames_per_bin, seed, dtype, precision, grids_per_frame,
+        start_residual, bins, frames_per_bin, seed, dtype, precision, grids_per_frame, start=start,
     )  # fmt: skip
 
 
@@ -206,7 +209,7 @@ def simulate_clip(
     given = KernelInput(
         frames, intensity, source_index, params,
         step_seconds if recipe.noise_unit == "second" else np.ones(steps), step_seconds, recipe.bins, edges,
-        voxel_dtype, levels=levels, grids_have_durations=recipe.is_timed,
+        voxel_dtype, levels=levels, grids_have_durations=recipe.is_timed, start=recipe.start,
     )  # fmt: skip
     if tolerance > 0.0 and params.effects:
         gone = left_out(changed_shares(given), tolerance)
@@ -232,6 +235,7 @@ def _simulate_array(
     grids_per_frame: int,
     effects: Mapping[str, float] = MappingProxyType({}),
     frame_seconds: float = 1.0,
+    start: str = "uniform",
 ) -> Voxels:
     """Simulate an array. ``intensity`` None: the frames are log intensities, and there are no effects."""
     threshold_neg = threshold_pos if threshold_neg is None else threshold_neg
@@ -240,6 +244,8 @@ def _simulate_array(
     check_thresholds(threshold_pos, threshold_neg)
     _check_number("noise_sigma", noise_sigma)
     _check_number("hot_pixel_sigma", hot_pixel_sigma)
+    if start not in STARTS:
+        raise UsageError(f"start = {start!r}: choose one of {', '.join(STARTS)}")
     if start_residual is not None and not -threshold_neg <= start_residual <= threshold_pos:
         raise UsageError(
             f"start_residual = {start_residual!r}: give a value from -threshold_neg to threshold_pos, "
@@ -268,7 +274,7 @@ def _simulate_array(
     durations = np.ones(steps)
     given = KernelInput(
         frames, intensity, np.arange(count), params, durations, durations * frame_seconds, bins, edges, dtype,
-        start_residual,
+        start_residual, start=start,
     )  # fmt: skip
     real = choose(precision, _most_events(given, ends))
     if intensity is None:

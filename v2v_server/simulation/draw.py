@@ -9,6 +9,8 @@ numbers, does not change the others.
 
     uniform [0, 1)     u = floor(raw / 2**11) * 2**-53
     range [a, b]       min(a + u (b - a), b)
+    its logarithm      min(a (b / a)**u, b): the product of a and the roots (b / a)**(2**-k), k = 1 .. 24, where the
+                       k-th highest bit of raw is set; each is the correctly rounded square root of the one before
     probability p      u < p
     whole 0 .. n-1     floor(raw * n / 2**64), exact
 """
@@ -151,7 +153,7 @@ def draw(
         effects={
             name: value
             for name in (effect_settings() if recipe.has_effects else ())
-            if (value := _in_range(getattr(recipe, name), stream(_stream_of(name), 1)[0])) > 0.0
+            if (value := _effect(recipe, name, stream(_stream_of(name), 1)[0])) > 0.0
         },
         log_eps=_log_eps(recipe.log_eps, stream(Purpose.LOG_EPS, 1)[0]),
     )
@@ -318,6 +320,17 @@ def _unit(raw: int) -> float:
 def _in_range(ends: Range, raw: int) -> float:
     low, high = ends
     return min(low + _unit(raw) * (high - low), high)
+
+
+def _effect(recipe: Recipe, name: str, raw: int) -> float:
+    low, high = getattr(recipe, name)
+    if low == high or name not in recipe.log_drawn:
+        return _in_range((low, high), raw)
+    value, root = low, high / low
+    for bit in range(63, 39, -1):
+        root = math.sqrt(root)
+        value *= root if raw >> bit & 1 else 1.0
+    return min(value, high)
 
 
 def _rounded(value: float) -> int:

@@ -16,7 +16,7 @@ from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import noise
 from v2v_server.simulation.effects import prepare
-from v2v_server.simulation.effects.kernel import Outputs, Segments, simulate_general
+from v2v_server.simulation.effects.kernel import FIXED, TRIANGULAR, UNIFORM, Outputs, Segments, simulate_general
 from v2v_server.simulation.intensity import Intensity, fine_table, log_table, log_table_float64
 from v2v_server.simulation.pixel import simulate_pixels, words
 from v2v_server.simulation.precision import Real
@@ -53,6 +53,7 @@ class KernelInput:
         edges: the ends of the bins.
         dtype: "int8", "int16" or "float32".
         start_residual: log units; None draws it.
+        start: how it is drawn, "uniform" or "triangular"; "zero" starts at 0.
         levels: intermediate levels, or None; only with frames of 8 bits.
         grids_have_durations: whether a grid's time is that of ``step_seconds``; else all its steps count as equal.
     """
@@ -69,10 +70,18 @@ class KernelInput:
     start_residual: float | None = None
     levels: Levels | None = None
     grids_have_durations: bool = False
+    start: str = "uniform"
 
     def __post_init__(self) -> None:
         if self.dtype not in LARGEST_COUNT:
             raise UsageError(f"voxel dtype {self.dtype!r}: choose one of {', '.join(VOXEL_DTYPES)}")
+
+    @property
+    def law(self) -> tuple[int, float]:
+        """How residuals start: a constant of ``effects/kernel.py``, and the value of FIXED."""
+        if self.start_residual is None and self.start != "zero":
+            return (TRIANGULAR if self.start == "triangular" else UNIFORM), 0.0
+        return FIXED, self.start_residual or 0.0
 
     @property
     def needs_general(self) -> bool:
@@ -176,10 +185,8 @@ def _listing(capacity: int) -> tuple[Longs, Doubles]:
 def _paper(given: KernelInput, real: Real, voxels: npt.NDArray[Any]) -> int:
     params, durations = given.params, given.noise_durations
     threshold_pos, threshold_neg = real(params.threshold_pos), real(params.threshold_neg)
-    if given.start_residual is None:
-        start_low, start_span = -threshold_neg, threshold_pos + threshold_neg
-    else:
-        start_low, start_span = real(given.start_residual), real(0)
+    law, fixed = given.law
+    start_low, start_span = (real(fixed), real(0)) if law == FIXED else (-threshold_neg, threshold_pos + threshold_neg)
     pixels = voxels[0, 0].size
     steps_per_bin = int(given.edges.step[1])
     position, drift = _hot(params, pixels, real)
@@ -189,7 +196,7 @@ def _paper(given: KernelInput, real: Real, voxels: npt.NDArray[Any]) -> int:
             np.array(params.noise_key, np.uint32), _noise_scale(params, durations).astype(real), position, drift,
             durations.astype(real), threshold_pos, threshold_neg,
             real(rounding_tolerance(params.threshold_pos, params.threshold_neg)), start_low, start_span,
-            steps_per_bin, real(LARGEST_COUNT[given.dtype]), voxels.reshape(-1, pixels),
+            law == TRIANGULAR, steps_per_bin, real(LARGEST_COUNT[given.dtype]), voxels.reshape(-1, pixels),
         )
     )  # fmt: skip
 
@@ -239,13 +246,13 @@ class _General:
         smallest, _ = pixel_thresholds(min(params.threshold_pos, params.threshold_neg), 1.0, sigma)
         between = np.empty((0, pixels), np.uint16) if given.levels is None else given.levels.grey
         table = _table(given.intensity, real)
+        law, fixed = given.law
         simulate_general(
             np.ascontiguousarray(given.frames).reshape(-1, pixels), between.reshape(-1, pixels),
             table, fine_table(table), np.array(params.noise_key, np.uint32), self._segments,
             *_hot(params, pixels, real), real(params.threshold_pos), real(params.threshold_neg),
-            real(rounding_tolerance(smallest, smallest)), given.start_residual is None,
-            real(given.start_residual or 0.0), not params.effects, given.bins, real(LARGEST_COUNT[given.dtype]), out,
-            self._tables,
+            real(rounding_tolerance(smallest, smallest)), law, real(fixed), not params.effects, given.bins,
+            real(LARGEST_COUNT[given.dtype]), out, self._tables,
         )  # fmt: skip
         return tally
 

@@ -159,6 +159,22 @@ def crossed(potential, threshold_pos, threshold_neg, tolerance):
 
 
 @numba.njit(nogil=True, inline="always")
+def triangular(uniform, threshold_pos, threshold_neg):
+    """Return the residual at the start of a clip, drawn from the triangular law by u in [0, 1). With s = c+ + c-:
+
+        r = -c- + sqrt(u s c-)        if u s < c-
+        r =  c+ - sqrt((1 - u) s c+)  otherwise
+
+    Its density is 2/s (1 - r/c+) above 0 and 2/s (1 + r/c-) below: where a residual that moves as a Brownian motion
+    and returns to 0 at each event stands in the long run.
+    """
+    span = threshold_pos + threshold_neg
+    if uniform * span < threshold_neg:
+        return np.sqrt(uniform * span * threshold_neg) - threshold_neg
+    return threshold_pos - np.sqrt((_ONE - uniform) * span * threshold_pos)
+
+
+@numba.njit(nogil=True, inline="always")
 def store(counts, limit, stored):
     """Store one bin of each pixel in the voxels; return how many had to be clipped."""
     exceeded = False
@@ -182,7 +198,7 @@ def _store_clipped(counts, limit, stored):
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def simulate_pixels(
     frames, table, source_index, key, noise_scale, hot_position, hot_drift, hot_scale,
-    threshold_pos, threshold_neg, tolerance, start_low, start_span, steps_per_bin, limit, voxels,
+    threshold_pos, threshold_neg, tolerance, start_low, start_span, is_triangular, steps_per_bin, limit, voxels,
 ):  # fmt: skip
     """Simulate every pixel of a clip. ``real`` below is float32 or float64, one for all.
 
@@ -197,6 +213,7 @@ def simulate_pixels(
         hot_scale: [steps] real.
         threshold_pos, threshold_neg, tolerance: real, log units (``voxel.py``).
         start_low, start_span: real, the residual starts uniformly in [low, low + span), log units.
+        is_triangular: True draws it from the triangular law between the thresholds instead.
         steps_per_bin: frames_per_bin.
         limit: real, largest count the dtype of ``voxels`` stores.
         voxels: [steps / steps_per_bin, pixels], written.
@@ -229,6 +246,10 @@ def simulate_pixels(
         for i in range(BLOCK_PX):
             uniform = np.float32(np.int32(word(start, first + i) >> np.uint32(8))) * _UNIT
             residual[i] = uniform * start_span + start_low
+        if is_triangular:
+            for i in range(BLOCK_PX):
+                uniform = np.float32(np.int32(word(start, first + i) >> np.uint32(8))) * _UNIT
+                residual[i] = triangular(uniform, threshold_pos, threshold_neg)
         if noisy:
             for i in range(BLOCK_PX):
                 radius_words[i] = word(pixel_radius, first + i)

@@ -24,6 +24,7 @@ from v2v_server.simulation.pixel import (
     folds_of,
     look_up,
     store,
+    triangular,
     two_normals,
     word,
 )
@@ -34,6 +35,8 @@ _PAIR_RADIUS, _PAIR_ANGLE = np.uint32(noise.PAIR_RADIUS), np.uint32(noise.PAIR_A
 _START = np.uint32(noise.START)
 _TIME = np.uint32(noise.TIME)
 _UNIT = np.float32(2.0**-24)
+FIXED, UNIFORM, TRIANGULAR = range(3)
+"""How residuals start."""
 
 
 class Segments(NamedTuple):
@@ -125,7 +128,7 @@ _OWN_ROWS = sum(effect.ROWS for effect in EFFECTS)
 @compiled
 def _simulate(
     frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
-    tolerance, drawn_start, start_residual, drifts_first, bins, limit, out, tables, state, words, floats,
+    tolerance, start, start_residual, drifts_first, bins, limit, out, tables, state, words, floats,
 ):  # fmt: skip
     """Run the kernel in memory of the caller, so that views of arrays need no reference counting."""
     use_widest_vectors()  # type: ignore[call-arg]
@@ -162,7 +165,9 @@ def _simulate(
         _start(tables, own, block, At(first, 0, False, now, now, shown))
         for i in range(BLOCK_PX):
             uniform = np.float32(np.int32(word(start_folds, first + i) >> np.uint32(8))) * _UNIT
-            residual[i] = uniform * (positive[i] + negative[i]) - negative[i] if drawn_start else start_residual
+            residual[i] = uniform * (positive[i] + negative[i]) - negative[i] if start == UNIFORM else start_residual
+            if start == TRIANGULAR:
+                residual[i] = triangular(uniform, positive[i], negative[i])
         if noisy:
             for i in range(BLOCK_PX):
                 radius_words[i] = word(pixel_radius, first + i)
@@ -332,7 +337,7 @@ def _list(out, pixel, segment, sign, passed):
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def simulate_general(
     frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
-    tolerance, drawn_start, start_residual, drifts_first, bins, limit, out, tables,
+    tolerance, start, start_residual, drifts_first, bins, limit, out, tables,
 ):  # fmt: skip
     """Simulate every pixel of a clip.
 
@@ -344,7 +349,8 @@ def simulate_general(
         table, key, hot_position, hot_drift, limit: as in ``pixel.simulate_pixels``.
         segments: what is simulated, and when.
         threshold_pos, threshold_neg, tolerance: real, log units (``voxel.py``).
-        drawn_start: True starts every residual uniformly between its own thresholds, False at ``start_residual``, real.
+        start: FIXED starts every residual at ``start_residual``, real; UNIFORM and TRIANGULAR draw it between the
+            pixel's own thresholds.
         drifts_first: True adds a hot pixel's drift in the order of ``pixel.simulate_pixels``, for the same roundings.
         bins: of a voxel grid.
         out: written.
@@ -355,5 +361,5 @@ def simulate_general(
     floats = aligned_rows(6, PITCH, np.float32)
     _simulate(
         frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
-        tolerance, drawn_start, start_residual, drifts_first, bins, limit, out, tables, state, words, floats,
+        tolerance, start, start_residual, drifts_first, bins, limit, out, tables, state, words, floats,
     )  # fmt: skip
