@@ -1,7 +1,6 @@
 """The broker decides which worker makes which sample for which consumer. It handles no pixels. Only one file does I/O.
 
-dispatcher        takes messages and lost peers, returns actions; the consumers' half
-worker_side       the workers' half
+dispatcher        takes messages and lost peers, returns actions
 actions           what the dispatcher wants done; the loop in ``serve.py`` does it
 transport         the protocol of the two sockets, and its implementation (I/O)
 admission         turns a consumer's Hello into a session

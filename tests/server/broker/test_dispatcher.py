@@ -41,7 +41,6 @@ from v2v_protocol.recipe import preset
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, LARGEST_REQUEST_BYTES, decode, decode_map, encode
 from v2v_server.broker import dispatcher as dispatcher_module
-from v2v_server.broker import worker_side
 from v2v_server.broker.actions import AddToQuarantine, Disconnect, GiveUp, ToConsumer
 from v2v_server.broker.admission import MOST_BATCH_SIZE, MOST_TABLES
 from v2v_server.broker.blame import Cause, Loss
@@ -985,7 +984,7 @@ NONSENSE: dict[str, Callable[[], list[Any]]] = {
 
 
 def test_there_is_a_limit_to_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker_side, "MOST_WORKERS", 2)
+    monkeypatch.setattr(dispatcher_module, "MOST_WORKERS", 2)
     at = peers()
     for name in (b"a", b"b", b"c"):
         at.join(name)
