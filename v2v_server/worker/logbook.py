@@ -16,9 +16,8 @@ import tempfile
 from contextlib import suppress
 from socket import recv_fds, send_fds, socket, socketpair
 
-from v2v_protocol.arena import ArenaName
+from v2v_protocol.arena import ArenaName, find_memory
 from v2v_protocol.errors import ProtocolError
-from v2v_protocol.shared_memory import find_memory
 
 _BYTES = 8
 _DECODES, _SIMULATES = b"d", b"s"

@@ -2,6 +2,9 @@
 
 Sending happens in ZeroMQ's own thread while the next sample is made. The process may be killed at any moment; it leaves
 nothing that would have to be undone.
+
+Memory: besides the sample being made, the clips that its lease's siblings need, each cropped to its own view: at most
+(samples_per_decode - 1) x frames x window bytes.
 """
 
 from __future__ import annotations
@@ -18,11 +21,11 @@ from importlib.resources.abc import Traversable
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.addresses import leaves_host
-from v2v_protocol.errors import SidecarError, UsageError, VideoError
+from v2v_protocol.arena import find_memory
+from v2v_protocol.errors import SidecarError, UsageError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.keys import key_for
 from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Lease, WorkerHello
-from v2v_protocol.shared_memory import find_memory
 from v2v_protocol.wire import Frames
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.schedule.sequences import MOST_LEASE_BYTES
@@ -55,13 +58,73 @@ from v2v_server.worker.conversation import (
     Timings,
     WorkerConversation,
 )
-from v2v_server.worker.decode_cache import Clips
 from v2v_server.worker.labels import read_ahead
 from v2v_server.worker.logbook import IDLE, note, take_arena
 from v2v_server.worker.output_buffer import open_output_buffer, sample_message
-from v2v_server.worker.produce import kernels_of, make_sample, sample_layout
+from v2v_server.worker.produce import Decoded, decode_for, kernels_of, make_sample, sample_layout
 from v2v_server.worker.sidecars import open_sidecars, sidecar_files
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
+
+
+class Clips:
+    """Decode clips for leases, together with those of their siblings.
+
+    Args:
+        source: where the videos come from.
+        cache: cache of decoded pieces for later epochs; None stores nothing.
+    """
+
+    def __init__(self, source: VideoSource, cache: Cache | None = None) -> None:
+        self._source = source
+        self._cache = cache
+        self._kept: dict[tuple[object, ...], Decoded] = {}
+
+    def take(self, lease: Lease) -> tuple[Decoded, bool]:
+        """Return the decoded clip of the lease's sample, and whether it was decoded just now.
+
+        Raises:
+            VideoError, ProtocolError: see :func:`v2v_server.worker.produce.decode_for`.
+        """
+        kept = self._kept.pop(_key(lease, lease.indices[0]), None)
+        if kept is not None:
+            return kept, False
+        self._kept = {}  # siblings that never came
+        if len(lease.indices) > 1:
+            try:
+                first, *others = decode_for(lease, lease.indices, self._source, self._cache)
+            except VideoError:
+                pass  # a sibling may need more of the clip than this sample; try without siblings
+            else:
+                self._kept = {_key(lease, index): one for index, one in zip(lease.indices[1:], others, strict=True)}
+                return first, True
+        try:
+            return decode_for(lease, lease.indices[:1], self._source, self._cache)[0], True
+        except (VideoChanged, VideoUnreadable):
+            raise
+        except VideoError:
+            # A decoder may hide a temporary storage error, so try once more. An error of the file repeats.
+            return decode_for(lease, lease.indices[:1], self._source, self._cache)[0], True
+
+    def said_of_cache(self, decoded: Decoded) -> str:
+        """Return the cache field of a sample's header, see :class:`v2v_protocol.messages.SampleHeader`."""
+        if self._cache is None or decoded.clip.origin == "store":
+            return ""
+        if decoded.clip.origin == "cache":
+            return "hit"
+        return f"miss: {self._cache.trouble}" if self._cache.trouble else "miss"
+
+    def has(self, lease: Lease) -> bool:
+        """Return whether the lease's sample needs no decoding."""
+        return _key(lease, lease.indices[0]) in self._kept
+
+
+def _key(lease: Lease, index: int) -> tuple[object, ...]:
+    """Return the fields of a lease that its decoded clip depends on, and its index."""
+    return (
+        lease.spec, lease.seed, lease.epoch, index, lease.arrays, lease.video, lease.fingerprint, lease.rows,
+        lease.start_frame, lease.thresholds,
+    )  # fmt: skip
+
 
 _SOON_FETCHED_BYTES = 32 << 20
 """The worker keeps its leases while it fetches a video up to this size; it returns them for a larger one."""

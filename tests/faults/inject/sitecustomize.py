@@ -38,7 +38,7 @@ def _act(fault: dict, video: str) -> None:
 
 def _install(fault: dict) -> None:
     from v2v_server.worker import arrays, produce
-    from v2v_server.worker import decode_cache as clips
+    from v2v_server.worker import process as clips
     from v2v_server.worker import process as worker
 
     at = {"video": ""}

@@ -35,7 +35,7 @@ from v2v_server.store.depth import detail_of, levels_of
 from v2v_server.store.encoding import Encoding
 from v2v_server.tradeoff.accuracy import Places, seen, simulated
 from v2v_server.video.luma import Signal, range_table
-from v2v_server.worker.decode_cache import Clips
+from v2v_server.worker.process import Clips
 from v2v_server.worker.produce import make_sample
 
 SDR = preset("noise-free").replace(
