@@ -99,7 +99,10 @@ def check_output(
             raise UsageError(f"{named}: unknown ending; give a name that ends in {', '.join(endings)}")
         if not path.parent.is_dir():
             raise UsageError(f"{named}: there is no folder {path.parent}; create it first")
-        locked = next((at for at in (path, path.parent) if at.exists() and not os.access(at, os.W_OK)), None)
+        # By the rights that writing will have, such as the capabilities of a user that is not root.
+        effective = os.access in os.supports_effective_ids
+        checked = (at for at in (path, path.parent) if at.exists())
+        locked = next((at for at in checked if not os.access(at, os.W_OK, effective_ids=effective)), None)
         if locked is not None:
             raise UsageError(f"{named}: {locked} is write-protected; give another name, or allow writing")
         if why := _input_reason(path.resolve(), inputs):

@@ -35,9 +35,8 @@ from v2v_server.broker.actions import (
     ToConsumer,
     ToWorker,
 )
-from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.leases import Request
+from v2v_server.broker.leases import Cause, Loss, Request
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, InFlight, ServerTransport, Sockets
 from v2v_server.broker.worker_registry import clean_name
 from v2v_server.config import ServeConfig
@@ -53,9 +52,9 @@ from v2v_server.schedule.summary import corpus_summary
 from v2v_server.status.snapshot import Service, StatusPublisher
 from v2v_server.status.terminal import StatusView, format_shutdown_summary
 from v2v_server.store.cache import make_cache
+from v2v_server.supervise.child import Standby
 from v2v_server.supervise.pool import Pool, make_pool
 from v2v_server.supervise.scaling import Scaling, question_workers
-from v2v_server.supervise.standby import Standby
 from v2v_server.system.log import Level, Log
 from v2v_server.system.process import keep_freed_memory, most_connections, open_many_files, usable_cores
 from v2v_server.system.start_times import StartTimes

@@ -33,8 +33,8 @@ from v2v_protocol.messages import (
     Welcome,
     WorkerHello,
 )
-from v2v_server.broker.blame import Cause
 from v2v_server.broker.dispatcher import Dispatcher
+from v2v_server.broker.leases import Cause
 from v2v_server.broker.transport import FromWorker
 from v2v_server.config import ServeConfig
 from v2v_server.quarantine.file import read_quarantine

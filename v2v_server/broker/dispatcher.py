@@ -51,13 +51,11 @@ from v2v_server.broker.actions import (
     denial,
     malformed,
 )
-from v2v_server.broker.admission import Admission
-from v2v_server.broker.blame import Cause, Loss, judge
 from v2v_server.broker.candidates import Candidates
 from v2v_server.broker.counters import Counters, bounded_seconds
 from v2v_server.broker.grants import Grants, check_result
-from v2v_server.broker.leases import LeaseBook, Request, Stall
-from v2v_server.broker.session import Session, Sessions
+from v2v_server.broker.leases import Cause, LeaseBook, Loss, Request, Stall, judge
+from v2v_server.broker.session import Admission, Session, Sessions
 from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Workers, clean_name
 from v2v_server.corpus.videos import CorpusFacts
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry

@@ -17,14 +17,12 @@ from importlib import import_module
 from typing import Any
 
 from v2v_protocol.errors import UsageError, WorkerCrashLoop
-from v2v_server.broker.blame import Cause, Loss
-from v2v_server.broker.leases import Stall
+from v2v_server.broker.leases import Cause, Loss, Stall
 from v2v_server.config import ENGINES, ServeConfig
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.keys.folder import KeyFolder
-from v2v_server.supervise.child import STOPPED, hung
+from v2v_server.supervise.child import STOPPED, Standby, hung
 from v2v_server.supervise.host import Exit, Host, ProcessStatus, WorkerPlace
-from v2v_server.supervise.standby import Standby
 
 _FIRST_BACKOFF_SECONDS = 0.2
 _LONGEST_BACKOFF_SECONDS = 10.0

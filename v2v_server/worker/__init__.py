@@ -4,8 +4,7 @@ conversation   what the worker says: a state machine without I/O
 process        the process that does what the conversation says, with one decode for siblings
 produce        from a lease to its sample: decode, view, simulate
 arrays         functions that fill each array; additional arrays are files beside it
-labels         boxes and masks
-sidecars       files beside the video that arrays are made from
+sidecars       files beside the video, and the boxes and masks made from them
 output_buffer  memory for a sample, shared with its consumer or private
 cleaning       which frames and which part of the picture are used
 scene_choice   which flow method a clip needs

@@ -58,11 +58,10 @@ from v2v_server.worker.conversation import (
     Timings,
     WorkerConversation,
 )
-from v2v_server.worker.labels import read_ahead
 from v2v_server.worker.logbook import IDLE, note, take_arena
 from v2v_server.worker.output_buffer import open_output_buffer, sample_message
 from v2v_server.worker.produce import Decoded, decode_for, kernels_of, make_sample, sample_layout
-from v2v_server.worker.sidecars import open_sidecars, sidecar_files
+from v2v_server.worker.sidecars import open_sidecars, read_ahead, sidecar_files
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 

@@ -26,7 +26,7 @@ from v2v_protocol.messages import (
     Unavailable,
 )
 from v2v_protocol.wire import decode_map
-from v2v_server.broker.blame import Cause, runs_alone
+from v2v_server.broker.leases import Cause, runs_alone
 
 _HALF_WRITTEN = (-1, -1, -1)
 

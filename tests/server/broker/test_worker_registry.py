@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.messages import WorkerHello
-from v2v_server.broker.blame import ALONE_AFTER, runs_alone
-from v2v_server.broker.leases import LeaseBook, Request
+from v2v_server.broker.leases import ALONE_AFTER, LeaseBook, Request, runs_alone
 from v2v_server.broker.worker_registry import MOST_WORKER_CREDIT, REST_SECONDS, SILENCE_SECONDS, Workers
 
 DEADLINE = 60.0

@@ -17,7 +17,7 @@ import pytest
 
 from tests.waiting import until
 from v2v_protocol.errors import WorkerCrashLoop
-from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.leases import Cause, Loss
 from v2v_server.supervise import child as child_module
 from v2v_server.supervise import local_host as host_module
 from v2v_server.supervise.local_host import LocalHost
