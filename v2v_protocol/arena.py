@@ -25,6 +25,11 @@ from dataclasses import dataclass
 
 from v2v_protocol.errors import ProtocolError
 
+NO_SLOT = 0
+MOST_SLOTS = 65_536
+_PAGE_BYTES = 4096
+_NAME = re.compile(r"(\d{1,10}):(\d{1,10}):(\d{1,10}):([0-9a-f]{32})")
+
 
 def create_memory(name: str, size: int) -> int:
     """Create memory of a fixed size, bytes, filled with zeros; return its descriptor.
@@ -118,12 +123,6 @@ def read_arrays(descriptor: int, sizes: Sequence[int]) -> list[memoryview]:
     *offsets, total = array_offsets(sizes, 1)
     whole = memoryview(mmap.mmap(descriptor, total, mmap.MAP_PRIVATE | mmap.MAP_POPULATE, mmap.PROT_READ))
     return [whole[offset : offset + size] for offset, size in zip(offsets, sizes, strict=True)]
-
-
-NO_SLOT = 0
-MOST_SLOTS = 65_536
-_PAGE_BYTES = 4096
-_NAME = re.compile(r"(\d{1,10}):(\d{1,10}):(\d{1,10}):([0-9a-f]{32})")
 
 
 @dataclass(frozen=True, slots=True)

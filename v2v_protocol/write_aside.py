@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from v2v_protocol.errors import UsageError
 
@@ -132,3 +134,12 @@ def _input_reason(path: Path, inputs: Iterable[str | os.PathLike[str]]) -> str:
 
 def _is_stream(path: Path) -> bool:
     return os.fspath(path.parent) in _STREAMS or (path.exists() and not path.is_file() and not path.is_dir())
+
+
+def write_json(file: str | os.PathLike[str], records: Sequence[Mapping[str, Any]]) -> None:
+    """Write the records of a command's ``--json FILE``.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+    write_file(Path(file), json.dumps(records, indent=1) + "\n", "--json")

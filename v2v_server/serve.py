@@ -65,56 +65,6 @@ _LONGEST_TURN_SECONDS = 1.0
 """A longer step than this counts as time in which the process was stopped."""
 
 
-class Clock:
-    """Seconds during which this process was running.
-
-    A stopped process (in a terminal, by a batch system, with its whole machine) receives no answers, and its peers may
-    be stopped as well. So a deadline that expires meanwhile does not count.
-    """
-
-    def __init__(self) -> None:
-        self._seen = time.monotonic()
-        self._away = 0.0
-
-    def __call__(self) -> float:
-        seen, self._seen = self._seen, time.monotonic()
-        self._away += max(0.0, self._seen - seen - _LONGEST_TURN_SECONDS)
-        return self._seen - self._away
-
-
-@contextlib.contextmanager
-def stop_on_signals(stop: threading.Event) -> Iterator[None]:
-    """Set ``stop`` at the first SIGINT or SIGTERM; a second signal has its usual effect."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def on_signal(number: int, frame: object) -> None:
-        for each, handler in before.items():
-            signal.signal(each, handler)
-        stop.set()
-
-    for number in before:
-        signal.signal(number, on_signal)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def write_port_file(file: str, address: str) -> None:
-    """Write the address in one step, so that readers see the whole content or no file.
-
-    Raises:
-        UsageError: the file cannot be written.
-    """
-    write_file(Path(file), address + "\n", "--port-file")
-
-
-def utc_now() -> str:
-    """Return the time of day, ISO 8601, UTC, in whole seconds."""
-    return datetime.now(UTC).isoformat(timespec="seconds")
-
-
 _FILES_A_WORKER = 6
 _TURN_SECONDS = 0.1
 """Longest wait of the loop without a message; also the interval of checks of deadlines and workers."""
@@ -476,3 +426,53 @@ class Server:
 def _private_address(label: str) -> str:
     """Return an address for local workers: a socket without a file, so that nothing is left even after a kill -9."""
     return f"ipc://@v2v-{label}-{secrets.token_hex(8)}" if sys.platform.startswith("linux") else "tcp://127.0.0.1:*"
+
+
+class Clock:
+    """Seconds during which this process was running.
+
+    A stopped process (in a terminal, by a batch system, with its whole machine) receives no answers, and its peers may
+    be stopped as well. So a deadline that expires meanwhile does not count.
+    """
+
+    def __init__(self) -> None:
+        self._seen = time.monotonic()
+        self._away = 0.0
+
+    def __call__(self) -> float:
+        seen, self._seen = self._seen, time.monotonic()
+        self._away += max(0.0, self._seen - seen - _LONGEST_TURN_SECONDS)
+        return self._seen - self._away
+
+
+@contextlib.contextmanager
+def stop_on_signals(stop: threading.Event) -> Iterator[None]:
+    """Set ``stop`` at the first SIGINT or SIGTERM; a second signal has its usual effect."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def on_signal(number: int, frame: object) -> None:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+        stop.set()
+
+    for number in before:
+        signal.signal(number, on_signal)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def write_port_file(file: str, address: str) -> None:
+    """Write the address in one step, so that readers see the whole content or no file.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+    write_file(Path(file), address + "\n", "--port-file")
+
+
+def utc_now() -> str:
+    """Return the time of day, ISO 8601, UTC, in whole seconds."""
+    return datetime.now(UTC).isoformat(timespec="seconds")

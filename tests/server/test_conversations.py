@@ -27,6 +27,7 @@ from v2v_protocol.messages import (
     ErrorCode,
     Hello,
     Lease,
+    Result,
     SampleHeader,
     Unavailable,
     Want,
@@ -140,7 +141,7 @@ class Worker:
                     error = VideoError(lease.video, 3, "cut short")
                     self._take(self.conversation.on_failure(error, self.world.now))
                 else:
-                    self._take(self.conversation.on_sample(self.frames(lease), self.world.now))
+                    self._take(self.conversation.on_sample(self.frames(lease), self.world.now, Result(0)))
 
     @staticmethod
     def frames(lease: Lease) -> list[Any]:

@@ -344,7 +344,7 @@ class Dispatcher:
 
     def stop_workers(self) -> list[ToWorker]:
         """Tell every worker to finish and leave."""
-        return [ToWorker(identity, encode(Stop())) for identity in self.registry.identities()]
+        return [ToWorker(identity, encode(Stop())) for identity in self.registry.members()]
 
     def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float, user: str) -> list[Action]:
         try:

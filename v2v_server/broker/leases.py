@@ -34,6 +34,13 @@ ALONE_AFTER = 2
 """Number of unexplained losses after which a sample runs alone."""
 
 
+SLOW_FACTOR = 3.0
+"""A lease in work for this many times the median of its session's decoded clips is slow."""
+_LEAST_SLOW_SECONDS = 1.0
+_REMEMBERED = 64
+_LEAST_REMEMBERED = 8
+
+
 class Cause(StrEnum):
     """Reason why a worker is gone."""
 
@@ -78,13 +85,6 @@ def judge(request: Request, loss: Loss) -> Request | str:
     if loss.cause is Cause.UNEXPLAINED and not runs_alone(request):
         return replace(request, deaths=request.deaths + 1)
     return f"a worker {loss.text} over it"
-
-
-SLOW_FACTOR = 3.0
-"""A lease in work for this many times the median of its session's decoded clips is slow."""
-_LEAST_SLOW_SECONDS = 1.0
-_REMEMBERED = 64
-_LEAST_REMEMBERED = 8
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,6 +44,17 @@ MOST_TABLES = 16
 """Sequence tables cached for later consumers. A session keeps its own, which is small."""
 
 
+GONE_SECONDS = 10.0
+"""Time that a consumer has to return to its session after its connection ended."""
+SILENT_SECONDS = 60.0
+AWAY_SECONDS = 2.0
+"""Between two epochs a consumer is away for a shorter time."""
+RETURN_SECONDS = 60.0
+"""A consumer that says Hello within this time of the last message of one with the same name continues its totals."""
+_MOST_DEPARTED = 1024
+"""Number of departed consumers whose totals are remembered; the oldest is dropped first."""
+
+
 def suggested_credit(batch_size: int, workers: int, samples_per_decode: int) -> int:
     """Return how many samples a consumer should have outstanding: one batch ahead, and two for each worker.
 
@@ -204,17 +215,6 @@ class Admission:
                 del self._tables[next(iter(self._tables))]
             self._tables[geometry] = table
         return table
-
-
-GONE_SECONDS = 10.0
-"""Time that a consumer has to return to its session after its connection ended."""
-SILENT_SECONDS = 60.0
-AWAY_SECONDS = 2.0
-"""Between two epochs a consumer is away for a shorter time."""
-RETURN_SECONDS = 60.0
-"""A consumer that says Hello within this time of the last message of one with the same name continues its totals."""
-_MOST_DEPARTED = 1024
-"""Number of departed consumers whose totals are remembered; the oldest is dropped first."""
 
 
 @dataclass(slots=True)

@@ -81,10 +81,6 @@ class Workers:
     def __contains__(self, identity: bytes) -> bool:
         return identity in self._workers
 
-    def identities(self) -> list[bytes]:
-        """Return the routing ids of all workers."""
-        return list(self._workers)
-
     def members(self) -> Mapping[bytes, Member]:
         """Return all workers by routing id."""
         return self._workers

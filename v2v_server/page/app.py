@@ -50,6 +50,34 @@ KNOWN_SECONDS = 15.0
 """A health check accepts a status of this age."""
 
 
+Message: TypeAlias = MutableMapping[str, Any]
+Receive: TypeAlias = Callable[[], Awaitable[Message]]
+Send: TypeAlias = Callable[[Message], Awaitable[None]]
+App: TypeAlias = Callable[[Message, Receive, Send], Awaitable[None]]
+HEADERS = {
+    "content-security-policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; "
+        "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "referrer-policy": "no-referrer",
+    "x-content-type-options": "nosniff",
+    "cache-control": "no-store",
+}
+_PREFIXES = {"workers": "v2v_worker_", "consumers": "v2v_consumer_", "cache": "v2v_cache_"}
+_LABELS = {"workers": {"worker": "name", "host": "host"}, "consumers": {"consumer": "name", "host": "host"}}
+_HELP = {
+    "v2v_worker_seconds": "Wall-clock time of workers, by activity.",
+    "v2v_time_ratio": "Shares of time over the last ten seconds: consumers waited, broker busy, workers at each part.",
+}
+"""Texts of metrics that several fields share, each under its own label."""
+STATIC = Path(__file__).parent / "static"
+EVENT_SECONDS = 0.5
+MOST_STREAMS = 64
+"""Browsers that receive every status. One that stops reading occupies its connection and the memory of one status."""
+
+
 class GetsStatus(Protocol):
     """Source of statuses, such as :class:`v2v_server.status.client.StatusClient`."""
 
@@ -117,24 +145,6 @@ class Source:
         return answered
 
 
-Message: TypeAlias = MutableMapping[str, Any]
-Receive: TypeAlias = Callable[[], Awaitable[Message]]
-Send: TypeAlias = Callable[[Message], Awaitable[None]]
-App: TypeAlias = Callable[[Message, Receive, Send], Awaitable[None]]
-
-HEADERS = {
-    "content-security-policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; "
-        "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
-    "cross-origin-opener-policy": "same-origin",
-    "cross-origin-resource-policy": "same-origin",
-    "referrer-policy": "no-referrer",
-    "x-content-type-options": "nosniff",
-    "cache-control": "no-store",
-}
-
-
 class Guard:
     """Middleware before an application (ASGI).
 
@@ -186,15 +196,6 @@ def _without_port(host: str) -> str:
     if host.startswith("["):
         return host[1 : host.find("]")] if "]" in host else ""
     return host.rpartition(":")[0] if ":" in host else host
-
-
-_PREFIXES = {"workers": "v2v_worker_", "consumers": "v2v_consumer_", "cache": "v2v_cache_"}
-_LABELS = {"workers": {"worker": "name", "host": "host"}, "consumers": {"consumer": "name", "host": "host"}}
-_HELP = {
-    "v2v_worker_seconds": "Wall-clock time of workers, by activity.",
-    "v2v_time_ratio": "Shares of time over the last ten seconds: consumers waited, broker busy, workers at each part.",
-}
-"""Texts of metrics that several fields share, each under its own label."""
 
 
 class StatusCollector:
@@ -262,12 +263,6 @@ def _merged(key: str, labels: Mapping[str, str], rows: list[Status]) -> dict[tup
         if row[key] is not None and row.get("state") != "gone":
             found.setdefault(tuple(row[of] for of in labels.values()), []).append(row[key])
     return found
-
-
-STATIC = Path(__file__).parent / "static"
-EVENT_SECONDS = 0.5
-MOST_STREAMS = 64
-"""Browsers that receive every status. One that stops reading occupies its connection and the memory of one status."""
 
 
 class Pages:

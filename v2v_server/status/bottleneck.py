@@ -30,6 +30,20 @@ _LEAST_PRESENT_SECONDS = 1.0
 """Shortest time that the rates of a new consumer are measured over."""
 
 
+NOTICEABLE_SHARE = 0.1
+"""Share of its time that a consumer may wait without being called stalled."""
+_IDLE_SHARE = 0.3
+"""Workers that are idle for a larger share of their time are not the bottleneck."""
+_FULL_SHARE = 0.85
+"""A broker that is busy for a larger share of its time is the bottleneck."""
+_LEAST_SECONDS = 2.0
+"""Shortest window that allows a conclusion."""
+_QUEUED_SHARE = 0.4
+"""If workers wait for a core for a larger share of their time, their host has too few cores."""
+_SPARE_SHARE = 0.5
+"""If workers are idle for a larger share of their time, fewer of them would do."""
+
+
 @dataclass(frozen=True, slots=True)
 class Moment:
     """The totals at one time.
@@ -143,20 +157,6 @@ class History:
         for each in self._dispatcher.sessions.totals():
             peers[each.number] = each.present(now), each.served, each.waited_seconds, each.passed
         return Moment(now, values(self._dispatcher.counters) | self._clocks, peers)
-
-
-NOTICEABLE_SHARE = 0.1
-"""Share of its time that a consumer may wait without being called stalled."""
-_IDLE_SHARE = 0.3
-"""Workers that are idle for a larger share of their time are not the bottleneck."""
-_FULL_SHARE = 0.85
-"""A broker that is busy for a larger share of its time is the bottleneck."""
-_LEAST_SECONDS = 2.0
-"""Shortest window that allows a conclusion."""
-_QUEUED_SHARE = 0.4
-"""If workers wait for a core for a larger share of their time, their host has too few cores."""
-_SPARE_SHARE = 0.5
-"""If workers are idle for a larger share of their time, fewer of them would do."""
 
 
 def _share(help: str, part: str, words: str) -> Any:

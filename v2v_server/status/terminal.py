@@ -20,6 +20,18 @@ from v2v_server.status.parts import Status, events, meanings_at
 from v2v_server.system.log import Log, write
 from v2v_server.system.status_fields import GIB
 
+_MOST_ROWS = 30
+_COLOURS = {
+    "working": "green",
+    "taking": "green",
+    "stalled": "yellow",
+    "resting": "yellow",
+    "lost": "red",
+    "gone": "red",
+}
+_TERMINAL_SECONDS, _LOG_SECONDS = 0.5, 10.0
+_MOST_CONSUMERS = 8
+
 
 def figures(status: Status) -> str:
     """Return rates and counts in one line."""
@@ -74,17 +86,6 @@ def format_shutdown_summary(status: Status) -> list[str]:
             f"consumers waited {format_duration(totals['waited_seconds'])}"
         )
     return lines
-
-
-_MOST_ROWS = 30
-_COLOURS = {
-    "working": "green",
-    "taking": "green",
-    "stalled": "yellow",
-    "resting": "yellow",
-    "lost": "red",
-    "gone": "red",
-}
 
 
 def line(status: Status) -> str:
@@ -187,10 +188,6 @@ def _text(value: str, style: str = "") -> Text:
 
 def _plain(value: int | None) -> str:
     return "" if value is None else str(value)
-
-
-_TERMINAL_SECONDS, _LOG_SECONDS = 0.5, 10.0
-_MOST_CONSUMERS = 8
 
 
 class StatusView:

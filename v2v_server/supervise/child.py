@@ -24,6 +24,12 @@ from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
 from v2v_server.worker.logbook import Logbook
 
+STOPPED = (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
+_CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
+PROGRAM = (sys.executable, "-m", "v2v_server.commands.worker")
+Program = subprocess.Popen[bytes]
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+
 
 class Standby:
     """One process. It ends if it is not told its arguments before this process ends.
@@ -72,13 +78,6 @@ def start_ahead(config: ServeConfig) -> Iterator[list[Standby]]:
     finally:
         for standby in standbys:
             standby.close()
-
-
-STOPPED = (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
-_CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
-PROGRAM = (sys.executable, "-m", "v2v_server.commands.worker")
-Program = subprocess.Popen[bytes]
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
 def start_child(

@@ -28,6 +28,12 @@ _FIRST_BACKOFF_SECONDS = 0.2
 _LONGEST_BACKOFF_SECONDS = 10.0
 
 
+_STALL_SECONDS = 1.0
+"""Time from one check for stalled workers to the next."""
+_STALE_SECONDS = 15.0
+"""Age at which an observation says nothing about a process any more."""
+
+
 def crash_budget(workers: int) -> int:
     """Return how many deaths in a row, without any finished sample between them, this number of workers may have."""
     return 3 * workers + 4
@@ -69,47 +75,6 @@ class Restarts:
         # Bounded before the power: a large pool may have hundreds of deaths in a row, which would overflow a float.
         doublings = min(self._deaths_in_a_row - 1, 16)
         return float(min(_FIRST_BACKOFF_SECONDS * 2**doublings, _LONGEST_BACKOFF_SECONDS))
-
-
-def make_pool(
-    config: ServeConfig,
-    source: VideoSource,
-    label: str,
-    flags: list[str],
-    keys: KeyFolder | None = None,
-    standbys: list[Standby] | None = None,
-) -> Pool:
-    """Return the pool that the configuration asks for.
-
-    Args:
-        config: of the server.
-        source: where the videos come from; workers open it by its name.
-        label: prefix of the workers' names, unique to this server.
-        flags: further flags of each worker.
-        keys: keys of the server, which lends one to workers on other hosts.
-        standbys: workers of this host that are started already; the pool takes them from the list.
-
-    Raises:
-        UsageError: the engine is not installed, or there is no cluster.
-    """
-    name = config.engine
-    try:
-        engine = import_module(ENGINES[name])
-    except ModuleNotFoundError as error:
-        if error.name != name:
-            raise
-        raise UsageError(
-            f"--engine {name} needs the Python package {name}, which is not installed; the extra '{name}' brings it: "
-            f"pip install '.[server,{name}]' in a checkout of v2v-stream, here and on every node of the cluster"
-        ) from error
-    key = None if keys is None or name == "local" else keys.lend(f"{name}-{label}", "worker")
-    return Pool(engine.make_host(config, source.name, label, flags, key, [] if standbys is None else standbys), label)
-
-
-_STALL_SECONDS = 1.0
-"""Time from one check for stalled workers to the next."""
-_STALE_SECONDS = 15.0
-"""Age at which an observation says nothing about a process any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,11 +140,6 @@ class Pool:
     def is_local(self) -> bool:
         """Return whether all workers run on this host."""
         return self._host.is_local
-
-    @property
-    def crash_budget(self) -> int:
-        """Deaths in a row, without any finished sample between them, that are tolerated."""
-        return crash_budget(self._workers)
 
     @property
     def running(self) -> int:
@@ -319,3 +279,38 @@ class Pool:
     def _release(self, slot: WorkerSlot) -> None:
         self._slots.remove(slot)
         slot.place.release()
+
+
+def make_pool(
+    config: ServeConfig,
+    source: VideoSource,
+    label: str,
+    flags: list[str],
+    keys: KeyFolder | None = None,
+    standbys: list[Standby] | None = None,
+) -> Pool:
+    """Return the pool that the configuration asks for.
+
+    Args:
+        config: of the server.
+        source: where the videos come from; workers open it by its name.
+        label: prefix of the workers' names, unique to this server.
+        flags: further flags of each worker.
+        keys: keys of the server, which lends one to workers on other hosts.
+        standbys: workers of this host that are started already; the pool takes them from the list.
+
+    Raises:
+        UsageError: the engine is not installed, or there is no cluster.
+    """
+    name = config.engine
+    try:
+        engine = import_module(ENGINES[name])
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise
+        raise UsageError(
+            f"--engine {name} needs the Python package {name}, which is not installed; the extra '{name}' brings it: "
+            f"pip install '.[server,{name}]' in a checkout of v2v-stream, here and on every node of the cluster"
+        ) from error
+    key = None if keys is None or name == "local" else keys.lend(f"{name}-{label}", "worker")
+    return Pool(engine.make_host(config, source.name, label, flags, key, [] if standbys is None else standbys), label)

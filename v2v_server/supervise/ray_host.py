@@ -33,6 +33,15 @@ from v2v_server.supervise.child import out_of_memory_kills, post_mortem, queued_
 from v2v_server.supervise.host import Exit, ProcessStatus
 from v2v_server.worker.logbook import Logbook
 
+WORKER_BYTES = 1 << 30
+"""Memory that Ray reserves for a worker, besides one CPU."""
+_FIRST_STATUS_SECONDS = 1.0
+_AGAIN_SECONDS = 1.0
+_NEWS_SECONDS = 10.0
+_CONNECT_SECONDS = 10.0
+_CALLS_AT_ONCE = 4
+"""In an actor: to run the process, to observe it, and to signal it."""
+
 
 @dataclass(frozen=True, slots=True)
 class ActorStatus:
@@ -116,16 +125,6 @@ def node() -> str:
     """Return the name of this node for logs."""
     context = ray.get_runtime_context()
     return f"{socket.gethostname()} ({context.get_node_id()[:6]})"
-
-
-WORKER_BYTES = 1 << 30
-"""Memory that Ray reserves for a worker, besides one CPU."""
-_FIRST_STATUS_SECONDS = 1.0
-_AGAIN_SECONDS = 1.0
-_NEWS_SECONDS = 10.0
-_CONNECT_SECONDS = 10.0
-_CALLS_AT_ONCE = 4
-"""In an actor: to run the process, to observe it, and to signal it."""
 
 
 def make_host(

@@ -25,7 +25,7 @@ from v2v_protocol.arena import find_memory
 from v2v_protocol.errors import SidecarError, UsageError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.keys import key_for
 from v2v_protocol.link.dealer import Dealer
-from v2v_protocol.messages import Lease, WorkerHello
+from v2v_protocol.messages import Lease, Result, WorkerHello
 from v2v_protocol.wire import Frames
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.schedule.sequences import MOST_LEASE_BYTES
@@ -55,7 +55,6 @@ from v2v_server.worker.conversation import (
     Reconnect,
     Say,
     Send,
-    Timings,
     WorkerConversation,
 )
 from v2v_server.worker.logbook import IDLE, note, take_arena
@@ -63,6 +62,20 @@ from v2v_server.worker.output_buffer import open_output_buffer, sample_message
 from v2v_server.worker.produce import Decoded, decode_for, kernels_of, make_sample, sample_layout
 from v2v_server.worker.sidecars import open_sidecars, read_ahead, sidecar_files
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
+
+_SOON_FETCHED_BYTES = 32 << 20
+"""The worker keeps its leases while it fetches a video up to this size; it returns them for a larger one."""
+LARGEST_MEMORY_BYTES = MOST_LEASE_BYTES + (1 << 30)
+"""A worker that needs more ends. After three such ends its sample is refused for its spec."""
+LONGEST_LEASE_SECONDS = 3600.0
+"""Limit of processor time for one lease. The server gives up its own workers sooner, by wall-clock time; this limit
+ends hung workers on other hosts."""
+MOST_NAME_BYTES = 200
+"""What an operator may call a worker; with what is added to it a name has 255 at most."""
+_LONGEST_ARENA_SECONDS = 1.0
+"""Longest wait for a lease's arena, which is sent before the lease. Without it the sample goes into the message."""
+_LINGER_MS = 5000
+"""Time that leaving may spend on sending the last sample."""
 
 
 class Clips:
@@ -123,21 +136,6 @@ def _key(lease: Lease, index: int) -> tuple[object, ...]:
         lease.spec, lease.seed, lease.epoch, index, lease.arrays, lease.video, lease.fingerprint, lease.rows,
         lease.start_frame, lease.thresholds,
     )  # fmt: skip
-
-
-_SOON_FETCHED_BYTES = 32 << 20
-"""The worker keeps its leases while it fetches a video up to this size; it returns them for a larger one."""
-LARGEST_MEMORY_BYTES = MOST_LEASE_BYTES + (1 << 30)
-"""A worker that needs more ends. After three such ends its sample is refused for its spec."""
-LONGEST_LEASE_SECONDS = 3600.0
-"""Limit of processor time for one lease. The server gives up its own workers sooner, by wall-clock time; this limit
-ends hung workers on other hosts."""
-MOST_NAME_BYTES = 200
-"""What an operator may call a worker; with what is added to it a name has 255 at most."""
-_LONGEST_ARENA_SECONDS = 1.0
-"""Longest wait for a lease's arena, which is sent before the lease. Without it the sample goes into the message."""
-_LINGER_MS = 5000
-"""Time that leaving may spend on sending the last sample."""
 
 
 class Worker:
@@ -260,15 +258,15 @@ class Worker:
                 self._at = lease.lease
                 note(self._logbook, self._at, decodes=True)
                 try:
-                    made: tuple[Frames, Timings] | VideoError | SidecarError = self._make_sample(lease)
+                    made: tuple[Frames, Result] | VideoError | SidecarError = self._make_sample(lease)
                 except (VideoError, SidecarError) as error:
                     made = error
                 note(self._logbook, IDLE)  # not after another exception: it ends the worker, and this lease is to blame
                 now = time.monotonic()
                 if isinstance(made, VideoError | SidecarError):
                     return conversation.on_failure(made, now)
-                frames, timings = made
-                return conversation.on_sample(frames, now, timings)
+                frames, work = made
+                return conversation.on_sample(frames, now, work)
             case _:
                 return []  # Leave
 
@@ -331,8 +329,8 @@ class Worker:
             self._is_confined = True
         return messages
 
-    def _make_sample(self, lease: Lease) -> tuple[Frames, Timings]:
-        """Make a lease's sample and return its message with the timings.
+    def _make_sample(self, lease: Lease) -> tuple[Frames, Result]:
+        """Make a lease's sample; return its message and what it took.
 
         Raises:
             VideoError, SidecarError: its video, or a file beside it, cannot be used.
@@ -368,14 +366,15 @@ class Worker:
             cache=self._clips.said_of_cache(clip) if decoded else "",
             packed=self._is_remote,
         )
-        timings = Timings(
+        work = Result(
+            lease.lease,
             decode_seconds=has_clip - has_room,
             simulate_seconds=has_sample - has_clip,
             handover_seconds=self._handover_seconds + has_room - began,
             memory_bytes=self._memory(has_sample),
         )
         self._handover_seconds = time.monotonic() - has_sample
-        return frames, timings
+        return frames, work
 
     def _memory(self, now: float) -> int:
         """Return the resident memory of this process, bytes, measured at most once a second."""

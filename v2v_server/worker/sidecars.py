@@ -27,6 +27,9 @@ _KEPT = 4
 """Sidecars that stay in memory once they are read: siblings use them one after the other."""
 
 
+_LONGEST_REASON = 500
+
+
 def _only_sidecar(array: str, video: str, sidecars: Mapping[str, Traversable | None]) -> tuple[str, Any]:
     """Return the one sidecar that the array is made from, and its ending.
 
@@ -87,9 +90,6 @@ def _mask(context: SampleContext, files: dict[int, Traversable], frame: int) -> 
         raise ValueError(f"has no file of frame {frame}: add one")
     mask = read_mask(files[frame], context.clip.picture_px)
     return view_mask(mask, context.clip.usable, context.params, context.recipe)
-
-
-_LONGEST_REASON = 500
 
 
 def sidecar_files(lease: Lease) -> dict[str, tuple[str, str]]:
