@@ -19,7 +19,7 @@ help:
 	@echo "make demo            reconstruct a clip, stream real ones through a server, train on them; leaves out/*.png"
 	@echo "make test            the fast tests (under five minutes on two cores)"
 	@echo "make test-slow       the tests that take longer"
-	@echo "make test-old-numpy  golden bytes of samples under an older numpy"
+	@echo "make test-old-numpy  the table of digests under an older numpy"
 	@echo "make check           formatting, lint, types"
 	@echo "make docs            the documentation as a site, in out/site"
 
@@ -72,7 +72,7 @@ $(OLD_NUMPY)/.ready: pyproject.toml constraints.txt
 	touch $@
 
 test-old-numpy: $(OLD_NUMPY)/.ready
-	$(OLD_NUMPY)/bin/python -m pytest -q tests/server/simulation/test_golden.py
+	$(OLD_NUMPY)/bin/python -m pytest -q tests/digests
 
 check: $(READY)
 	$(BIN)/ruff format --check .

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from av.video.frame import VideoFrame
 from av.video.reformatter import ColorRange, ColorTrc
 from av.video.stream import VideoStream
-from skimage import data
 
 TIME_BASE = Fraction(1, 1000)
 """Clock of the clips that state their time stamps; containers may choose another one."""
@@ -26,6 +25,8 @@ _TEXTURED = (140, 200)
 
 @cache
 def _photograph() -> npt.NDArray[np.uint8]:
+    from skimage import data  # clips of other pictures are written without it
+
     # A copy: the reader hands out a read-only or shared array in some versions.
     return np.array(data.camera(), np.uint8)  # type: ignore[no-untyped-call]
 

@@ -36,7 +36,6 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.prepare import prepare
-from v2v_server.store.encoding import Encoding
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
 
@@ -69,7 +68,7 @@ def forms_of(video: Path, folder: Path, colour: bool) -> Iterator[tuple[str, str
             planes = () if form == "store" else (form,)
             with closing(open_catalogue(source, processes=0)) as catalogue:
                 target = folder / clip / form
-                prepare.prepare(catalogue, target, Encoding.of("lossless"), planes=planes, processes=0)
+                prepare.prepare(catalogue, target, planes=planes, processes=0)
             yield clip, form, target
 
 

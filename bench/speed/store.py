@@ -35,9 +35,8 @@ from v2v_protocol.command import Parser
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.prepare.transcode import Transcoding, transcode
-from v2v_server.store.encoding import Encoding
 from v2v_server.store.format import Head, group_frames_for
-from v2v_server.store.packing import DENSE, FAST, QUICK, RAW, Packing
+from v2v_server.store.packing import DEFAULT_SIZE, DENSE, FAST, QUICK, RAW, Packing
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter
 from v2v_server.video.decode import decode_luma, stream_luma
@@ -150,8 +149,8 @@ def prepared(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
             top, bottom = catalogue.rows.bounds(video.height_px)
             index = catalogue.frame_index(video.id).to_bytes()
             job = Transcoding(
-                video.id, catalogue.path(video.id), video.fingerprint, video.codec, index, video.frames_per_second,
-                (top, 0, bottom - top, video.width_px), Encoding.of("lossless"), root, root / "made",
+                video.id, catalogue.path(video.id), video.fingerprint, index, video.frames_per_second,
+                (top, 0, bottom - top, video.width_px), DEFAULT_SIZE, root, root / "made",
             )  # fmt: skip
             fastest = {"prepare_cpu_seconds": math.inf, "prepare_scene_cpu_seconds": math.inf}
             for name in _TURNS * list(fastest):

@@ -1,6 +1,9 @@
-"""Write a fixture of the present release: the files that users keep, and the bytes that they must go on to give.
+"""Write fixtures of the present release: the files that users keep, and the bytes that they must go on to give.
 
     python -m tests.compatibility.make
+
+    numerics-N   a folder of videos with its index, store and cache; a recipe, a state, a checkpoint
+    planes-N     the same of videos with colour, deep light, motion, scenes and labels
 
 A fixture is made once for each ``NUMERICS_VERSION``, with the release that first has it, and is never rewritten.
 ``test_compatibility.py`` reads all of them.
@@ -24,15 +27,21 @@ import torch
 import yaml
 
 from tests.clips import panned_luma, write_clip
+from tests.digests.clips import boxes_text, panning, write_coloured, write_deep, zooming
+from tests.digests.rows import ROWS as PLANE_ROWS
+from tests.digests.rows import SIZE, Row, digest, made, samples_of
 from trainer.run.checkpoint import load_checkpoint
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol import NUMERICS_VERSION, __version__
-from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.refresh import index_path
+from v2v_server.prepare.prepare import prepare
+from v2v_server.store.cache import Cache, make_cache
 from v2v_server.video.rows import Rows
 
 FOLDER = Path(__file__).parent / f"numerics-{NUMERICS_VERSION}"
+PLANES = Path(__file__).parent / f"planes-{NUMERICS_VERSION}"
 RECIPE_FIELDS = {
     "preset": "paper", "voxels_per_clip": 2, "crop_height_px": 24, "crop_width_px": 24, "noise_sigma": [0.0, 0.05],
 }  # fmt: skip
@@ -43,12 +52,14 @@ CUT = 1
 
 
 def main() -> int:
-    """Write the fixture of this release, and refuse to replace one."""
-    if FOLDER.exists():
-        print(f"{FOLDER} exists: a fixture is never rewritten", file=sys.stderr)
+    """Write the fixtures of this release that are missing, and refuse to replace one."""
+    missing = [(folder, make) for folder, make in ((FOLDER, _make), (PLANES, _make_planes)) if not folder.exists()]
+    if not missing:
+        print(f"{FOLDER} and {PLANES.name} exist: a fixture is never rewritten", file=sys.stderr)
         return 2
-    with tempfile.TemporaryDirectory() as scratch:
-        shutil.copytree(_make(Path(scratch)), FOLDER)
+    for folder, make in missing:
+        with tempfile.TemporaryDirectory() as scratch:
+            shutil.copytree(make(Path(scratch)), folder)
     return 0
 
 
@@ -115,6 +126,66 @@ def _make(scratch: Path) -> Path:
     assert done.returncode == 0, done.stderr
     shutil.copy(scratch / "run" / "last.pt", fixture / "last.pt")
     expected["model"] = tensors_digest(load_checkpoint(fixture / "last.pt").model)
+    (fixture / "expected.json").write_text(json.dumps(expected, indent=1))
+    return fixture
+
+
+STREAMS: Mapping[str, Row] = {
+    "planes": Row(
+        {"threshold": (0.1, 0.2)}, ("voxels", "frames", "frames_rgb", "boxes"),
+        {"substep_px": 0.5, "scene": "auto", "moving_share": 1.0, "max_sequences_per_video": 2},
+    ),
+    "deep": Row({"light": "declared"}, ("voxels", "frames_u16"), {"max_sequences_per_video": 2}),
+}  # fmt: skip
+"""What the fixture of planes is read with."""
+STREAM_FLAGS = ("--scene=auto", f"--rows={PLANE_ROWS}", *(f"--set={name}={value}" for name, value in SIZE.items()))
+
+
+def plane_digests(catalogue: Catalogue, cache: Cache | None = None) -> dict[str, dict[str, str]]:
+    """Return the digest of each array of each of STREAMS."""
+    return {
+        name: {array: digest(values) for array, values in made(samples_of(catalogue, row, cache))[0].items()}
+        for name, row in STREAMS.items()
+    }
+
+
+def labelled(address: str, state: Mapping[str, Any] | None = None) -> list[Batch]:
+    """Return the samples of the first of STREAMS, from the start or from a saved state on."""
+    row = STREAMS["planes"]
+    spec: dict[str, Any] = {**row.spec, "recipe": row.stream.recipe}
+    dataset = V2VStreamDataset(address, 1, row.arrays, labels="optional", seed=row.seed, **spec)
+    if state is not None:
+        dataset.load_state_dict(state)
+    return list(dataset)
+
+
+def _make_planes(scratch: Path) -> Path:
+    os.environ["V2V_CACHE_DIR"] = str(scratch / "user-cache")
+    fixture = scratch / "fixture"
+    videos = fixture / "videos"
+    videos.mkdir(parents=True)
+    luma, chroma = zooming(20)
+    write_coloured(videos / "a.mkv", luma[:, :40, :56], chroma[:, :, :20, :28])
+    write_deep(videos / "b.mkv", panning(20)[:, :40, :56])
+    (videos / "a.boxes.json").write_text(boxes_text(20))
+    make_cache(fixture / "cache")
+    with closing(open_catalogue(videos, rows=PLANE_ROWS, scene=True, processes=0)) as catalogue:
+        cache = Cache(fixture / "cache", 1 << 30, least_free_bytes=0)
+        streams = plane_digests(catalogue, cache)
+        planes = ("motion", "chroma")
+        prepare(catalogue, fixture / "store", processes=0, scene=True, planes=planes)
+        shutil.copy(index_path(catalogue.folder, None), fixture / "index.sqlite3")
+        expected = {
+            "release": __version__,
+            "numerics_version": NUMERICS_VERSION,
+            "catalogue_digest": catalogue.digest,
+            "scene_digest": catalogue.scene_digest,
+            "streams": streams,
+        }
+    with LocalServer(videos, workers=1, flags=STREAM_FLAGS) as server:
+        batches = labelled(server.address)
+    (fixture / "state.json").write_text(json.dumps(batches[0].resume_state, indent=1, sort_keys=True))
+    expected["labelled"] = [digest(batch.arrays[name].numpy()) for batch in batches for name in batch.arrays]
     (fixture / "expected.json").write_text(json.dumps(expected, indent=1))
     return fixture
 

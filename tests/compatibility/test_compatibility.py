@@ -2,7 +2,8 @@
 
 Each folder ``numerics-N`` was written by ``make.py`` with the release that first had ``NUMERICS_VERSION`` N. The
 present version must give the bytes of the fixture. A state or checkpoint of an earlier version is refused by number;
-stores, caches, indexes and recipes of earlier versions go on.
+stores, caches, indexes and recipes of earlier versions go on. Folders ``planes-N`` are of videos with colour, deep
+light, motion, scenes and labels.
 """
 
 from __future__ import annotations
@@ -17,8 +18,21 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.compatibility.make import CUT, ROWS, sample_digests, stream, tensors_digest, train
+from tests.compatibility.make import (
+    CUT,
+    ROWS,
+    STREAM_FLAGS,
+    labelled,
+    plane_digests,
+    sample_digests,
+    stream,
+    tensors_digest,
+    train,
+)
+from tests.digests.rows import ROWS as PLANE_ROWS
+from tests.digests.rows import digest
 from trainer.run.checkpoint import load_checkpoint
+from v2v_client.local_server import LocalServer
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import StateMismatch
 from v2v_protocol.recipe import Recipe
@@ -26,14 +40,23 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus import refresh
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.index.file import SCHEMA_VERSION
+from v2v_server.corpus.scenes.analysis import SceneAnalysis
+from v2v_server.store.cache import Cache
 from v2v_server.video.rows import Rows
 
 FIXTURES = sorted(Path(__file__).parent.glob("numerics-*"))
+PLANES = sorted(Path(__file__).parent.glob("planes-*"))
 
 
 @pytest.fixture(params=FIXTURES, ids=lambda path: path.name)
 def fixture(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """Return a copy of a fixture that a test may write to."""
+    return Path(shutil.copytree(request.param, tmp_path / "fixture"))
+
+
+@pytest.fixture(params=PLANES, ids=lambda path: path.name)
+def planes(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """Return a copy of a fixture of planes that a test may write to."""
     return Path(shutil.copytree(request.param, tmp_path / "fixture"))
 
 
@@ -51,8 +74,9 @@ def digests(videos: Path, *flags: str, fixture: Path, state: Any = None) -> list
     return [digest for batch in batches for digest in sample_digests(batch)]
 
 
-def test_there_is_a_fixture_of_the_present_version() -> None:
+def test_there_are_fixtures_of_the_present_version() -> None:
     assert f"numerics-{NUMERICS_VERSION}" in [path.name for path in FIXTURES]
+    assert f"planes-{NUMERICS_VERSION}" in [path.name for path in PLANES]
 
 
 def test_a_recipe_keeps_its_digest(fixture: Path) -> None:
@@ -112,7 +136,8 @@ def test_a_checkpoint_is_resumed_or_refused_with_both_numbers(fixture: Path, tmp
     assert f"has {NUMERICS_VERSION}; serve with the release that the state was saved with" in done.stderr
 
 
-def test_an_index_is_taken_over_or_replaced_with_a_note(fixture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def taken_over(fixture: Path) -> tuple[Path, int]:
+    """Put the fixture's index where a start looks for it; return the folder of indexes, and the index's version."""
     cache, videos = fixture / "user-cache", fixture / "videos"
     index = refresh.index_path(videos.resolve(), cache)
     cache.mkdir()
@@ -126,10 +151,15 @@ def test_an_index_is_taken_over_or_replaced_with_a_note(fixture: Path, monkeypat
                 "UPDATE video SET size_bytes = ?, mtime_ns = ?, ctime_ns = ? WHERE id = ?",
                 (state.st_size, state.st_mtime_ns, state.st_ctime_ns, path.name),
             )
+    return cache, version
+
+
+def test_an_index_is_taken_over_or_replaced_with_a_note(fixture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache, version = taken_over(fixture)
     probed: list[str] = []
     probe = refresh.probe_files
     monkeypatch.setattr(refresh, "probe_files", lambda root, ids, *rest: probed.extend(ids) or probe(root, ids, *rest))
-    with closing(open_catalogue(videos, rows=Rows.parse(ROWS), cache_dir=cache)) as catalogue:
+    with closing(open_catalogue(fixture / "videos", rows=Rows.parse(ROWS), cache_dir=cache)) as catalogue:
         assert [video.id for video in catalogue.videos] == ["a.mp4", "b.webm"]
         if version == SCHEMA_VERSION:
             assert probed == []
@@ -137,3 +167,37 @@ def test_an_index_is_taken_over_or_replaced_with_a_note(fixture: Path, monkeypat
             assert f"(version {version}, this one has {SCHEMA_VERSION})" in catalogue.notes[0]
         if is_present(fixture):
             assert catalogue.digest == expected(fixture)["catalogue_digest"]
+
+
+def test_planes_give_the_bytes_of_the_release_that_wrote_them(planes: Path) -> None:
+    """From the store, from the cache, which is not written again, and from the videos."""
+    was = expected(planes)
+    shutil.copy(planes / "videos" / "a.boxes.json", planes / "store")
+    pieces = {path: path.stat().st_mtime_ns for path in planes.glob("cache/??/*")}
+    cache = Cache(planes / "cache", 1 << 30, least_free_bytes=0)
+    for folder, kept in (("store", None), ("videos", cache), ("videos", None)):
+        rows = PLANE_ROWS if folder == "videos" else None
+        with closing(open_catalogue(planes / folder, rows=rows, cache_dir=planes, scene=True, processes=0)) as opened:
+            assert plane_digests(opened, kept) == was["streams"], (folder, kept)
+            assert (opened.digest, opened.scene_digest) == (was["catalogue_digest"], was["scene_digest"])
+    assert pieces
+    assert {path: path.stat().st_mtime_ns for path in planes.glob("cache/??/*")} == pieces
+
+
+def test_scenes_in_an_index_are_taken_over(planes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache, version = taken_over(planes)
+    monkeypatch.setattr(SceneAnalysis, "add", None)
+    assert version == SCHEMA_VERSION
+    with closing(
+        open_catalogue(planes / "videos", rows=PLANE_ROWS, cache_dir=cache, scene=True, processes=0)
+    ) as catalogue:
+        assert catalogue.scene_digest == expected(planes)["scene_digest"]
+
+
+@pytest.mark.slow
+def test_a_state_with_labels_and_scenes_continues(planes: Path) -> None:
+    was, state = expected(planes)["labelled"], json.loads((planes / "state.json").read_text())
+    with LocalServer(planes / "videos", workers=1, flags=STREAM_FLAGS) as server:
+        batches = labelled(server.address, state)
+    found = [digest(batch.arrays[name].numpy()) for batch in batches for name in batch.arrays]
+    assert found == was[len(batches[0].arrays) :]

@@ -29,11 +29,9 @@ from v2v_server.prepare.prepare import prepare
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX
 from v2v_server.quarantine.file import read_quarantine
 from v2v_server.simulation.variants import warm_up
-from v2v_server.store.encoding import Encoding
 from v2v_server.video.fingerprint import fingerprint
 
 INJECT = Path(__file__).parent / "inject"
-H264 = Encoding.of("h264")
 COMPILED = pytest.mark.usefixtures("_compiled")
 INDEX_NOTE = re.compile(r"the catalogue's index \S+ cannot be used \((disk I/O error|database or disk is full)\)")
 
@@ -178,7 +176,7 @@ def source(tmp_path: Path) -> Path:
 
 
 def _preparing(source: Path, out: Path, cache: Path) -> list[str]:
-    settings = ["--codec", "h264", "--gop", "25", "--workers", "2", "--cache-dir", str(cache), "--floor", "0"]
+    settings = ["--workers", "2", "--cache-dir", str(cache)]
     return ["v2v_server.commands.prepare", str(source), str(out), *settings]
 
 
@@ -189,7 +187,7 @@ def _require_it_goes_on(source: Path, out: Path, cache: Path) -> None:
     kept = [record for record in records if record.problem is None]
     assert all(fingerprint(out / record.id) == record.fingerprint for record in kept)
     with closing(open_catalogue(source, cache_dir=cache)) as catalogue:
-        report = prepare(catalogue, out, H264, floor_db=0.0)
+        report = prepare(catalogue, out)
     assert (report.kept, report.complete) == (len(kept), True)
 
 

@@ -76,7 +76,11 @@ from pathlib import Path
 class Overlay:
     @staticmethod
     def find_spec(name, path=None, target=None):
-        file = Path(__file__).parent.joinpath(*name.split(".")).with_suffix(".py")
+        place = Path(__file__).parent.joinpath(*name.split("."))
+        if (place / "__init__.py").is_file():
+            others = [f"{below}/{place.name}" for below in path]
+            return spec_from_file_location(name, place / "__init__.py", submodule_search_locations=others)
+        file = place.with_suffix(".py")
         return spec_from_file_location(name, file) if file.is_file() else None
 
 

@@ -1,14 +1,13 @@
 """The command line of `v2v-prepare`: arguments -> settings -> call.
 
-Exit status: 0 every video file of the source was prepared; 1 some were not, fall below a floor or lack requested
-statistics; 2 wrong usage or input; 130 interrupted. Errors are one line on stderr; `--debug` shows the traceback.
+Exit status: 0 every video file of the source was prepared; 1 some were not, or lack requested statistics; 2 wrong usage
+or input; 130 interrupted. Errors are one line on stderr; `--debug` shows the traceback.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import statistics
 import sys
 import time
 from collections.abc import Sequence
@@ -25,10 +24,8 @@ from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
 from v2v_server.prepare.report import Report
-from v2v_server.store.chroma import CHROMA
-from v2v_server.store.encoding import DEFAULT_GOP, DEFAULT_QUALITY, DEFAULT_SIZE, H264, LOSSLESS, Encoding
-from v2v_server.store.motion import MADE_PLANES
-from v2v_server.store.packing import SIZES
+from v2v_server.store.packing import DEFAULT_SIZE, SIZES
+from v2v_server.store.planes import OPTIONAL, PLANES
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 
@@ -39,12 +36,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
     parser = Parser(
         "v2v-prepare", "SRC DST [flags]",
-        "Decode a corpus once, and store its luma bit for bit in blocks that read fast, or as small H.264 files.",
+        "Decode a corpus once, and store its luma bit for bit in blocks that read fast.",
         [
             "v2v-prepare webvid10k/ store/ --rows top:0.54",
             "v2v-prepare clips/ store/ --size fast --scene auto",
         ],
-        "Exit status: 1 if some videos were not prepared, fall below a floor or lack requested statistics.",
+        "Exit status: 1 if some videos were not prepared, or lack requested statistics.",
     )  # fmt: skip
     videos = parser.group("Videos")
     videos.add_argument("source", metavar="SRC", help="folder of videos, a video, or a list file; never written to")
@@ -60,39 +57,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="auto: also compute the statistics that v2v-serve --scene auto uses",
     )
     videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
-    encoding = parser.group("Encoding")
-    encoding.add_argument(
-        "--codec", choices=(LOSSLESS, H264), default=LOSSLESS,
-        help="lossless (default): the same samples as SRC, about 9 times its size; h264: smaller than SRC, but lossy",
-    )  # fmt: skip
-    encoding.add_argument(
-        "--size",
-        choices=tuple(SIZES),
-        help=f"lossless: {DEFAULT_SIZE} (default), fast: a third larger, reads faster, or raw: "
+    stored = parser.group("Files")
+    stored.add_argument(
+        "--size", choices=tuple(SIZES), default=DEFAULT_SIZE,
+        help=f"{DEFAULT_SIZE} (default), about 9 times the size of SRC; fast: a third larger, reads faster; raw: "
         "not compressed, reads fastest from memory",
-    )
-    encoding.add_argument(
-        "--planes", choices=(*MADE_PLANES, CHROMA), action="append", default=[],
-        help="lossless: also store the motion between frames, which streams with substep_px then need not find, or "
-        "chroma, for frames_rgb; a video prepared without it is prepared again",
     )  # fmt: skip
-    encoding.add_argument(
-        "--quality", type=int, metavar="Q", help=f"h264: rate factor, lower is better and larger ({DEFAULT_QUALITY})"
-    )
-    encoding.add_argument("--gop", type=int, metavar="N", help=f"h264: distance of keyframes ({DEFAULT_GOP})")
+    stored.add_argument(
+        "--planes", choices=OPTIONAL, action="append", default=[],
+        help="also store what some streams read or else find again: "
+        f"{', '.join(f'{name} (for {PLANES[name].serves})' for name in OPTIONAL)}; a video prepared without it is "
+        "prepared again",
+    )  # fmt: skip
     run = parser.group("Run")
     run.add_argument(
         "--workers", type=int, default=usable_cores(), metavar="N",
         help="number of processes (default: one per available core)",
-    )  # fmt: skip
-    run.add_argument(
-        "--floor", type=float, default=prepare.DEFAULT_FLOOR_DB, metavar="DB",
-        help=f"report clips with a lower PSNR, dB, and exit with status 1 (default {prepare.DEFAULT_FLOOR_DB:g})",
-    )  # fmt: skip
-    run.add_argument(
-        "--frame-floor", type=float, metavar="DB",
-        help="the same for the worst frame of a clip, dB "
-        f"(default: {prepare.DEFAULT_FRAME_FLOOR_BELOW_DB:g} below --floor)",
     )  # fmt: skip
     parser.add_output("Run", "--json", JSON, "also write a record of each video")
     interrupted = "interrupted; run the same command to continue"
@@ -100,7 +80,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    encoding = Encoding.of(arguments.codec, arguments.size, arguments.quality, arguments.gop)
     if arguments.workers < 1:
         raise UsageError(f"--workers {arguments.workers}: give at least 1")
     started = time.monotonic()
@@ -118,16 +97,14 @@ def _run(arguments: argparse.Namespace) -> int:
         report = prepare.prepare(
             catalogue,
             arguments.destination,
-            encoding,
+            arguments.size,
             processes=arguments.workers,
-            floor_db=arguments.floor,
-            frame_floor_db=arguments.frame_floor,
             scene=arguments.scene != "off",
             planes=tuple(dict.fromkeys(arguments.planes)),
             single=_is_video(Path(arguments.source)),
             progress=lambda done, total, made, expected: shown(done, total, _size(made, expected)),
         )
-    for line in summary(report, encoding, time.monotonic() - started):
+    for line in summary(report, arguments.size, time.monotonic() - started):
         show(line)
     for ending, sidecars in catalogue.sidecars.items():
         if sidecars.states:
@@ -146,11 +123,11 @@ def _is_video(source: Path) -> bool:
     return source.is_file() and source.suffix.lower() not in LIST_SUFFIXES
 
 
-def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:
+def summary(report: Report, size: str, seconds: float) -> list[str]:
     """Return lines that state what was made, what it saved, and what failed and why."""
     prepared = report.prepared
     lines = [
-        f"{len(prepared)} of {len(report.videos)} videos prepared as {encoding} ({report.kept} of them earlier) "
+        f"{len(prepared)} of {len(report.videos)} videos prepared as {size} ({report.kept} of them earlier) "
         f"in {seconds:.0f} s"
     ]
     if report.looked_at:
@@ -167,29 +144,7 @@ def summary(report: Report, encoding: Encoding, seconds: float) -> list[str]:
             f"{before / 1e6:.1f} MB -> {after / 1e6:.1f} MB ({after / before:.2f} of the size): "
             f"{change} {abs(before - after) / 1e6:.1f} MB"
         )
-        if encoding.is_lossless:
-            lines.append("every frame was read back and equals the source's, bit for bit")
-    if prepared and not encoding.is_lossless:
-        quality = {video.id: video.psnr_db or 0.0 for video in prepared}
-        worst = min(quality, key=lambda id: quality[id])
-        lines.append(
-            f"PSNR of a clip to its source: median {statistics.median(quality.values()):.1f} dB, "
-            f"lowest {quality[worst]:.1f} dB ({worst})"
-        )
-        frames = {video.id: video.worst_psnr_db or 0.0 for video in prepared}
-        worst = min(frames, key=lambda id: frames[id])
-        lines.append(
-            f"PSNR of the worst frame: {frames[worst]:.1f} dB ({worst}); the floors are {report.floor_db:g} dB for a "
-            f"clip and {report.frame_floor_db:g} dB for a frame"
-        )
-    lines += _listed(
-        f"below the floor of {report.floor_db:g} dB, or a frame below {report.frame_floor_db:g} dB (kept; a lower "
-        "--quality improves them):",
-        [
-            (video.id, f"{video.psnr_db:.1f} dB, worst frame {video.worst_psnr_db:.1f} dB")
-            for video in report.below_floor
-        ],
-    )
+        lines.append("every frame was read back and equals the source's, bit for bit")
     lines += _listed("could not be prepared:", [(video.id, str(video.problem)) for video in report.failed])
     lines += _listed(
         "lack requested statistics or planes (their files stay):",

@@ -24,10 +24,10 @@ from v2v_server.simulation.variants import warm_up
 from v2v_server.system.process import keep_freed_memory
 from v2v_server.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, Places, accuracy, parts, predicted_loss
 from v2v_server.tradeoff.diversity import diversity
-from v2v_server.tradeoff.forms import DEFAULT_FORMS, ENCODINGS, SOURCE, CorpusForm, forms
+from v2v_server.tradeoff.forms import BESIDE, DEFAULT_FORMS, SOURCE, STORES, CorpusForm, forms
 from v2v_server.tradeoff.front import best
 from v2v_server.tradeoff.report import ERROR_KEY, error_fields, name_dominated, plot, tables
-from v2v_server.tradeoff.settings import ServeSetting, axes, full_model, settings
+from v2v_server.tradeoff.settings import ServeSetting, axes, full_model, planes_for, settings
 from v2v_server.tradeoff.speed import leases_of, making, measure
 from v2v_server.video.rows import Rows
 
@@ -39,18 +39,23 @@ def _parser() -> Parser:
     parser = Parser(
         "v2v-tradeoff", "--videos DIR [flags]",
         "Measure on your clips what each way to serve them costs: processor time, disk space, voxel error against the "
-        "recipe's own full model, and diversity, for the source, lossless stores and H.264, with every combination of "
+        "recipe's own full model, and diversity, for the source, stores and another encoding, with all combinations of "
         "the values of some fields. A setting is dominated when another one is at least as good in everything and "
         "better in one thing. Name the best setting for a wish, and write it for v2v-serve --config.",
         [
             "v2v-tradeoff --videos clips/ --json tradeoff.json --plot tradeoff.png",
             "v2v-tradeoff --videos clips/ --target-rate 20 --vary samples_per_decode=1,2 --preset-out chosen.yaml",
+            "v2v-tradeoff --videos clips/ --beside smaller/ --forms 'lossless dense'",
             "v2v-tradeoff --videos clips/ --recipe my_camera.yaml --vary tolerance=0,0.01 --max-error 0.02",
         ],
         "Exit status: 1 where no setting fulfils --target-rate or --max-error.",
     )  # fmt: skip
     videos = parser.group("Videos")
     videos.add_argument("--videos", required=True, type=Path, metavar="DIR", help="a corpus that is not prepared")
+    videos.add_argument(
+        "--beside", type=Path, metavar="DIR",
+        help="also compare the videos of this folder, with the same names and frames in another encoding",
+    )  # fmt: skip
     videos.add_argument("--rows", default="top:0.54", help="rows to use (default top:0.54, as for WebVid)")
     videos.add_argument("--clips", type=int, default=4, metavar="N", help="different clips to take (default 4)")
     videos.add_argument("--places", type=int, default=8, metavar="N", help="sequences to sample (default 8)")
@@ -63,7 +68,7 @@ def _parser() -> Parser:
     )  # fmt: skip
     work.add_argument(
         "--forms", default=",".join(DEFAULT_FORMS), metavar="FORM,FORM",
-        help=f"ways to prepare the clips, of {', '.join(ENCODINGS)} (default {', '.join(DEFAULT_FORMS)})",
+        help=f"ways to prepare the clips, of {', '.join(STORES)} (default {', '.join(DEFAULT_FORMS)})",
     )  # fmt: skip
     work.add_argument(
         "--budget-minutes", type=float, default=8.0, metavar="X",
@@ -94,8 +99,8 @@ def _check(asked: argparse.Namespace) -> None:
             raise UsageError(f"{wish:g}: --target-rate and --max-error are finite numbers from 0 on")
     asked.forms = [name.strip() for name in asked.forms.split(",")]
     for name in asked.forms:
-        if name not in ENCODINGS:
-            raise UsageError(f"--forms {name!r}: choose of {', '.join(ENCODINGS)}")
+        if name not in STORES:
+            raise UsageError(f"--forms {name!r}: choose of {', '.join(STORES)}")
 
 
 def _run(asked: argparse.Namespace) -> int:
@@ -104,13 +109,15 @@ def _run(asked: argparse.Namespace) -> int:
     budget = 60.0 * asked.budget_minutes
     rows = Rows.parse(asked.rows)
     spec = StreamSpec.from_dict({"recipe": recipe_setting(asked.recipe or "paper", asked.set)})
-    compared = settings(asked.forms, spec, axes(asked.vary))
+    named = asked.forms if asked.beside is None else [BESIDE, *asked.forms]
+    compared = settings(named, spec, axes(asked.vary))
     cv2.setNumThreads(1)
     keep_freed_memory()
     warm_up()
     with tempfile.TemporaryDirectory(prefix="v2v-tradeoff-") as folder, forms(
-        asked.videos, rows, spec, asked.forms, motion=any(setting.spec.substep_px for setting in compared),
-        most_clips=asked.clips, folder=Path(folder), until=begun + _FORMS_SHARE * budget, tell=_tell,
+        asked.videos, rows, spec, asked.forms, beside=asked.beside,
+        planes=planes_for(setting.spec for setting in compared), most_clips=asked.clips, folder=Path(folder),
+        until=begun + _FORMS_SHARE * budget, tell=_tell,
     ) as corpus:  # fmt: skip
         compared = [setting for setting in compared if setting.form in corpus]
         records = _measured(corpus, compared, asked.places, begun, budget)

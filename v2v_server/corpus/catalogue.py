@@ -30,9 +30,9 @@ from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.listfile import ListEntry
 from v2v_server.corpus.sources.sidecar import sidecar_id
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, State, VideoSource, open_source
-from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos, has_chroma
-from v2v_server.store.clips import STORE_FORMAT
+from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos, missing_arrays
 from v2v_server.store.format import PIECE_FRAMES
+from v2v_server.store.reader import STORE_FORMAT
 from v2v_server.system.process import without_collections
 from v2v_server.system.status_fields import gauge, text
 from v2v_server.video.frame_index import FrameIndex, unseekable
@@ -210,8 +210,8 @@ class Catalogue:
     def facts(self) -> CorpusFacts:
         """What is known in memory: all that a server's dispatcher needs."""
         ids = self.videos.ids if not self._absent else [id for id in self.videos.ids if id not in self._absent]
-        has_colour = self.prepared is None or has_chroma(self.source, ids)
-        return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars, has_colour)
+        missing = {} if self.prepared is None else missing_arrays(self.source, ids)
+        return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars, missing)
 
     def part(self) -> CorpusPart:
         """Return what the status says of it."""

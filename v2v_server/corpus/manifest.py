@@ -24,14 +24,16 @@ from v2v_protocol.safe_json import parse_json
 from v2v_server.corpus.index.file import IndexRow
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.names import UNPRINTABLE
-from v2v_server.store.clips import STORE_FORMAT
-from v2v_server.store.encoding import Encoding
-from v2v_server.video.fingerprint import is_same_file
+from v2v_server.store.packing import SIZES
+from v2v_server.store.reader import STORE_FORMAT
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 from v2v_server.video.rows import Rows
 
 MANIFEST_NAME = "v2v-prepared.jsonl"
 MANIFEST_VERSION = 2
+_OF_LOSSY = frozenset({"codec", "quality", "gop", "psnr_db", "worst_psnr_db"})
+"""Fields of releases that could also prepare lossy files."""
+NO_LOSSY = "which this release does not serve: re-encode the videos with ffmpeg, and serve them as videos"
 _Record = TypeVar("_Record", "Header", "PreparedVideo")
 
 
@@ -41,7 +43,7 @@ class Header:
 
     Attributes:
         rows: rows of the source's pictures that it holds, canonical.
-        codec, size, quality, gop: see :class:`v2v_server.store.encoding.Encoding`.
+        size: how its files are packed, a key of :data:`v2v_server.store.packing.SIZES`.
         videos: how many videos the source corpus has; the folder is finished when it has a record of each. Those
             that are set aside do not count.
         source: name of the source folder, for people.
@@ -50,27 +52,16 @@ class Header:
     """
 
     rows: str
-    codec: str
     size: str
-    quality: int
-    gop: int
     videos: int
     source: str
     source_digest: str
     version: int = MANIFEST_VERSION
 
     @property
-    def encoding(self) -> Encoding:
-        """How its files are encoded."""
-        return Encoding(self.codec, self.size, self.quality, self.gop)
-
-    def same_settings(self, other: Header) -> bool:
-        """Return whether one folder may hold videos of both."""
-        return (self.rows, self.encoding) == (other.rows, other.encoding)
-
     def settings(self) -> str:
-        """rows and encoding as text."""
-        return f"rows {self.rows}, {self.encoding}"
+        """Return what all files of a folder have in common."""
+        return f"rows {self.rows}, size {self.size}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +72,8 @@ class PreparedVideo:
         id: of the source, and the path of the prepared file below the folder.
         source_fingerprint, source_bytes: of the source file.
         frames, frames_per_second: of the source (None where unknown), and so of the prepared file.
-        height_px, width_px: of the prepared picture, 0 where the source has not the rows asked for; in a lossless
-            folder of the source's picture, of which the file keeps some rows.
+        height_px, width_px: of the source's picture, of which the file keeps some rows.
         fingerprint, bytes: of the prepared file; "" and 0 with a problem.
-        psnr_db: all frames against the source's, full-range luma, peak 255; None with a problem.
-        worst_psnr_db: the same of the worst frame.
         problem: why there is no prepared file; None if there is one.
         remark: of the source, see :class:`v2v_server.video.probe.VideoFacts`.
         scene: statistics of the source's frames, base64 of ``Scene.to_bytes()``; "" where they were not asked for.
@@ -100,8 +88,6 @@ class PreparedVideo:
     width_px: int
     fingerprint: str = ""
     bytes: int = 0
-    psnr_db: float | None = None
-    worst_psnr_db: float | None = None
     problem: str | None = None
     scene: str = ""
     remark: str = ""
@@ -123,15 +109,10 @@ class Manifest:
     videos: dict[str, PreparedVideo]
     aside: dict[str, PreparedVideo] = field(default_factory=dict)
 
-    @property
-    def lossless(self) -> bool:
-        """Whether its files have exactly the pixels of their sources; the folder is then served like the source."""
-        return self.header.encoding.is_lossless
-
     def served_rows(self, rows: Rows | None) -> Rows:
-        """Return the rows that a corpus of this folder may use: of a lossy folder, all rows of its pictures.
+        """Return the rows that a corpus of this folder may use.
 
-        A lossless folder that stores all rows may be served with any rows, another one only with its stored rows.
+        A folder that stores all rows may be served with any rows, another one only with its stored rows.
 
         Args:
             rows: the requested rows.
@@ -146,14 +127,14 @@ class Manifest:
             )
         asked = None if rows is None or str(rows) == "full" else rows
         kept = Rows.parse(self.header.rows)
-        if self.lossless and asked is not None and kept == Rows():
+        if asked is not None and kept == Rows():
             return asked
         if asked is not None and asked != kept:
             raise CorpusError(
                 f"{self.root}: rows {rows} asked for, but this prepared folder holds rows {self.header.rows} of its "
                 "source only; leave --rows out, or serve the source"
             )
-        return kept if self.lossless else Rows()
+        return kept
 
     def wanted(self, listed: Iterable[str] | None, refused: dict[str, str]) -> tuple[str, ...]:
         """Return the ids that a corpus of this folder has, without files that the manifest does not know.
@@ -168,21 +149,17 @@ class Manifest:
                 refused[id] = "is prepared, but the last v2v-prepare was not asked for it; run it once for all of them"
             elif id not in self.videos:
                 refused[id] = "is not in the prepared folder's manifest: the source had no such usable video"
-            elif not self.videos[id].height_px:
-                refused[id] = f"was not prepared: {self.videos[id].problem}"
         return tuple(id for id in wanted if id not in refused)
 
     def describes(self, record: IndexRow) -> bool:
         """Return whether the probed file is the prepared one.
 
-        A lossless one may be damaged since: it says itself what it was made of, and each of its blocks is checked when
-        it is read. The source itself will do in its place.
+        It may be damaged since: it says itself what it was made of, and each of its blocks is checked when it is read.
+        The source itself will do in its place.
         """
         video = self.videos[record.id]
-        if self.lossless:
-            is_either = record.codec == STORE_FORMAT or record.fingerprint == video.source_fingerprint
-            return record.problem is None and record.frames == video.frames and is_either
-        return is_same_file(record.fingerprint, video.fingerprint) and record.frames == video.frames
+        is_either = record.codec == STORE_FORMAT or record.fingerprint == video.source_fingerprint
+        return record.problem is None and record.frames == video.frames and is_either
 
     def as_source(self, record: IndexRow) -> IndexRow:
         """Return the record of a prepared file with the facts that have to agree with its source.
@@ -191,10 +168,9 @@ class Manifest:
         frames are counted.
         """
         video = self.videos[record.id]
-        made = video.fingerprint or f"none-of-{video.source_fingerprint}"
         return replace(
             record,
-            fingerprint=video.source_fingerprint if self.lossless else made,
+            fingerprint=video.source_fingerprint,
             frames=video.frames,
             height_px=video.height_px,
             width_px=video.width_px,
@@ -230,7 +206,8 @@ def read_manifest(root: Path) -> Manifest:
                     records.pop(video.id, None)
                 (aside if is_aside else videos)[video.id] = video
         except (ValueError, TypeError, UsageError) as error:
-            raise CorpusError(f"{path}, line {number}: {error}; prepare another folder") from error
+            remedy = "" if NO_LOSSY in str(error) else "; prepare another folder"
+            raise CorpusError(f"{path}, line {number}: {error}{remedy}") from error
     return Manifest(root, header, videos, aside)
 
 
@@ -238,8 +215,11 @@ def _header(line: bytes) -> Header:
     data = _object(line)
     if data.get("version") != MANIFEST_VERSION:
         raise ValueError(f"format version {data.get('version')!r}; this program reads {MANIFEST_VERSION}")
+    if data.get("codec", "lossless") != "lossless":
+        raise ValueError(f"the folder was prepared with --codec {data['codec']!r:.80}, {NO_LOSSY}")
     header = _record(Header, data)
-    header.encoding  # noqa: B018 - refuses what cannot be
+    if header.size not in SIZES:
+        raise ValueError(f"size {header.size!r:.80}: this program reads {', '.join(SIZES)}")
     Rows.parse(header.rows)
     if not _whole(header.videos, 1, math.inf):
         raise ValueError(f"{header.videos!r} videos")
@@ -277,6 +257,7 @@ def _record(kind: type[_Record], data: dict[str, Any]) -> _Record:
         ValueError: a field is unknown, missing or of another type.
     """
     known = {each.name: each for each in fields(kind)}
+    data = {name: value for name, value in data.items() if name not in _OF_LOSSY}
     if unknown := data.keys() - known.keys():
         raise ValueError(f"unknown fields {', '.join(sorted(unknown))}")
     for name, each in known.items():

@@ -13,7 +13,7 @@ from typing import TypeVar
 from v2v_protocol.errors import VideoError, VideoUnreadable
 from v2v_server.corpus.index.file import IndexRow
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.clips import facts_of
+from v2v_server.store.pixels import open_pixels
 from v2v_server.system.isolate import Died, run_twice
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.probe import VideoFacts
@@ -70,6 +70,12 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
         remark=facts.remark,
         frame_index=facts.index.to_bytes(),
     )
+
+
+def facts_of(path: Path) -> VideoFacts:
+    """Return what is known of the video in a file. Errors: :class:`v2v_server.store.pixels.Pixels`."""
+    with open_pixels(path) as pixels:
+        return pixels.facts()
 
 
 def _facts(path: Path) -> VideoFacts:

@@ -9,15 +9,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import overload
 
-from v2v_protocol.errors import UsageError
-from v2v_protocol.sample import sidecar_endings
+from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_server.corpus.index.columns import CHUNK, NO_STRINGS, VideoTable
 from v2v_server.corpus.scenes.pieces import SplitVideos
 from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.chroma import CHROMA
-from v2v_server.store.format import is_store_file
-from v2v_server.store.reader import has_planes
+from v2v_server.store.planes import PLANES
+from v2v_server.store.reader import StoreFile
 from v2v_server.video.rows import Rows
 
 Thresholds = tuple[float | None, float | None]
@@ -147,20 +146,29 @@ class Videos(Sequence[VideoEntry]):
         )
 
 
-COLOUR_REMEDY = "prepare them again with v2v-prepare --planes chroma, or serve the videos that they were prepared from"
 _ASKED = 16
-"""Prepared files that are checked for their colour."""
+"""Prepared files that are checked for their planes."""
 
 
-def has_chroma(source: VideoSource, ids: Sequence[str]) -> bool:
-    """Return whether some prepared files of this host, evenly spaced, all have their colour."""
-    if not source.is_local:
-        return False
-    for id in ids[:: max(1, len(ids) // _ASKED)]:
-        with source.open_local(id, "") as path:
-            if not is_store_file(path) or not has_planes(path, (CHROMA,)):
-                return False
-    return True
+def missing_arrays(source: VideoSource, ids: Sequence[str]) -> dict[str, str]:
+    """Return the arrays that need a plane which some prepared files lack, with the remedy.
+
+    Some files of this host are read, evenly spaced.
+    """
+    some = ids[:: max(1, len(ids) // _ASKED)]
+    return {
+        plane.serves: f"the plane {name}, which these prepared videos do not have: {plane.remedy}"
+        for name, plane in PLANES.items()
+        if plane.serves in ARRAYS and not (source.is_local and all(_has_plane(source, id, name) for id in some))
+    }
+
+
+def _has_plane(source: VideoSource, id: str, name: str) -> bool:
+    try:
+        with source.open_pixels(id, "") as pixels:
+            return isinstance(pixels, StoreFile) and name in pixels.planes
+    except VideoError:  # making a sample says why
+        return True
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +181,7 @@ class CorpusFacts:
         digest: names this snapshot.
         scene_digest: names this snapshot together with the statistics of its videos; None without them.
         sidecars: the files beside the videos, by ending.
-        has_colour: whether the videos were catalogued with their colour.
+        missing: arrays that prepared videos have not what they are made from, with the remedy.
     """
 
     videos: Sequence[VideoEntry]
@@ -181,18 +189,19 @@ class CorpusFacts:
     digest: str
     scene_digest: str | None
     sidecars: Mapping[str, Sidecars] = field(default_factory=dict)
-    has_colour: bool = True
+    missing: Mapping[str, str] = field(default_factory=dict)
 
     def require_arrays(self, arrays: tuple[str, ...]) -> None:
         """Check that the videos have what these arrays are made from.
 
         Raises:
-            UsageError: they have no colour.
+            UsageError: they have not.
         """
-        if "frames_rgb" in arrays and not self.has_colour:
-            raise UsageError(
-                "arrays: frames_rgb needs colour, which these prepared videos do not have: " + COLOUR_REMEDY
-            )
+        for name in arrays:
+            if name in self.missing:
+                raise UsageError(
+                    f"arrays: {name} needs {self.missing[name]}, or serve the videos that they were prepared from"
+                )
 
     def sidecars_of(self, video: str, arrays: tuple[str, ...]) -> dict[str, str]:
         """Return the fingerprints of a video's sidecars that these arrays are made from, by ending."""

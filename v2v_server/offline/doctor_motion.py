@@ -94,11 +94,12 @@ def _predicted(source: VideoSource, middle: _Middle) -> _Fields | None:
     import numpy as np
 
     from v2v_server.motion.prediction import predict
-    from v2v_server.offline.motion import pictures_from
+    from v2v_server.video.collect import ClipRequest, Cut
 
     try:
-        with source.open_local(middle.id, "") as path:
-            frames = list(pictures_from(path, middle.index, middle.start, middle.count, middle.window))
+        with source.open_pixels(middle.id, "") as pixels:
+            request = ClipRequest(middle.index, middle.start, (Cut(middle.count, middle.window),))
+            frames = [picture.grey for picture in pixels.pictures(request)]
     except V2VError:
         return None
     return astuple(predict(np.stack(frames)))

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -33,12 +32,10 @@ from v2v_server.corpus.scenes.findings import (
 )  # fmt: skip
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.corpus.videos import VideoEntry
-from v2v_server.store.clips import pictures_of, signal_of
-from v2v_server.store.format import is_store_file
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.system.process import usable_cores
-from v2v_server.video.decode import stream_luma
+from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.orientation import Window
@@ -271,12 +268,10 @@ def _look_at(source: VideoSource, excerpt: _Excerpt) -> tuple[int, tuple[Defect,
 
     index, window = excerpt.index, excerpt.window
     try:
-        with source.open_local(excerpt.id, "") as path:
-            if is_store_file(path):
-                scene = analyse(islice(pictures_of(path, index, window), excerpt.count))
-            else:
-                scene = analyse(stream_luma(path, index, excerpt.start, excerpt.count, window))
-            signal = signal_of(path, index)
+        with source.open_pixels(excerpt.id, "") as pixels:
+            request = ClipRequest(index, excerpt.start, (Cut(excerpt.count, window),))
+            scene = analyse(picture.grey for picture in pixels.pictures(request))
+            signal = pixels.signal(index)
     except V2VError as error:
         return 0, (), SDR, getattr(error, "reason", str(error))
     return scene.end, defects_of(scene), signal, ""

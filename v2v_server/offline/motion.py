@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,14 +24,10 @@ from v2v_server.offline.remake import RemadeSample, Remaker
 from v2v_server.schedule.sequences import VideoSequence
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.view import apply_view, without_margin
-from v2v_server.store.clips import signal_of
-from v2v_server.store.format import is_store_file
-from v2v_server.store.reader import StoreFile
 from v2v_server.system.opencv import cv2
-from v2v_server.video.decode import DecodedClip, stream_luma
-from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.collect import ClipRequest, Cut
+from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import SDR
-from v2v_server.video.orientation import Window
 from v2v_server.worker.produce import Decoded, make_sample, plan_sample
 
 LONGEST_SIDE_PX = 384
@@ -176,12 +170,12 @@ class WholePictures:
         frames = np.empty((len(plan.source), height, width), np.uint8)
         index, stride = catalogue.frame_index(video.id), recipe.frame_stride
         count = (len(frames) - 1) * stride + 1
-        with catalogue.source.open_local(video.id, video.fingerprint) as path:
-            signal = SDR if recipe.light == "sdr" else signal_of(path, index)._replace(bits=8)
-            window = (top, 0, bottom - top, video.width_px)
-            taken = pictures_from(path, index, sequence.start_frame, count, window)
-            for frame, picture in zip(frames, islice(taken, 0, None, stride), strict=True):
-                cv2.resize(picture, (width, height), frame, interpolation=cv2.INTER_AREA)
+        cut = Cut(len(frames), (top, 0, bottom - top, video.width_px))
+        with catalogue.source.open_pixels(video.id, video.fingerprint) as pixels:
+            signal = SDR if recipe.light == "sdr" else pixels.signal(index)._replace(bits=8)
+            taken = pixels.pictures(ClipRequest(index, sequence.start_frame, (cut,), stride))
+            for frame, picture in zip(frames, taken, strict=True):
+                cv2.resize(picture.grey, (width, height), frame, interpolation=cv2.INTER_AREA)
         seconds = index.seconds(sequence.start_frame, count)[::stride]
         clip = DecodedClip(frames, seconds, codec="", bit_exact=False, signal=signal)
         sample = make_sample(lease, Decoded(plan, clip))
@@ -221,20 +215,6 @@ class WholePictures:
             events * THRESHOLD / max(params.threshold_pos, params.threshold_neg),
             noise_rate(params, seconds),
         )
-
-
-def pictures_from(
-    path: Path, index: FrameIndex, start: int, count: int, window: Window
-) -> Iterator[npt.NDArray[np.uint8]]:
-    """Yield the luma of frame after frame, in the memory of a few."""
-    if not is_store_file(path):
-        yield from stream_luma(path, index, start, count, window)
-        return
-    with StoreFile(path) as stored:
-        for first in range(start, start + count, _STORED_FRAMES):
-            frames = np.empty((min(_STORED_FRAMES, start + count - first), *window[2:]), np.uint8)
-            stored.read(first, 1, window, frames)
-            yield from frames
 
 
 def moving_seeds(remaker: Remaker, wholes: WholePictures, count: int) -> tuple[list[int], int]:

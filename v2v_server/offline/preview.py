@@ -33,8 +33,7 @@ from v2v_server.offline.motion import WholePictures, describe_loss, moving_seeds
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.simulation.intensity import tone_table
-from v2v_server.store.clips import clips_of, signal_of
-from v2v_server.video.collect import Cut
+from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.luma import SDR
 from v2v_server.video.probe import DOLBY_VISION
 
@@ -214,8 +213,8 @@ def _camera(
 def _signal_note(catalogue: Catalogue, provenance: Provenance, recipe: Recipe) -> str:
     """Return what the video states about its levels, and whether the recipe uses it; "" for 8 bits of SDR."""
     id = provenance.video
-    with catalogue.source.open_local(id, provenance.fingerprint) as path:
-        signal = signal_of(path, catalogue.frame_index(id))
+    with catalogue.source.open_pixels(id, provenance.fingerprint) as pixels:
+        signal = pixels.signal(catalogue.frame_index(id))
     if DOLBY_VISION in provenance.remark:
         return ""  # its levels are not what they are called
     if signal == SDR or recipe.light == "declared":
@@ -228,10 +227,9 @@ def _whole_picture(catalogue: Catalogue, provenance: Provenance, recipe: Recipe)
     index = catalogue.frame_index(provenance.video)
     top, bottom = catalogue.rows.bounds(index.height_px)
     cut = Cut(1, (top, 0, bottom - top, index.width_px))
-    with catalogue.source.open_local(provenance.video, provenance.fingerprint) as path:
-        most_bits = None if recipe.light == "sdr" else SDR.bits
-        what = provenance.fingerprint, index, provenance.start_frame, [cut], 1
-        (clip,) = clips_of(path, *what, most_bits=most_bits)
+    most_bits = None if recipe.light == "sdr" else SDR.bits
+    with catalogue.source.open_pixels(provenance.video, provenance.fingerprint) as pixels:
+        (clip,) = pixels.clips(ClipRequest(index, provenance.start_frame, (cut,), most_bits=most_bits))
     picture: npt.NDArray[np.uint8] = tone_table(recipe.gamma, clip.signal)[clip.frames[0]]
     return picture
 

@@ -2,7 +2,6 @@
 
 prepare    a run over a corpus
 transcode  one video into its prepared form, verified
-encode     write luma as H.264, for small disks
 resume     what earlier runs left in a folder
 report     the results of a run
 """

@@ -1,8 +1,8 @@
 """`v2v-prepare`: decode a corpus once, and store what training needs.
 
-The prepared folder mirrors the source: the same relative paths, so the same ids, order, list files and permutation. A
-manifest states what the files are, whatever their suffixes: store files (:mod:`v2v_server.store.format`), which
-reproduce the exact frames of their sources, or MP4.
+The prepared folder mirrors the source: the same relative paths, so the same ids, order, list files and permutation. Its
+files are store files (:mod:`v2v_server.store.format`), whatever their suffixes, with the exact frames of their sources.
+A manifest lists them.
 
 The folder stays consistent after any interruption: a file gets its final name only when complete and verified, and its
 line in the manifest after that. A second run keeps files that the manifest lists if file and source are unchanged, and
@@ -32,25 +32,19 @@ from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.report import Report
 from v2v_server.prepare.resume import has_failed, known_records, locked, refuse_overlap, standing_files
 from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode
-from v2v_server.store.chroma import CHROMA
-from v2v_server.store.encoding import Encoding
-from v2v_server.store.motion import MADE_PLANES
+from v2v_server.store.packing import DEFAULT_SIZE, SIZES
+from v2v_server.store.planes import OPTIONAL
 from v2v_server.store.reader import has_planes
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.orientation import Window
 from v2v_server.video.rows import Rows
 
-DEFAULT_FLOOR_DB = 35.0
-DEFAULT_FRAME_FLOOR_BELOW_DB = 5.0
-"""Distance of a frame's floor below the clip's floor. The worst frame of a sound clip is at most some 5 dB worse than
-the clip; a frame whose lower quarter is grey has 11 to 24 dB, however long the clip."""
-
 LEAST_FREE_BYTES = 1 << 30
 """Always keep this much disk space free: a full disk stops other programs."""
 
 _STORED_BITS_PER_PIXEL = 2.2
-"""Size of a lossless file, median of the measured clips (docs/prepare.md): 0.7 to 3.4."""
+"""Size of a store file, median of the measured clips (docs/prepare.md): 0.7 to 3.4."""
 
 _TELLING_SHARE = 0.02
 _CRASHES = "crashes the transcoder: its process died"
@@ -62,11 +56,9 @@ Progress = Callable[[int, int, int, int], None]
 def prepare(
     catalogue: Catalogue,
     destination: str | os.PathLike[str],
-    encoding: Encoding,
+    size: str = DEFAULT_SIZE,
     *,
     processes: int = 1,
-    floor_db: float = DEFAULT_FLOOR_DB,
-    frame_floor_db: float | None = None,
     scene: bool = False,
     planes: tuple[str, ...] = (),
     single: bool = False,
@@ -77,14 +69,12 @@ def prepare(
     Args:
         catalogue: the source; its ``rows`` are stored.
         destination: the folder to create or to continue.
-        encoding: codec settings.
+        size: how the files are packed, a key of :data:`v2v_server.store.packing.SIZES`.
         processes: number of parallel transcoding processes, spawned; 0 transcodes in this process.
-        floor_db: lowest PSNR of a clip for ``Report.below_floor``, dB.
-        frame_floor_db: lowest PSNR of each frame for the same, dB; None: 5 dB below ``floor_db``.
         scene: also compute the scene statistics; for a video prepared without them they are computed from its source,
             and its file stays.
-        planes: names of the planes to store (:data:`v2v_server.store.motion.MADE_PLANES`); a video prepared without one
-            of them is prepared again, and keeps its others.
+        planes: names of the planes to store (:data:`v2v_server.store.planes.OPTIONAL`); a video prepared without one of
+            them is prepared again, and keeps its others.
         single: the source is one video, so the destination may lie in its folder.
         progress: called at the start, after each video whose file was checked, and after each that was done.
 
@@ -92,26 +82,18 @@ def prepare(
         CorpusError: source and destination overlap, the destination holds something else or was prepared with other
             settings or from another source, a prepared file cannot be read, another process works there, the source is
             a prepared folder itself, or the disk is too full.
-        UsageError: a number outside its limits, or planes of a lossy encoding.
+        UsageError: a number of processes below 0, or an unknown size.
     """
-    if planes and not encoding.is_lossless:
-        raise UsageError(f"planes {', '.join(planes)} with {encoding}: only lossless files hold planes")
-    if frame_floor_db is None:
-        frame_floor_db = floor_db - DEFAULT_FRAME_FLOOR_BELOW_DB
-    if processes < 0 or not math.isfinite(floor_db) or not math.isfinite(frame_floor_db):
-        raise UsageError(
-            f"{processes} processes, floor {floor_db:g} dB, frame floor {frame_floor_db:g} dB: give 0 or more, and "
-            "finite numbers"
-        )
+    if processes < 0:
+        raise UsageError(f"{processes} processes: give 0 or more")
+    if size not in SIZES:
+        raise UsageError(f"size {size!r}: choose one of {', '.join(SIZES)}")
     tell = progress or (lambda done, total, made, expected: None)
     total = sum(video.frames for video in catalogue.videos)
     tell(0, total, 0, 0)
     target = Path(destination).resolve()
     refuse_overlap(catalogue, target, single)
-    header = Header(
-        str(catalogue.rows), encoding.codec, encoding.size, encoding.quality, encoding.gop, len(catalogue.videos),
-        catalogue.folder.name, catalogue.digest,
-    )  # fmt: skip
+    header = Header(str(catalogue.rows), size, len(catalogue.videos), catalogue.folder.name, catalogue.digest)
     made: dict[str, PreparedVideo] = {}
     not_looked_at = []
     try:
@@ -122,11 +104,11 @@ def prepare(
             standing, finished, lacking = earlier.standing, earlier.finished, earlier.lacking
             left = [video for video in catalogue.videos if video.id not in finished]
             done = total - sum(video.frames for video in left)
-            room = _Room(target, catalogue, encoding, left)
+            room = _Room(target, catalogue, left)
             wanted = {video.id for video in catalogue.videos}
             aside = [record for id, record in known.items() if id not in wanted]
             with ManifestWriter(target, header, [*standing.values(), *earlier.failed], aside) as manifest:
-                for video, outcome in _outcomes(catalogue, left, earlier, target, encoding, scene, planes, processes):
+                for video, outcome in _outcomes(catalogue, left, earlier, target, size, scene, planes, processes):
                     if isinstance(outcome, Refusal):
                         not_looked_at.append(outcome)
                     else:
@@ -143,8 +125,6 @@ def prepare(
         videos=tuple(records[id] for id in sorted(records)),
         kept=len(finished),
         unusable=catalogue.refusals,
-        floor_db=floor_db,
-        frame_floor_db=frame_floor_db,
         looked_at=len((made.keys() & standing.keys()) - lacking),
         aside=len(aside),
         not_looked_at=tuple(not_looked_at),
@@ -159,10 +139,9 @@ class _Room:
         OSError: the free space cannot be read.
     """
 
-    def __init__(self, target: Path, catalogue: Catalogue, encoding: Encoding, left: Sequence[VideoEntry]) -> None:
+    def __init__(self, target: Path, catalogue: Catalogue, left: Sequence[VideoEntry]) -> None:
         self._target = target
         self._pixels = {video.id: _pixels(video, catalogue.rows) for video in left}
-        self._lossless = encoding.is_lossless
         self._all_pixels, self._done_pixels = sum(self._pixels.values()), 0
         self.made = 0
         free = shutil.disk_usage(target).free
@@ -170,7 +149,7 @@ class _Room:
             raise CorpusError(
                 f"{target}: about {self.expected / 1e9:.1f} GB will be written, but the disk has "
                 f"{free / 1e9:.1f} GB free, of which {LEAST_FREE_BYTES / 1e9:.1f} must stay free; "
-                "free disk space, keep fewer rows, select fewer videos with --list, or use --codec h264"
+                "free disk space, keep fewer rows, or select fewer videos with --list"
             )
 
     def done(self, video: VideoEntry, made: int) -> None:
@@ -183,7 +162,7 @@ class _Room:
         """Expected total of bytes, estimated from the finished videos once they are representative."""
         if self.made and self._done_pixels > _TELLING_SHARE * self._all_pixels:
             return int(self.made / self._done_pixels * self._all_pixels)
-        return int(_STORED_BITS_PER_PIXEL / 8 * self._all_pixels) if self._lossless else 0
+        return int(_STORED_BITS_PER_PIXEL / 8 * self._all_pixels)
 
     def check(self) -> None:
         """Check the free space during the run.
@@ -254,7 +233,7 @@ def _outcomes(
     videos: Iterable[VideoEntry],
     earlier: _Earlier,
     target: Path,
-    encoding: Encoding,
+    size: str,
     scene: bool,
     planes: tuple[str, ...],
     processes: int,
@@ -266,7 +245,7 @@ def _outcomes(
             window = _window(video, catalogue.rows)
             jobs.append(_ToPrepare(video, window, earlier.standing.get(video.id), video.id in earlier.lacking))
         except UsageError as error:
-            yield video, _record(video, 0, 0, str(error), encoding)
+            yield video, _record(video, str(error))
 
     changed: list[tuple[_ToPrepare, str]] = []
 
@@ -275,15 +254,15 @@ def _outcomes(
             id = job.video.id
             keeps_scene = job.standing is not None and job.standing.scene != ""
             # A file that is made again for one plane keeps its others.
-            more = [name for name in (*MADE_PLANES, CHROMA) if job.lacks_planes and has_planes(target / id, (name,))]
+            more = [name for name in OPTIONAL if job.lacks_planes and has_planes(target / id, (name,))]
             try:
                 index = catalogue.frame_index(id).to_bytes()
             except VideoError as error:
                 changed.append((job, error.reason))
                 continue
             yield job, Transcoding(
-                id, catalogue.path(id), job.video.fingerprint, job.video.codec, index, job.video.frames_per_second,
-                job.window, encoding, target, target / id, scene or keeps_scene,
+                id, catalogue.path(id), job.video.fingerprint, index, job.video.frames_per_second,
+                job.window, size, target, target / id, scene or keeps_scene,
                 tuple(dict.fromkeys((*planes, *more))),
             )  # fmt: skip
 
@@ -305,7 +284,7 @@ def _outcomes(
         else:
             # Only a process that a video has taken over analyses what it was told to transcode.
             made = f"{_CRASHES} (it sent a malformed result)" if isinstance(result, Scene) else result
-            yield job.video, _record(job.video, *job.window[2:], made, encoding)
+            yield job.video, _record(job.video, made)
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,14 +322,13 @@ def _attempt(job: tuple[_ToPrepare, Transcoding]) -> Made | Scene | str:
         return f"preparing failed: {type(error).__name__}: {error}"
 
 
-def _record(video: VideoEntry, height: int, width: int, result: Made | str, encoding: Encoding) -> PreparedVideo:
-    if encoding.is_lossless:
-        height, width = video.height_px, video.width_px
+def _record(video: VideoEntry, result: Made | str) -> PreparedVideo:
     rate = video.frames_per_second
     # A fingerprint begins with the size in bytes.
     size = int(video.fingerprint.partition("-")[0])
     record = PreparedVideo(
-        video.id, video.fingerprint, size, video.frames, None if math.isnan(rate) else rate, height, width,
+        video.id, video.fingerprint, size, video.frames, None if math.isnan(rate) else rate, video.height_px,
+        video.width_px,
         remark=video.remark,
     )  # fmt: skip
     if isinstance(result, str):
@@ -359,8 +337,6 @@ def _record(video: VideoEntry, height: int, width: int, result: Made | str, enco
         record,
         fingerprint=result.fingerprint,
         bytes=result.bytes,
-        psnr_db=result.psnr_db,
-        worst_psnr_db=result.worst_psnr_db,
         scene="" if result.scene is None else _text(result.scene),
     )
 

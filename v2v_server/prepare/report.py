@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from v2v_protocol.refusal import Refusal
@@ -21,15 +20,11 @@ class Report:
             :mod:`v2v_server.corpus.manifest`.
         not_looked_at: prepared videos whose statistics could not be computed, and why. Their files stay.
         unusable: files of the source that a server cannot use either.
-        floor_db: lowest PSNR of a clip, dB.
-        frame_floor_db: lowest PSNR of each of its frames, dB.
     """
 
     videos: tuple[PreparedVideo, ...]
     kept: int
     unusable: tuple[Refusal, ...]
-    floor_db: float
-    frame_floor_db: float
     looked_at: int = 0
     aside: int = 0
     not_looked_at: tuple[Refusal, ...] = ()
@@ -45,18 +40,6 @@ class Report:
         return tuple(video for video in self.videos if video.problem is not None)
 
     @property
-    def below_floor(self) -> tuple[PreparedVideo, ...]:
-        """The videos whose PSNR, or that of one of their frames, is below its floor, the worst frame first. Their files
-        are kept, and served.
-        """
-        low = [
-            video
-            for video in self.prepared
-            if _known(video.psnr_db) < self.floor_db or _known(video.worst_psnr_db) < self.frame_floor_db
-        ]
-        return tuple(sorted(low, key=lambda video: _known(video.worst_psnr_db)))
-
-    @property
     def source_bytes(self) -> int:
         """Size of the sources that were prepared, bytes."""
         return sum(video.source_bytes for video in self.prepared)
@@ -68,9 +51,5 @@ class Report:
 
     @property
     def complete(self) -> bool:
-        """Return whether every video file was prepared, with everything requested, and above the floors."""
-        return not (self.failed or self.below_floor or self.unusable or self.not_looked_at)
-
-
-def _known(psnr_db: float | None) -> float:
-    return math.inf if psnr_db is None else psnr_db
+        """Return whether every video file was prepared, with everything requested."""
+        return not (self.failed or self.unusable or self.not_looked_at)

@@ -93,12 +93,12 @@ def known_records(target: Path, header: Header, videos: Sequence[VideoEntry]) ->
             )
         return {}
     manifest = read_manifest(target)
-    if not manifest.header.same_settings(header):
+    if manifest.header.settings != header.settings:
         # One header describes all files of a folder, so it cannot hold two settings; and preparing all of them again
         # without being asked may cost days.
         made = sum(video.problem is None for records in (manifest.videos, manifest.aside) for video in records.values())
         raise CorpusError(
-            f"{target} holds {made} videos prepared with {manifest.header.settings()}, but {header.settings()} is "
+            f"{target} holds {made} videos prepared with {manifest.header.settings}, but {header.settings} is "
             "requested; choose another folder, or delete this one to prepare all of them again"
         )
     known = manifest.aside | manifest.videos

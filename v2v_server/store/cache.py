@@ -24,25 +24,18 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnreadable
-from v2v_server.store.chroma import CHROMA, chroma_planes, matrix_of, whole_chroma, with_chroma
-from v2v_server.store.depth import detail_planes, read_levels, same_transfer
-from v2v_server.store.format import PIECE_FRAMES, Head, group_frames_for
-from v2v_server.store.motion import MOTION, read_motion, wants_motion, with_motion, with_planes
+from v2v_protocol.errors import CorpusError, VideoError, VideoUnreadable
+from v2v_server.store.format import PIECE_FRAMES, Head
 from v2v_server.store.packing import QUICK, RAW, Packing
+from v2v_server.store.pixels import Pixels
+from v2v_server.store.planes import OPTIONAL, PLANES, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
-from v2v_server.store.reader import StoreFile, has_planes
-from v2v_server.store.writer import StoreWriter
+from v2v_server.store.reader import StoreFile, has_planes, read_clips
+from v2v_server.store.writer import StoreWriter, head_of, planes_of, write_pictures
 from v2v_server.system.private import make_private
 from v2v_server.system.status_fields import GIB
-from v2v_server.video.collect import Cut, LastFrame
-from v2v_server.video.decode import BIT_EXACT_CODECS, DecodedClip, stream_decoded
-from v2v_server.video.fingerprint import check_fingerprint
-from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import MIXED, Signal
+from v2v_server.video.collect import ClipRequest, DecodedPicture
+from v2v_server.video.decode import DecodedClip
 from v2v_server.video.orientation import Window
 
 _LOCK_SECONDS = 0.06
@@ -91,25 +84,14 @@ class Cache:
             _remove_abandoned(folder)
 
     def clips(
-        self,
-        path: Path,
-        video: str,
-        fingerprint: str,
-        rows: tuple[int, int],
-        index: FrameIndex,
-        start: int,
-        cuts: Sequence[Cut],
-        stride: int,
-        most_bits: int | None = None,
+        self, pixels: Pixels, video: str, fingerprint: str, request: ClipRequest
     ) -> tuple[DecodedClip, ...] | None:
-        """Return several cuts of a video, read from the cache, or decoded and stored in it.
+        """Return the cuts of a request, read from the cache, or decoded and stored in it.
 
         Args:
-            path: the video.
+            pixels: the video.
             video, fingerprint: its catalogue id and fingerprint.
-            rows: (first, one after the last) usable row; these are stored. The cuts lie within.
-            index: its frames, or a part that holds the needed pieces.
-            start, cuts, stride, most_bits: see :func:`v2v_server.video.decode.decode_cuts`.
+            request: its usable rows are stored; the cuts lie within. Its index holds the needed pieces if it can.
 
         Returns:
             None if the cache can neither read nor store them; the caller then decodes without the cache.
@@ -119,110 +101,77 @@ class Cache:
             UsageError: a range outside the index.
         """
         self.trouble = ""
-        last = start + max((cut.count - 1) * stride for cut in cuts)
-        index.position(start, last - start + 1)
-        size = piece_frames(rows[1] - rows[0], index.width_px)
+        request.check()
+        index, usable, start = request.index, request.usable, request.start
+        rows, last = (usable[0], usable[0] + usable[2]), start + (request.count - 1) * request.stride
+        size = piece_frames(usable[2], usable[3])
         # Pieces that state their transfer have names of their own: older ones do not state it.
-        named = (video, fingerprint, rows, size) if most_bits is None else (video, fingerprint, rows, size, most_bits)
+        named: tuple[Any, ...] = video, fingerprint, rows, size
+        if request.most_bits is not None:
+            named = *named, request.most_bits
         key = hashlib.sha256(repr(named).encode()).hexdigest()[:32]
         pieces = [
             _Piece(self.folder / key[:2] / f"{key}-{number}", number * size, min((number + 1) * size, index.end))
             for number in range(start // size, last // size + 1)
         ]
-        picture = rows[0], 0, rows[1] - rows[0], index.width_px
-        planes = [*([MOTION] if stride == 1 and wants_motion(cuts) else []), *chroma_planes(cuts)]
+        planes = [name for name in OPTIONAL if PLANES[name].is_worth_storing(request)]
         lacking = [piece for piece in pieces if not has_planes(piece.path, planes)]
+        needed = [name for name in planes if PLANES[name].remedy]
+        is_readable = all(has_planes(piece.path, needed) for piece in lacking)
         # Keep what other streams stored; otherwise two streams would replace each other's pieces.
-        kept = [name for name in (MOTION, CHROMA) if any(has_planes(piece.path, (name,)) for piece in lacking)]
-        planes = [*dict.fromkeys([*planes, *kept])]
-        made = self._read(pieces, fingerprint, index, start, cuts, stride, picture)
+        kept = [name for name in OPTIONAL if any(has_planes(piece.path, (name,)) for piece in lacking)]
+        made = self._read(pieces, fingerprint, request) if is_readable else None
         if made is not None and not lacking:
             return made
-        missing = [piece for piece in pieces if piece in lacking or not piece.path.exists()]
-        if not missing or index.first > missing[0].first or not self._has_room(missing, rows, index):
-            return made
-        check_fingerprint(path, fingerprint)
-        try:
-            self._fill(path, video, fingerprint, rows, index, missing, planes, most_bits)
-        except OSError as error:
-            self._rest(f"cannot be written to: {error.strerror or error}")
-            return made
-        except VideoError:
-            return made  # the damage may lie beyond the frames that this sample needs
-        if made is None:
-            made = self._read(pieces, fingerprint, index, start, cuts, stride, picture)
-        return None if made is None else tuple(replace(clip, origin="") for clip in made)
+        for _ in pieces:  # reading may find one damaged piece after the other
+            missing = [piece for piece in pieces if piece in lacking or not piece.path.exists()]
+            if not missing or index.first > missing[0].first or not self._has_room(missing, usable):
+                break
+            pixels.check(fingerprint)
+            try:
+                self._fill(pixels, video, fingerprint, request, missing, tuple(dict.fromkeys((*planes, *kept))))
+            except OSError as error:
+                self._rest(f"cannot be written to: {error.strerror or error}")
+                break
+            except VideoError:
+                break  # the damage may lie beyond the frames that this sample needs
+            made, lacking = made or self._read(pieces, fingerprint, request), []
+            if made is not None:
+                return tuple(replace(clip, origin="") for clip in made)
+        return made
 
     @property
     def used_bytes(self) -> int:
         """Bytes stored in the folder by all processes that share it; 0 if unknown."""
         return self._quota.used_bytes
 
-    def _read(
-        self,
-        pieces: Sequence[_Piece],
-        fingerprint: str,
-        index: FrameIndex,
-        start: int,
-        cuts: Sequence[Cut],
-        stride: int,
-        picture: Window,
-    ) -> tuple[DecodedClip, ...] | None:
+    def _read(self, pieces: Sequence[_Piece], fingerprint: str, request: ClipRequest) -> tuple[DecodedClip, ...] | None:
         """Read the cuts if all pieces are present and sound. Damaged pieces are removed."""
-        clips: list[npt.NDArray[Any]] = []
-        codec, bit_exact, sound, signals = "", False, True, set[Signal]()
-        files: list[tuple[StoreFile, range]] = []
         with contextlib.ExitStack() as opened:
+            files = []
             for piece in pieces:
                 try:
-                    stored = opened.enter_context(StoreFile(piece.path, fingerprint))
-                    codec, bit_exact = stored.head.codec, stored.head.bit_exact
-                    signal = stored.head.signal
-                    signals.add(signal)
-                    if not clips:
-                        clips = [np.empty((cut.count, *_window(cut, index)[2:]), signal.dtype) for cut in cuts]
-                    # The frames of start, start + stride ... that lie in this piece.
-                    low = max(0, -(-(piece.first - start) // stride))
-                    end = -(-(piece.end - start) // stride)
-                    files.append((stored, range(low, min(end, max(cut.count for cut in cuts)))))
-                    for cut, frames in zip(cuts, clips, strict=True):
-                        if low < (high := min(cut.count, end)):
-                            place = start + low * stride, stride, _window(cut, index)
-                            read_levels(stored, *place, frames[low:high], signal)
+                    files.append(opened.enter_context(StoreFile(piece.path, fingerprint)))
+                    files[-1].require(piece.first, piece.end)
                 except VideoUnreadable as error:
                     if not isinstance(error.__cause__, FileNotFoundError):
                         self.trouble = error.reason
                     return None
-                except (VideoError, UsageError) as error:
-                    self._remove(piece.path, error.reason if isinstance(error, VideoError) else str(error))
-                    sound = False  # continue, so that all damaged pieces are decoded again together
-            if not sound:
-                return None
-            if len(signals) > 1:
-                signal = signal._replace(transfer=MIXED)
-            times = [index.seconds(start, (cut.count - 1) * stride + 1)[::stride] for cut in cuts]
+                except VideoError as error:
+                    self._remove(piece.path, error.reason)
             try:
-                vectors = read_motion(files, start, cuts, stride, picture)
-                if not all(stored.planes.issuperset(chroma_planes(cuts)) for stored, _ in files):
-                    return None  # made for a stream without colour
-                read = [
-                    DecodedClip(frames, seconds, codec, bit_exact, "cache", signal=signal)
-                    for frames, seconds in zip(clips, times, strict=True)
-                ]
-                read = list(with_chroma(read, cuts, files, start, stride))
+                return read_clips(files, request, "cache") if len(files) == len(pieces) else None
             except VideoUnreadable as error:
                 self.trouble = error.reason
-                return None
             except VideoError as error:
                 self._remove(Path(error.video), error.reason)
-                return None
-        return with_motion(read, cuts, vectors)
+        return None
 
-    def _has_room(self, missing: Sequence[_Piece], rows: tuple[int, int], index: FrameIndex) -> bool:
+    def _has_room(self, missing: Sequence[_Piece], usable: Window) -> bool:
         if time.monotonic() < self._rest_until:
             self.trouble = self._rest_reason
             return False
-        pixels = (rows[1] - rows[0]) * index.width_px * sum(piece.end - piece.first for piece in missing)
+        pixels = usable[2] * usable[3] * sum(piece.end - piece.first for piece in missing)
         try:
             free = self._quota.free_bytes
         except OSError as error:
@@ -239,14 +188,12 @@ class Cache:
 
     def _fill(
         self,
-        path: Path,
+        pixels: Pixels,
         video: str,
         fingerprint: str,
-        rows: tuple[int, int],
-        index: FrameIndex,
+        request: ClipRequest,
         missing: Sequence[_Piece],
         planes: Sequence[str],
-        most_bits: int | None,
     ) -> None:
         """Decode the missing pieces in one pass, and store each.
 
@@ -254,42 +201,32 @@ class Cache:
             VideoError: they cannot be decoded.
             OSError: they cannot be written.
         """
-        top, width = rows[0], index.width_px
-        height, begin, end = rows[1] - rows[0], missing[0].first, missing[-1].end
-        picture_px = top, 0, height, width
-        chroma = whole_chroma(planes, picture_px)
-        decoded = stream_decoded(path, index, begin, end - begin, picture_px, most_bits, chroma)
-        with contextlib.closing(decoded) as frames:
-            for piece in missing:
-                for _ in range(begin, piece.first):  # frames of a piece that exists
-                    next(frames)
-                begin = piece.end
-                stream, picture = next(frames)
-                signal = stream.signal
-                head = Head(
-                    video=video, fingerprint=fingerprint, height_px=index.height_px, width_px=width, top=top,
-                    rows=height, first=piece.first, count=piece.end - piece.first, frames=piece.end,
-                    frames_per_second=0.0, codec=stream.codec, bit_exact=stream.codec in BIT_EXACT_CODECS,
-                    group=group_frames_for(height, width), packing=self._packing.method, bits=signal.bits,
-                    transfer=signal.transfer, matrix=matrix_of(stream),
-                )  # fmt: skip
-                more = chain(((stream, picture),), islice(frames, head.count - 1))
-                self._keep(piece.path, head, more, [*planes, *detail_planes(signal)])
+        usable, index = request.usable, request.index
+        begin, end = missing[0].first, missing[-1].end
+        cut = whole_cut(end - begin, usable, planes)
+        frames = pixels.pictures(ClipRequest(index, begin, (cut,), most_bits=request.most_bits))
+        for piece in missing:
+            for _ in range(begin, piece.first):  # frames of a piece that exists
+                next(frames)
+            begin, count = piece.end, piece.end - piece.first
+            picture = next(frames)
+            head = head_of(
+                picture, index, usable, video=video, fingerprint=fingerprint, first=piece.first, count=count,
+                packing=self._packing,
+            )  # fmt: skip
+            self._keep(piece.path, head, chain((picture,), islice(frames, count - 1)), planes_of(head, planes))
 
-    def _keep(
-        self, path: Path, head: Head, pictures: Iterable[tuple[LastFrame, npt.NDArray[Any]]], planes: Sequence[str]
-    ) -> None:
+    def _keep(self, path: Path, head: Head, pictures: Iterable[DecodedPicture], planes: Sequence[str]) -> None:
         """Write a piece, and rename it into place if it fits the limit."""
         partial = self.folder / PARTIAL / secrets.token_hex(8)
         try:
             partial.parent.mkdir(exist_ok=True)
             make_private(partial)
             with StoreWriter(partial, head, self._packing, planes) as writer:
-                fcntl.flock(
-                    writer.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB
-                )  # held for the life of this process: see _remove_abandoned
-                for picture, arrays in with_planes(same_transfer(head, pictures), planes):
-                    writer.add(picture, arrays)
+                # Held for the life of this process: see _remove_abandoned.
+                fcntl.flock(writer.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+                for _ in write_pictures(writer, head, pictures, planes):
+                    pass
                 writer.close()
             with self._waiting():
                 self._quota.add(partial, path)
@@ -314,6 +251,33 @@ class Cache:
     def _rest(self, why: str) -> None:
         self.trouble = self._rest_reason = why
         self._rest_until = time.monotonic() + _REST_SECONDS
+
+
+class Cached:
+    """:class:`v2v_server.store.pixels.Pixels` of a video through a cache.
+
+    Args:
+        pixels: the video.
+        cache: where decoded pieces of it are kept.
+        video, fingerprint: its catalogue id and fingerprint.
+    """
+
+    is_stored = True
+
+    def __init__(self, pixels: Pixels, cache: Cache, video: str, fingerprint: str) -> None:
+        self._pixels, self._cache, self._name = pixels, cache, (video, fingerprint)
+        self.facts, self.pictures, self.signal = pixels.facts, pixels.pictures, pixels.signal
+
+    def check(self, fingerprint: str) -> None:
+        """Do nothing: a piece states what it was made from, and the video is checked before it is decoded."""
+
+    def clips(self, request: ClipRequest) -> tuple[DecodedClip, ...]:
+        """Return the cuts of a request from the cache; decode them where it can neither read nor store them."""
+        clips = self._cache.clips(self._pixels, *self._name, request)
+        if clips is None:
+            self._pixels.check(self._name[1])
+            clips = self._pixels.clips(request)
+        return clips
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,7 +307,3 @@ def _remove_abandoned(folder: Path) -> None:
         with contextlib.suppress(OSError), path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             path.unlink()
-
-
-def _window(cut: Cut, index: FrameIndex) -> Window:
-    return cut.window or (0, 0, index.height_px, index.width_px)

@@ -176,16 +176,6 @@ def read_head(path: str, file: int, offset: int = 0) -> tuple[Head, int]:
         ) from error
 
 
-def is_store_file(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file begins like a store file; False if it cannot be read."""
-    try:
-        # Opening a FIFO without O_NONBLOCK would block until there is a writer.
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
-    except OSError:
-        return False
-
-
 def pack_record(head: Head, group: int, offset: int, sizes: list[int], checks: list[int]) -> bytes:
     """Encode a record of the table.
 

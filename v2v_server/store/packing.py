@@ -56,6 +56,8 @@ FAST = Packing("lz4", level=6)
 RAW = Packing("raw")
 
 SIZES = {"dense": DENSE, "fast": FAST, "raw": RAW}
+"""How a prepared folder may store its files, by name."""
+DEFAULT_SIZE = "dense"
 METHODS = ("zstd", "lz4", "raw")
 
 

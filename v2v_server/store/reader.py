@@ -1,9 +1,11 @@
-"""Read from a store file. A crop of some frames costs only the blocks that it touches."""
+"""Read from store files. A crop of some frames costs only the blocks that it touches."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -13,20 +15,31 @@ from typing import Any, NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import UsageError, VideoChanged, VideoError, VideoUnreadable
+from v2v_protocol.errors import ProtocolError, UsageError, VideoChanged, VideoError, VideoUnreadable
 from v2v_server.store.format import (
     BLOCK_COLUMNS,
     BLOCK_ROWS,
+    GROUP_FRAMES,
     LARGEST_BLOCK_BYTES,
+    MAGIC,
     BlockRecord,
+    Head,
     block_check,
     read_head,
     unpack_record,
 )
 from v2v_server.store.packing import UnpackingError, unpack
-from v2v_server.store.planes import PLANES, PlanePlace, read_footer
+from v2v_server.store.planes import PLANES
+from v2v_server.store.planes.plane import Files, PlanePlace, read_footer
+from v2v_server.video.collect import ClipRequest, DecodedPicture
+from v2v_server.video.decode import DecodedClip
+from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import MIXED, SDR, Signal
 from v2v_server.video.orientation import Window
+from v2v_server.video.probe import VideoFacts
 
+STORE_FORMAT = "v2v store"
+"""Name of the store file format, which only a prepared folder can serve."""
 _REMEDY = "re-create it with v2v-prepare"
 _ZEROS = np.empty(0, np.uint8)
 
@@ -91,7 +104,7 @@ class BlockReader:
 
     def _read_group(self, group: int, first: int, stride: int, window: Window, out: npt.NDArray[np.uint8]) -> bool:
         # Import lazily: listing files must not load numba.
-        from v2v_server.store.pixels import from_differences
+        from v2v_server.store.differences import from_differences
 
         head, (top, left, height, width) = self.head, window
         record = self._record(group)
@@ -168,7 +181,7 @@ class BlockReader:
 
 
 class StoreFile(BlockReader):
-    """An open store file.
+    """An open store file: :class:`v2v_server.store.pixels.Pixels` of the video that it was made from.
 
     Args:
         path: the file.
@@ -183,6 +196,8 @@ class StoreFile(BlockReader):
         VideoError: it is not a store file, or its head is damaged.
     """
 
+    is_stored = True
+
     def __init__(self, path: str | os.PathLike[str], fingerprint: str = "") -> None:
         path = os.fspath(path)
         try:
@@ -191,12 +206,68 @@ class StoreFile(BlockReader):
             raise VideoUnreadable(path, None, f"cannot be read: {error.strerror or error}") from error
         try:
             super().__init__(path, file)
-            if fingerprint not in ("", self.head.fingerprint):
-                made_of = self.head.fingerprint
-                raise VideoChanged(path, None, f"was made from another file: {made_of} instead of {fingerprint}")
+            if fingerprint:
+                self.check(fingerprint)
         except BaseException:
             os.close(file)
             raise
+
+    def facts(self) -> VideoFacts:
+        """Return the facts of the source."""
+        head = self.head
+        try:
+            index = FrameIndex.from_bytes(head.index)
+        except ProtocolError as error:
+            raise VideoError(self._path, None, f"its index is damaged: {error}") from error
+        if (len(index), index.height_px, index.width_px) != (head.frames, head.height_px, head.width_px):
+            raise VideoError(self._path, None, f"its index has {index}, and its head {head.frames} frames")
+        return VideoFacts(
+            frames=head.frames,
+            height_px=head.height_px,
+            width_px=head.width_px,
+            codec=STORE_FORMAT,
+            pixel_format="gray",
+            frames_per_second=head.frames_per_second or math.nan,
+            rotation_degrees=0,
+            full_range=True,
+            index=index,
+        )
+
+    def check(self, fingerprint: str) -> None:
+        """Check what the file was made from.
+
+        Raises:
+            VideoChanged: it was made from another source.
+        """
+        made_of = self.head.fingerprint
+        if made_of != fingerprint:
+            raise VideoChanged(self._path, None, f"was made from another file: {made_of} instead of {fingerprint}")
+
+    def require(self, first: int, end: int) -> None:
+        """Check that the file holds frames ``first`` .. ``end`` - 1.
+
+        Raises:
+            VideoError: it does not.
+        """
+        if not self.head.first <= first < end <= self.head.first + self.head.count:
+            raise VideoError(self._path, None, f"holds no frames {first} to {end}, but {self.head.count}: {_REMEDY}")
+
+    def clips(self, request: ClipRequest) -> tuple[DecodedClip, ...]:
+        """Read the cuts of a request, see :func:`read_clips`."""
+        return read_clips([self], request, "store")
+
+    def pictures(self, request: ClipRequest) -> Iterator[DecodedPicture]:
+        """Yield the frames of the only cut of a request in 8 bits, in the memory of a few."""
+        (cut,) = request.cuts
+        for done in range(0, cut.count, GROUP_FRAMES):
+            grey = np.empty((min(GROUP_FRAMES, cut.count - done), *request.window(cut)[2:]), np.uint8)
+            self.read(request.start + done * request.stride, request.stride, request.window(cut), grey)
+            for picture in grey:
+                yield DecodedPicture(picture, picture, SDR, self.head.codec, self.head.bit_exact)
+
+    def signal(self, index: FrameIndex) -> Signal:
+        """Return what the levels of the source mean."""
+        return self.head.signal
 
     def __enter__(self) -> StoreFile:
         return self
@@ -244,6 +315,15 @@ class StoreFile(BlockReader):
             return np.zeros((count if wanted is None else len(wanted), kind.values, *cells[2:]), kind.dtype)
         return kind.from_pictures(pictures if wanted is None else pictures[wanted], cells)
 
+    def arrays(self, name: str) -> Iterator[npt.NDArray[Any]]:
+        """Yield the arrays of a plane, one for each frame. Errors: :meth:`plane`."""
+        head = self.head
+        _, rows, columns = PLANES[name].shape(head.rows, head.width_px)
+        for number in range(head.groups):
+            first, count = head.first + number * head.group, head.group_frames(number)
+            for array in self.plane(name, first, count, (0, 0, rows, columns)):
+                yield np.ascontiguousarray(array)
+
     @cached_property
     def _places(self) -> Mapping[str, PlanePlace]:
         try:
@@ -251,6 +331,65 @@ class StoreFile(BlockReader):
         except OSError as error:
             raise VideoUnreadable(self._path, None, f"cannot be read: {error.strerror or error}") from error
         return {name: place for name, place in places.items() if name in PLANES}
+
+
+def read_clips(files: Sequence[StoreFile], request: ClipRequest, origin: str) -> tuple[DecodedClip, ...]:
+    """Read the cuts of a request from files that follow each other and together hold it.
+
+    Raises:
+        UsageError: they do not hold a requested frame or cell.
+        VideoUnreadable: the system reports an error.
+        VideoError: a needed part is damaged, or a file lacks a needed plane. Its ``video`` is the file.
+    """
+    heads = [stored.head for stored in files]
+    bits = min(request.most_bits or SDR.bits, heads[0].bits)
+    transfers = {head.transfer for head in heads}
+    transfer = MIXED if len(transfers) > 1 else heads[0].transfer
+    signal = SDR if request.most_bits is None else Signal(bits, transfer)
+    parts: Files = [(stored, _held(stored.head, request)) for stored in files]
+    added = []
+    for name, plane in PLANES.items():
+        if plane.is_wanted(request, signal):
+            for stored in files:
+                if plane.remedy and name not in stored.planes:
+                    raise VideoError(stored._path, None, f"the store file lacks the plane {name}: {plane.remedy}")
+            values = plane.read(parts, request)
+            request = replace(request, cuts=tuple(map(plane.narrowed, request.cuts, values)))
+            added.append((plane, values))
+    clips = []
+    for number, cut in enumerate(request.cuts):
+        grey = np.empty((cut.count, *request.window(cut)[2:]), np.uint8)
+        for stored, held in parts:
+            if frames := range(held.start, min(held.stop, cut.count)):
+                start = request.start + frames.start * request.stride
+                stored.read(start, request.stride, request.window(cut), grey[frames.start : frames.stop])
+        clip = DecodedClip(grey, request.seconds(cut), heads[-1].codec, heads[-1].bit_exact, origin, signal=signal)
+        for plane, values in added:
+            clip = plane.added(clip, values[number])
+        clips.append(clip)
+    return tuple(clips)
+
+
+def _held(head: Head, request: ClipRequest) -> range:
+    """Return the frames of a clip that lie in a file."""
+    low = max(0, -(-(head.first - request.start) // request.stride))
+    end = -(-(head.first + head.count - request.start) // request.stride)
+    return range(low, max(low, min(end, request.count)))
+
+
+def open_pixels(path: Path) -> StoreFile | None:
+    """Open a store file; return None for any other file."""
+    return StoreFile(path) if is_store_file(path) else None
+
+
+def is_store_file(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file begins like a store file; False if it cannot be read."""
+    try:
+        # Opening a FIFO without O_NONBLOCK would block until there is a writer.
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
 
 
 def has_planes(path: Path, planes: Collection[str]) -> bool:

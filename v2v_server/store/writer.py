@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -14,10 +14,14 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import UsageError
-from v2v_server.store.format import BLOCK_COLUMNS, BLOCK_ROWS, Head, block_check, pack_record
+from v2v_protocol.errors import UsageError, VideoError
+from v2v_server.store.format import BLOCK_COLUMNS, BLOCK_ROWS, Head, block_check, group_frames_for, pack_record
 from v2v_server.store.packing import Packing
-from v2v_server.store.planes import PLANES, PlanePlace, pack_footer
+from v2v_server.store.planes import PLANES
+from v2v_server.store.planes.plane import PlanePlace, pack_footer
+from v2v_server.video.collect import DecodedPicture
+from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.orientation import Window
 
 
 class _BlockWriter:
@@ -57,7 +61,7 @@ class _BlockWriter:
 
     def _write_group(self, frames: npt.NDArray[np.uint8]) -> None:
         # Import lazily: listing files must not load numba.
-        from v2v_server.store.pixels import to_differences
+        from v2v_server.store.differences import to_differences
 
         group, head = len(self._table), self._head
         blocks: list[bytes] = []
@@ -179,3 +183,53 @@ class StoreWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._files.close()
+
+
+def planes_of(head: Head, planes: Iterable[str] = ()) -> tuple[str, ...]:
+    """Return the names of the planes of a file: the given ones, and those that every file of its signal has."""
+    own = (name for name, plane in PLANES.items() if plane.is_part_of(head.signal))
+    return tuple(dict.fromkeys((*planes, *own)))
+
+
+def write_pictures(
+    writer: StoreWriter, head: Head, pictures: Iterable[DecodedPicture], planes: Iterable[str]
+) -> Iterator[tuple[npt.NDArray[np.uint8], dict[str, npt.NDArray[Any]]]]:
+    """Write pictures and their planes; yield what was written of each.
+
+    Raises:
+        VideoError: a picture states another transfer than the head.
+        UsageError, OSError: see :class:`StoreWriter`.
+    """
+    makers = {name: PLANES[name].maker() for name in planes}
+    for picture in pictures:
+        if picture.signal.transfer != head.transfer:
+            why = f"its transfer changes from {head.transfer or 'SDR'}: re-encode it with one transfer"
+            raise VideoError(head.video, None, why)
+        arrays = {name: make(picture) for name, make in makers.items()}
+        writer.add(picture.grey, arrays)
+        yield picture.grey, arrays
+
+
+def head_of(
+    picture: DecodedPicture, index: FrameIndex, usable: Window, *, video: str, fingerprint: str, first: int, count: int,
+    packing: Packing, frames_per_second: float = 0.0, stored_index: bytes = b"",
+) -> Head:  # fmt: skip
+    """Return the head of a file.
+
+    Args:
+        picture: its first one.
+        index: of the video, or the part of it that is known.
+        usable: the part of the pictures to store, all columns.
+        video, fingerprint: of the source.
+        first, count: the frames to store.
+        packing: of the file.
+        frames_per_second: of the video; 0 if unknown.
+        stored_index: the encoded index; empty in a piece of a video.
+    """
+    top, _, rows, width = usable
+    return Head(
+        video=video, fingerprint=fingerprint, height_px=index.height_px, width_px=width, top=top, rows=rows,
+        first=first, count=count, frames=first + count, frames_per_second=frames_per_second, codec=picture.codec,
+        bit_exact=picture.bit_exact, group=group_frames_for(rows, width), packing=packing.method,
+        index=stored_index, bits=picture.signal.bits, transfer=picture.signal.transfer, matrix=picture.matrix,
+    )  # fmt: skip

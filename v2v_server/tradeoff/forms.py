@@ -1,7 +1,7 @@
-"""The corpus in all its forms: as it is, and prepared in several ways.
+"""The corpus in all its forms: as it is, prepared in several ways, and as another folder has it.
 
-Everything is in a temporary folder: links to a few different clips of the corpus, and their prepared forms, made by the
-functions of ``v2v-prepare``.
+Everything is in a temporary folder: links to a few different clips of the corpus and of the other folder, and stores,
+made by the functions of ``v2v-prepare``.
 """
 
 from __future__ import annotations
@@ -17,16 +17,12 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.prepare.prepare import prepare
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.store.encoding import Encoding
-from v2v_server.store.motion import MADE_PLANES
 from v2v_server.video.rows import Rows
 
-SOURCE = "source"
-ENCODINGS = {
-    "lossless dense": Encoding("lossless", "dense"),
-    "lossless fast": Encoding("lossless", "fast"),
-} | {f"h264 {quality}": Encoding("h264", quality=quality, gop=25) for quality in (12, 18, 23)}
-DEFAULT_FORMS = ("lossless dense", "lossless fast", "h264 12", "h264 18")
+SOURCE, BESIDE = "source", "beside"
+STORES = {"lossless dense": "dense", "lossless fast": "fast", "lossless raw": "raw"}
+"""Sizes of stores, by form."""
+DEFAULT_FORMS = ("lossless dense", "lossless fast")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +42,8 @@ class CorpusForm:
 
 @contextlib.contextmanager
 def forms(
-    videos: Path, rows: Rows, spec: StreamSpec, names: Sequence[str], *, motion: bool, most_clips: int, folder: Path,
-    until: float, tell: Callable[[str], None],
+    videos: Path, rows: Rows, spec: StreamSpec, names: Sequence[str], *, beside: Path | None, planes: Sequence[str],
+    most_clips: int, folder: Path, until: float, tell: Callable[[str], None],
 ) -> Iterator[dict[str, CorpusForm]]:  # fmt: skip
     """Make the forms.
 
@@ -55,18 +51,19 @@ def forms(
         videos: the corpus, not a prepared one.
         rows: rows of the pictures to use.
         spec: decides which clips are long and large enough.
-        names: keys of ENCODINGS, in order.
-        motion: whether lossless forms hold the motion between frames.
+        names: keys of STORES, in order.
+        beside: a folder that has each clip under the same name, in another encoding; None: there is none.
+        planes: of the stores.
         most_clips: number of clips to take: the first different ones.
         folder: an empty folder for all files.
         until: reading of ``time.monotonic`` after which no further form is made.
         tell: for progress.
 
     Yields:
-        forms by name, SOURCE first; the catalogues are open inside the block.
+        forms by name, SOURCE first, then BESIDE; the catalogues are open inside the block.
 
     Raises:
-        CorpusError: there is no clip, or one could not be prepared.
+        CorpusError: there is no clip, one could not be prepared, or ``beside`` lacks one or has it with other frames.
         UsageError: the corpus is a prepared one.
     """
     with contextlib.ExitStack() as stack:
@@ -77,17 +74,22 @@ def forms(
             return catalogue
 
         links = folder / "clips"
-        _link(opened(videos, rows), spec, most_clips, links)
+        chosen = _chosen(opened(videos, rows), spec, most_clips)
+        _link(videos, chosen, links)
         source = opened(links, rows)
         made = {SOURCE: CorpusForm(source, _nbytes(source), _seconds(source))}
+        if beside is not None:
+            _link(beside, chosen, folder / BESIDE)
+            clips = opened(folder / BESIDE, rows)
+            _require_alike(source, clips, beside)
+            made[BESIDE] = CorpusForm(clips, _nbytes(clips), _seconds(source))
         for name in names:
             if time.monotonic() >= until:
                 tell(f"left out for lack of time: {name}")
                 continue
             tell(f"preparing {len(source.videos)} clips as {name}")
-            how, into = ENCODINGS[name], folder / name.replace(" ", "-")
-            planes = tuple(MADE_PLANES) if motion and how.is_lossless else ()
-            failed = prepare(source, into, how, processes=0, floor_db=0.0, planes=planes).failed
+            into = folder / name.replace(" ", "-")
+            failed = prepare(source, into, STORES[name], processes=0, planes=tuple(planes)).failed
             if failed:
                 raise CorpusError(f"{failed[0].id} could not be prepared as {name}: {failed[0].problem}")
             clips = opened(into)
@@ -103,7 +105,8 @@ def _seconds(catalogue: Catalogue) -> float:
     return sum(video.frames / video.frames_per_second for video in catalogue.videos if video.frames_per_second)
 
 
-def _link(catalogue: Catalogue, spec: StreamSpec, most: int, folder: Path) -> None:
+def _chosen(catalogue: Catalogue, spec: StreamSpec, most: int) -> list[str]:
+    """Return the ids of the first different clips."""
     if catalogue.prepared is not None:
         raise UsageError(f"--videos {catalogue.folder}: a prepared corpus; give its source")
     table = SequenceTable(catalogue.videos, catalogue.rows, spec)
@@ -111,7 +114,29 @@ def _link(catalogue: Catalogue, spec: StreamSpec, most: int, folder: Path) -> No
         raise CorpusError(f"--videos {catalogue.folder}: no video gives a sequence: {table.refusals[0]}")
     unusable = {refusal.video for refusal in table.refusals}
     distinct = {video.fingerprint: video for video in reversed(catalogue.videos) if video.id not in unusable}
+    return sorted(video.id for video in distinct.values())[:most]
+
+
+def _link(videos: Path, ids: Sequence[str], folder: Path) -> None:
+    """Link some videos of a folder, or of the folder of a list file, under names that tell them apart."""
+    root = videos if videos.is_dir() else videos.parent
     folder.mkdir(parents=True)
-    for number, video in enumerate(sorted(distinct.values(), key=lambda video: video.id)[:most]):
-        path = catalogue.path(video.id)
-        (folder / f"{number:03d}_{path.name}").symlink_to(path.resolve())
+    for number, id in enumerate(ids):
+        if not (root / id).exists():
+            raise CorpusError(f"{root / id}: there is no such file: give a folder with each clip under its own name")
+        (folder / f"{number:03d}_{Path(id).name}").symlink_to((root / id).resolve())
+
+
+def _require_alike(source: Catalogue, other: Catalogue, folder: Path) -> None:
+    """Check that both have the same videos, with equal numbers and sizes of frames."""
+    for video in source.videos:
+        found = other.videos.find(video.id)
+        if found is None:
+            raise CorpusError(f"{folder}: {video.id[4:]} cannot be used")
+        with_size = ((each.frames, each.height_px, each.width_px) for each in (video, other.videos[found]))
+        (frames, height, width), (got, tall, wide) = with_size
+        if (got, tall, wide) != (frames, height, width):
+            raise CorpusError(
+                f"{folder}: {video.id[4:]} has {got} frames of {wide}x{tall} px instead of {frames} of "
+                f"{width}x{height} px: encode it again with all frames in their size"
+            )

@@ -12,7 +12,8 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.safe_yaml import format_yaml, parse_yaml
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
-from v2v_server.tradeoff.forms import ENCODINGS, SOURCE
+from v2v_server.store.planes import OPTIONAL, PLANES
+from v2v_server.tradeoff.forms import BESIDE, SOURCE, STORES
 
 SAMPLES_PER_DECODE = (1, 2, 4)
 DEFAULT_AXES = {"samples_per_decode": ("1", "2", "4"), "substep_px": ("0", "1")}
@@ -26,7 +27,7 @@ class ServeSetting:
     """One way to serve a corpus.
 
     Attributes:
-        form: SOURCE, or how the corpus is prepared: a key of ENCODINGS.
+        form: SOURCE, BESIDE, or how the corpus is prepared: a key of STORES.
         spec: what is streamed.
         values: what tells it from other settings of the form, for example "substep_px = 1"; K is apart.
     """
@@ -53,16 +54,22 @@ class ServeSetting:
     def yaml(self, rows: str, why: str) -> str:
         """Return the setting as a file for ``v2v-serve --config``; ``why`` is one line about the choice."""
         lines = [f"# {self.name}: {why}"]
-        if self.form != SOURCE:
-            how = ENCODINGS[self.form]
-            kind = f"--size {how.size}" if how.is_lossless else f"--quality {how.quality} --gop {how.gop}"
-            planes = " --planes motion" if self.spec.substep_px and how.is_lossless else ""
-            flags = f"--rows {rows} --codec {how.codec} {kind}{planes}"
+        if self.form == BESIDE:
+            lines += ["# Serve the folder of --beside."]
+        elif self.form != SOURCE:
+            planes = "".join(f" --planes {name}" for name in planes_for([self.spec]))
+            flags = f"--rows {rows} --size {STORES[self.form]}{planes}"
             lines += [f"# Prepare the corpus first: v2v-prepare SOURCE PREPARED {flags}", "# and serve PREPARED."]
         plain, usual = self.spec.to_dict(), StreamSpec().to_dict()
         recipe = _different(plain.pop("recipe"), usual.pop("recipe"))
         chosen = {"rows": rows, "samples_per_decode": self.spec.samples_per_decode, **_different(plain, usual)}
         return "\n".join([*lines, format_yaml(chosen | ({"recipe": recipe} if recipe else {}))])
+
+
+def planes_for(specs: Iterable[StreamSpec]) -> tuple[str, ...]:
+    """Return the planes of a store that these streams read."""
+    specs = tuple(specs)
+    return tuple(name for name in OPTIONAL if any(getattr(spec, PLANES[name].serves, 0) for spec in specs))
 
 
 def _different(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 from av.video.frame import VideoFrame
 
-from v2v_protocol.errors import VideoError
-from v2v_server.video.colour.chroma import Chroma, ChromaCut, ChromaStack
+from v2v_protocol.errors import UsageError, VideoError
+from v2v_server.video.colour.chroma import DEFAULT_MATRIX, Chroma, ChromaCut, ChromaStack
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import MIXED, SDR, TRANSFERS, BeyondBits, LumaFormat, Signal, copy_luma, luma_plane, stretch
 from v2v_server.video.orientation import Orientation, Window
@@ -37,74 +37,157 @@ class Cut:
     still: Window | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class ClipRequest:
+    """What is wanted of the frames of a video.
+
+    Attributes:
+        index: the video's frames, or a part that holds the wanted ones.
+        start: ordinal of the first wanted frame, presentation order.
+        cuts: what each sample takes of them, at least one.
+        stride: takes frames start, start + stride ...
+        rows: (first, one after the last) usable row, which the cells of a cut count from; None: all rows.
+        most_bits: bits of a level to keep of deeper luma, 8 to ``luma.MOST_BITS``; None: 8, and the signal is SDR,
+            whatever the file states.
+        samples: (seed, epoch, index) of the sample of each cut, for pixels that differ from sample to sample; empty
+            where no sample is made.
+    """
+
+    index: FrameIndex
+    start: int
+    cuts: tuple[Cut, ...]
+    stride: int = 1
+    rows: tuple[int, int] | None = None
+    most_bits: int | None = None
+    samples: tuple[tuple[int, int, int], ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Return the number of frames of the longest cut."""
+        return max(cut.count for cut in self.cuts)
+
+    @property
+    def usable(self) -> Window:
+        """Return the part of the upright picture that may be used."""
+        top, bottom = self.rows or (0, self.index.height_px)
+        return top, 0, bottom - top, self.index.width_px
+
+    def seconds(self, cut: Cut) -> npt.NDArray[np.float64]:
+        """Return the presentation times of the frames of a cut."""
+        return self.index.seconds(self.start, (cut.count - 1) * self.stride + 1)[:: self.stride]
+
+    def window(self, cut: Cut) -> Window:
+        """Return the window of a cut."""
+        return cut.window or (0, 0, self.index.height_px, self.index.width_px)
+
+    def check(self) -> None:
+        """Check that the index has the frames, and the picture the windows.
+
+        Raises:
+            UsageError: it has not.
+        """
+        height_px, width_px = self.index.height_px, self.index.width_px
+        for cut in self.cuts:
+            self.index.position(self.start, (cut.count - 1) * self.stride + 1)
+            top, left, height, width = self.window(cut)
+            inside = top >= 0 and left >= 0 and top + height <= height_px and left + width <= width_px
+            if not inside or height < 1 or width < 1:
+                raise UsageError(
+                    f"window (top {top}, left {left}, {width}x{height} px) does not lie inside a picture of "
+                    f"{width_px}x{height_px} px"
+                )
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedPicture:
+    """A decoded picture, or a part of it.
+
+    Attributes:
+        luma: [h, w] levels, upright and in full range, of the signal's dtype.
+        grey: the same in 8 bits.
+        signal: what the levels mean.
+        codec: name of the format that it was decoded from.
+        bit_exact: whether every host decodes these very bytes.
+        colour: [2, rows, columns] int8, Cb and Cr; None if they were not asked for.
+        matrix: of the colour (:class:`v2v_server.video.colour.chroma.Chroma`).
+    """
+
+    luma: npt.NDArray[Any]
+    grey: npt.NDArray[np.uint8]
+    signal: Signal
+    codec: str
+    bit_exact: bool
+    colour: npt.NDArray[np.int8] | None = None
+    matrix: str = DEFAULT_MATRIX
+
+
 class DecodedFrame(NamedTuple):
     """A frame in the decoder's memory, which it holds.
 
     Attributes:
+        frame: the frame.
         samples, luma: see :func:`v2v_server.video.luma.luma_plane`.
         orientation, height_px, width_px: of the upright picture.
+        signal: what the levels mean that were asked for.
     """
 
+    frame: VideoFrame
     samples: npt.NDArray[np.unsignedinteger]
     luma: LumaFormat
     orientation: Orientation
     height_px: int
     width_px: int
+    signal: Signal
 
     def raw(self, window: Window) -> npt.NDArray[np.unsignedinteger]:
         """Return a window of the upright picture as the decoder stores it, without a copy."""
         top, left, height, width = self.orientation.stored_window(window, self.height_px, self.width_px)
         return self.samples[top : top + height, left : left + width]
 
-    def part(self, window: Window) -> npt.NDArray[np.uint8]:
-        """Return a window of the upright picture, [h, w] uint8 in full range."""
+    def part(self, window: Window, signal: Signal = SDR) -> npt.NDArray[Any]:
+        """Return levels of a window of the upright picture, [h, w] of the signal's dtype, in full range."""
         stored = self.orientation.stored_window(window, self.height_px, self.width_px)
-        part = np.empty((1, *stored[2:]), np.uint8)
-        copy_luma(self.samples, self.luma, stored, part[0])
+        part = np.empty((1, *stored[2:]), signal.dtype)
+        copy_luma(self.samples, self.luma, stored, part[0], signal)
         stretch(part, self.luma)
-        upright: npt.NDArray[np.uint8] = self.orientation.upright(part)[0]
+        upright: npt.NDArray[Any] = self.orientation.upright(part)[0]
         return upright
+
+    def picture(self, window: Window, chroma: ChromaCut | None, codec: str, bit_exact: bool) -> DecodedPicture:
+        """Return a window of the picture, with the colour of a cut."""
+        luma = self.part(window, self.signal)
+        grey = self.part(window) if self.signal.bits > SDR.bits else luma
+        if chroma is None:
+            return DecodedPicture(luma, grey, self.signal, codec, bit_exact)
+        stack = ChromaStack(chroma, self.orientation, self.height_px, self.width_px)
+        return DecodedPicture(luma, grey, self.signal, codec, bit_exact, *stack.cells_of(self.frame))
 
 
 Watch = Callable[[], Callable[[DecodedFrame], object]]
 """What else looks at the frames: called whenever decoding begins; returns what gets each frame."""
 
 
-@dataclass(frozen=True, slots=True)
-class FrameRange:
-    """Which frames of a file are to be decoded.
+class Stack:
+    """Collects the asked frames of one pass, and refuses what is not exactly that.
 
-    Attributes:
-        path, index, start, stride, most_bits: see :func:`v2v_server.video.decode.decode_cuts`.
+    Args:
+        path: the file.
+        wanted: the request.
+        watch: looks at each frame.
+        collects: whether to keep the cuts.
     """
 
-    path: str
-    index: FrameIndex
-    start: int
-    stride: int
-    most_bits: int | None = None
-
-
-def window_of(cut: Cut) -> Window:
-    """Return the window of a cut that was checked."""
-    assert cut.window is not None
-    return cut.window
-
-
-class Stack:
-    """Collects the asked frames of one pass, and refuses what is not exactly that."""
-
-    def __init__(self, wanted: FrameRange, cuts: Sequence[Cut], watch: Watch | None = None) -> None:
-        self.wanted = wanted
+    def __init__(self, path: str, wanted: ClipRequest, watch: Watch | None = None, *, collects: bool = True) -> None:
+        self.path, self.wanted = path, wanted
         self._show = None if watch is None else watch()
         self.index = index = wanted.index
         self._orientation = index.orientation
         self.codec = ""  # FFmpeg's name, once decoding has begun
         self.signal = SDR  # of the collected frames
         self.sparse = False  # whether frames before the range are left out on purpose
-        self._cuts = cuts
+        self._cuts = wanted.cuts if collects else ()
         self._stride = stride = wanted.stride
-        first, most = wanted.start - index.first, max(cut.count for cut in cuts)
+        first, most = wanted.start - index.first, wanted.count
         self._pts: list[int] = index.pts.tolist()  # single numbers of an array take longer to get
         self._expected = self._pts[first : first + (most - 1) * stride + 1 : stride]
         self._seen = 0  # frames delivered by the decoder, for files where they must be counted
@@ -113,8 +196,9 @@ class Stack:
         self._damaged = False
         size = index.height_px, index.width_px
         self._colours = [
-            None if cut.chroma is None else ChromaStack(cut.chroma, self._orientation, *size) for cut in cuts
+            None if cut.chroma is None else ChromaStack(cut.chroma, self._orientation, *size) for cut in self._cuts
         ]
+        self._luma: LumaFormat | None = None
         self._parts: list[tuple[Window, npt.NDArray[np.unsignedinteger]]] = []  # stored window and frames of each cut
 
     def take(self, frame: VideoFrame) -> bool:
@@ -131,7 +215,9 @@ class Stack:
             self.refuse("is damaged, or refers to a damaged or lost frame")
         try:
             self._copy(frame)
-            self._collect_colour(frame)
+            for colour in self._colours:
+                if colour is not None:
+                    colour.add(frame, self.taken)
         except BeyondBits as error:
             self.refuse(str(error))
         self.taken += 1
@@ -167,7 +253,7 @@ class Stack:
         return self._stride > 1 and pts in self._pts
 
     def _copy(self, frame: VideoFrame) -> None:
-        if not self._parts:
+        if self._luma is None:
             self._luma = LumaFormat.of(frame)
             if self.wanted.most_bits is not None:
                 self.signal = Signal(min(self._luma.bits, self.wanted.most_bits), TRANSFERS.get(frame.color_trc, ""))
@@ -183,18 +269,15 @@ class Stack:
         if self.wanted.most_bits is not None and TRANSFERS.get(frame.color_trc, "") != self.signal.transfer:
             self.signal = self.signal._replace(transfer=MIXED)
         samples = luma_plane(frame, self._luma)
-        self._keep(samples)
-        if self._show is not None:
-            height, width = self.index.height_px, self.index.width_px
-            self._show(DecodedFrame(samples, self._luma, self._orientation, height, width))
-
-    def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
         for stored, raw in self._parts:
             if self.taken < len(raw):
                 copy_luma(samples, self._luma, stored, raw[self.taken], self.signal)
+        if self._show is not None:
+            size = self.index.height_px, self.index.width_px
+            self._show(DecodedFrame(frame, samples, self._luma, self._orientation, *size, self.signal))
 
     def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.unsignedinteger]]:
-        window = window_of(cut)
+        window = self.wanted.window(cut)
         stored = self._orientation.stored_window(window, self.index.height_px, self.index.width_px)
         return stored, np.empty((cut.count, *stored[2:]), self.signal.dtype)
 
@@ -204,12 +287,7 @@ class Stack:
         Raises:
             VideoError: always.
         """
-        raise VideoError(self.wanted.path, self.wanted.start + self.taken * self._stride, why)
-
-    def _collect_colour(self, frame: VideoFrame) -> None:
-        for colour in self._colours:
-            if colour is not None:
-                colour.add(frame, self.taken)
+        raise VideoError(self.path, self.wanted.start + self.taken * self._stride, why)
 
     def chroma(self) -> list[Chroma | None]:
         """Return the collected colour of each cut; None if it takes none."""
@@ -218,39 +296,6 @@ class Stack:
     def grey(self) -> Iterator[npt.NDArray[Any]]:
         """Yield the collected frames of each cut, [count, h, w] of the signal's dtype: upright, in full range."""
         for _, raw in self._parts:
+            assert self._luma is not None
             stretch(raw, self._luma)
             yield self._orientation.upright(raw)
-
-
-class LastFrame(Stack):
-    """Keep only the last of the asked frames, of one cut."""
-
-    def __init__(self, wanted: FrameRange, cut: Cut) -> None:
-        super().__init__(wanted, [cut])
-        self.colour: tuple[npt.NDArray[np.int8], str] | None = None  # Cb and Cr of the last frame, and their matrix
-
-    def _collect_colour(self, frame: VideoFrame) -> None:
-        (colour,) = self._colours
-        self.colour = None if colour is None else colour.cells_of(frame)
-
-    def _keep(self, samples: npt.NDArray[np.unsignedinteger]) -> None:
-        ((stored, last),) = self._parts
-        self._parts = [(stored, np.empty_like(last))]  # a caller may keep the last one
-        copy_luma(samples, self._luma, stored, self._parts[0][1][0], self.signal)
-        if self.signal.bits > SDR.bits:
-            self._grey = np.empty(last.shape, np.uint8)
-            copy_luma(samples, self._luma, stored, self._grey[0])
-
-    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.unsignedinteger]]:
-        return super()._part(replace(cut, count=1))
-
-    def grey_picture(self) -> npt.NDArray[np.uint8]:
-        """Return the last frame in 8 bits, [h, w], where the signal has more."""
-        upright: npt.NDArray[np.uint8] = self._orientation.upright(self._grey)[0]
-        return upright
-
-    def picture(self) -> npt.NDArray[Any]:
-        """Return the last frame that was taken, [h, w] of the signal's dtype: upright, in full range."""
-        (grey,) = self.grey()
-        picture: npt.NDArray[Any] = grey[0]
-        return picture

@@ -14,9 +14,9 @@ version: 4:4:4 H.264 of x264 before build 151 comes out wrong otherwise. So they
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any
 
@@ -28,9 +28,9 @@ from av.packet import Packet
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
-from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.video.collect import Cut, FrameRange, LastFrame, Stack, Watch
-from v2v_server.video.colour.chroma import Chroma, ChromaCut
+from v2v_protocol.errors import VideoError
+from v2v_server.video.collect import ClipRequest, Cut, DecodedFrame, DecodedPicture, Stack, Watch
+from v2v_server.video.colour.chroma import Chroma
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.orientation import Window
@@ -59,6 +59,7 @@ class DecodedClip:
         signal: what the levels mean.
         motion: [count, 2, rows, columns] int16, the motion to each frame from the one before in the cells of its cut
             (:mod:`v2v_server.motion`), zero for the first; None if it was not asked for.
+        arrays: arrays of the sample that come with the pixels, by name, as they are delivered.
     """
 
     frames: npt.NDArray[Any]
@@ -69,6 +70,7 @@ class DecodedClip:
     chroma: Chroma | None = None
     signal: Signal = SDR
     motion: npt.NDArray[np.int16] | None = None
+    arrays: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
 
 
 class _SeekFailed(Exception):
@@ -79,31 +81,19 @@ def decode_luma(
     path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: Window | None = None
 ) -> DecodedClip:
     """Decode frames start .. start + count - 1 of a video, or a window of them: :func:`decode_cuts` of one cut."""
-    return decode_cuts(path, index, start, [Cut(count, window)])[0]
+    return decode_cuts(path, ClipRequest(index, start, (Cut(count, window),)))[0]
 
 
 def decode_cuts(
-    path: str | os.PathLike[str],
-    index: FrameIndex,
-    start: int,
-    cuts: Sequence[Cut],
-    *,
-    stride: int = 1,
-    most_bits: int | None = None,
-    watch: Watch | None = None,
+    path: str | os.PathLike[str], request: ClipRequest, watch: Watch | None = None
 ) -> tuple[DecodedClip, ...]:
-    """Return several cuts of the frames from ``start`` on, from one pass of the decoder.
+    """Return several cuts of some frames, from one pass of the decoder.
 
     Memory: the cuts themselves (frames x height x width bytes each) and what the decoder holds.
 
     Args:
         path: the file.
-        index: its index, or a slice of it that holds the range.
-        start: ordinal of the first frame, presentation order.
-        cuts: at least one.
-        stride: takes frames start, start + stride ...
-        most_bits: bits of a level to keep of deeper luma, 8 to ``luma.MOST_BITS``; None: 8, and the signal is SDR,
-            whatever the file states.
+        request: what is wanted.
         watch: looks at the frames of the longest cut.
 
     Raises:
@@ -111,39 +101,19 @@ def decode_cuts(
         VideoError: a frame of the longest cut is missing or damaged, the file is shorter than its index, or the
             picture's size or format changes. Its ``frame`` is the ordinal of the first frame that was not delivered.
     """
-    for cut in cuts:
-        index.position(start, (cut.count - 1) * stride + 1)
-    checked = [replace(cut, window=_checked(cut.window, index)) for cut in cuts]
-    stack = _filled(FrameRange(os.fspath(path), index, start, stride, most_bits), checked, watch)
+    request.check()
+    stack = _filled(os.fspath(path), request, watch)
     return tuple(
         DecodedClip(
-            grey,
-            index.seconds(start, (cut.count - 1) * stride + 1)[::stride],
-            stack.codec,
-            stack.codec in BIT_EXACT_CODECS,
-            signal=stack.signal,
-            chroma=chroma,
+            grey, request.seconds(cut), stack.codec, stack.codec in BIT_EXACT_CODECS, signal=stack.signal, chroma=chroma
         )
-        for grey, chroma, cut in zip(stack.grey(), stack.chroma(), checked, strict=True)
+        for grey, chroma, cut in zip(stack.grey(), stack.chroma(), request.cuts, strict=True)
     )
 
 
-def _checked(window: Window | None, index: FrameIndex) -> Window:
-    if window is None:
-        return 0, 0, index.height_px, index.width_px
-    top, left, height, width = window
-    inside = top >= 0 and left >= 0 and top + height <= index.height_px and left + width <= index.width_px
-    if not inside or height < 1 or width < 1:
-        raise UsageError(
-            f"window (top {top}, left {left}, {width}x{height} px) does not lie inside a picture of "
-            f"{index.width_px}x{index.height_px} px"
-        )
-    return window
-
-
-def _filled(wanted: FrameRange, cuts: Sequence[Cut], watch: Watch | None = None) -> Stack:
+def _filled(path: str, wanted: ClipRequest, watch: Watch | None = None) -> Stack:
     for frames_of in (_from_keyframe_on, _from_beginning):
-        stack = Stack(wanted, cuts, watch)
+        stack = Stack(path, wanted, watch)
         try:
             for _ in _fill(stack, frames_of(stack)):
                 pass
@@ -167,35 +137,26 @@ def stream_luma(
     Raises:
         UsageError, VideoError: see :func:`decode_cuts`.
     """
-    for _, picture in stream_decoded(path, index, start, count, window):
-        yield picture
+    for picture in stream_pictures(path, ClipRequest(index, start, (Cut(count, window),))):
+        yield picture.grey
 
 
-def stream_decoded(
-    path: str | os.PathLike[str],
-    index: FrameIndex,
-    start: int,
-    count: int,
-    window: Window | None = None,
-    most_bits: int | None = None,
-    chroma: ChromaCut | None = None,
-) -> Generator[tuple[LastFrame, npt.NDArray[Any]], None, None]:
-    """Yield the frames of :func:`stream_luma`, each with what collects them: ``codec`` and ``signal`` so far.
+def stream_pictures(path: str | os.PathLike[str], request: ClipRequest) -> Generator[DecodedPicture, None, None]:
+    """Yield the frames of the only cut of a request, in the memory of one. Errors: :func:`decode_cuts`."""
+    request.check()
+    (cut,), done = request.cuts, 0
+    shown: list[DecodedPicture] = []
 
-    Args:
-        most_bits: see :func:`decode_cuts`.
-        chroma: part of the picture whose colour to collect; None: none.
-    """
-    index.position(start, count)
-    cut, done = Cut(count, _checked(window, index), chroma), 0
-    wanted = FrameRange(os.fspath(path), index, start, 1, most_bits)
+    def see(frame: DecodedFrame) -> None:
+        shown[:] = [frame.picture(request.window(cut), cut.chroma, stack.codec, stack.codec in BIT_EXACT_CODECS)]
+
     for frames_of in (_from_keyframe_on, _from_beginning):
-        stream = LastFrame(wanted, cut)
+        stack = Stack(os.fspath(path), request, lambda: see, collects=False)
         try:
-            for _ in _fill(stream, frames_of(stream)):
-                if stream.taken > done:
+            for _ in _fill(stack, frames_of(stack)):
+                if stack.taken > done:
                     done += 1
-                    yield stream, stream.picture()
+                    yield shown[0]
             return
         except _SeekFailed:
             continue
@@ -212,7 +173,7 @@ def decodes_as_listed(path: str, index: FrameIndex, start: int, count: int) -> b
     """
     index.position(start, count)
     try:
-        _filled(FrameRange(path, index, start, 1), [Cut(count, (0, 0, 1, 1))])
+        _filled(path, ClipRequest(index, start, (Cut(count, (0, 0, 1, 1)),)))
     except VideoError:
         return False
     return True
@@ -230,7 +191,7 @@ def _from_keyframe_on(stack: Stack) -> Iterator[VideoFrame]:
     which = int(np.searchsorted(index.keyframes, wanted.start, side="right")) - 1
     keyframe = int(index.keyframes[which]) if which >= 0 else 0
     begin = int(index.pts[index.position(wanted.start, 1)])
-    with opened(wanted.path) as (container, stream):
+    with opened(stack.path) as (container, stream):
         codec = stack.codec = stream.codec_context.codec.canonical_name
         prefix = length_bytes(stream.codec_context.extradata) if codec == "h264" else 0
         stack.sparse = prefix > 0
@@ -250,8 +211,7 @@ def _from_keyframe_on(stack: Stack) -> Iterator[VideoFrame]:
 
 def _from_beginning(stack: Stack) -> Iterator[VideoFrame]:
     """Every frame of the file."""
-    wanted = stack.wanted
-    with opened(wanted.path) as (container, stream):
+    with opened(stack.path) as (container, stream):
         stack.codec = stream.codec_context.codec.canonical_name
         begun = False
         for packet in chain(packets(container, stream), [None]):

@@ -44,10 +44,8 @@ from v2v_server.simulation.kernels import ARRAYS, list_events
 from v2v_server.simulation.variants import Variant, variants
 from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
-from v2v_server.store.cache import Cache
-from v2v_server.store.clips import clips_of
-from v2v_server.store.format import is_store_file
-from v2v_server.video.collect import Cut
+from v2v_server.store.cache import Cache, Cached
+from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR
@@ -202,16 +200,16 @@ def decode_for(
     frames = plans[0].frames
     _refuse_outside(lease.video)
     try:
-        index, cuts = frame_index(lease, frames.span), [plan.cut for plan in plans]
-        what = index, lease.start_frame, cuts, frames.stride or 1
-        most_bits = _most_bits(plans[0].spec)
-        clips = None
-        rows = Rows.parse(lease.rows).bounds(lease.height_px)
-        with source.open_local(lease.video, lease.fingerprint) as path:
-            if cache is not None and not is_store_file(path):
-                clips = cache.clips(path, lease.video, lease.fingerprint, rows, *what, most_bits)
-            if clips is None:
-                clips = clips_of(path, lease.fingerprint, *what, rows, most_bits)
+        request = ClipRequest(
+            frame_index(lease, frames.span), lease.start_frame, tuple(plan.cut for plan in plans), frames.stride or 1,
+            Rows.parse(lease.rows).bounds(lease.height_px), _most_bits(plans[0].spec),
+            tuple((lease.seed, lease.epoch, index) for index in indices),
+        )  # fmt: skip
+        with source.open_pixels(lease.video, lease.fingerprint) as pixels:
+            if cache is not None and not pixels.is_stored:
+                pixels = Cached(pixels, cache, lease.video, lease.fingerprint)
+            pixels.check(lease.fingerprint)
+            clips = pixels.clips(request)
     except VideoError as error:
         # Consumer and log identify videos by id; a path of this host means nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error
@@ -269,6 +267,9 @@ def make_sample(
     unlabelled = dict[str, str]()
     for name, array in context.into.items():
         try:
+            if name in decoded.clip.arrays:
+                array[...] = decoded.clip.arrays[name]
+                continue
             with errors_of_sidecar(lease.video, name, sidecars, refused_sidecars(lease)):
                 ARRAY_BUILDERS[name](context, array)
         except SidecarError as error:
@@ -329,7 +330,7 @@ def sample_context(
     plan = decoded.plan
     params, recipe = plan.params, plan.spec.recipe
     frames, signal, flow, levels = decoded.clip.frames, decoded.clip.signal, None, None
-    if plan.flow is not None and into:  # events need no flow
+    if plan.flow is not None and into and "flow" not in decoded.clip.arrays:  # events need no flow
         methods = () if plan.flow_plan is None else plan.flow_plan.methods
         part = without_margin(frames, params, recipe, plan.margin_px, plan.flow.margin_px)
         flow = flow_for(

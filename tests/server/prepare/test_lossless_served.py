@@ -22,13 +22,11 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.offline.remake import remake
-from v2v_server.store.encoding import Encoding
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import plan_sample
 
 ROWS = "top:0.9"
 SMALL = Recipe(voxels_per_clip=2, bins=3, crop_height_px=24, crop_width_px=32)
-LOSSLESS = Encoding.of("lossless")
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +46,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     write_clip(source / "varying.mkv", panned_luma(30), pts=stamps)
     write_clip(source / "untimed.h264", panned_luma(20), rate=50, b_frames=2)
     write_clip(source / "small.mp4", panned_luma(20, 16, 16))
-    assert run(source, folder / "store", LOSSLESS, rows=ROWS).complete
+    assert run(source, folder / "store", rows=ROWS).complete
     return source, folder / "store"
 
 
@@ -101,7 +99,7 @@ def test_same_digests(pair: tuple[Path, Path], tmp_path: Path) -> None:
 
 
 def test_the_scenes_in_the_manifest_are_those_of_the_source(pair: tuple[Path, Path], tmp_path: Path) -> None:
-    run(pair[0], tmp_path / "store", LOSSLESS, rows=ROWS, scene=True)
+    run(pair[0], tmp_path / "store", rows=ROWS, scene=True)
     with (
         closing(open_catalogue(pair[0], rows=Rows.parse(ROWS), cache_dir=tmp_path, processes=0, scene=True)) as source,
         closing(open_catalogue(tmp_path / "store", cache_dir=tmp_path, processes=0, scene=True)) as store,
@@ -111,7 +109,7 @@ def test_the_scenes_in_the_manifest_are_those_of_the_source(pair: tuple[Path, Pa
 
 def test_a_store_of_whole_pictures_takes_any_rows(pair: tuple[Path, Path], tmp_path: Path) -> None:
     """The scenes in its manifest are those of whole pictures: of other rows they are found again."""
-    run(pair[0], tmp_path / "store", LOSSLESS, scene=True)
+    run(pair[0], tmp_path / "store", scene=True)
     for rows in ("full", "top:0.5", "0.2:0.8"):
         opened = [open_catalogue(at, rows=Rows.parse(rows), cache_dir=tmp_path, processes=0, scene=True)
                   for at in (pair[0], tmp_path / "store")]  # fmt: skip
@@ -124,7 +122,7 @@ def test_a_store_of_whole_pictures_takes_any_rows(pair: tuple[Path, Path], tmp_p
 
 
 def test_rows_that_a_picture_has_not_change_no_digest(pair: tuple[Path, Path], tmp_path: Path) -> None:
-    report = run(pair[0], tmp_path / "store", LOSSLESS, rows="top:60px")
+    report = run(pair[0], tmp_path / "store", rows="top:60px")
     assert {video.id for video in report.failed} > {"444.mp4", "small.mp4"}
     with (
         closing(open_catalogue(pair[0], rows=Rows.parse("top:60px"), cache_dir=tmp_path, processes=0)) as source,
@@ -180,7 +178,7 @@ def test_samples_of_real_footage(size: str, tmp_path: Path, monkeypatch: pytest.
     source.mkdir()
     for name in SOUND:
         (source / name).symlink_to(FOLDER / name)
-    assert run(source, tmp_path / "store", Encoding.of("lossless", size), processes=2).complete
+    assert run(source, tmp_path / "store", size=size, processes=2).complete
     videos = set()
     for preset, arrays in (("paper", ("voxels", "frames")), ("paper-flow", ("voxels", "frames", "flow", "flow_valid"))):
         spec = StreamSpec.from_dict({"recipe": {"preset": preset, "voxels_per_clip": 8}, "max_sequences_per_video": 1})

@@ -13,18 +13,16 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from tests.oracles.leases import open_leases
 from tests.server.prepare.test_prepare import run
-from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server import motion
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.encoding import Encoding
 from v2v_server.store.reader import StoreFile
 from v2v_server.worker.produce import decode_for, make_sample
 
-ROWS, LOSSLESS, PLANES = "top:0.9", Encoding.of("lossless"), ("motion",)
+ROWS, PLANES = "top:0.9", ("motion",)
 RECIPE = Recipe(
     voxels_per_clip=3, bins=3, crop_height_px=26, crop_width_px=32, resize_scale=(0.7, 1.3), pause_probability=0.5
 )
@@ -46,8 +44,8 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("motion")
     (folder / "source").mkdir()
     write_clip(folder / "source" / "turned.mov", panned_luma(40, 60, 80), rotation_degrees=90, b_frames=2)
-    assert run(folder / "source", folder / "plain", LOSSLESS, rows=ROWS).complete
-    assert run(folder / "source", folder / "planes", LOSSLESS, rows=ROWS, planes=PLANES).complete
+    assert run(folder / "source", folder / "plain", rows=ROWS).complete
+    assert run(folder / "source", folder / "planes", rows=ROWS, planes=PLANES).complete
     return {name: folder / name for name in ("source", "plain", "planes")}
 
 
@@ -95,7 +93,7 @@ def test_samples_with_sub_steps_are_those_of_the_source(
 def test_where_nothing_moves_no_margin_is_read_for_sub_steps(tmp_path: Path, flow: bool) -> None:
     (tmp_path / "source").mkdir()
     write_clip(tmp_path / "source" / "still.mp4", np.repeat(panned_luma(1, 80, 90), 20, axis=0))
-    assert run(tmp_path / "source", tmp_path / "planes", LOSSLESS, rows=ROWS, planes=PLANES).complete
+    assert run(tmp_path / "source", tmp_path / "planes", rows=ROWS, planes=PLANES).complete
     spec = StreamSpec(recipe=RECIPE.replace(resize_scale=(1.0, 1.0)), substep_px=0.5, flow_margin_px=4)
     made = []
     for folder in ("source", "planes"):
@@ -112,18 +110,13 @@ def test_where_nothing_moves_no_margin_is_read_for_sub_steps(tmp_path: Path, flo
 def test_motion_is_added_to_a_store_that_lacks_it(folders: dict[str, Path], tmp_path: Path) -> None:
     store = Path(shutil.copytree(folders["plain"], tmp_path / "store"))
     before = (store / "turned.mov").read_bytes()
-    report = run(folders["source"], store, LOSSLESS, rows=ROWS, planes=PLANES)
+    report = run(folders["source"], store, rows=ROWS, planes=PLANES)
     assert report.complete
     assert (report.kept, report.looked_at) == (0, 0)
     after = (store / "turned.mov").read_bytes()
     assert after == (folders["planes"] / "turned.mov").read_bytes()
     assert after.startswith(before)
-    assert run(folders["source"], store, LOSSLESS, rows=ROWS, planes=PLANES).kept == 1
-    assert run(folders["source"], store, LOSSLESS, rows=ROWS).kept == 1
+    assert run(folders["source"], store, rows=ROWS, planes=PLANES).kept == 1
+    assert run(folders["source"], store, rows=ROWS).kept == 1
     with StoreFile(store / "turned.mov") as stored:
         assert stored.planes == {"motion"}
-
-
-def test_small_files_hold_no_planes(folders: dict[str, Path], tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="only lossless files hold planes"):
-        run(folders["source"], tmp_path, Encoding.of("h264"), planes=PLANES)

@@ -14,27 +14,27 @@ from hypothesis import strategies as st
 
 from tests.server.store.test_store_file import PACKINGS, head_of, in_folder, written
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.store import planes
 from v2v_server.store.packing import QUICK, Packing
-from v2v_server.store.planes import PLANES, PlaneKind
+from v2v_server.store.planes import PLANES, plane
+from v2v_server.store.planes.plane import Plane
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter
 
 KINDS = {
     "motion": PLANES["motion"],
-    "chroma": PlaneKind(version=1, dtype="|u1", values=2, cell_px=2),
-    "luma10": PlaneKind(version=1, dtype="<u2", values=1, cell_px=1),
-    "odd": PlaneKind(version=1, dtype="<i4", values=3, cell_px=5),
+    "chroma": Plane(version=1, dtype="|u1", values=2, cell_px=2),
+    "luma10": Plane(version=1, dtype="<u2", values=1, cell_px=1),
+    "odd": Plane(version=1, dtype="<i4", values=3, cell_px=5),
 }
 
 
 @pytest.fixture(autouse=True)
 def kinds(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("planes", "reader", "writer"):
+    for module in ("reader", "writer"):
         monkeypatch.setattr(f"v2v_server.store.{module}.PLANES", KINDS)
 
 
-def arrays_of(kind: PlaneKind, count: int, rows: int, width: int, seed: int) -> npt.NDArray[Any]:
+def arrays_of(kind: Plane, count: int, rows: int, width: int, seed: int) -> npt.NDArray[Any]:
     """Return values of which most are zero."""
     generator = np.random.default_rng(seed)
     shape = (count, *kind.shape(rows, width))
@@ -85,7 +85,7 @@ def moving(tmp_path: Path) -> tuple[Path, npt.NDArray[Any]]:
 def test_a_plane_of_another_version_is_missing(
     moving: tuple[Path, npt.NDArray[Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(KINDS, "motion", PlaneKind(version=2, dtype="<i2", values=2, cell_px=4))
+    monkeypatch.setitem(KINDS, "motion", Plane(version=2, dtype="<i2", values=2, cell_px=4))
     with StoreFile(moving[0]) as stored:
         assert stored.planes == frozenset()
     monkeypatch.delitem(KINDS, "motion")
@@ -99,7 +99,7 @@ def test_a_damaged_plane_is_found_and_harms_no_luma(moving: tuple[Path, npt.NDAr
     path, motion = moving
     content = bytearray(path.read_bytes())
     with StoreFile(path) as stored:
-        place = planes.read_footer(str(path), stored._file)["motion"]
+        place = plane.read_footer(str(path), stored._file)["motion"]
     at = data.draw(st.integers(place.offset, len(content) - 1))
     content[at] ^= 1 << data.draw(st.integers(0, 7))
     other = path.with_name("y")

@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from v2v_protocol.errors import ProtocolError, UsageError, VideoChanged, VideoError, VideoUnreadable
-from v2v_server.store.format import GROUP_FRAMES, Head, group_frames_for, is_store_file, pack_record
+from v2v_server.store.format import GROUP_FRAMES, Head, group_frames_for, pack_record
 from v2v_server.store.packing import DENSE, FAST, QUICK, RAW, Packing, UnpackingError, unpack
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.reader import StoreFile, is_store_file
 from v2v_server.store.writer import StoreWriter
 
 PACKINGS = st.sampled_from([DENSE, FAST, QUICK, RAW])

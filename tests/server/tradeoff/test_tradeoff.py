@@ -24,10 +24,12 @@ from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, Places
 from v2v_server.tradeoff.diversity import diversity, effective_samples
 from v2v_server.tradeoff.errors import Tally, compare, correlation
-from v2v_server.tradeoff.forms import ENCODINGS, SOURCE
+from v2v_server.tradeoff.forms import BESIDE, SOURCE, STORES
 from v2v_server.tradeoff.front import best, dominates, dominators
 from v2v_server.tradeoff.settings import ServeSetting, axes, full_model, settings
 from v2v_server.tradeoff.speed import Speed, TimedWork, leases_of, measure
+from v2v_server.video.decode import decode_luma
+from v2v_server.video.probe import probe
 
 
 def voxels(*values: float) -> np.ndarray[Any, Any]:
@@ -157,12 +159,12 @@ def test_a_value_given_twice_is_compared_once() -> None:
 
 AXES = ["tolerance=0,0.01", "voxel_seconds=0.1,0.2"]
 CAMERA_OF_A_USER = StreamSpec(recipe=Recipe(leak_hz=(0.1, 0.2)))
-EVERY = settings(list(ENCODINGS), CAMERA_OF_A_USER, axes(AXES))
+EVERY = settings([BESIDE, *STORES], CAMERA_OF_A_USER, axes(AXES))
 
 
 def test_settings_are_all_combinations_under_names_of_their_own() -> None:
     assert EVERY[0].name == "source, K = 1, substep_px = 0, tolerance = 0, voxel_seconds = 0.1"
-    assert len({setting.name for setting in EVERY}) == len(EVERY) == 3 * 2 * 2 * 2 * (1 + len(ENCODINGS))
+    assert len({setting.name for setting in EVERY}) == len(EVERY) == 3 * 2 * 2 * 2 * (2 + len(STORES))
     assert len({setting.way for setting in EVERY}) == len({setting.single for setting in EVERY}) == len(EVERY) // 3
 
 
@@ -182,11 +184,7 @@ def test_every_setting_is_a_configuration_of_the_server(setting: ServeSetting, t
     config = ServeConfig.load(str(file), {"videos": "clips"})
     assert config.rows == "top:0.54"
     assert config.spec == setting.spec
-    how = ENCODINGS.get(setting.form)
-    command = ""
-    if how is not None:
-        kind = f"--size {how.size}" if how.is_lossless else f"--quality {how.quality} --gop {how.gop}"
-        command = f"--codec {how.codec} {kind}"
+    command = f"--size {STORES[setting.form]}" if setting.form in STORES else ""
     assert command in file.read_text(encoding="utf-8")
 
 
@@ -250,27 +248,50 @@ def test_a_corpus_without_videos_is_status_2(tmp_path: Path, capsys: pytest.Capt
     assert error.count("\n") == 1
 
 
+def test_a_folder_beside_has_the_same_clips(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, frames in (("clips", 40), ("shorter", 39)):
+        (tmp_path / name).mkdir()
+        write_clip(tmp_path / name / "a.mp4", panned_luma(frames, 100, 180))
+    (tmp_path / "empty").mkdir()
+    flags = ["--rows", "full", "--set", "voxels_per_clip=3", "--set", "crop_height_px=64", "--set", "crop_width_px=64"]
+    for name, complaint in (
+        ("shorter", "a.mp4 has 39 frames of 180x100 px instead of 40 of 180x100 px: encode it again with all frames"),
+        ("empty", "a.mp4: there is no such file: give a folder with each clip under its own name"),
+    ):
+        beside = ["--videos", str(tmp_path / "clips"), "--beside", str(tmp_path / name)]
+        assert tradeoff.main([*beside, *flags]) == 2
+        assert complaint in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_short_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, picture, chosen = tmp_path / "tradeoff.json", tmp_path / "tradeoff.png", tmp_path / "chosen.yaml"
-    flags = ["--videos", str(clips(tmp_path / "clips")), "--rows", "full", "--clips", "2", "--places", "3"]
-    flags += ["--forms", "h264 23", "--budget-minutes", "0.5", "--vary", "samples_per_decode=1,4"]
+    folder = clips(tmp_path / "clips")
+    smaller = tmp_path / "smaller"
+    smaller.mkdir()
+    for path in folder.iterdir():
+        facts = probe(path)
+        luma = decode_luma(path, facts.index, 0, facts.frames).frames
+        write_clip(smaller / path.name, luma, options={"crf": "40"}, full_range=facts.full_range)
+    flags = ["--videos", str(folder), "--beside", str(smaller), "--rows", "full", "--clips", "2", "--places", "3"]
+    flags += ["--forms", "lossless fast", "--budget-minutes", "0.5", "--vary", "samples_per_decode=1,4"]
     flags += ["--vary", "tolerance=0,0.5", "--set", "leak_hz=0.01", "--max-error", "0", "--preset-out", str(chosen)]
     assert tradeoff.main([*flags, *FLAGS, "--json", str(out), "--plot", str(picture)]) == 0
     found = records(out)
     by_name = {item["name"]: item for item in found if item["measure"] == "setting"}
     spec = StreamSpec()
     varied = axes(["samples_per_decode=1,4", "tolerance=0,0.5"])
-    assert set(by_name) == {setting.name for setting in settings(["h264 23"], spec, varied)}
+    assert set(by_name) == {setting.name for setting in settings([BESIDE, "lossless fast"], spec, varied)}
     way = {item["way"]: item for item in by_name.values()}
     error = {name: item["voxel_error_at_0.2"] for name, item in way.items()}
     # The full model is among the settings, so it has no error; each thing that it has more of changes something.
     assert error["source, substep_px = 1, tolerance = 0"] == 0
     assert 0 < error["source, substep_px = 1, tolerance = 0.5"] <= 0.5
-    assert 0 < error["source, substep_px = 0, tolerance = 0"] < error["h264 23, substep_px = 0, tolerance = 0"]
+    assert 0 < error["source, substep_px = 0, tolerance = 0"] < error["beside, substep_px = 0, tolerance = 0"]
+    assert error["lossless fast, substep_px = 1, tolerance = 0"] == 0
     first = by_name["source, K = 1, substep_px = 0, tolerance = 0"]
     assert first["speed_ratio"] == 1
-    prepared = by_name["h264 23, K = 1, substep_px = 0, tolerance = 0"]
+    prepared = by_name["beside, K = 1, substep_px = 0, tolerance = 0"]
     assert prepared["bytes_per_video_second"] / first["bytes_per_video_second"] == pytest.approx(
         prepared["bytes_ratio"]
     )

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from tests.clips import damaged, panned_luma, truncated, write_clip
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.video import decode
-from v2v_server.video.collect import Cut
+from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.decode import decode_cuts, decode_luma
 from v2v_server.video.frame_index import unseekable
 from v2v_server.video.luma import range_table
@@ -141,7 +141,7 @@ def test_any_cuts_of_one_pass_are_those_of_passes_of_their_own(clip: Clip, data:
         window = (top, left, data.draw(st.integers(1, height - top)), data.draw(st.integers(1, width - left)))
         count = data.draw(st.integers(1, min(12, (FRAMES - 1 - start) // stride + 1)))
         cuts.append(Cut(count, data.draw(st.sampled_from((window, None)))))
-    together = decode_cuts(clip.path, clip.facts.index, start, cuts, stride=stride)
+    together = decode_cuts(clip.path, ClipRequest(clip.facts.index, start, tuple(cuts), stride))
     assert len(together) == len(cuts)
     for got, cut in zip(together, cuts, strict=True):
         alone = decode_luma(clip.path, clip.facts.index, start, (cut.count - 1) * stride + 1, cut.window)
@@ -359,7 +359,7 @@ def test_a_damaged_frame_that_the_stride_leaves_out_spoils_what_refers_to_it(tmp
     damaged(tmp_path / "whole.mp4", tmp_path / "bad.mp4", 30)
     index = probe(tmp_path / "whole.mp4").index
     with pytest.raises(VideoError) as caught:
-        decode_cuts(tmp_path / "bad.mp4", index, 0, [Cut(20)], stride=3)
+        decode_cuts(tmp_path / "bad.mp4", ClipRequest(index, 0, (Cut(20),), 3))
     assert caught.value.frame is not None
     assert caught.value.frame % 3 == 0
     assert 30 <= caught.value.frame <= 33

@@ -17,7 +17,7 @@ from v2v_server.corpus.probe import probe_files
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.video import probe as probing
 from v2v_server.video import source
-from v2v_server.video.collect import Cut
+from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import decode_cuts
 from v2v_server.video.probe import probe
@@ -158,8 +158,8 @@ def test_a_raw_sample_beyond_its_bits_is_a_damaged_frame(tmp_path: Path, plane: 
     facts = probe(path)
     wanted = Cut(24, chroma=ChromaCut(tuple(range(24)), (0, 0, 32, 32), (0, 32)))
     with pytest.raises(VideoError, match=f"at frame 20: has a {colour}sample of 5000, beyond its 10 bits"):
-        decode_cuts(path, facts.index, 0, [wanted])
-    assert len(decode_cuts(path, facts.index, 0, [Cut(20)])[0].frames) == 20
+        decode_cuts(path, ClipRequest(facts.index, 0, (wanted,)))
+    assert len(decode_cuts(path, ClipRequest(facts.index, 0, (Cut(20),)))[0].frames) == 20
 
 
 def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:

@@ -29,7 +29,6 @@ from v2v_server.prepare.prepare import prepare
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.encoding import Encoding
 from v2v_server.store.reader import has_planes
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import decode_for, make_sample
@@ -127,7 +126,7 @@ def test_colour_stays_with_another_plane_and_without_some_files(tmp_path: Path) 
         write_coloured(source / f"{name}.mp4", coloured(12))
     for planes in (("chroma",), ("motion",)):
         with closing(open_catalogue(source, processes=0)) as catalogue:
-            prepare(catalogue, prepared, Encoding(size="fast"), processes=0, planes=planes)
+            prepare(catalogue, prepared, "fast", processes=0, planes=planes)
     assert has_planes(prepared / "a.mp4", ("chroma", "motion"))
     (prepared / "b.mp4").unlink()
     with closing(open_catalogue(prepared, processes=0)) as catalogue:
@@ -141,14 +140,17 @@ def test_a_prepared_folder_with_chroma_gives_the_same_colour(tmp_path: Path, rec
     source.mkdir()
     write_coloured(source / "a.mp4", coloured(40))
     with closing(open_catalogue(source, processes=0, rows=Rows.parse("0.1:0.9"))) as catalogue:
-        prepare(catalogue, prepared, Encoding(size="fast"), processes=0, planes=("chroma",))
-        prepare(catalogue, grey, Encoding(size="fast"), processes=0)
+        prepare(catalogue, prepared, "fast", processes=0, planes=("chroma",))
+        prepare(catalogue, grey, "fast", processes=0)
     with closing(open_catalogue(source, processes=0)) as catalogue:
-        prepare(catalogue, whole, Encoding(size="dense"), processes=0, planes=("chroma",))
+        prepare(catalogue, whole, "dense", processes=0, planes=("chroma",))
     expected = samples_of(source, recipe)
     assert samples_of(prepared, recipe) == expected
     assert samples_of(whole, recipe) == expected
-    with pytest.raises(UsageError, match=r"frames_rgb needs colour, .*: prepare them again with v2v-prepare --planes"):
+    with pytest.raises(
+        UsageError,
+        match=r"frames_rgb needs the plane chroma, .*: prepare .* with v2v-prepare --planes chroma, or serve",
+    ):
         samples_of(grey, recipe)
 
 

@@ -31,8 +31,7 @@ from v2v_server.offline.preview import _signal_note
 from v2v_server.offline.remake import Remaker
 from v2v_server.simulation.intensity import light_table
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.depth import detail_of, levels_of
-from v2v_server.store.encoding import Encoding
+from v2v_server.store.planes.detail import detail_of, levels_of
 from v2v_server.tradeoff.accuracy import Places, seen, simulated
 from v2v_server.video.luma import Signal, range_table
 from v2v_server.worker.process import Clips
@@ -127,7 +126,7 @@ def test_store_and_cache_keep_transfer_and_bits(tmp_path: Path, is_deep: bool) -
     else:
         (tmp_path / "clips").mkdir()
         write_clip(tmp_path / "clips" / "a.mp4", LUMA, transfer=ColorTrc.ARIB_STD_B67)
-    assert run(tmp_path / "clips", tmp_path / "store", Encoding.of("lossless")).complete
+    assert run(tmp_path / "clips", tmp_path / "store").complete
     exact = sample_of(tmp_path / "clips", DECLARED)
     require_equal(sample_of(tmp_path / "store", DECLARED), exact, "store")
     for recipe, substep_px in ((SDR, 0.0), (DECLARED, 0.5), (DECLARED.replace(frame_stride=3, bins=1), 0.0)):
@@ -142,13 +141,6 @@ def test_store_and_cache_keep_transfer_and_bits(tmp_path: Path, is_deep: bool) -
             decoded, _ = clips.take(lease)
             assert clips.said_of_cache(decoded) == said
     require_equal(make_sample(lease, decoded), exact, "cache")
-
-
-def test_a_lossy_corpus_keeps_the_transfer(tmp_path: Path) -> None:
-    (tmp_path / "clips").mkdir()
-    write_clip(tmp_path / "clips" / "a.mp4", LUMA, transfer=ColorTrc.ARIB_STD_B67)
-    assert run(tmp_path / "clips", tmp_path / "small", Encoding.of("h264")).complete
-    assert sample_of(tmp_path / "small", DECLARED).provenance.decoder == "h264, 8 bits, HLG"
 
 
 def test_preview_and_doctor_name_what_a_video_has(tmp_path: Path) -> None:
@@ -203,5 +195,5 @@ def test_a_clip_of_two_transfers_is_refused(tmp_path: Path) -> None:
     assert sample_of(tmp_path / "clips", SDR).arrays["voxels"].any()
     with pytest.raises(VideoError, match="different transfer characteristics"):
         sample_of(tmp_path / "clips", DECLARED)
-    report = run(tmp_path / "clips", tmp_path / "store", Encoding.of("lossless"))
+    report = run(tmp_path / "clips", tmp_path / "store")
     assert "its transfer changes from pq" in str(report.failed)

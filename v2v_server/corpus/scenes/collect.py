@@ -13,7 +13,6 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
 
 import numpy as np
 import xxhash
@@ -27,9 +26,9 @@ from v2v_server.corpus.scenes.pieces import SplitVideos, encoded_pieces
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_FRAMES, PIECE, Scene
 from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.clips import pictures_of
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import run_twice
+from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import Window
 from v2v_server.video.rows import Rows
@@ -54,19 +53,13 @@ class SceneCollection:
     @property
     def kind(self) -> FigureKind:
         """Distinguish analyses of one file."""
-        made = ""
-        if self.manifest is not None and not self.manifest.lossless:
-            made = f"prepared {self.manifest.header.rows}, "
-        elif self.manifest is not None and not self._is_stated:
-            made = "part of prepared, "
+        made = "part of prepared, " if self.manifest is not None and not self._is_stated else ""
         return FigureKind("scene", f"{made}{self.rows}{_ENDING}")
 
     @property
     def _is_stated(self) -> bool:
         """Whether the manifest's scenes are of the rows of the corpus."""
-        return self.manifest is not None and (
-            not self.manifest.lossless or Rows.parse(self.manifest.header.rows) == self.rows
-        )
+        return self.manifest is not None and Rows.parse(self.manifest.header.rows) == self.rows
 
     def collect(
         self,
@@ -204,10 +197,10 @@ def _analyse(source: VideoSource, job: _Job) -> Scene | None:
     analysis = SceneAnalysis()
     if job.index and job.window is not None:
         try:
-            with source.open_local(job.id, job.fingerprint) as path:
-                pictures = pictures_of(path, FrameIndex.from_bytes(job.index), job.window)
-                for picture in islice(pictures, MOST_FRAMES):
-                    analysis.add(picture)
+            with source.open_pixels(job.id, job.fingerprint) as pixels:
+                index = FrameIndex.from_bytes(job.index)
+                for picture in pixels.pictures(ClipRequest(index, 0, (Cut(min(len(index), MOST_FRAMES), job.window),))):
+                    analysis.add(picture.grey)
         except VideoError as error:
             if isinstance(error, VideoUnreadable) or isinstance(error.__cause__, OSError):
                 return None

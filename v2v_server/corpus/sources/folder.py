@@ -21,7 +21,7 @@ from v2v_server.corpus.sources.listfile import LIST_SUFFIXES, ListEntry, read_li
 from v2v_server.corpus.sources.names import UNPRINTABLE, count_left_out, is_video_name
 from v2v_server.corpus.sources.sidecar import check_local, is_sidecar, local_state, sidecar_id
 from v2v_server.corpus.sources.source import GONE, NO_STATE, SourceOptions, State, VideoSource
-from v2v_server.store.clips import check_file
+from v2v_server.store.pixels import open_pixels
 from v2v_server.video.fingerprint import unreadable
 
 PSEUDO_FILE_SYSTEMS = frozenset({
@@ -126,7 +126,8 @@ class Folder(VideoSource):
         if is_sidecar(id):
             check_local(self.folder / id, id, fingerprint, str(state or ""))
         else:
-            check_file(self.folder / id, fingerprint)
+            with open_pixels(self.folder / id) as pixels:
+                pixels.check(fingerprint)
 
     def _regular_files(self, refused: dict[str, str]) -> Iterator[str]:
         """Yield the listed ids that do not name something else than a file.

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.sources.listfile import ListEntry, read_list
+from v2v_server.store.pixels import Pixels, open_pixels
 from v2v_server.video.rows import Rows
 
 if TYPE_CHECKING:
@@ -150,7 +151,7 @@ class VideoSource(ABC):
 
     @abstractmethod
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
-        """Lend a file of this host with the bytes of a video or sidecar until the end of the context.
+        """Lend a file of this host with the bytes of a video or sidecar, until the end of the context.
 
         Args:
             fingerprint: as catalogued; "" takes what is there now.
@@ -159,6 +160,20 @@ class VideoSource(ABC):
             VideoUnreadable, VideoChanged: the file cannot be read, or differs. A local video may be lent unchecked:
                 reading it reports the same errors.
         """
+
+    @contextmanager
+    def open_pixels(self, id: str, fingerprint: str) -> Iterator[Pixels]:
+        """Lend the frames of a video until the end of the context.
+
+        Args:
+            fingerprint: as catalogued; "" takes what is there now.
+
+        Raises:
+            VideoUnreadable, VideoChanged: see :meth:`open_local`.
+            VideoError: the video is damaged.
+        """
+        with self.open_local(id, fingerprint) as path, open_pixels(path) as pixels:
+            yield pixels
 
     def keep_as(self, id: str, found: str, fingerprint: str) -> None:  # noqa: B027 - a local source has no copies
         """Let the copy that was made for probing be found under the video's full fingerprint.

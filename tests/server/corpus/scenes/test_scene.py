@@ -39,7 +39,6 @@ from v2v_server.corpus.scenes.scene import (
     Sides,
 )  # fmt: skip
 from v2v_server.prepare.prepare import prepare
-from v2v_server.store.encoding import Encoding
 from v2v_server.system.isolate import run_twice
 from v2v_server.video.rows import Rows
 
@@ -312,7 +311,7 @@ def test_a_prepared_folder_has_the_scenes_of_its_source(folder: Path, tmp_path: 
     (folder / "broken.mp4").unlink()
     target = tmp_path / "prepared"
     with opened(folder) as source:
-        prepare(source, target, Encoding.of("h264", quality=30, gop=12), processes=0, scene=True)
+        prepare(source, target, processes=0, scene=True)
         looked: list[int] = []
         with opened(target, progress=lambda done, total: looked.append(done)) as prepared:
             for video in source.videos:
@@ -324,16 +323,16 @@ def test_a_folder_prepared_without_scenes_gets_them_from_its_source(folder: Path
     (folder / "broken.mp4").unlink()
     target = tmp_path / "prepared"
     with opened(folder, scene=False) as source:
-        plain = prepare(source, target, Encoding.of("h264", quality=30, gop=12), processes=0)
+        plain = prepare(source, target, processes=0)
         assert not any(video.scene for video in plain.videos)
         before = {path.name: path.stat().st_ino for path in target.glob("*.mp4")}
-        again = prepare(source, target, Encoding.of("h264", quality=30, gop=12), processes=0, scene=True)
+        again = prepare(source, target, processes=0, scene=True)
         assert (plain.kept, again.kept) == (0, 0)
         assert again.looked_at == 2
         assert {path.name: path.stat().st_ino for path in target.glob("*.mp4")} == before
         assert all(video.scene for video in again.prepared)
-        afresh = prepare(source, tmp_path / "afresh", Encoding.of("h264", quality=30, gop=12), processes=0, scene=True)
+        afresh = prepare(source, tmp_path / "afresh", processes=0, scene=True)
         assert [video.scene for video in again.prepared] == [video.scene for video in afresh.prepared]
-        assert prepare(source, target, Encoding.of("h264", quality=30, gop=12), processes=0, scene=True).kept == 2
+        assert prepare(source, target, processes=0, scene=True).kept == 2
         # Without them, what is there with them will do.
-        assert prepare(source, target, Encoding.of("h264", quality=30, gop=12), processes=0).kept == 2
+        assert prepare(source, target, processes=0).kept == 2

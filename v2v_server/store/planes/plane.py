@@ -7,19 +7,15 @@
 
 A plane has one cell for every square of ``cell_px`` pixels of the stored rows, and some values in each cell. A plane of
 another version is treated as missing. A block in which every value is zero takes no space and no time.
-
-To add a plane, add its kind to :data:`PLANES`, and pass its arrays to :meth:`v2v_server.store.writer.StoreWriter.add`.
-:func:`v2v_server.store.reader.StoreFile.plane` reads a part of it.
 """
 
 from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgpack
 import numpy as np
@@ -27,29 +23,78 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.store.format import BLOCK_ROWS, Head, check, group_frames_for
-from v2v_server.video.colour.chroma import CELL_PX
+from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
+from v2v_server.video.decode import DecodedClip
+from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.orientation import Window
+
+if TYPE_CHECKING:
+    from v2v_server.store.reader import StoreFile
 
 _MAGIC = b"V2VPLAN1"
 _SUFFIX = struct.Struct("<IQ8s")
 _LARGEST_FOOTER_BYTES = 1 << 16
 
 
+Files: TypeAlias = "Sequence[tuple[StoreFile, range]]"
+"""Open store files that together hold a clip, and the frames of the clip that each one holds."""
+
+
 @dataclass(frozen=True, slots=True)
-class PlaneKind:
-    """How a plane is stored.
+class Plane:
+    """A kind of plane. A subclass says what it is for; its ``PLANE`` says how it is stored.
 
     Attributes:
         version: to be raised when the same pictures get other values.
         dtype: of a value, in little-endian order.
         values: values of a cell; together at most 32 bytes.
         cell_px: side of a cell, pixels.
+        serves: the array, or the field of the spec, whose streams read it; empty if each file has it that can.
+        remedy: what to do about a file without it; empty if a clip can be read without it.
     """
 
     version: int
     dtype: str
     values: int
     cell_px: int
+    serves: str = ""
+    remedy: str = ""
+
+    def is_wanted(self, request: ClipRequest, signal: Signal) -> bool:
+        """Return whether clips of this signal are to be read with the plane."""
+        return False
+
+    def is_worth_storing(self, request: ClipRequest) -> bool:
+        """Return whether clips of 8 bits read the plane, so that a cache stores it."""
+        return self.is_wanted(request, SDR)
+
+    def is_part_of(self, signal: Signal) -> bool:
+        """Return whether every file of this signal has the plane."""
+        return False
+
+    def asked(self, cut: Cut) -> Cut:
+        """Return a cut of whole pictures with what the plane is made from."""
+        return cut
+
+    def maker(self) -> Callable[[DecodedPicture], npt.NDArray[Any]]:
+        """Return a function that gets one usable picture after the other, and returns its array."""
+        raise NotImplementedError
+
+    def read(self, files: Files, request: ClipRequest) -> Sequence[Any]:
+        """Return what a clip has of the plane, for each cut; None for one that does not ask for it.
+
+        Raises:
+            UsageError, VideoError: see :meth:`v2v_server.store.reader.StoreFile.plane`.
+        """
+        raise NotImplementedError
+
+    def narrowed(self, cut: Cut, value: Any) -> Cut:
+        """Return the cut to read with this value of the plane."""
+        return cut
+
+    def added(self, clip: DecodedClip, value: Any) -> DecodedClip:
+        """Return the clip with this value of the plane."""
+        raise NotImplementedError
 
     def shape(self, rows: int, width_px: int) -> tuple[int, int, int]:
         """Return the shape of a frame's array: values, rows and columns of cells."""
@@ -112,19 +157,6 @@ class PlaneKind:
                 into[:, value, ..., byte] = parts[:, :, value, byte]
         first = top % self._band
         return array.reshape(count, self.values, -1, columns)[:, :, first : first + rows]
-
-
-PLANES: Mapping[str, PlaneKind] = MappingProxyType(
-    {
-        # Motion to each frame from the one before (v2v_server.motion), x and y; zero for the first frame of the file.
-        "motion": PlaneKind(version=1, dtype="<i2", values=2, cell_px=4),
-        # What 8 bits lack of the levels of deeper luma (v2v_server.store.depth).
-        "detail": PlaneKind(version=1, dtype="i1", values=1, cell_px=1),
-        # Cb and Cr (v2v_server.video.colour.chroma).
-        "chroma": PlaneKind(version=1, dtype="i1", values=2, cell_px=CELL_PX),
-    }
-)
-"""The kinds of planes, by name."""
 
 
 @dataclass(frozen=True, slots=True)

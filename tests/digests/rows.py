@@ -1,0 +1,267 @@
+"""The rows of the table: streams, and their first samples made in several ways.
+
+A row pins one preset or field. It is made from the videos, from stores of each size, through a cache that is empty and
+full, and by a server that shares samples: all of them have the digests of the table.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tests.digests.clips import write_clips, write_lossy
+from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, Sample
+from v2v_protocol.spec import StreamSpec
+from v2v_server.broker.leases import Request
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.offline.leases import lease_for
+from v2v_server.prepare.prepare import prepare
+from v2v_server.schedule.epoch import Schedule
+from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.store.cache import Cache, make_cache
+from v2v_server.video.rows import Rows
+from v2v_server.worker.produce import decode_for, make_sample
+from v2v_server.worker.sidecars import open_sidecars
+
+ROWS = Rows.parse("0.05:0.95")
+SIZE: Mapping[str, Any] = {"voxels_per_clip": 2, "bins": 3, "crop_height_px": 16, "crop_width_px": 20}
+_EVENTS = ("voxels", "event_counts", "voxels_bilinear")
+_DRAWN = ("video", "start_frame", "saturated_bins", "irregular_timestamps", "left_out", "substeps", "boxes_dropped")
+"""Fields of the provenance that the table has, beside the draw. The rest names files, or is printed for people."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A stream.
+
+    Attributes:
+        recipe: its preset, or fields beside SIZE.
+        arrays: those that are pinned.
+        spec: fields beside the recipe.
+        count: number of samples, from index 0 on.
+        seed, epoch: of these samples.
+    """
+
+    recipe: str | Mapping[str, Any] = field(default_factory=dict)
+    arrays: tuple[str, ...] = ("voxels", "frames")
+    spec: Mapping[str, Any] = field(default_factory=dict)
+    count: int = 3
+    seed: int = 11
+    epoch: int = 0
+
+    @property
+    def stream(self) -> StreamSpec:
+        """Return the spec."""
+        recipe = {"preset": self.recipe} if isinstance(self.recipe, str) else self.recipe
+        return StreamSpec.from_dict({**self.spec, "recipe": {**SIZE, **recipe}})
+
+
+STEADY = {"pause_probability": 0.0, "flip_probability": 0.0}
+FINE = {"threshold": (0.1, 0.2)}
+AUTO = {"scene": "auto"}
+PORTABLE: Mapping[str, Row] = {
+    "paper": Row("paper"),
+    "largest seed and epoch": Row("paper", seed=LARGEST_SEED, epoch=LARGEST_EPOCH),
+    "paper-fixed-thresholds": Row("paper-fixed-thresholds"),
+    "contrast_scale": Row({"contrast_probability": 1.0, "contrast_scale": (0.2, 0.9)}),
+    "paper-contrast": Row("paper-contrast", ("voxels", "frames", "frames_u16", "frames_rgb")),
+    "paper-flow": Row("paper-flow"),
+    "paper-eraft": Row("paper-eraft", ("voxels", "frames", "event_counts", "frames_rgb")),
+    "noise-free": Row("noise-free"),
+    "clean": Row("clean"),
+    "sensor": Row("sensor"),
+    "davis346": Row("davis346", (*_EVENTS, "frames")),
+    "balanced": Row(spec={"preset": "balanced", "sibling_spacing": 2}),
+    "natural": Row(spec={"preset": "natural"}, count=9),
+    "int16": Row(FINE, spec={"voxel_dtype": "int16"}),
+    "float32": Row(FINE, spec={"voxel_dtype": "float32"}),
+    "in order": Row(spec={"shuffle": False, "max_sequences_per_video": 2}),
+    "fixed view": Row(STEADY),
+    "pauses": Row({"pause_probability": 0.4, "pause_stay_probability": 0.4, "flip_probability": 1.0}, count=6),
+    "frames_per_bin": Row({"frames_per_bin": 2}),
+    "frame_stride": Row({"frame_stride": 2}, ("voxels", "frames", "frames_rgb")),
+    "gamma and noise": Row({"gamma": 1.7, "noise_scales_with_threshold": True, "hot_pixel_share": 0.05}),
+    "noise per second": Row({"noise_unit": "second", "hot_pixel_share": 0.02}),
+    "grids_per_frame": Row({"grids_per_frame": 2}, (*_EVENTS, "frames")),
+    "voxel_seconds": Row({"voxel_seconds": (0.05, 0.2)}, (*_EVENTS, "frames")),
+    "event_counts": Row(FINE, ("event_counts",)),
+    "voxels_bilinear": Row(FINE, ("voxels_bilinear",)),
+    "frames_rgb": Row({}, ("frames_rgb",)),
+    "frames_u16": Row({}, ("frames_u16",)),
+    "frames_all": Row({"pause_probability": 0.2}, ("frames_all",)),
+    "boxes": Row({"max_boxes": 2}, ("boxes",), count=6),
+    "masks": Row({}, ("masks",), count=6),
+    "light": Row({"light": "declared"}, ("voxels", "frames", "frames_u16", "frames_all"), count=6),
+    "substep_px": Row(FINE, (*_EVENTS, "frames"), {"substep_px": 0.5}, count=6),
+    "substep_px of deep light": Row(FINE | {"light": "declared"}, ("voxels",), {"substep_px": 0.25, **AUTO}, count=6),
+    "tolerance": Row("davis346", ("voxels",), {"tolerance": 0.3}, count=9),
+    "tolerance of leak": Row(FINE | {"leak_hz": (0.05, 20.0)}, ("voxels",), {"tolerance": 0.4}, count=9),
+    "scene": Row({}, ("voxels", "frames", "frames_rgb", "boxes"), AUTO | {"still_share": 0.5}, count=6),
+    "keep_defects": Row({}, spec=AUTO | {"keep_defects": "bars,cuts,duplicates"}, count=6),
+    "quiet_share": Row({}, spec=AUTO | {"quiet_share": 0.3, "moving_share": 1.0, "substep_px": 1.0}, count=6),
+}
+"""The same bytes on every host: the committed table."""
+OF_THIS_HOST: Mapping[str, Row] = {
+    "flow": Row("paper-flow", ("flow", "flow_valid", "voxels")),
+    "flow_method": Row("paper-flow", ("flow",), {"flow_method": "dis-fast"}),
+    "flow backward": Row("paper-flow", ("flow",), {"flow_direction": "backward", "flow_from": 1, "flow_margin_px": 4}),
+    "flow of scenes": Row("paper-flow", ("flow", "voxels"), AUTO | {"substep_px": 1.0}, count=6),
+    "resize_scale": Row(
+        {"resize_scale": (0.7, 1.4)}, ("voxels", "frames", "frames_rgb", "masks"), {"substep_px": 1.0}, count=6
+    ),
+}
+"""OpenCV estimates flow and resizes: compared before and after a change, on one host."""
+
+Arrays = Mapping[str, npt.NDArray[Any]]
+Made = tuple[Arrays, list[dict[str, Any]]]
+"""The arrays of some samples, one after the other, by name; their draws."""
+
+
+def made(samples: Sequence[Sample]) -> Made:
+    """Return what the table has of samples."""
+    arrays = {name: np.stack([sample.arrays[name] for sample in samples]) for name in samples[0].arrays}
+    return arrays, [_drawn(sample) for sample in samples]
+
+
+def digest(array: npt.NDArray[Any]) -> str:
+    """Return 32 hexadecimal digits that name an array."""
+    form = repr((array.dtype.name, array.shape)).encode()
+    return hashlib.sha256(form + np.ascontiguousarray(array).tobytes()).hexdigest()[:32]
+
+
+def _drawn(sample: Sample) -> dict[str, Any]:
+    provenance = sample.provenance
+    drawn = {name: getattr(provenance, name) for name in _DRAWN}
+    drawn |= {"saturated": dict(provenance.saturated), "grid_seconds": list(provenance.grid_seconds)}
+    drawn |= {"labelled": sorted(set(sample.arrays) & {"boxes", "masks"} - set(provenance.unlabelled))}
+    plain: dict[str, Any] = json.loads(json.dumps(drawn | provenance.params.to_dict()))
+    return plain
+
+
+class Ways:
+    """The corpora, each in its own folder; a way makes the samples of a row.
+
+    Args:
+        folder: an existing folder to write to.
+        lossy: add a video in MJPEG.
+    """
+
+    def __init__(self, folder: Path, *, lossy: bool = False) -> None:
+        self.folder, self.videos = folder, folder / "videos"
+        self.videos.mkdir()
+        write_clips(self.videos)
+        if lossy:
+            write_lossy(self.videos / "d.avi")
+        self._catalogues: dict[str, Catalogue] = {}
+        self.all: Mapping[str, Callable[[Row], Made]] = {
+            "video": self._plain("videos"),
+            "store dense": self._plain("dense"),
+            "store fast, its motion computed": self._plain("fast"),
+            "store raw": self._plain("raw"),
+            "cache, empty and full": self._cached,
+        }
+
+    def close(self) -> None:
+        """Close the catalogues."""
+        for catalogue in self._catalogues.values():
+            catalogue.close()
+
+    def catalogue(self, name: str) -> Catalogue:
+        """Return the catalogue of the videos, or of a store of this size, which is written first."""
+        if name not in self._catalogues:
+            if name != "videos":
+                self._prepare(name)
+            rows = ROWS if name == "videos" else None
+            self._catalogues[name] = open_catalogue(
+                self.folder / name, rows=rows, cache_dir=self.folder, processes=0, scene=True
+            )
+        return self._catalogues[name]
+
+    def _prepare(self, size: str) -> None:
+        planes = ("chroma",) if size == "fast" else ("motion", "chroma")
+        store = self.folder / size
+        prepare(self.catalogue("videos"), store, size, processes=0, scene=True, planes=planes)
+        for sidecar in self.videos.glob("*.boxes.json"):
+            shutil.copy(sidecar, store)
+        shutil.copytree(self.videos / "a.masks", store / "a.masks", dirs_exist_ok=True)
+
+    def _plain(self, name: str) -> Callable[[Row], Made]:
+        def make(row: Row) -> Made:
+            samples = samples_of(self.catalogue(name), row)
+            if name != "videos":
+                assert all(sample.provenance.decoder.endswith(", from the store") for sample in samples)
+            return made(samples)
+
+        return make
+
+    def _cached(self, row: Row) -> Made:
+        """Make the samples twice: the second time each is read from the cache."""
+        with _empty_folder(self.folder / "cache") as folder:
+            make_cache(folder)
+            first, again = (
+                samples_of(self.catalogue("videos"), row, Cache(folder, 1 << 30, least_free_bytes=0)) for _ in range(2)
+            )
+        assert all(sample.provenance.decoder.endswith(", from the cache") for sample in again)
+        differences = compared(made(first), made(again))
+        assert not differences, f"the cache, when it was empty: {differences[0]}"
+        return made(again)
+
+
+@contextmanager
+def _empty_folder(folder: Path) -> Iterator[Path]:
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder)
+
+
+def samples_of(catalogue: Catalogue, row: Row, cache: Cache | None = None) -> list[Sample]:
+    """Make the samples of a row as a worker does, those of one decode together."""
+    spec, samples = row.stream, dict[int, Sample]()
+    schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, spec), spec)
+    views, spacing = spec.samples_per_decode, max(1, spec.sibling_spacing)
+    for index in range(row.count):
+        if index in samples:
+            continue
+        siblings = tuple(index + spacing * more for more in range(1, views))
+        sequence = schedule.candidate(row.seed, row.epoch, index, 0)
+        lease = lease_for(
+            Request(b"", row.epoch, index), sequence=sequence, catalogue=catalogue, spec=spec, seed=row.seed,
+            arrays=row.arrays, siblings=siblings,
+        )  # fmt: skip
+        all_decoded = decode_for(lease, lease.indices, catalogue.source, cache)
+        with open_sidecars(lease, catalogue.source) as sidecars:
+            for which, decoded in zip(lease.indices, all_decoded, strict=True):
+                samples[which] = make_sample(replace(lease, indices=(which,)), decoded, sidecars=sidecars)
+    return [samples[index] for index in range(row.count)]
+
+
+def compared(expected: Made, found: Made) -> list[str]:
+    """Return, for each array and draw that differs, the first difference and both values."""
+    differences = []
+    for name, array in expected[0].items():
+        other = found[0].get(name)
+        if other is None or (array.dtype, array.shape) != (other.dtype, other.shape):
+            was = "missing" if other is None else f"{other.dtype}{list(other.shape)}"
+            differences.append(f"{name} is {was}, not {array.dtype}{list(array.shape)}")
+        elif array.tobytes() != other.tobytes():
+            at = tuple(int(each[0]) for each in np.nonzero(array != other))
+            many = int(np.count_nonzero(array != other))
+            differences.append(f"{name}{list(at)} is {other[at]}, not {array[at]} ({many} of {array.size} differ)")
+    differences += [f"{name} is not in the table" for name in found[0].keys() - expected[0].keys()]
+    for number, (draw, now) in enumerate(zip(expected[1], found[1], strict=True)):
+        for key in sorted(draw.keys() | now.keys()):
+            if draw.get(key) != now.get(key):
+                differences.append(f"{key} of sample {number} is {now.get(key)}, not {draw.get(key)}")
+                break
+    return differences
