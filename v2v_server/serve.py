@@ -63,8 +63,6 @@ from v2v_server.video.rows import Rows
 
 _LONGEST_TURN_SECONDS = 1.0
 """A longer step than this counts as time in which the process was stopped."""
-
-
 _FILES_A_WORKER = 6
 _TURN_SECONDS = 0.1
 """Longest wait of the loop without a message; also the interval of checks of deadlines and workers."""
