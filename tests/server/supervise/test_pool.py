@@ -400,7 +400,7 @@ def test_the_wait_is_bounded_however_large_the_pool() -> None:
     pool.scale(1000)
     for slot in pool._slots[1:]:
         slot.start_at = float("inf")
-    pool._restarts._deaths_in_a_row = pool.crash_budget - 1
+    pool._restarts._deaths_in_a_row = crash_budget(1000) - 1
     dead = subprocess.Popen([sys.executable, "-S", "-E", "-c", LEAVES])
     dead.wait()
     pool._slots[0].place.process = dead
@@ -412,7 +412,7 @@ def test_the_wait_is_bounded_however_large_the_pool() -> None:
 
 def test_workers_that_only_die_use_up_the_budget(start: Callable[[int, str], Pool]) -> None:
     pool = start(1, LEAVES)
-    assert pool.crash_budget == 7
+    assert crash_budget(1) == 7
     now = 0.0
     for _ in range(crash_budget(1)):
         pool.watch(now, 0)
@@ -428,7 +428,7 @@ def test_workers_that_only_die_use_up_the_budget(start: Callable[[int, str], Poo
 def test_any_finished_sample_forgives(start: Callable[[int, str], Pool]) -> None:
     pool = start(1, SLEEPS)
     now = 0.0
-    for samples in range(2 * pool.crash_budget):
+    for samples in range(2 * crash_budget(1)):
         pool.watch(now, samples)
         kill_one(pool)
         # The first death after progress waits the shortest time again.
