@@ -33,10 +33,10 @@ from v2v_pictures.files import write_png
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.events import EventList
 from v2v_protocol.recipe import PRESETS
-from v2v_protocol.records import write_json
 from v2v_protocol.settings import settings_of
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
+from v2v_protocol.write_aside import write_json
 from v2v_server.config import ServeConfig
 from v2v_server.offline.event_files import FORMS, write_events
 

@@ -13,10 +13,9 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 from v2v_client import notebook
 from v2v_protocol.errors import UsageError
-from v2v_protocol.sample import ARRAYS, BOX_COLUMNS, Provenance
+from v2v_protocol.sample import ARRAYS, BOX_COLUMNS, Provenance, html_table
 from v2v_protocol.settings import nearest
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.tables import html_table
 
 _SHOWN = 3
 

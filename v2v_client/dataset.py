@@ -30,11 +30,10 @@ from v2v_client.session.liveness import Patience
 from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import RepeatedSamplesWarning, StateMismatch, UsageError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED
+from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, html_table
 from v2v_protocol.settings import require_whole
 from v2v_protocol.spec import SpecOptions, StreamSpec
 from v2v_protocol.spec_flags import read_recipe
-from v2v_protocol.tables import html_table
 
 _NOT_SHARED = (
     "samples of one decode go to different ranks or loader workers here, so each is decoded separately: the stream was "

@@ -22,11 +22,10 @@ from v2v_client.options import Labels, check_labels, require_arguments, require_
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample
+from v2v_protocol.sample import DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample, html_table
 from v2v_protocol.settings import require_whole
 from v2v_protocol.spec import SpecOptions, StreamSpec
 from v2v_protocol.spec_flags import read_recipe
-from v2v_protocol.tables import html_table
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,7 +16,6 @@ from v2v_protocol.errors import ProtocolError, UsageError
 from v2v_protocol.recipe import Recipe, effect_settings
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.settings import require_whole
-from v2v_protocol.tables import html_table
 
 LARGEST_SEED = 2**64 - 1
 LARGEST_EPOCH = 2**32 - 1
@@ -396,3 +396,15 @@ class Sample:
     def _repr_html_(self) -> str:
         rows = {name: f"{array.dtype} {list(array.shape)}" for name, array in self.arrays.items()}
         return html_table("Sample", rows) + self.provenance._repr_html_()
+
+
+def html_table(title: str, rows: Mapping[str, Any]) -> str:
+    """Return a heading and one line for each row. Names and values are escaped: file names come from untrusted
+    sources.
+    """
+    lines = "".join(
+        f'<tr><th style="text-align:left">{html.escape(str(name))}</th>'
+        f'<td style="text-align:left">{html.escape(str(value))}</td></tr>'
+        for name, value in rows.items()
+    )
+    return f"<b>{html.escape(title)}</b><table>{lines}</table>"

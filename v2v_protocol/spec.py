@@ -35,9 +35,6 @@ FlowDirection = Literal["forward", "backward"]
 SceneChoice = Literal["off", "auto"]
 SpeedPreset = Literal["exact", "balanced", "fast", "natural"]
 VOXEL_DTYPES: tuple[VoxelDtype, ...] = get_args(VoxelDtype)
-FLOW_METHODS: tuple[FlowMethod, ...] = get_args(FlowMethod)
-ON_BAD_VIDEO: tuple[OnBadVideo, ...] = get_args(OnBadVideo)
-FLOW_DIRECTIONS: tuple[FlowDirection, ...] = get_args(FlowDirection)
 SCENES: tuple[SceneChoice, ...] = get_args(SceneChoice)
 DEFECTS = ("bars", "black", "combed", "cuts", "duplicates", "fades", "white")
 """What scene "auto" finds in a video and leaves out."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from v2v_protocol.errors import UsageError
 
@@ -99,7 +101,10 @@ def check_output(
             raise UsageError(f"{named}: unknown ending; give a name that ends in {', '.join(endings)}")
         if not path.parent.is_dir():
             raise UsageError(f"{named}: there is no folder {path.parent}; create it first")
-        locked = next((at for at in (path, path.parent) if at.exists() and not os.access(at, os.W_OK)), None)
+        # By the rights that writing will have, such as the capabilities of a user that is not root.
+        effective = os.access in os.supports_effective_ids
+        checked = (at for at in (path, path.parent) if at.exists())
+        locked = next((at for at in checked if not os.access(at, os.W_OK, effective_ids=effective)), None)
         if locked is not None:
             raise UsageError(f"{named}: {locked} is write-protected; give another name, or allow writing")
         if why := _input_reason(path.resolve(), inputs):
@@ -129,3 +134,12 @@ def _input_reason(path: Path, inputs: Iterable[str | os.PathLike[str]]) -> str:
 
 def _is_stream(path: Path) -> bool:
     return os.fspath(path.parent) in _STREAMS or (path.exists() and not path.is_file() and not path.is_dir())
+
+
+def write_json(file: str | os.PathLike[str], records: Sequence[Mapping[str, Any]]) -> None:
+    """Write the records of a command's ``--json FILE``.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+    write_file(Path(file), json.dumps(records, indent=1) + "\n", "--json")

@@ -7,11 +7,14 @@ import gc
 import math
 import os
 import secrets
+import signal
 import sys
 import threading
+import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,7 @@ from v2v_protocol.allocator import give_back_freed_memory
 from v2v_protocol.errors import CorpusError
 from v2v_protocol.link.user import OwnUser
 from v2v_protocol.progress import Progress
+from v2v_protocol.write_aside import write_file
 from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,
@@ -31,9 +35,8 @@ from v2v_server.broker.actions import (
     ToConsumer,
     ToWorker,
 )
-from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.leases import Request
+from v2v_server.broker.leases import Cause, Loss, Request
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, InFlight, ServerTransport, Sockets
 from v2v_server.broker.worker_registry import clean_name
 from v2v_server.config import ServeConfig
@@ -46,23 +49,20 @@ from v2v_server.quarantine.file import quarantine_path, read_quarantine
 from v2v_server.quarantine.snapshots import Quarantine
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.schedule.summary import corpus_summary
-from v2v_server.status.publisher import StatusPublisher
-from v2v_server.status.snapshot import Service
-from v2v_server.status.terminal import StatusView
-from v2v_server.status.text import format_shutdown_summary
+from v2v_server.status.snapshot import Service, StatusPublisher
+from v2v_server.status.terminal import StatusView, format_shutdown_summary
 from v2v_server.store.cache import make_cache
-from v2v_server.supervise.engines import make_pool
-from v2v_server.supervise.pool import Pool
+from v2v_server.supervise.child import Standby
+from v2v_server.supervise.pool import Pool, make_pool
 from v2v_server.supervise.scaling import Scaling, question_workers
-from v2v_server.supervise.standby import Standby
-from v2v_server.system.clock import Clock
 from v2v_server.system.log import Level, Log
 from v2v_server.system.process import keep_freed_memory, most_connections, open_many_files, usable_cores
-from v2v_server.system.service import stop_on_signals, utc_now, write_port_file
 from v2v_server.system.start_times import StartTimes
 from v2v_server.system.status_fields import GIB
 from v2v_server.video.rows import Rows
 
+_LONGEST_TURN_SECONDS = 1.0
+"""A longer step than this counts as time in which the process was stopped."""
 _FILES_A_WORKER = 6
 _TURN_SECONDS = 0.1
 """Longest wait of the loop without a message; also the interval of checks of deadlines and workers."""
@@ -108,7 +108,7 @@ def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None
 
     Args:
         times: logged once the first sample is sent, if they are to be.
-        standbys: see :func:`v2v_server.supervise.engines.make_pool`.
+        standbys: see :func:`v2v_server.supervise.pool.make_pool`.
 
     Raises:
         CorpusError: the corpus gives no sequence.
@@ -217,7 +217,7 @@ class Server:
         pool: runs the workers' processes.
         quarantine: the snapshots.
         quarantine_file: file that new entries are written to.
-        clock: returns the time, seconds; None: a :class:`v2v_server.system.clock.Clock`.
+        clock: returns the time, seconds; None: a :class:`v2v_server.serve.Clock`.
         page: the status page; None: no page.
         times: see :func:`serve`.
     """
@@ -424,3 +424,53 @@ class Server:
 def _private_address(label: str) -> str:
     """Return an address for local workers: a socket without a file, so that nothing is left even after a kill -9."""
     return f"ipc://@v2v-{label}-{secrets.token_hex(8)}" if sys.platform.startswith("linux") else "tcp://127.0.0.1:*"
+
+
+class Clock:
+    """Seconds during which this process was running.
+
+    A stopped process (in a terminal, by a batch system, with its whole machine) receives no answers, and its peers may
+    be stopped as well. So a deadline that expires meanwhile does not count.
+    """
+
+    def __init__(self) -> None:
+        self._seen = time.monotonic()
+        self._away = 0.0
+
+    def __call__(self) -> float:
+        seen, self._seen = self._seen, time.monotonic()
+        self._away += max(0.0, self._seen - seen - _LONGEST_TURN_SECONDS)
+        return self._seen - self._away
+
+
+@contextlib.contextmanager
+def stop_on_signals(stop: threading.Event) -> Iterator[None]:
+    """Set ``stop`` at the first SIGINT or SIGTERM; a second signal has its usual effect."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def on_signal(number: int, frame: object) -> None:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+        stop.set()
+
+    for number in before:
+        signal.signal(number, on_signal)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def write_port_file(file: str, address: str) -> None:
+    """Write the address in one step, so that readers see the whole content or no file.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+    write_file(Path(file), address + "\n", "--port-file")
+
+
+def utc_now() -> str:
+    """Return the time of day, ISO 8601, UTC, in whole seconds."""
+    return datetime.now(UTC).isoformat(timespec="seconds")

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, get_args
 
 from hypothesis import strategies as st
 
 from v2v_protocol.bounds import LARGEST_EVENTS
 from v2v_protocol.errors import RecipeError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, MOST_SUBSTEPS, ON_BAD_VIDEO, VOXEL_DTYPES, StreamSpec
+from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, MOST_SUBSTEPS, VOXEL_DTYPES, OnBadVideo, StreamSpec
 
 
 def _range(low: float, high: float) -> st.SearchStrategy[tuple[float, float]]:
@@ -94,6 +94,6 @@ specs = st.builds(
     voxel_dtype=st.sampled_from(VOXEL_DTYPES),
     shuffle=st.booleans(),
     max_sequences_per_video=st.integers(1, 1_000_000),
-    on_bad_video=st.sampled_from(ON_BAD_VIDEO),
+    on_bad_video=st.sampled_from(get_args(OnBadVideo)),
     samples_per_decode=st.integers(1, MOST_SAMPLES_PER_DECODE),
 )

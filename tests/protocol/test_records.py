@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.records import write_json
+from v2v_protocol.write_aside import write_json
 
 
 def test_records_are_read_back(tmp_path: Path) -> None:

@@ -40,8 +40,8 @@ from v2v_server.broker.actions import (
     ToConsumer,
     ToWorker,
 )
-from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import Dispatcher
+from v2v_server.broker.leases import Cause, Loss
 from v2v_server.corpus.catalogue import Catalogue, complete_lease
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 

@@ -10,8 +10,7 @@ from typing import Any
 from v2v_protocol.messages import Message
 from v2v_protocol.wire import decode, encode
 from v2v_server.broker.actions import ToConsumer, ToWorker
-from v2v_server.broker.blame import Cause, Loss
-from v2v_server.broker.leases import Stall
+from v2v_server.broker.leases import Cause, Loss, Stall
 from v2v_server.broker.transport import Arrival, FromConsumer, FromWorker
 from v2v_server.supervise.pool import Death
 

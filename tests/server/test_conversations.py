@@ -27,14 +27,15 @@ from v2v_protocol.messages import (
     ErrorCode,
     Hello,
     Lease,
+    Result,
     SampleHeader,
     Unavailable,
     Want,
     Welcome,
     WorkerHello,
 )
-from v2v_server.broker.blame import Cause
 from v2v_server.broker.dispatcher import Dispatcher
+from v2v_server.broker.leases import Cause
 from v2v_server.broker.transport import FromWorker
 from v2v_server.config import ServeConfig
 from v2v_server.quarantine.file import read_quarantine
@@ -140,7 +141,7 @@ class Worker:
                     error = VideoError(lease.video, 3, "cut short")
                     self._take(self.conversation.on_failure(error, self.world.now))
                 else:
-                    self._take(self.conversation.on_sample(self.frames(lease), self.world.now))
+                    self._take(self.conversation.on_sample(self.frames(lease), self.world.now, Result(0)))
 
     @staticmethod
     def frames(lease: Lease) -> list[Any]:

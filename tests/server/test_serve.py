@@ -21,10 +21,9 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import encode
 from v2v_server import serve as serve_module
 from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, GiveUp, ReportRefusal, ToConsumer, ToWorker
-from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.counters import Counters
 from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.leases import Request
+from v2v_server.broker.leases import Cause, Loss, Request
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, CorpusPart
 from v2v_server.corpus.sources.folder import Folder
@@ -32,7 +31,6 @@ from v2v_server.quarantine.file import read_quarantine
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.serve import Server
 from v2v_server.supervise.scaling import question_workers
-from v2v_server.system import clock as clock_module
 
 VERDICT = QuarantineEntry(0, "v.mp4", "f", 0, "crash", "t")
 RECORD = AddToQuarantine(VERDICT, Request(b"c", 0, 0))
@@ -241,7 +239,7 @@ def test_a_time_in_which_the_server_was_stopped_is_no_silence_of_others(
 ) -> None:
     """No deadline may run out: its workers were stopped too, or their answers were not read."""
     dispatcher = Scripted()
-    monkeypatch.setattr(clock_module, "time", SimpleNamespace(monotonic=lambda: 50.0 + 100.0 * len(dispatcher.times)))
+    monkeypatch.setattr(serve_module, "time", SimpleNamespace(monotonic=lambda: 50.0 + 100.0 * len(dispatcher.times)))
     server = served(dispatcher, tmp_path)
     server.turn(0.0)
     server.turn(0.0)

@@ -6,11 +6,12 @@ import resource
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from pathlib import Path
 
 import psutil
 import pytest
+import zmq
 
 from tests.clips import panned_luma, write_clip
 from tests.stream.conftest import SMALL, SMALL_FLAGS
@@ -18,7 +19,6 @@ from tests.stream.test_loaders import singles
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Hello, Want
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.wire import encode
@@ -87,17 +87,15 @@ def test_consumers_that_never_read_cost_their_credit_and_nothing_else(tmp_path: 
         before = broker.memory_info().rss
         files = broker.num_fds()
         resource.prlimit(server.pid, resource.RLIMIT_NOFILE, (FILES, FILES))
-        first = stack.enter_context(closing(Dealer(server.address)))
-        deaf = [
-            stack.enter_context(closing(Dealer(server.address, options={"RCVHWM": 1, "SNDHWM": 2000}, beside=first)))
-            for _ in range(DEAF)
-        ]
+        context = stack.enter_context(zmq.Context())
+        deaf = [stack.enter_context(context.socket(zmq.DEALER)) for _ in range(DEAF)]
         for each in deaf:
-            each.connect()
-            each.send(encode(Hello({"recipe": LARGE.to_dict()}, ("voxels", "frames"), 4, 0)))
+            each.linger, each.rcvhwm, each.sndhwm = 0, 1, 2000
+            each.connect(server.address)
+            each.send_multipart(encode(Hello({"recipe": LARGE.to_dict()}, ("voxels", "frames"), 4, 0)))
         for _ in range(500):
             for each in deaf:
-                each.send(encode(Want(0, tuple(range(8)))))
+                each.send_multipart(encode(Want(0, tuple(range(8)))))
         with StatusClient(server.address) as client:
             until(lambda: client.get_status()["totals"]["shared"] >= DEAF)
         assert [list(singles(batch)) for batch in V2VStreamDataset(server.address, batch_size=4, recipe=LARGE)] == alone

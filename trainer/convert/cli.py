@@ -15,7 +15,7 @@ from trainer.evaluation import layout
 from v2v_protocol.command import JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
-from v2v_protocol.records import write_json
+from v2v_protocol.write_aside import write_json
 from v2v_recordings import items
 from v2v_recordings.forms import FORMS
 from v2v_recordings.items import NS_PER_UNIT

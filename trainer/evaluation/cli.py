@@ -30,7 +30,7 @@ from trainer.weights import SHIPPED, load_network
 from v2v_protocol.command import JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
-from v2v_protocol.records import write_json
+from v2v_protocol.write_aside import write_json
 from v2v_recordings.items import ConvertOptions, SensorSize
 
 OF_PICTURES = (

@@ -24,9 +24,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.arena import ArenaName, Slot, array_offsets
+from v2v_protocol.arena import ArenaName, Slot, array_offsets, create_memory, seal_memory
 from v2v_protocol.sample import Form, Layout, new_arrays
-from v2v_protocol.shared_memory import create_memory, seal_memory
 
 Bytes = npt.NDArray[np.uint8]
 

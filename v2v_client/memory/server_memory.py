@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from v2v_protocol.arena import ArenaName, array_offsets
+from v2v_protocol.arena import ArenaName, array_offsets, open_memory, read_arrays
 from v2v_protocol.errors import ProtocolError
-from v2v_protocol.shared_memory import open_memory, read_arrays
 
 
 def open_sample(arena: str, sizes: Sequence[int]) -> list[memoryview]:

@@ -25,10 +25,10 @@ from v2v_client.tools.schedule_check import ScheduleCheck
 from v2v_protocol.command import INTERRUPTED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
-from v2v_protocol.records import write_json
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_spec, recipe_changes, spec_fields
+from v2v_protocol.write_aside import write_json
 
 _RSS_EVERY_SECONDS = 0.5
 _LEAST_WIDTH = 110

@@ -6,6 +6,7 @@ message from a peer leads to an action or a counted fault, never to an exception
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,13 +19,19 @@ from v2v_protocol.errors import (
     UsageError,
 )
 from v2v_protocol.messages import (
+    Begun,
+    Denied,
     ErrorCode,
     GetStatus,
     Goodbye,
     Hello,
+    LeaseFailed,
     Message,
     Ping,
     Pong,
+    Result,
+    SampleHeader,
+    Stop,
     Want,
     WorkerHello,
 )
@@ -44,15 +51,12 @@ from v2v_server.broker.actions import (
     denial,
     malformed,
 )
-from v2v_server.broker.admission import Admission
-from v2v_server.broker.blame import Loss
 from v2v_server.broker.candidates import Candidates
-from v2v_server.broker.counters import Counters
-from v2v_server.broker.grants import Grants
-from v2v_server.broker.leases import LeaseBook, Request, Stall
-from v2v_server.broker.session import Session, Sessions
-from v2v_server.broker.worker_registry import SILENCE_SECONDS, Workers
-from v2v_server.broker.worker_side import WorkerSide, owner_digest
+from v2v_server.broker.counters import Counters, bounded_seconds
+from v2v_server.broker.grants import Grants, check_result
+from v2v_server.broker.leases import Cause, LeaseBook, Loss, Request, Stall, judge
+from v2v_server.broker.session import Admission, Session, Sessions
+from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Workers, clean_name
 from v2v_server.corpus.videos import CorpusFacts
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.sharing.ring import SampleRing
@@ -60,6 +64,8 @@ from v2v_server.sharing.ring import SampleRing
 MOST_SESSIONS = 4096
 MOST_FAULTS = 16
 """Malformed messages and refused specs after which a consumer is disconnected: an answer costs as much as a sample."""
+_LONGEST_SECRET_BYTES = 64
+_LONGEST_NAME_BYTES = 255
 
 
 class Dispatcher:
@@ -110,9 +116,6 @@ class Dispatcher:
         self.registry = Workers(self.leases)
         ring = SampleRing(share_bytes) if share_bytes else None
         self._grants = Grants(facts, self.sessions, self.leases, self.registry, self.candidates, self.counters, ring)
-        self._worker_side = WorkerSide(
-            facts, self.sessions, self.leases, self.registry, self.candidates, self._grants, self.counters
-        )
         self._faults: dict[bytes, int] = {}  # malformed messages and refused specs of connected consumers
 
     @property
@@ -286,24 +289,172 @@ class Dispatcher:
     # --- workers -----------------------------------------------------------------------------------------------------
 
     def from_worker(self, identity: bytes, frames: Sequence[Any], now: float, user: str = "") -> list[Action]:
-        """See :meth:`WorkerSide.receive`."""
-        return self._worker_side.receive(identity, frames, now, user)
+        """Handle a message from the workers' side. The frames behind a Result are passed on unchanged.
+
+        Args:
+            identity: routing id of the connection.
+            frames: the message.
+            now: monotonic time, seconds.
+            user: name of the connection's key; empty without keys, and for a worker of this host.
+        """
+        try:
+            message = decode(frames[0] if frames else b"")
+        except ProtocolError as error:
+            return [ToWorker(identity, self._malformed(error))]
+        if isinstance(message, WorkerHello):
+            return self._worker_hello(identity, message, now, user)
+        if isinstance(message, GetStatus):
+            return [SendStatus(identity, is_worker_side=True)]
+        if isinstance(message, Hello):
+            text = "this is the workers' port: connect to the address of --bind"
+            return [ToWorker(identity, denial(ErrorCode.MALFORMED, text))]
+        if not self.registry.mark_heard(identity, now):
+            return [ToWorker(identity, encode(Denied(ErrorCode.UNKNOWN_SESSION, "unknown worker: say WorkerHello")))]
+        match message:
+            case Begun(lease):
+                self.leases.mark_begun(lease, identity, now)
+                return []
+            case Result():
+                return self._result(identity, message, frames[1:], now)
+            case LeaseFailed():
+                return self._lease_failed(identity, message, now)
+            case Ping():
+                return [ToWorker(identity, encode(Pong()))]
+            case Goodbye():
+                return self._take_back(identity, Loss(Cause.KILLED, "left"), now)
+            case _:
+                self.counters.malformed += 1
+                return []
 
     def worker_lost(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
-        """See :meth:`WorkerSide.lost`."""
-        return self._worker_side.lost(identity, loss, now)
+        """Reassign the leases of a worker that died, was given up, or is unreachable."""
+        self.counters.workers_lost += 1
+        return self._take_back(identity, loss, now)
 
     def worker_stalled(self, identity: bytes, stalled: Stall) -> None:
-        """See :meth:`WorkerSide.stalled`."""
-        self._worker_side.stalled(identity, stalled)
+        """Extend the deadlines of a worker by the time in which it could not run."""
+        self.counters.queued_seconds += stalled.queued_seconds
+        self.leases.extend_deadlines(identity, stalled)
 
     def worker_unreachable(self, identity: bytes, now: float) -> list[Action]:
-        """See :meth:`WorkerSide.unreachable`."""
-        return self._worker_side.unreachable(identity, now)
+        """Take back the leases of a worker that a message did not reach and that no supervisor watches."""
+        if identity not in self.registry:
+            return []
+        return self.worker_lost(identity, Loss(Cause.KILLED, "is not connected any more"), now)
 
     def stop_workers(self) -> list[ToWorker]:
-        """See :meth:`WorkerSide.stop`."""
-        return self._worker_side.stop()
+        """Tell every worker to finish and leave."""
+        return [ToWorker(identity, encode(Stop())) for identity in self.registry.members()]
+
+    def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float, user: str) -> list[Action]:
+        try:
+            owner = owner_digest(user, hello.secret)
+            before = self._replaced_by(identity, hello.name, owner, user)
+        except LimitExceeded as error:
+            return [ToWorker(identity, self._malformed(error))]
+        again = Loss(Cause.KILLED, "started again")
+        actions = [action for each in before for action in self._take_back(each, again, now)]
+        if hello.numerics_version != NUMERICS_VERSION:
+            text = f"worker numerics version {hello.numerics_version}, the server's is {NUMERICS_VERSION}"
+            return [ToWorker(identity, encode(Denied(ErrorCode.VERSION, text))), *actions]
+        if len(self.registry) >= MOST_WORKERS:
+            text = f"this server has {MOST_WORKERS} workers, its limit"
+            return [ToWorker(identity, denial(ErrorCode.BUSY, text)), *actions]
+        self.registry.add(identity, hello, now, user, owner)
+        return actions + self._grants.assign(now)
+
+    def _replaced_by(self, identity: bytes, name: str, owner: bytes, user: str) -> list[bytes]:
+        """Return the connections that a worker's hello replaces: its own ones.
+
+        Raises:
+            LimitExceeded: one of them is another worker's, or the name is too long.
+        """
+        if len(name.encode()) > _LONGEST_NAME_BYTES:
+            raise LimitExceeded(f"the name has {len(name.encode())} bytes; the limit is {_LONGEST_NAME_BYTES}")
+        members = self.registry.members()
+        before = [each for each in {identity, self.registry.named(name)} if each is not None and each in members]
+        for each in before:
+            is_own = members[each].owner == owner and (bool(owner) or each == identity)
+            # A worker of this host needs no key. Its supervisor knows it by its name, so no key can hold that.
+            if not is_own and (user or not members[each].user):
+                raise LimitExceeded(
+                    f"a worker with the name or routing id of {clean_name(name)!r} is connected; both must be unique: "
+                    "start this one with another --name"
+                )
+        return before
+
+    def _result(self, identity: bytes, result: Result, payload: Sequence[Any], now: float) -> list[Action]:
+        request = self.leases.request(result.lease, identity)
+        session = None if request is None else self.sessions.get(request.session)
+        actions: list[Action] = []
+        decoded = True
+        if request is None or session is None:
+            self.counters.late_results += 1
+            self._charge(result.lease, identity, now)
+        else:
+            try:
+                header = check_result(payload, self._grants.as_leased(request, result.lease), session.form)
+            except ProtocolError as error:
+                # Our workers never send such a result; a worker that sends one would send more.
+                refused = ToWorker(identity, self._malformed(ProtocolError(f"malformed result: {error}")))
+                return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
+            decoded = header.decoded
+            if self._count(session, request, header, in_slot=len(payload) == 1):
+                self.counters.add(result, header.cpu_seconds)
+                self.registry.worked(identity, result, header.cpu_seconds)
+                actions += self._grants.deliver(session, request, result.lease, header, payload)
+        self.registry.can_work(identity)
+        self.leases.finished(result.lease, identity, now, decoded=decoded)
+        self.leases.mark_begun(result.begins, identity, now)
+        return actions + self._grants.assign(now)
+
+    def _lease_failed(self, identity: bytes, failed: LeaseFailed, now: float) -> list[Action]:
+        self._charge(failed.lease, identity, now)
+        request = self.leases.finished(failed.lease, identity, now)
+        session = None if request is None else self.sessions.get(request.session)
+        if request is None or session is None:
+            return self._grants.assign(now)
+        video, sidecar = self.candidates.sequence(session, request).video, failed.sidecar
+        fingerprint = self._facts.sidecars_of(video.id, session.arrays).get(sidecar) if sidecar else video.fingerprint
+        failure = CheckVideo(
+            video.id, fingerprint or "", identity, failed.frame, failed.reason, request, sidecar if fingerprint else ""
+        )
+        if not failed.here:
+            self.registry.can_work(identity)
+            return [*self.candidates.blame(failure), *self._grants.assign(now)]
+        # The catalogue lists this host's files: if the file is here, other workers can probably read it.
+        return [failure]
+
+    def _charge(self, lease: int, worker: bytes, now: float) -> None:
+        """Charge a consumer for a sample that it asked for and then abandoned."""
+        debt = self.leases.debt(lease, worker, now)
+        if debt is not None:
+            self.sessions.charge(*debt)
+
+    def _count(self, session: Session, request: Request, header: SampleHeader, *, in_slot: bool) -> bool:
+        """Count what was sent of a sample; return False if no session waits for it."""
+        if not self.sessions.mark_answered(request, bounded_seconds(header.cpu_seconds)):
+            self.counters.late_results += 1
+            return False
+        self.counters.decodes += header.decoded
+        self.counters.count_cache(header.cache)
+        self.counters.count_sent(session.batch_size, session.form.sizes, in_slot=in_slot)
+        return True
+
+    def _take_back(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
+        self.registry.remove(identity)
+        actions: list[Action] = []
+        returned = self.leases.lost(identity, loss.lease)
+        self.counters.returned_leases += len(returned)
+        for request, begun in reversed(returned):
+            verdict = judge(request, loss) if begun else request
+            if isinstance(verdict, Request):
+                self.sessions.put_back(verdict)
+            else:
+                actions += self.candidates.quarantine_candidate(
+                    request, verdict, for_all=loss.for_all and loss.cause is not Cause.UNEXPLAINED
+                )
+        return actions + self._grants.assign(now)
 
     # --- what comes of actions, and of time ---------------------------------------------------------------------------
 
@@ -406,3 +557,14 @@ def _slots(want: Want) -> list[Slot | None]:
 
 def _deny(identity: bytes, code: ErrorCode, text: str) -> ToConsumer:
     return ToConsumer(identity, denial(code, text))
+
+
+def owner_digest(user: str, secret: bytes) -> bytes:
+    """Return a digest of the owner of a session or worker name: its key, if there are keys, and its secret.
+
+    Raises:
+        LimitExceeded: the secret is too long.
+    """
+    if len(secret) > _LONGEST_SECRET_BYTES:
+        raise LimitExceeded(f"the secret has {len(secret)} bytes; the limit is {_LONGEST_SECRET_BYTES}")
+    return hashlib.blake2b(secret, key=hashlib.sha256(user.encode()).digest()).digest() if secret else b""

@@ -24,10 +24,9 @@ from v2v_protocol.sample import Form
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import decode, largest_packed_bytes
 from v2v_server.broker.actions import Action, SendLease, ToConsumer
-from v2v_server.broker.blame import runs_alone
 from v2v_server.broker.candidates import Candidates
 from v2v_server.broker.counters import Counters
-from v2v_server.broker.leases import LeaseBook, Request
+from v2v_server.broker.leases import LeaseBook, Request, runs_alone
 from v2v_server.broker.session import Session, Sessions
 from v2v_server.broker.worker_registry import Workers
 from v2v_server.corpus.videos import CorpusFacts, VideoEntry

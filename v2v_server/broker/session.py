@@ -16,20 +16,33 @@ about that number of bytes, and none of them holds up the others.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 
+from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import Slot
-from v2v_protocol.errors import LimitExceeded
+from v2v_protocol.errors import CorpusError, LimitExceeded, UsageError
 from v2v_protocol.liveness import Liveness
-from v2v_protocol.sample import Form, array_layout
+from v2v_protocol.messages import Hello, Welcome
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import Form, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import MOST_IN_FLIGHT_BYTES
-from v2v_server.broker.blame import runs_alone
+from v2v_protocol.wire import LARGEST_ARRAY_BYTES, MOST_IN_FLIGHT_BYTES
 from v2v_server.broker.fair_queue import FairQueue
-from v2v_server.broker.leases import LeaseBook, Request
+from v2v_server.broker.leases import LeaseBook, Request, runs_alone
+from v2v_server.broker.worker_registry import clean_name
+from v2v_server.corpus.videos import CorpusFacts
+from v2v_server.quarantine.snapshots import Quarantine
 from v2v_server.schedule.epoch import Schedule
+from v2v_server.schedule.sequences import MOST_CLIP_BYTES, Columns, SequenceTable
+
+MOST_BATCH_SIZE = 65_536
+MOST_CREDIT = 400
+"""Less than ``router.MOST_QUEUED``, the number of queued messages at which a consumer is disconnected."""
+MOST_TABLES = 16
+"""Sequence tables cached for later consumers. A session keeps its own, which is small."""
+
 
 GONE_SECONDS = 10.0
 """Time that a consumer has to return to its session after its connection ended."""
@@ -40,6 +53,168 @@ RETURN_SECONDS = 60.0
 """A consumer that says Hello within this time of the last message of one with the same name continues its totals."""
 _MOST_DEPARTED = 1024
 """Number of departed consumers whose totals are remembered; the oldest is dropped first."""
+
+
+def suggested_credit(batch_size: int, workers: int, samples_per_decode: int) -> int:
+    """Return how many samples a consumer should have outstanding: one batch ahead, and two for each worker.
+
+    With K samples per decode the count is in blocks of ``batch_size`` clips with K samples each. A worker gets the
+    siblings of a clip together only if all of them have been requested. So the credit covers the blocks in work (two
+    clips for each worker) and one more. It is then raised by a seventh, because our client asks only when an eighth of
+    its credit is free.
+    """
+    ahead = 2 * max(1, workers)
+    if samples_per_decode == 1:
+        return max(2 * batch_size, ahead)
+    under_way = batch_size * samples_per_decode * (1 + -(-ahead // batch_size))
+    return under_way + -(-under_way // 7)
+
+
+class Admission:
+    """Turn what consumers ask for into sessions.
+
+    Args:
+        facts: what is known of the videos, in memory.
+        default_spec: the spec of a consumer that sends none.
+        max_credit_bytes: bound on the bytes in flight to one consumer.
+        session_idle_seconds: a session that is silent for this long is dropped, even if it waits for samples. Its
+            consumer opens it again with its next request, so the limit only bounds the cost of abandoned consumers.
+        quarantine: the snapshots that a consumer may ask for.
+    """
+
+    def __init__(
+        self,
+        facts: CorpusFacts,
+        default_spec: StreamSpec,
+        max_credit_bytes: int,
+        session_idle_seconds: float,
+        quarantine: Quarantine,
+    ) -> None:
+        self._facts = facts
+        self._default_spec = default_spec
+        self._max_credit_bytes = max_credit_bytes
+        self._session_idle_seconds = session_idle_seconds
+        self._quarantine = quarantine
+        self._columns = Columns(facts.videos)
+        self._tables: dict[tuple[object, ...], SequenceTable] = {}
+
+    def admit(self, identity: bytes, hello: Hello, workers: int, now: float) -> tuple[Session, Welcome]:
+        """Open the session that a consumer asks for, and return it with the reply.
+
+        Args:
+            identity: the consumer's routing id.
+            hello: its message.
+            workers: number of workers, present or expected; the credit keeps all of them busy, within its bounds.
+            now: monotonic time, seconds.
+
+        Raises:
+            UsageError, CorpusError: the request cannot be served.
+        """
+        if not 1 <= hello.batch_size <= MOST_BATCH_SIZE:
+            raise UsageError(f"batch_size = {hello.batch_size}: give 1 to {MOST_BATCH_SIZE}")
+        spec = StreamSpec.from_dict(hello.spec, self._default_spec)
+        spec = spec.spaced(hello.stride or hello.batch_size)
+        layout = array_layout(spec.recipe, spec.voxel_dtype, hello.arrays)
+        self._check_sizes(spec.recipe, layout)
+        self._facts.require_arrays(hello.arrays)
+        newest = self._quarantine.latest
+        quarantine = newest if hello.quarantine is None else hello.quarantine
+        if quarantine > newest:
+            raise CorpusError(
+                f"quarantine snapshot {quarantine} was asked for, this server has 0 .. {newest}: the stream follows "
+                "entries that this server has not read. Replace this server's quarantine file with that of the "
+                "stream's earlier server (v2v-quarantine --videos DIR prints its path), and restart this server; if "
+                'they are the same file, just restart. To continue without these entries, set "quarantine" of the '
+                "saved state to None: the sequences that they refused then return"
+            )
+        table = self._table(spec)
+        schedule = Schedule.of(table, spec)
+        if not schedule.count:
+            raise UsageError(
+                f"{table.count} sequences do not fill a block of sibling_spacing = {spec.sibling_spacing}: use a "
+                "smaller batch size, fewer ranks or loader workers, samples_per_decode = 1, or more videos"
+            )
+        suggested = suggested_credit(hello.batch_size, workers, spec.samples_per_decode)
+        session = Session(
+            identity=identity,
+            spec=spec,
+            seed=hello.seed,
+            arrays=hello.arrays,
+            batch_size=hello.batch_size,
+            schedule=schedule,
+            credit=min(suggested, MOST_CREDIT, self._max_credit_bytes // layout_bytes(layout)),
+            liveness=Liveness(now, gone_seconds=self._session_idle_seconds),
+            quarantine=quarantine,
+            since=now,
+            packed=hello.packed,
+            name=clean_name(hello.name),
+            host=clean_name(hello.host),
+        )
+        return session, Welcome(
+            spec=spec.to_dict(),
+            spec_digest=spec.digest,
+            catalogue_digest=self._facts.digest_under(spec.scene),
+            numerics_version=NUMERICS_VERSION,
+            sequences=schedule.count,
+            credit=session.credit,
+            quarantine=quarantine,
+            sidecars=self._facts.sidecars_digest(hello.arrays),
+        )
+
+    def _check_sizes(self, recipe: Recipe, layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:
+        remedy = "ask for fewer voxels_per_clip or a smaller crop"
+        for name, (dtype, shape) in layout.items():
+            size = layout_bytes({name: (dtype, shape)})
+            if size > LARGEST_ARRAY_BYTES:
+                raise UsageError(
+                    f"array {name} {dtype}{list(shape)} of one sample is {size} bytes; the limit is "
+                    f"{LARGEST_ARRAY_BYTES}: {remedy}"
+                )
+        # The view of an enlarged picture may be larger than the picture, which the sequences are bounded by. How many
+        # frames a duration has depends on the video.
+        view = (recipe.steps + 1) * recipe.crop_height_px * recipe.crop_width_px
+        if view > MOST_CLIP_BYTES and not recipe.is_timed:
+            raise UsageError(
+                f"the {recipe.steps + 1} frames of {recipe.crop_width_px}x{recipe.crop_height_px} px of one sample "
+                f"are {view >> 20} MiB; the limit is {MOST_CLIP_BYTES >> 20} MiB: {remedy}"
+            )
+        if layout_bytes(layout) > self._max_credit_bytes:
+            raise UsageError(
+                f"one sample is {layout_bytes(layout)} bytes; the server's --max-credit-bytes is "
+                f"{self._max_credit_bytes}: raise it, or {remedy}"
+            )
+
+    def _table(self, spec: StreamSpec) -> SequenceTable:
+        recipe = spec.recipe
+        # The sequences depend only on these fields, so many specs share a table.
+        geometry = (
+            recipe.frames_needed,
+            spec.samples_per_decode,
+            recipe.frames_per_sequence,
+            recipe.frame_stride,
+            recipe.voxel_seconds[1],
+            recipe.crop_height_px,
+            recipe.crop_width_px,
+            recipe.resize_scale,
+            recipe.light,
+            spec.flow_margin_px,
+            spec.substep_px > 0.0,
+            spec.voxel_dtype,
+            spec.max_sequences_per_video,
+            spec.scene,
+            spec.kept_defects,
+            spec.still_share,
+            spec.quiet_share,
+        )
+        table = self._tables.get(geometry)
+        if table is None:
+            table = SequenceTable(self._facts.videos, self._facts.rows, spec, self._columns)
+            if not table.count:
+                raise UsageError(f"none of the {len(table.refusals)} videos gives a sequence; {table.refusals[0]}")
+            while len(self._tables) >= MOST_TABLES:
+                del self._tables[next(iter(self._tables))]
+            self._tables[geometry] = table
+        return table
 
 
 @dataclass(slots=True)

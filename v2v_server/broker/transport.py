@@ -126,17 +126,15 @@ class Sockets:
         self.waited_seconds = 0.0
         self.has_session: Callable[[bytes], bool] = lambda identity: False
         self._routers = Routers(keys)
-
-        def has_session(identity: bytes) -> bool:
-            return self.has_session(identity)
-
         try:
+            # The attribute is read at each call, because it is set later.
             self._consumers = self._routers.open(
-                "consumer", LARGEST_REQUEST_BYTES, most_connections, has_session, admits
+                "consumer", LARGEST_REQUEST_BYTES, most_connections, lambda peer: self.has_session(peer), admits
             )
             is_private = worker_bind.startswith("ipc:")
+            most = None if is_private else most_connections
             self._workers = self._routers.open(
-                "worker", LARGEST_ARRAY_BYTES, None if is_private else most_connections, has_session, admits
+                "worker", LARGEST_ARRAY_BYTES, most, lambda peer: self.has_session(peer), admits
             )
             self.address = self._consumers.bind(bind, "--bind")
             local = ""

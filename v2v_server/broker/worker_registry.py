@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import Result, WorkerHello
-from v2v_server.broker.blame import runs_alone
 from v2v_server.broker.counters import WorkDone
-from v2v_server.broker.leases import LeaseBook
+from v2v_server.broker.leases import LeaseBook, runs_alone
 
 MOST_WORKERS = 4096
 MOST_WORKER_CREDIT = 64
@@ -81,10 +80,6 @@ class Workers:
 
     def __contains__(self, identity: bytes) -> bool:
         return identity in self._workers
-
-    def identities(self) -> list[bytes]:
-        """Return the routing ids of all workers."""
-        return list(self._workers)
 
     def members(self) -> Mapping[bytes, Member]:
         """Return all workers by routing id."""

@@ -18,8 +18,8 @@ from v2v_protocol.command import FAILED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
-from v2v_protocol.records import write_json
 from v2v_protocol.spec import SCENES
+from v2v_protocol.write_aside import write_json
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare

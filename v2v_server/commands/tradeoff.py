@@ -16,10 +16,9 @@ import cv2
 
 from v2v_protocol.command import FAILED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
-from v2v_protocol.records import write_json
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_recipe, recipe_setting
-from v2v_protocol.write_aside import write_file
+from v2v_protocol.write_aside import write_file, write_json
 from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, Prediction
 from v2v_server.simulation.variants import warm_up
 from v2v_server.system.process import keep_freed_memory

@@ -12,8 +12,7 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from v2v_protocol.link.user import OwnUser
-from v2v_server.page.app import make_app
-from v2v_server.page.source import Source
+from v2v_server.page.app import Source, make_app
 from v2v_server.status.client import StatusClient
 from v2v_server.system.log import Log
 from v2v_server.system.process import die_with_parent

@@ -1,5 +1,4 @@
 """Finished samples, kept for consumers that ask for equal ones.
 
-memory      one sample in memory that consumers of this host can read and no process can write
-ring        the newest samples, up to a limit
+ring   the newest samples, up to a limit, in memory that consumers of this host can read and no process can write
 """

@@ -1,8 +1,9 @@
 """Keep the newest finished samples up to a limit, in the order in which they arrived.
 
-A sample lies in memory of the server that its worker filled (:mod:`v2v_server.sharing.memory`), or in the frames of its
-message, if its worker or the consumer that asked first is on another host. Consumers get the frames, or the name of
-sealed memory, and thus nothing that a process can write to.
+A sample lies in memory of the server that its worker filled, or in the frames of its message, if its worker or the
+consumer that asked first is on another host. Consumers get the frames, or the name of sealed memory, and thus nothing
+that a process can write to. The memory outlives the worker, and lasts until the ring drops it and its last reader is
+done.
 
 A consumer may open the memory after the ring has dropped the sample. It finds nothing there and asks again without a
 slot; that answer is a message, which holds its bytes itself.
@@ -13,15 +14,65 @@ way to a consumer, which the credit of all consumers bounds (:mod:`v2v_server.br
 
 from __future__ import annotations
 
+import os
 import resource
+import weakref
 from collections.abc import Container, Hashable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
-from v2v_protocol.arena import NO_SLOT, Slot
+from v2v_protocol.arena import NO_SLOT, ArenaName, Slot, array_offsets, create_memory, read_arrays, seal_memory
 from v2v_protocol.messages import SampleHeader
 from v2v_protocol.wire import Buffer, Frames, encode
-from v2v_server.sharing.memory import SampleMemory, mappings
+
+mappings: weakref.WeakSet[object] = weakref.WeakSet()
+"""All mappings that exist, each with a descriptor of its own: also those that only messages on their way refer to."""
+
+
+class SampleMemory:
+    """Memory for one sample.
+
+    Args:
+        sizes: bytes of each array.
+
+    Attributes:
+        slot: what a lease names, so that the worker writes there.
+        nbytes: its size.
+
+    Raises:
+        OSError: the system does not support sealed anonymous files, or has no memory left.
+    """
+
+    def __init__(self, sizes: Sequence[int]) -> None:
+        self._sizes = tuple(sizes)
+        self.nbytes = array_offsets(sizes, 1)[-1]
+        token = os.urandom(16).hex()
+        self._descriptor = create_memory(ArenaName(os.getpid(), 0, 1, token).memory_name, self.nbytes)
+        weakref.finalize(self, os.close, self._descriptor)
+        self.slot = Slot(str(ArenaName(os.getpid(), self._descriptor, 1, token)), 1)
+
+    def seal(self) -> bool:
+        """Make the memory read-only for every process; return False if one still has it mapped for writing."""
+        try:
+            seal_memory(self._descriptor, content=True)
+        except OSError:
+            return False
+        return True
+
+    @cached_property
+    def arrays(self) -> Sequence[bytes | memoryview]:
+        """Bytes of each array, for all messages: mapped once, or copied if the system has no descriptor left. They stay
+        valid without this object.
+        """
+        try:
+            arrays = read_arrays(self._descriptor, self._sizes)
+        except OSError:
+            offsets = array_offsets(self._sizes, 1)
+            return [os.pread(self._descriptor, size, at) for size, at in zip(self._sizes, offsets, strict=False)]
+        mappings.add(arrays[0].obj)
+        return arrays
+
 
 _FILES_SHARE = 4
 """Samples use at most this part of the process's open files."""

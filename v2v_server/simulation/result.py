@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
-from v2v_protocol.tables import html_table
+from v2v_protocol.sample import html_table
 from v2v_server.simulation.kernels import ARRAYS, KernelInput, fill, list_events
 from v2v_server.simulation.precision import Real
 

@@ -1,18 +1,24 @@
-"""Build the status from the server's parts. Pure; times are passed in.
+"""Build the status from the server's parts on request, and answer the requests.
 
 Every number has one owner (counters, sessions, the registry of workers, the leases, the history) and is read there. It
-costs a few microseconds for each worker and consumer, of which the first :data:`MOST_SHOWN` are listed.
+costs a few microseconds for each worker and consumer, of which the first :data:`MOST_SHOWN` are listed. A status is
+built at most a few times a second, whatever the number of clients and requests, and all of them get the same bytes. So
+every request is answered: a client has one at a time, and connections are limited.
 """
 
 from __future__ import annotations
 
 import json
 import platform
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from v2v_protocol import PROTOCOL_VERSION, __version__
-from v2v_protocol.wire import LARGEST_HEADER_BYTES
+from v2v_protocol.messages import Status as StatusMessage
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, encode
+from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
 from v2v_server.broker.counters import FaultTotal
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.session import Session
@@ -21,8 +27,7 @@ from v2v_server.broker.worker_registry import Member, clean_name
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.quarantine.snapshots import Quarantine
-from v2v_server.status.bottleneck import Bottleneck, Shares, find_bottleneck
-from v2v_server.status.history import TimeWindow
+from v2v_server.status.bottleneck import Bottleneck, History, Shares, TimeWindow, find_bottleneck
 from v2v_server.status.parts import (
     STATUS_VERSION,
     ConsumerPart,
@@ -34,6 +39,11 @@ from v2v_server.status.parts import (
 from v2v_server.store.quota import cache_part
 from v2v_server.supervise.pool import Pool
 from v2v_server.system.status_fields import GIB, short, values
+
+ANSWER_SECONDS = 0.4
+LARGEST_SHARE = 0.02
+"""Share of the loop's time that building may take; with thousands of workers and consumers it happens less often."""
+
 
 MOST_SHOWN = 1000
 """Largest number of workers listed, and of consumers; the others are only counted."""
@@ -206,3 +216,60 @@ def _consumer(session: Session, window: TimeWindow) -> ConsumerPart:
         seed=session.seed,
         quarantine=session.quarantine,
     )
+
+
+class StatusPublisher:
+    """Answer requests for the status of one service.
+
+    Args:
+        service: what the status is read from.
+        now: monotonic time of the server's start, seconds.
+        wall_clock: returns the time of day, ISO 8601.
+        processor_clock: returns the processor seconds of this thread.
+
+    Attributes:
+        is_ready: whether the server has announced that it is ready.
+    """
+
+    def __init__(
+        self,
+        service: Service,
+        now: float,
+        wall_clock: Callable[[], str],
+        processor_clock: Callable[[], float] = time.thread_time,
+    ) -> None:
+        self._service = service
+        self._started = now
+        self._waited_before = service.transport.waited_seconds
+        self._history = History(service.dispatcher, now)
+        self._wall_clock = wall_clock
+        self._processor_clock = processor_clock
+        self._waiting: dict[SendStatus, None] = {}
+        self._answer_at = now
+        self.is_ready = False
+
+    def status(self, now: float) -> Status:
+        """Return the current status."""
+        return self._service.status(
+            self._history.window(now),
+            self._wall_clock(),
+            uptime_seconds=now - self._started,
+            is_ready=self.is_ready,
+            is_attended=self._history.is_attended(now),
+        )
+
+    def ask(self, request: SendStatus) -> None:
+        """Take a request, which :meth:`tick` answers."""
+        self._waiting[request] = None
+
+    def tick(self, now: float) -> list[ToConsumer | ToWorker]:
+        """Return the answers that are due. Call a few times a second."""
+        waited_seconds = self._service.transport.waited_seconds - self._waited_before
+        self._history.note(now, max(0.0, now - self._started - waited_seconds))
+        if not self._waiting or now < self._answer_at:
+            return []
+        began = self._processor_clock()
+        waiting, self._waiting = self._waiting, {}
+        frames = encode(StatusMessage(to_json(self.status(now))))
+        self._answer_at = now + max(ANSWER_SECONDS, (self._processor_clock() - began) / LARGEST_SHARE)
+        return [(ToWorker if each.is_worker_side else ToConsumer)(each.identity, frames) for each in waiting]

@@ -1,4 +1,8 @@
-"""Start one worker's process, read its state, and interpret its end: on this host, or by an actor on another one."""
+"""Start one worker's process, read its state, and interpret its end: on this host, or by an actor on another one.
+
+Processes may be started before there is work: they import their modules while the server imports its own and opens its
+catalogue. The pool then tells them their arguments, in place of starting other processes.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,8 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +20,8 @@ import psutil
 
 from v2v_protocol.keys import PeerKey, nameless_key
 from v2v_protocol.programs import environment
-from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.leases import Cause, Loss
+from v2v_server.config import ServeConfig
 from v2v_server.worker.logbook import Logbook
 
 STOPPED = (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
@@ -23,6 +29,55 @@ _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, 
 PROGRAM = (sys.executable, "-m", "v2v_server.commands.worker")
 Program = subprocess.Popen[bytes]
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+
+
+class Standby:
+    """One process. It ends if it is not told its arguments before this process ends.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+
+    def __init__(self) -> None:
+        self.logbook = Logbook()
+        flags = ["--standby", str(os.getpid())]
+        self.process = start_program(
+            flags, [self.logbook.descriptor, self.logbook.arenas.fileno()], stdin=subprocess.PIPE
+        )
+
+    def begin(self, arguments: Sequence[str]) -> None:
+        """Tell it the arguments of ``v2v-worker``.
+
+        Raises:
+            OSError: it has ended.
+        """
+        assert self.process.stdin is not None
+        try:
+            with self.process.stdin as file:
+                file.write("\0".join(arguments).encode())
+        except OSError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """End it."""
+        self.process.kill()
+        self.process.communicate()
+        self.logbook.close()
+
+
+@contextmanager
+def start_ahead(config: ServeConfig) -> Iterator[list[Standby]]:
+    """Start the workers of this host that a server begins with; at the end, end those that are left in the list."""
+    standbys: list[Standby] = []
+    try:
+        with suppress(OSError):  # the pool starts the others, and reports why if it cannot
+            while config.engine == "local" and len(standbys) < config.least_workers:
+                standbys.append(Standby())
+        yield standbys
+    finally:
+        for standby in standbys:
+            standby.close()
 
 
 def start_child(

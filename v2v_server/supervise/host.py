@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from v2v_server.broker.blame import Loss
+from v2v_server.broker.leases import Loss
 
 
 @dataclass(frozen=True, slots=True)

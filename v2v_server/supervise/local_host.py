@@ -14,9 +14,10 @@ import time
 from collections.abc import Sequence
 
 from v2v_protocol.keys import PeerKey
-from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
 from v2v_server.supervise.child import (
+    Standby,
     arguments,
     out_of_memory_kills,
     post_mortem,
@@ -25,7 +26,6 @@ from v2v_server.supervise.child import (
     status_of,
 )
 from v2v_server.supervise.host import Exit, ProcessStatus
-from v2v_server.supervise.standby import Standby
 from v2v_server.worker.logbook import Logbook
 
 _MEMORY_SECONDS = 5.0

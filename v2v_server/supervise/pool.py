@@ -5,7 +5,7 @@
                                `--too many--> leaving --exit--> gone
 
 A worker that dies is started again after a delay that doubles with every death in a row. If the workers die repeatedly
-and not one sample is finished, restarting does not help, and the pool says so.
+and not one sample is finished, something is wrong that restarting does not repair, and the pool says so.
 """
 
 from __future__ import annotations
@@ -13,18 +13,68 @@ from __future__ import annotations
 import math
 import signal
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
-from v2v_server.broker.blame import Cause, Loss
-from v2v_server.broker.leases import Stall
-from v2v_server.supervise.child import STOPPED, hung
+from v2v_protocol.errors import UsageError, WorkerCrashLoop
+from v2v_server.broker.leases import Cause, Loss, Stall
+from v2v_server.config import ENGINES, ServeConfig
+from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.keys.folder import KeyFolder
+from v2v_server.supervise.child import STOPPED, Standby, hung
 from v2v_server.supervise.host import Exit, Host, ProcessStatus, WorkerPlace
-from v2v_server.supervise.restarts import Restarts, crash_budget
+
+_FIRST_BACKOFF_SECONDS = 0.2
+_LONGEST_BACKOFF_SECONDS = 10.0
+
 
 _STALL_SECONDS = 1.0
 """Time from one check for stalled workers to the next."""
 _STALE_SECONDS = 15.0
 """Age at which an observation says nothing about a process any more."""
+
+
+def crash_budget(workers: int) -> int:
+    """Return how many deaths in a row, without any finished sample between them, this number of workers may have."""
+    return 3 * workers + 4
+
+
+class Restarts:
+    """Count deaths in a row."""
+
+    def __init__(self) -> None:
+        self._deaths_in_a_row = 0
+        self._samples_seen = 0
+
+    def progress(self, samples: int) -> None:
+        """Update the number of samples finished so far; any increase resets the count of deaths."""
+        if samples > self._samples_seen:
+            self._samples_seen = samples
+            self._deaths_in_a_row = 0
+
+    def delay(self, workers: int, loss: Loss) -> float:
+        """Count a death.
+
+        Args:
+            workers: number of workers that there should be.
+            loss: what happened to the worker.
+
+        Returns:
+            seconds until its successor may be started.
+
+        Raises:
+            WorkerCrashLoop: the crash budget is used up.
+        """
+        self._deaths_in_a_row += 1
+        if self._deaths_in_a_row > crash_budget(workers):
+            raise WorkerCrashLoop(
+                f"{self._deaths_in_a_row} server workers died in a row without finishing a sample (limit "
+                f"{crash_budget(workers)}); the last one {loss.text}. What they printed is above; "
+                f"`v2v-simulate` on one of the videos shows the same in one process"
+            )
+        # Bounded before the power: a large pool may have hundreds of deaths in a row, which would overflow a float.
+        doublings = min(self._deaths_in_a_row - 1, 16)
+        return float(min(_FIRST_BACKOFF_SECONDS * 2**doublings, _LONGEST_BACKOFF_SECONDS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,11 +140,6 @@ class Pool:
     def is_local(self) -> bool:
         """Return whether all workers run on this host."""
         return self._host.is_local
-
-    @property
-    def crash_budget(self) -> int:
-        """Deaths in a row, without any finished sample between them, that are tolerated."""
-        return crash_budget(self._workers)
 
     @property
     def running(self) -> int:
@@ -234,3 +279,38 @@ class Pool:
     def _release(self, slot: WorkerSlot) -> None:
         self._slots.remove(slot)
         slot.place.release()
+
+
+def make_pool(
+    config: ServeConfig,
+    source: VideoSource,
+    label: str,
+    flags: list[str],
+    keys: KeyFolder | None = None,
+    standbys: list[Standby] | None = None,
+) -> Pool:
+    """Return the pool that the configuration asks for.
+
+    Args:
+        config: of the server.
+        source: where the videos come from; workers open it by its name.
+        label: prefix of the workers' names, unique to this server.
+        flags: further flags of each worker.
+        keys: keys of the server, which lends one to workers on other hosts.
+        standbys: workers of this host that are started already; the pool takes them from the list.
+
+    Raises:
+        UsageError: the engine is not installed, or there is no cluster.
+    """
+    name = config.engine
+    try:
+        engine = import_module(ENGINES[name])
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise
+        raise UsageError(
+            f"--engine {name} needs the Python package {name}, which is not installed; the extra '{name}' brings it: "
+            f"pip install '.[server,{name}]' in a checkout of v2v-stream, here and on every node of the cluster"
+        ) from error
+    key = None if keys is None or name == "local" else keys.lend(f"{name}-{label}", "worker")
+    return Pool(engine.make_host(config, source.name, label, flags, key, [] if standbys is None else standbys), label)

@@ -4,8 +4,8 @@
                   ▲                                                                      │
                   └───────────────────── ZeroMQ: leases and samples ─────────────────────┘
 
-Ray carries no sample. The actor is :mod:`v2v_server.supervise.ray_actor`; only these two modules import Ray (the extra
-``ray``).
+Ray carries no sample. The actor starts the worker's process on its node, observes it, and reports its end: a decoder
+that crashes ends the process, never the actor. Only this module imports Ray (the extra ``ray``).
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ import contextlib
 import math
 import signal
 import socket
+import subprocess
+import threading
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import ray
@@ -25,10 +27,11 @@ from ray.exceptions import ActorDiedError, ActorUnavailableError, RayError
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.keys import PeerKey
-from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
+from v2v_server.supervise.child import out_of_memory_kills, post_mortem, queued_seconds, start_child, status_of
 from v2v_server.supervise.host import Exit, ProcessStatus
-from v2v_server.supervise.ray_actor import ActorStatus, RayWorker
+from v2v_server.worker.logbook import Logbook
 
 WORKER_BYTES = 1 << 30
 """Memory that Ray reserves for a worker, besides one CPU."""
@@ -38,6 +41,90 @@ _NEWS_SECONDS = 10.0
 _CONNECT_SECONDS = 10.0
 _CALLS_AT_ONCE = 4
 """In an actor: to run the process, to observe it, and to signal it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActorStatus:
+    """What an actor observes.
+
+    Attributes:
+        node: its node.
+        name: name of its worker; empty if none runs.
+        process: the worker's process.
+    """
+
+    node: str
+    name: str = ""
+    process: ProcessStatus = field(default_factory=ProcessStatus)
+
+
+class RayWorker:
+    """The actor.
+
+    Args:
+        root: the corpus, a folder of its node or an address.
+        flags: further flags of the worker.
+        key: key of the worker; None: the key that ``V2V_KEYS`` names on its node.
+    """
+
+    def __init__(self, root: str, flags: Sequence[str], key: PeerKey | None = None) -> None:
+        self._key = key
+        self._root, self._flags = root, list(flags)
+        self._lock = threading.Lock()
+        self._child: tuple[str, subprocess.Popen[bytes], Logbook] | None = None
+        self._memory_kills = out_of_memory_kills()
+
+    def run(self, name: str, address: str) -> tuple[int, Loss]:
+        """Run one worker from its start to its end.
+
+        Returns:
+            its exit status, and what that means.
+
+        Raises:
+            OSError: it cannot be started.
+        """
+        with self._lock:
+            if self._child is not None:
+                self._child[1].kill()  # the result of the call that started it was lost on its way
+            logbook = Logbook()
+            with contextlib.ExitStack() as undo:
+                undo.callback(logbook.close)
+                process = start_child(address, self._root, name, self._flags, logbook, self._key)
+                undo.pop_all()
+            self._child = name, process, logbook
+        returncode = process.wait()
+        with self._lock:
+            short = out_of_memory_kills() > self._memory_kills
+            loss = post_mortem(returncode, logbook, short_of_memory=short)
+            loss = replace(loss, text=f"{loss.text} on {node()}")
+            logbook.close()
+            if self._child is not None and self._child[1] is process:
+                self._child = None
+        return returncode, loss
+
+    def status(self) -> ActorStatus:
+        """Observe the worker's process."""
+        with self._lock:
+            self._memory_kills = out_of_memory_kills()
+            if self._child is None:
+                return ActorStatus(node())
+            name, process, logbook = self._child
+            seen = ProcessStatus(
+                status_of(process.pid), queued_seconds(process.pid), logbook.lease(), logbook.decodes()
+            )
+            return ActorStatus(node(), name, seen)
+
+    def signal(self, name: str, number: int) -> None:
+        """Send a worker a signal, if it still runs."""
+        with self._lock:
+            if self._child is not None and self._child[0] == name:
+                self._child[1].send_signal(number)
+
+
+def node() -> str:
+    """Return the name of this node for logs."""
+    context = ray.get_runtime_context()
+    return f"{socket.gethostname()} ({context.get_node_id()[:6]})"
 
 
 def make_host(

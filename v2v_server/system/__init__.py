@@ -7,9 +7,7 @@ compile_cache   where numba stores compiled kernels
 private         files that other users of the host cannot open
 status_fields   what each number of the status means
 locks           locks on files that processes share
-service         an orderly stop, a file that states the address, the time of day
 start_times     how long each step of a start takes
 log             log lines, as text or JSON
-clock           a clock that stands still while its process is stopped
 opencv          OpenCV, imported on first use
 """

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 from v2v_protocol.errors import (
@@ -122,16 +122,6 @@ Action: TypeAlias = Send | Reconnect | Say | Listen | Inspect | Load | Make | Le
 
 
 @dataclass(frozen=True, slots=True)
-class Timings:
-    """Cost of a sample, as reported in its :class:`v2v_protocol.messages.Result`."""
-
-    decode_seconds: float = 0.0
-    simulate_seconds: float = 0.0
-    handover_seconds: float = 0.0
-    memory_bytes: int = 0
-
-
-@dataclass(frozen=True, slots=True)
 class Readiness:
     """What the work on a lease needs.
 
@@ -166,8 +156,7 @@ class WorkerConversation:
         self._away = False  # we said goodbye to compile
         self._silence = Liveness(0.0)
         self._silence_reported = False
-        # Finished leases with their messages and timings.
-        self._unsent: list[tuple[int, Frames, Timings]] = []
+        self._unsent: list[tuple[Result, Frames]] = []  # finished leases with their messages
         self._unsent_since = 0.0
         self._may_wait = False  # the latest of them may wait for its sibling's
         self._stopping = False
@@ -230,16 +219,16 @@ class WorkerConversation:
         self._restart_silence(now)
         return [Listen(0.0)] if self._away else self._next_actions(now)
 
-    def on_sample(self, frames: Frames, now: float, timings: Timings = Timings()) -> list[Action]:
+    def on_sample(self, frames: Frames, now: float, work: Result) -> list[Action]:
         """Report a sample that is made.
 
         Args:
             frames: its SampleHeader message.
             now: monotonic time, seconds.
-            timings: what the sample took.
+            work: what the sample took; its numbers of leases do not count.
         """
         lease = self._done(now)
-        self._unsent.append((lease.lease, frames, timings))
+        self._unsent.append((replace(work, lease=lease.lease), frames))
         self._may_wait = (
             len(frames) == 1  # arrays in the message should be sent at once
             and self._is_watched  # without a logbook the server blames the lease last announced
@@ -340,16 +329,10 @@ class WorkerConversation:
         if not self._unsent:
             return []
         self._begun = begins
-        begun = [*(number for number, *_ in self._unsent[1:]), begins]
+        begun = [*(work.lease for work, _ in self._unsent[1:]), begins]
         results = [
-            Send([*encode(_result(number, next_one, timings)), *frames])
-            for (number, frames, timings), next_one in zip(self._unsent, begun, strict=True)
+            Send([*encode(replace(work, begins=next_one)), *frames])
+            for (work, frames), next_one in zip(self._unsent, begun, strict=True)
         ]
         self._unsent.clear()
         return list(results)
-
-
-def _result(lease: int, begins: int, timings: Timings) -> Result:
-    return Result(
-        lease, begins, timings.decode_seconds, timings.simulate_seconds, timings.handover_seconds, timings.memory_bytes
-    )

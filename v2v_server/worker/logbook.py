@@ -16,9 +16,7 @@ import tempfile
 from contextlib import suppress
 from socket import recv_fds, send_fds, socket, socketpair
 
-from v2v_protocol.arena import ArenaName
-from v2v_protocol.errors import ProtocolError
-from v2v_protocol.shared_memory import find_memory
+from v2v_protocol.arena import ArenaName, find_memory
 
 _BYTES = 8
 _DECODES, _SIMULATES = b"d", b"s"
@@ -54,12 +52,17 @@ class Logbook:
         return os.pread(self.descriptor, 1, _BYTES) == _DECODES
 
     def lend(self, arena: str) -> None:
-        """Send the worker the descriptor of a lease's arena, or none if the arena is not accessible here."""
+        """Send the worker the token of a lease's arena, with its descriptor if the arena is accessible here.
+
+        Raises:
+            ProtocolError: the text does not name an arena.
+        """
+        name = ArenaName.parse(arena)
         found: list[int] = []
-        with suppress(OSError, ProtocolError):
-            found.append(find_memory(ArenaName.parse(arena), writable=True))
+        with suppress(OSError):
+            found.append(find_memory(name, writable=True))
         with suppress(OSError):  # the worker has ended, or is stopped
-            send_fds(self._pool, [b"\0"], found)
+            send_fds(self._pool, [name.token.encode()], found)
         for descriptor in found:
             os.close(descriptor)
 
@@ -82,9 +85,11 @@ def take_arena(arenas: socket, name: ArenaName, writable: bool) -> int:
         OSError: the arena is not accessible to the pool, or nothing came in the socket's time.
     """
     while True:
-        _, found, *_ = recv_fds(arenas, 1, 1)
-        if not found:
-            raise FileNotFoundError(name.path)
-        if os.readlink(f"/proc/self/fd/{found[0]}") == name.link:
+        token, found, *_ = recv_fds(arenas, len(name.token), 1)
+        is_it = token.decode() in (name.token, "")  # nothing is left of a pool that has ended
+        if is_it and found:
             return found[0]
-        os.close(found[0])
+        if is_it:
+            raise FileNotFoundError(name.path)
+        for descriptor in found:
+            os.close(descriptor)

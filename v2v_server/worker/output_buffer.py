@@ -4,7 +4,7 @@ The arena is opened and mapped for each sample, which takes less than a millisec
 consumer that is gone, and a killed worker leaves nothing to clean up. A confined worker cannot open it, and receives
 its descriptor from the server (:func:`v2v_server.worker.logbook.take_arena`).
 
-An arena with one slot, such as the server's (:mod:`v2v_server.sharing.memory`), is new memory as a rule. Writing a
+An arena with one slot, such as the server's (:mod:`v2v_server.sharing.ring`), is new memory as a rule. Writing a
 finished sample to it takes less than half the time of mapping it, because its pages need no zeros and no faults.
 """
 
@@ -21,11 +21,10 @@ import numpy as np
 import numpy.typing as npt
 import zstandard
 
-from v2v_protocol.arena import NO_SLOT, ArenaName, Slot, array_offsets
+from v2v_protocol.arena import NO_SLOT, ArenaName, Slot, array_offsets, find_memory, open_memory
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import Form, Layout, new_arrays
-from v2v_protocol.shared_memory import find_memory, open_memory
 from v2v_protocol.wire import Buffer, Frames, encode_sample
 
 Find: TypeAlias = Callable[[ArenaName, bool], int]
@@ -53,7 +52,7 @@ def open_output_buffer(lease: Lease, layout: Layout, find: Find = find_memory) -
     Args:
         lease: the work.
         layout: layout of its sample.
-        find: how its arena is found, see :func:`v2v_protocol.shared_memory.open_memory`.
+        find: how its arena is found, see :func:`v2v_protocol.arena.open_memory`.
     """
     if lease.slot != NO_SLOT and not _has_one_slot(lease.arena):
         there = slot_arrays(Slot(lease.arena, lease.slot), layout, find)

@@ -2,6 +2,9 @@
 
 Sending happens in ZeroMQ's own thread while the next sample is made. The process may be killed at any moment; it leaves
 nothing that would have to be undone.
+
+Memory: besides the sample being made, the clips that its lease's siblings need, each cropped to its own view: at most
+(samples_per_decode - 1) x frames x window bytes.
 """
 
 from __future__ import annotations
@@ -18,11 +21,11 @@ from importlib.resources.abc import Traversable
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.addresses import leaves_host
-from v2v_protocol.errors import SidecarError, UsageError, VideoError
+from v2v_protocol.arena import find_memory
+from v2v_protocol.errors import SidecarError, UsageError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.keys import key_for
 from v2v_protocol.link.dealer import Dealer
-from v2v_protocol.messages import Lease, WorkerHello
-from v2v_protocol.shared_memory import find_memory
+from v2v_protocol.messages import Lease, Result, WorkerHello
 from v2v_protocol.wire import Frames
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.schedule.sequences import MOST_LEASE_BYTES
@@ -52,15 +55,12 @@ from v2v_server.worker.conversation import (
     Reconnect,
     Say,
     Send,
-    Timings,
     WorkerConversation,
 )
-from v2v_server.worker.decode_cache import Clips
-from v2v_server.worker.labels import read_ahead
 from v2v_server.worker.logbook import IDLE, note, take_arena
 from v2v_server.worker.output_buffer import open_output_buffer, sample_message
-from v2v_server.worker.produce import kernels_of, make_sample, sample_layout
-from v2v_server.worker.sidecars import open_sidecars, sidecar_files
+from v2v_server.worker.produce import Decoded, decode_for, kernels_of, make_sample, sample_layout
+from v2v_server.worker.sidecars import open_sidecars, read_ahead, sidecar_files
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 _SOON_FETCHED_BYTES = 32 << 20
@@ -76,6 +76,66 @@ _LONGEST_ARENA_SECONDS = 1.0
 """Longest wait for a lease's arena, which is sent before the lease. Without it the sample goes into the message."""
 _LINGER_MS = 5000
 """Time that leaving may spend on sending the last sample."""
+
+
+class Clips:
+    """Decode clips for leases, together with those of their siblings.
+
+    Args:
+        source: where the videos come from.
+        cache: cache of decoded pieces for later epochs; None stores nothing.
+    """
+
+    def __init__(self, source: VideoSource, cache: Cache | None = None) -> None:
+        self._source = source
+        self._cache = cache
+        self._kept: dict[tuple[object, ...], Decoded] = {}
+
+    def take(self, lease: Lease) -> tuple[Decoded, bool]:
+        """Return the decoded clip of the lease's sample, and whether it was decoded just now.
+
+        Raises:
+            VideoError, ProtocolError: see :func:`v2v_server.worker.produce.decode_for`.
+        """
+        kept = self._kept.pop(_key(lease, lease.indices[0]), None)
+        if kept is not None:
+            return kept, False
+        self._kept = {}  # siblings that never came
+        if len(lease.indices) > 1:
+            try:
+                first, *others = decode_for(lease, lease.indices, self._source, self._cache)
+            except VideoError:
+                pass  # a sibling may need more of the clip than this sample; try without siblings
+            else:
+                self._kept = {_key(lease, index): one for index, one in zip(lease.indices[1:], others, strict=True)}
+                return first, True
+        try:
+            return decode_for(lease, lease.indices[:1], self._source, self._cache)[0], True
+        except (VideoChanged, VideoUnreadable):
+            raise
+        except VideoError:
+            # A decoder may hide a temporary storage error, so try once more. An error of the file repeats.
+            return decode_for(lease, lease.indices[:1], self._source, self._cache)[0], True
+
+    def said_of_cache(self, decoded: Decoded) -> str:
+        """Return the cache field of a sample's header, see :class:`v2v_protocol.messages.SampleHeader`."""
+        if self._cache is None or decoded.clip.origin == "store":
+            return ""
+        if decoded.clip.origin == "cache":
+            return "hit"
+        return f"miss: {self._cache.trouble}" if self._cache.trouble else "miss"
+
+    def has(self, lease: Lease) -> bool:
+        """Return whether the lease's sample needs no decoding."""
+        return _key(lease, lease.indices[0]) in self._kept
+
+
+def _key(lease: Lease, index: int) -> tuple[object, ...]:
+    """Return the fields of a lease that its decoded clip depends on, and its index."""
+    return (
+        lease.spec, lease.seed, lease.epoch, index, lease.arrays, lease.video, lease.fingerprint, lease.rows,
+        lease.start_frame, lease.thresholds,
+    )  # fmt: skip
 
 
 class Worker:
@@ -198,15 +258,15 @@ class Worker:
                 self._at = lease.lease
                 note(self._logbook, self._at, decodes=True)
                 try:
-                    made: tuple[Frames, Timings] | VideoError | SidecarError = self._make_sample(lease)
+                    made: tuple[Frames, Result] | VideoError | SidecarError = self._make_sample(lease)
                 except (VideoError, SidecarError) as error:
                     made = error
                 note(self._logbook, IDLE)  # not after another exception: it ends the worker, and this lease is to blame
                 now = time.monotonic()
                 if isinstance(made, VideoError | SidecarError):
                     return conversation.on_failure(made, now)
-                frames, timings = made
-                return conversation.on_sample(frames, now, timings)
+                frames, work = made
+                return conversation.on_sample(frames, now, work)
             case _:
                 return []  # Leave
 
@@ -269,8 +329,8 @@ class Worker:
             self._is_confined = True
         return messages
 
-    def _make_sample(self, lease: Lease) -> tuple[Frames, Timings]:
-        """Make a lease's sample and return its message with the timings.
+    def _make_sample(self, lease: Lease) -> tuple[Frames, Result]:
+        """Make a lease's sample; return its message and what it took.
 
         Raises:
             VideoError, SidecarError: its video, or a file beside it, cannot be used.
@@ -306,14 +366,15 @@ class Worker:
             cache=self._clips.said_of_cache(clip) if decoded else "",
             packed=self._is_remote,
         )
-        timings = Timings(
+        work = Result(
+            lease.lease,
             decode_seconds=has_clip - has_room,
             simulate_seconds=has_sample - has_clip,
             handover_seconds=self._handover_seconds + has_room - began,
             memory_bytes=self._memory(has_sample),
         )
         self._handover_seconds = time.monotonic() - has_sample
-        return frames, timings
+        return frames, work
 
     def _memory(self, now: float) -> int:
         """Return the resident memory of this process, bytes, measured at most once a second."""

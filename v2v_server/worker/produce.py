@@ -5,6 +5,7 @@ Server workers and `v2v-simulate` both use this module, so they make equal sampl
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -16,7 +17,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-import v2v_server.worker.labels  # noqa: F401  # registers its arrays
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
 from v2v_protocol.events import EventList
@@ -46,14 +46,52 @@ from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache, Cached
 from v2v_server.video.collect import ClipRequest, Cut
+from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR
 from v2v_server.video.rows import Rows
-from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, simulate
+from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, makes, simulate
 from v2v_server.worker.cleaning import CleanFrames, frame_index, frame_times, most_frames, usable_window, within_rows
-from v2v_server.worker.colour import chroma_cut
 from v2v_server.worker.scene_choice import FlowPlan, crop_weight, plan_flow
 from v2v_server.worker.sidecars import errors_of_sidecar, refused_sidecars, sidecar_files
+
+
+@makes("frames_rgb")
+def frames_rgb(context: SampleContext, out: npt.NDArray[Any]) -> None:
+    """Fill in the delivered frames, [T, 3, H, W]: the grey levels of ``frames`` and the colour of the video."""
+    if context.clip.colour is None:
+        raise VideoError(context.video, None, "was read without its colour")
+    (cells, matrix), cut = context.clip.colour
+    params, size = context.params, out.shape[2:]
+    grey = np.empty((len(out), 1, *size), np.uint8)
+    ARRAY_BUILDERS["frames"](context, grey)
+    # The cut names the delivered frames in ascending order.
+    places = np.unique(context.source[context.target_steps], return_inverse=True)[1]
+    chroma = np.ascontiguousarray(cells).view(np.uint8) ^ 128  # the bits of int8 plus 128
+    rows, columns = cut.places
+    if params.scale == 1.0:
+        columns = np.ascontiguousarray(columns[::-1]) if params.flip else columns
+    else:
+        # Colour differences are not grey levels: the contrast is a factor of them.
+        view = dataclasses.replace(params, contrast=0.0)
+        chroma = np.stack([apply_view(each[:, rows[:, None], columns], view, context.recipe) for each in chroma])
+        rows, columns = (np.arange(side, dtype=np.int64) for side in size)
+    # Import lazily: most workers make no colour.
+    from v2v_server.video.colour.rgb import add_colour, differences_of
+
+    add_colour(grey[:, 0], chroma, places, rows, columns, differences_of(matrix, params.contrast or 1.0), out)
+
+
+def chroma_cut(
+    lease: Lease, params: SampleParams, spec: StreamSpec, frames: CleanFrames, source: npt.NDArray[np.int64]
+) -> ChromaCut:
+    """Return which colour to decode: that of the delivered frames, in the crop."""
+    delivered = np.unique(source[params.ends(spec.recipe)[spec.recipe.first_frame :]])
+    if not frames.stride:
+        delivered = frames.numbers[delivered] - frames.numbers[0]
+    top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
+    window = source_window(params, spec.recipe, usable_window(lease, frames.sides))
+    return ChromaCut(tuple(delivered.tolist()), window, (top, bottom - top))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import CorpusError, UsageError, V2VError
 from v2v_protocol.messages import Hello
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.admission import MOST_BATCH_SIZE, Admission
+from v2v_server.broker.session import MOST_BATCH_SIZE, Admission
 from v2v_server.corpus.scenes.pieces import encoded_pieces
 from v2v_server.corpus.scenes.scene import Flag
 from v2v_server.corpus.videos import CorpusFacts

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from v2v_server.broker.blame import ALONE_AFTER, Cause, Loss, judge, runs_alone
-from v2v_server.broker.leases import Request
+from v2v_server.broker.leases import ALONE_AFTER, Cause, Loss, Request, judge, runs_alone
 
 REQUEST = Request(b"consumer", 3, 7, candidate=2)
 

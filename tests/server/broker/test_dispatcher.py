@@ -41,13 +41,11 @@ from v2v_protocol.recipe import preset
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, LARGEST_REQUEST_BYTES, decode, decode_map, encode
 from v2v_server.broker import dispatcher as dispatcher_module
-from v2v_server.broker import worker_side
 from v2v_server.broker.actions import AddToQuarantine, Disconnect, GiveUp, ToConsumer
-from v2v_server.broker.admission import MOST_BATCH_SIZE, MOST_TABLES
-from v2v_server.broker.blame import Cause, Loss
 from v2v_server.broker.dispatcher import MOST_FAULTS
 from v2v_server.broker.grants import work_seconds
-from v2v_server.broker.session import GONE_SECONDS, SILENT_SECONDS
+from v2v_server.broker.leases import Cause, Loss
+from v2v_server.broker.session import GONE_SECONDS, MOST_BATCH_SIZE, MOST_TABLES, SILENT_SECONDS
 from v2v_server.broker.worker_registry import REST_SECONDS, SILENCE_SECONDS
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.schedule.epoch import MOST_CANDIDATES
@@ -985,7 +983,7 @@ NONSENSE: dict[str, Callable[[], list[Any]]] = {
 
 
 def test_there_is_a_limit_to_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker_side, "MOST_WORKERS", 2)
+    monkeypatch.setattr(dispatcher_module, "MOST_WORKERS", 2)
     at = peers()
     for name in (b"a", b"b", b"c"):
         at.join(name)

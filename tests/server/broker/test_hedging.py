@@ -9,7 +9,7 @@ import pytest
 from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import DEADLINE, Peers, peers
 from v2v_protocol.messages import Lease, LeaseFailed, Result
-from v2v_server.broker.blame import ALONE_AFTER, Cause
+from v2v_server.broker.leases import ALONE_AFTER, Cause
 
 
 def practised() -> tuple[Peers, Lease]:

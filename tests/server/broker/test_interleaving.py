@@ -26,7 +26,7 @@ from v2v_protocol.messages import (
     Unavailable,
 )
 from v2v_protocol.wire import decode_map
-from v2v_server.broker.blame import Cause, runs_alone
+from v2v_server.broker.leases import Cause, runs_alone
 
 _HALF_WRITTEN = (-1, -1, -1)
 
@@ -294,7 +294,7 @@ class Interleaving(RuleBasedStateMachine):
         if at is None:
             return
         book = at.dispatcher.leases
-        for identity in at.dispatcher.registry.identities():
+        for identity in list(at.dispatcher.registry.members()):
             lonely = any(runs_alone(request) for request in book.requests_of(identity))
             assert not lonely or book.held_by(identity) == 1
 

@@ -14,7 +14,7 @@ from tests.server.peers import SMALL_SPEC, Peers, peers
 from v2v_protocol.errors import UsageError
 from v2v_protocol.messages import ErrorCode, Hello
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.blame import Cause
+from v2v_server.broker.leases import Cause
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.rows import Rows

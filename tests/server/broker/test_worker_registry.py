@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.messages import WorkerHello
-from v2v_server.broker.blame import ALONE_AFTER, runs_alone
-from v2v_server.broker.leases import LeaseBook, Request
+from v2v_server.broker.leases import ALONE_AFTER, LeaseBook, Request, runs_alone
 from v2v_server.broker.worker_registry import MOST_WORKER_CREDIT, REST_SECONDS, SILENCE_SECONDS, Workers
 
 DEADLINE = 60.0
@@ -57,7 +56,7 @@ def test_the_registry_starts_empty_and_forgets_removed_workers() -> None:
     table = Table()
     assert (len(table.workers), table.next(), table.workers.for_lone_request()) == (0, None, None)
     table.add(b"a", 1, 0.0)
-    assert (len(table.workers), b"a" in table.workers, table.workers.identities()) == (1, True, [b"a"])
+    assert (len(table.workers), b"a" in table.workers, list(table.workers.members())) == (1, True, [b"a"])
     table.workers.remove(b"a")
     table.workers.remove(b"a")
     assert (len(table.workers), b"a" in table.workers, table.next()) == (0, False, None)

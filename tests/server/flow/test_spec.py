@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import pytest
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.spec import FLOW_METHODS, StreamSpec
+from v2v_protocol.spec import FlowMethod, StreamSpec
 from v2v_server.flow import FlowSettings
 from v2v_server.flow.methods import AUTO, METHODS
 
 
 def test_both_sides_know_the_same_names() -> None:
-    assert (AUTO, *METHODS) == FLOW_METHODS
+    assert (AUTO, *METHODS) == get_args(FlowMethod)
     assert FlowSettings.of(StreamSpec()) == FlowSettings()
 
 

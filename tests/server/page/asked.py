@@ -9,7 +9,7 @@ from typing import Any
 
 from tests.server.status.services import Published
 from v2v_protocol.errors import ServerLost
-from v2v_server.page.guard import App
+from v2v_server.page.app import App
 
 
 @dataclass

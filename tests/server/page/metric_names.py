@@ -6,7 +6,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from tests.server.peers import peers
 from tests.server.status.services import published
-from v2v_server.page.metrics import exposition
+from v2v_server.page.app import exposition
 
 
 def metric_names() -> set[str]:

@@ -11,9 +11,7 @@ import pytest
 from tests.server.page.asked import Answer, FakeClient, ask, asked
 from tests.server.peers import peers
 from tests.server.status.services import Published, published
-from v2v_server.page.app import MOST_STREAMS, make_app
-from v2v_server.page.guard import App
-from v2v_server.page.source import FRESH_SECONDS, Source
+from v2v_server.page.app import FRESH_SECONDS, MOST_STREAMS, App, Source, make_app
 
 
 def app_of(service: Published | None) -> App:

@@ -11,7 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from tests.server.peers import peers
 from tests.server.status.services import published
 from v2v_protocol.messages import Hello
-from v2v_server.page.metrics import exposition
+from v2v_server.page.app import exposition
 from v2v_server.status.parts import meanings_at
 
 

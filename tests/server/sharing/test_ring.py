@@ -14,12 +14,10 @@ from hypothesis import given
 
 from tests.server.peers import frames_of
 from v2v_client.memory.server_memory import open_sample
-from v2v_protocol.arena import ArenaName, Slot
+from v2v_protocol.arena import ArenaName, Slot, open_memory
 from v2v_protocol.messages import SampleHeader
-from v2v_protocol.shared_memory import open_memory
 from v2v_protocol.wire import Frames, decode
-from v2v_server.sharing.memory import mappings
-from v2v_server.sharing.ring import SampleRing
+from v2v_server.sharing.ring import SampleRing, mappings
 from v2v_server.worker.output_buffer import slot_arrays
 
 LAYOUT = {"voxels": ("int8", (3, 5)), "frames": ("uint8", (7,))}
@@ -93,7 +91,7 @@ def test_without_a_descriptor_for_a_mapping_a_sample_is_copied(monkeypatch: pyte
     ring = SampleRing(1 << 20)
     fill(ring, 1, 9)
     sample = ring.add("key", 1, header(), [])
-    monkeypatch.setattr("v2v_protocol.shared_memory.mmap.mmap", refuse)
+    monkeypatch.setattr("v2v_protocol.arena.mmap.mmap", refuse)
     assert read(sample.message(None, is_first=True)) == content(9)
 
 

@@ -14,8 +14,7 @@ from v2v_protocol.wire import decode
 from v2v_server.broker.actions import Action, SendStatus, ToConsumer, ToWorker
 from v2v_server.config import ServeConfig
 from v2v_server.status.parts import Status
-from v2v_server.status.publisher import StatusPublisher
-from v2v_server.status.snapshot import Service, to_json
+from v2v_server.status.snapshot import Service, StatusPublisher, to_json
 
 WALL = "2024-02-29T12:00:00+00:00"
 

@@ -16,12 +16,11 @@ from v2v_protocol.messages import GetStatus, Goodbye, Hello, Result, Want, Worke
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import encode
 from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
-from v2v_server.broker.blame import Cause
+from v2v_server.broker.leases import Cause
 from v2v_server.broker.session import RETURN_SECONDS
 from v2v_server.quarantine.snapshots import QuarantineEntry
 from v2v_server.status.parts import STATUS_VERSION
-from v2v_server.status.publisher import ANSWER_SECONDS
-from v2v_server.status.snapshot import MOST_SHOWN, to_json
+from v2v_server.status.snapshot import ANSWER_SECONDS, MOST_SHOWN, to_json
 
 
 def finish(at: Peers, worker: bytes = b"w", **took: float) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.server.peers import peers
 from tests.server.status.services import published
-from v2v_server.status.text import format_shutdown_summary
+from v2v_server.status.terminal import format_shutdown_summary
 
 
 def test_a_server_that_did_nothing_says_so() -> None:

@@ -20,7 +20,7 @@ from tests.server.status.services import published
 from tests.waiting import until
 from v2v_client.local_server import LocalServer
 from v2v_server.commands.top import main
-from v2v_server.status.top import draw, line
+from v2v_server.status.terminal import draw, line
 
 HOSTILE = "[red]x[/red]\x1b[2J<b>.mp4"
 

@@ -26,10 +26,10 @@ from tests.server.peers import peers
 from tests.server.status.services import published
 from v2v_protocol.messages import Ping
 from v2v_server.page.app import make_app
-from v2v_server.page.source import Source
+from v2v_server.page.app import Source
 from v2v_server.status.terminal import StatusView
-from v2v_server.status.text import format_shutdown_summary
-from v2v_server.status.top import draw
+from v2v_server.status.terminal import format_shutdown_summary
+from v2v_server.status.terminal import draw
 from v2v_server.system.log import Log
 
 at = peers()

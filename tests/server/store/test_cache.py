@@ -30,7 +30,7 @@ from v2v_server.store.cache import Cache, make_cache, piece_frames
 from v2v_server.store.packing import RAW
 from v2v_server.store.quota import used_bytes
 from v2v_server.store.reader import StoreFile
-from v2v_server.worker.decode_cache import Clips
+from v2v_server.worker.process import Clips
 from v2v_server.worker.produce import make_sample
 
 SPEC = StreamSpec(recipe=Recipe(voxels_per_clip=4, bins=5, crop_height_px=24, crop_width_px=32))

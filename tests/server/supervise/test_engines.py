@@ -11,7 +11,7 @@ import pytest
 from v2v_protocol.errors import UsageError
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.supervise.engines import make_pool
+from v2v_server.supervise.pool import make_pool
 
 RAY = {"videos": "videos", "engine": "ray", "worker_bind": "tcp://127.0.0.1:5556"}
 

@@ -17,11 +17,11 @@ import pytest
 
 from tests.waiting import until
 from v2v_protocol.errors import WorkerCrashLoop
-from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.leases import Cause, Loss
 from v2v_server.supervise import child as child_module
 from v2v_server.supervise import local_host as host_module
 from v2v_server.supervise.local_host import LocalHost
-from v2v_server.supervise.pool import Death, Pool
+from v2v_server.supervise.pool import Death, Pool, crash_budget
 from v2v_server.worker.logbook import Logbook, note
 
 SLEEPS = "import time\ntime.sleep(600)"
@@ -167,7 +167,7 @@ def test_a_process_that_the_system_does_not_start_is_tried_again(
     lost = Death(b"label-0.2", Loss(Cause.KILLED, "could not be started: Resource temporarily unavailable"))
     assert pool.watch(2.0, 0) == [lost]
     assert not pool.watches(b"label-0.2")
-    for turn in range(1, pool.crash_budget + 2):  # however often: no worker has crashed
+    for turn in range(1, crash_budget(2) + 2):  # however often: no worker has crashed
         assert len(pool.watch(2.0 + 10.0 * turn, 0)) == 1
     short[0] = False
     assert pool.watch(1e3, 0) == []
@@ -182,7 +182,7 @@ def test_a_system_that_starts_no_process_at_all_ends_in_the_crash_budget(
 
     monkeypatch.setattr(subprocess, "Popen", refuse)
     pool = start(1, SLEEPS)
-    for now in range(pool.crash_budget):
+    for now in range(crash_budget(1)):
         assert len(pool.watch(100.0 * now, 0)) == 1
     with pytest.raises(WorkerCrashLoop, match="could not be started: No such file or directory"):
         pool.watch(1e6, 0)
@@ -400,7 +400,7 @@ def test_the_wait_is_bounded_however_large_the_pool() -> None:
     pool.scale(1000)
     for slot in pool._slots[1:]:
         slot.start_at = float("inf")
-    pool._restarts._deaths_in_a_row = pool.crash_budget - 1
+    pool._restarts._deaths_in_a_row = crash_budget(1000) - 1
     dead = subprocess.Popen([sys.executable, "-S", "-E", "-c", LEAVES])
     dead.wait()
     pool._slots[0].place.process = dead
@@ -412,9 +412,9 @@ def test_the_wait_is_bounded_however_large_the_pool() -> None:
 
 def test_workers_that_only_die_use_up_the_budget(start: Callable[[int, str], Pool]) -> None:
     pool = start(1, LEAVES)
-    assert pool.crash_budget == 7
+    assert crash_budget(1) == 7
     now = 0.0
-    for _ in range(pool.crash_budget):
+    for _ in range(crash_budget(1)):
         pool.watch(now, 0)
         all_dead(pool)
         assert len(pool.watch(now, 0)) == 1
@@ -428,7 +428,7 @@ def test_workers_that_only_die_use_up_the_budget(start: Callable[[int, str], Poo
 def test_any_finished_sample_forgives(start: Callable[[int, str], Pool]) -> None:
     pool = start(1, SLEEPS)
     now = 0.0
-    for samples in range(2 * pool.crash_budget):
+    for samples in range(2 * crash_budget(1)):
         pool.watch(now, samples)
         kill_one(pool)
         # The first death after progress waits the shortest time again.

@@ -12,8 +12,7 @@ pytest.importorskip("ray", reason="the extra 'ray' is not installed")
 
 from v2v_server.supervise import ray_host
 from v2v_server.supervise.pool import Pool
-from v2v_server.supervise.ray_actor import ActorStatus, RayWorker
-from v2v_server.supervise.ray_host import WORKER_BYTES, RayHost
+from v2v_server.supervise.ray_host import WORKER_BYTES, ActorStatus, RayHost, RayWorker
 
 _BUNDLE = {"CPU": 1.0, "memory": float(WORKER_BYTES)}
 

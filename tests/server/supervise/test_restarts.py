@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from v2v_protocol.errors import WorkerCrashLoop
-from v2v_server.broker.blame import Cause, Loss
-from v2v_server.supervise.restarts import Restarts, crash_budget
+from v2v_server.broker.leases import Cause, Loss
+from v2v_server.supervise.pool import Restarts, crash_budget
 
 LOSS = Loss(Cause.CRASHED, "was ended by SIGSEGV")
 

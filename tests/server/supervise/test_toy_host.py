@@ -8,11 +8,10 @@ import pytest
 
 from tests.server.supervise.toy_host import ToyHost
 from v2v_server import config
-from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.supervise.engines import make_pool
-from v2v_server.supervise.pool import Death, Pool
+from v2v_server.supervise.pool import Death, Pool, make_pool
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import signal
 from collections.abc import Sequence
 from typing import Any
 
-from v2v_server.broker.blame import Cause, Loss
+from v2v_server.broker.leases import Cause, Loss
 from v2v_server.supervise.host import Exit, ProcessStatus
 
 

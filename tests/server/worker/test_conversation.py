@@ -108,7 +108,7 @@ class Talk:
         """It makes that lease's sample."""
         assert self.step == Make(lease(number))
         self.now += seconds
-        self._take(self.conversation.on_sample(frames, self.now))
+        self._take(self.conversation.on_sample(frames, self.now, Result(0)))
         return self.said()
 
     def fails(self, number: int, error: VideoError = FAILURE) -> list[Message]:

@@ -34,7 +34,7 @@ from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.planes.detail import detail_of, levels_of
 from v2v_server.tradeoff.accuracy import Places, seen, simulated
 from v2v_server.video.luma import Signal, range_table
-from v2v_server.worker.decode_cache import Clips
+from v2v_server.worker.process import Clips
 from v2v_server.worker.produce import make_sample
 
 SDR = preset("noise-free").replace(

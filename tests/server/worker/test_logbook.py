@@ -116,14 +116,31 @@ def test_what_the_pool_cannot_open_is_no_arena(book: Logbook) -> None:
     name = name_of(arena)
     unknown = ArenaName(name.pid, name.descriptor, name.slots, "0" * 32)
     gone = ArenaName(name.pid, 65_000, name.slots, name.token)
-    for each in (str(unknown), str(gone), "no arena"):
-        book.lend(each)
+    for each in (unknown, gone):
+        book.lend(str(each))
         with pytest.raises(FileNotFoundError):
-            take_arena(book.arenas, name, True)
+            take_arena(book.arenas, each, True)
     book.lend(str(name))
     assert not write(book, Slot(str(ArenaName(name.pid, name.descriptor, 3000, name.token)), 1), 5)  # another size
     with pytest.raises(ProtocolError):
-        ArenaName.parse("no arena")
+        book.lend("no arena")
+
+
+@needs_memfd
+def test_an_arena_that_is_gone_costs_only_its_own_lease(book: Logbook) -> None:
+    """The lease before was not worked on, so what the pool said about its arena comes first."""
+    arena = Arena(LAYOUT, 2)
+    book.lend("1:65000:2:" + "0" * 32)
+    book.lend(str(name_of(arena)))
+    assert write(book, arena.slot(0), 7)
+    assert holds(arena, 7)
+
+
+def test_an_ended_pool_lends_nothing(book: Logbook) -> None:
+    with book.arenas.dup() as arenas:
+        book.close()
+        with pytest.raises(FileNotFoundError):
+            take_arena(arenas, ArenaName(1, 1, 1, "0" * 32), True)
 
 
 def test_a_worker_that_does_not_read_stops_no_pool(book: Logbook) -> None:

@@ -14,7 +14,7 @@ from v2v_protocol.messages import Begun, Denied, ErrorCode, Goodbye, Hello, Leas
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.blame import ALONE_AFTER, Cause
+from v2v_server.broker.leases import ALONE_AFTER, Cause
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.offline import remake as remake_module
 from v2v_server.offline.remake import remake

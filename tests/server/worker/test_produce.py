@@ -26,7 +26,7 @@ from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_e
 from v2v_server.quarantine.snapshots import QuarantineEntry
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.worker import decode_cache as clips
+from v2v_server.worker import process as clips
 from v2v_server.worker import produce
 from v2v_server.worker.produce import Decoded, decode_for, make_sample
 
