@@ -59,8 +59,6 @@ BARS = {
     "exact, dense": 25.0,
     "exact, dense-12": 20.0,
     "exact, fast": 25.0,
-    "exact, h264": 11.0,
-    "fast, h264": 20.0,
 }
 LIMIT_BARS = {"exact, source": 0.9}  # Least share of the decode limit of the same corpus, by the clock
 
@@ -226,7 +224,7 @@ def missed(records: Sequence[Record]) -> list[str]:
 def _prepared(text: str) -> Corpus:
     name, equals, folder = text.partition("=")
     if not equals or not name or not folder:
-        raise argparse.ArgumentTypeError(f"{text}: write NAME=DIR, for example h264=prepared/")
+        raise argparse.ArgumentTypeError(f"{text}: write NAME=DIR, for example dense=prepared/")
     return Corpus(name, Path(folder), "full")
 
 

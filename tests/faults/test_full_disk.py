@@ -206,7 +206,7 @@ def test_preparing_files_that_cannot_be_written(source: Path, tmp_path: Path, ca
 def test_preparing_onto_a_full_disk(source: Path, tmp_path: Path, cache: Path, room: str) -> None:
     disk, after = tmp_path / "disk", tmp_path / "after"
     disk.mkdir()
-    size, filler = {"nothing": (64, 64), "a manifest": (64, 60), "some videos": (84, 4)}[room]
+    size, filler = {"nothing": (64, 64), "a manifest": (64, 60), "some videos": (400, 4)}[room]
     # Without the free space that it keeps for others, which would end it before the disk is full.
     program = (
         "from v2v_server.prepare import prepare; prepare.LEAST_FREE_BYTES = -(1 << 40); "

@@ -229,6 +229,7 @@ def _whole_picture(catalogue: Catalogue, provenance: Provenance, recipe: Recipe)
     cut = Cut(1, (top, 0, bottom - top, index.width_px))
     most_bits = None if recipe.light == "sdr" else SDR.bits
     with catalogue.source.open_pixels(provenance.video, provenance.fingerprint) as pixels:
+        pixels.check(provenance.fingerprint)
         (clip,) = pixels.clips(ClipRequest(index, provenance.start_frame, (cut,), most_bits=most_bits))
     picture: npt.NDArray[np.uint8] = tone_table(recipe.gamma, clip.signal)[clip.frames[0]]
     return picture

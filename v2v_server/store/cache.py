@@ -152,7 +152,7 @@ class Cache:
             for piece in pieces:
                 try:
                     files.append(opened.enter_context(StoreFile(piece.path, fingerprint)))
-                    files[-1].require(piece.first, piece.end)
+                    files[-1].require(piece.first, piece.end, request.usable)
                 except VideoUnreadable as error:
                     if not isinstance(error.__cause__, FileNotFoundError):
                         self.trouble = error.reason

@@ -243,14 +243,16 @@ class StoreFile(BlockReader):
         if made_of != fingerprint:
             raise VideoChanged(self._path, None, f"was made from another file: {made_of} instead of {fingerprint}")
 
-    def require(self, first: int, end: int) -> None:
-        """Check that the file holds frames ``first`` .. ``end`` - 1.
+    def require(self, first: int, end: int, usable: Window) -> None:
+        """Check that the file holds frames ``first`` .. ``end`` - 1 of a usable picture.
 
         Raises:
             VideoError: it does not.
         """
-        if not self.head.first <= first < end <= self.head.first + self.head.count:
-            raise VideoError(self._path, None, f"holds no frames {first} to {end}, but {self.head.count}: {_REMEDY}")
+        head = self.head
+        is_there = head.first <= first < end <= head.first + head.count
+        if not is_there or usable != (head.top, 0, head.rows, head.width_px):
+            raise VideoError(self._path, None, f"holds other frames or rows than its name says: {head}"[:200])
 
     def clips(self, request: ClipRequest) -> tuple[DecodedClip, ...]:
         """Read the cuts of a request, see :func:`read_clips`."""

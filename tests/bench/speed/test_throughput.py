@@ -11,14 +11,14 @@ import pytest
 from bench.speed import throughput
 from bench.speed.throughput import Contender, Corpus, Measured, line_up
 
-SOURCE, MADE = Corpus("source", Path("a"), "full"), Corpus("h264", Path("b"), "full")
+SOURCE, MADE = Corpus("source", Path("a"), "full"), Corpus("fast store", Path("b"), "full")
 
 
 def test_every_corpus_has_its_limit_and_the_baseline_comes_first() -> None:
     labels = [contender.label for contender in line_up(SOURCE, [MADE], ["fast", "exact"])]
     assert labels == [
         "released, source", "decode, source", "exact, source", "fast, source",
-        "decode, h264", "exact, h264", "fast, h264",
+        "decode, fast store", "exact, fast store", "fast, fast store",
     ]  # fmt: skip
 
 
