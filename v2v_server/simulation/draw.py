@@ -323,9 +323,10 @@ def _in_range(ends: Range, raw: int) -> float:
 
 
 def _effect(recipe: Recipe, name: str, raw: int) -> float:
-    low, high = getattr(recipe, name)
+    ends: Range = getattr(recipe, name)
+    low, high = ends
     if low == high or name not in recipe.log_drawn:
-        return _in_range((low, high), raw)
+        return _in_range(ends, raw)
     value, root = low, high / low
     for bit in range(63, 39, -1):
         root = math.sqrt(root)
