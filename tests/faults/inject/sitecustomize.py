@@ -37,12 +37,13 @@ def _act(fault: dict, video: str) -> None:
 
 
 def _install(fault: dict) -> None:
-    from v2v_server.worker import arrays, produce
+    from v2v_server.store.video_file import VideoFile
+    from v2v_server.worker import arrays
     from v2v_server.worker import decode_cache as clips
     from v2v_server.worker import process as worker
 
     at = {"video": ""}
-    decode_for, clips_of, simulate_clip = clips.decode_for, produce.clips_of, arrays.simulate_clip
+    decode_for, clips_of, simulate_clip = clips.decode_for, VideoFile.clips, arrays.simulate_clip
     sample_message, confine = worker.sample_message, worker.confine
     folder = Path(fault.get("once", "/nowhere")).parent
     # A confined worker may write to no folder but its cache.
@@ -61,7 +62,7 @@ def _install(fault: dict) -> None:
         return call
 
     clips.decode_for = decoding
-    produce.clips_of = before("decode", clips_of)
+    VideoFile.clips = before("decode", clips_of)
     arrays.simulate_clip = before("simulate", simulate_clip)
     worker.sample_message = before("send", sample_message)
 
