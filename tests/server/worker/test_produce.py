@@ -212,11 +212,24 @@ def test_a_damaged_index_costs_its_video_only(catalogue: Catalogue, lease: Lease
         decode_for(dataclasses.replace(lease, frame_index=damaged), lease.indices, catalogue.source)
 
 
-@pytest.mark.parametrize("file", ["sample", "sample.npz", "sample.mp4"])
-def test_a_sample_lies_where_it_is_said_to(
-    file: str, catalogue: Catalogue, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def _simulated(catalogue: Catalogue, folder: Path, file: str) -> int | None:
+    """Simulate one sample with the command; return its exit status."""
     recipe = [f"--set={name}={value}" for name, value in SMALL_SPEC.recipe.to_dict().items() if name in CHANGED]
-    simulate([str(catalogue.folder / "a.mp4"), f"--out={tmp_path / file}", f"--cache-dir={tmp_path}", *recipe])
+    return simulate([str(catalogue.folder / "a.mp4"), f"--out={folder / file}", f"--cache-dir={folder}", *recipe])
+
+
+def test_a_sample_lies_where_it_is_said_to(
+    catalogue: Catalogue, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _simulated(catalogue, tmp_path, "sample.npz") == 0
     with np.load(capsys.readouterr().out.split("written to ")[1].strip()) as content:
         assert sorted(content) == ["frames", "provenance", "voxels"]
+
+
+@pytest.mark.parametrize("file", ["sample", "sample.mp4"])
+def test_a_sample_gets_no_name_of_another_kind(
+    file: str, catalogue: Catalogue, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _simulated(catalogue, tmp_path, file) == 2
+    assert f"{file}: unknown ending; give a name that ends in .npz" in capsys.readouterr().err
+    assert not (tmp_path / file).exists()
