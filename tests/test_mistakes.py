@@ -125,7 +125,7 @@ def test_an_output_never_destroys_an_input(
 ) -> None:
     # Root may write anywhere, so the check itself is asked.
     access = import_module("os").access
-    monkeypatch.setattr("os.access", lambda path, how: Path(path).name != "locked.png" and access(path, how))
+    monkeypatch.setattr("os.access", lambda path, how, **_: Path(path).name != "locked.png" and access(path, how))
     before = contents(desk)
     said = answer(line, capsys)
     assert [word for word in words if word not in said] == [], said

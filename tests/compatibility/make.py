@@ -3,9 +3,10 @@
     python -m tests.compatibility.make
 
     numerics-N   a folder of videos with its index, store and cache; a recipe, a state, a checkpoint
-    planes-N     the same of videos with colour, deep light, motion, scenes and labels
+    planes-N-A   the same of videos with colour, deep light, motion, scenes and labels
 
-A fixture is made once for each ``NUMERICS_VERSION``, with the release that first has it, and is never rewritten.
+A fixture is made once for each ``NUMERICS_VERSION`` N, and one of planes for each ``ANALYSIS_VERSION`` A, with the
+release that first has it, and is never rewritten.
 ``test_compatibility.py`` reads all of them.
 """
 
@@ -36,12 +37,13 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol import NUMERICS_VERSION, __version__
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.refresh import index_path
+from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION
 from v2v_server.prepare.prepare import prepare
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.video.rows import Rows
 
 FOLDER = Path(__file__).parent / f"numerics-{NUMERICS_VERSION}"
-PLANES = Path(__file__).parent / f"planes-{NUMERICS_VERSION}"
+PLANES = Path(__file__).parent / f"planes-{NUMERICS_VERSION}-{ANALYSIS_VERSION}"
 RECIPE_FIELDS = {
     "preset": "paper", "voxels_per_clip": 2, "crop_height_px": 24, "crop_width_px": 24, "noise_sigma": [0.0, 0.05],
 }  # fmt: skip
@@ -178,6 +180,7 @@ def _make_planes(scratch: Path) -> Path:
         expected = {
             "release": __version__,
             "numerics_version": NUMERICS_VERSION,
+            "analysis_version": ANALYSIS_VERSION,
             "catalogue_digest": catalogue.digest,
             "scene_digest": catalogue.scene_digest,
             "streams": streams,

@@ -2,8 +2,9 @@
 
 Each folder ``numerics-N`` was written by ``make.py`` with the release that first had ``NUMERICS_VERSION`` N. The
 present version must give the bytes of the fixture. A state or checkpoint of an earlier version is refused by number;
-stores, caches, indexes and recipes of earlier versions go on. Folders ``planes-N`` are of videos with colour, deep
-light, motion, scenes and labels.
+stores, caches, indexes and recipes of earlier versions go on. Folders ``planes-N-A`` are of videos with colour, deep
+light, motion, scenes and labels; a release with another ``ANALYSIS_VERSION`` analyses the scenes again, and its streams
+with scenes begin again.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from v2v_server.corpus import refresh
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.index.file import SCHEMA_VERSION
 from v2v_server.corpus.scenes.analysis import SceneAnalysis
+from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION
 from v2v_server.store.cache import Cache
 from v2v_server.video.rows import Rows
 
@@ -69,6 +71,10 @@ def is_present(fixture: Path) -> bool:
     return bool(expected(fixture)["numerics_version"] == NUMERICS_VERSION)
 
 
+def has_same_analysis(planes: Path) -> bool:
+    return expected(planes)["analysis_version"] == ANALYSIS_VERSION
+
+
 def digests(videos: Path, *flags: str, fixture: Path, state: Any = None) -> list[str]:
     batches = stream(videos, *flags, recipe=fixture / "recipe.yaml", state=state)
     return [digest for batch in batches for digest in sample_digests(batch)]
@@ -76,7 +82,7 @@ def digests(videos: Path, *flags: str, fixture: Path, state: Any = None) -> list
 
 def test_there_are_fixtures_of_the_present_version() -> None:
     assert f"numerics-{NUMERICS_VERSION}" in [path.name for path in FIXTURES]
-    assert f"planes-{NUMERICS_VERSION}" in [path.name for path in PLANES]
+    assert f"planes-{NUMERICS_VERSION}-{ANALYSIS_VERSION}" in [path.name for path in PLANES]
 
 
 def test_a_recipe_keeps_its_digest(fixture: Path) -> None:
@@ -179,25 +185,32 @@ def test_planes_give_the_bytes_of_the_release_that_wrote_them(planes: Path) -> N
         rows = PLANE_ROWS if folder == "videos" else None
         with closing(open_catalogue(planes / folder, rows=rows, cache_dir=planes, scene=True, processes=0)) as opened:
             assert plane_digests(opened, kept) == was["streams"], (folder, kept)
-            assert (opened.digest, opened.scene_digest) == (was["catalogue_digest"], was["scene_digest"])
+            assert opened.digest == was["catalogue_digest"]
+            assert (opened.scene_digest == was["scene_digest"]) == has_same_analysis(planes)
     assert pieces
     assert {path: path.stat().st_mtime_ns for path in planes.glob("cache/??/*")} == pieces
 
 
-def test_scenes_in_an_index_are_taken_over(planes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scenes_in_an_index_are_taken_over_or_analysed_again(planes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cache, version = taken_over(planes)
-    monkeypatch.setattr(SceneAnalysis, "add", None)
-    assert version == SCHEMA_VERSION
+    is_present = version == SCHEMA_VERSION and has_same_analysis(planes)
+    if is_present:
+        monkeypatch.setattr(SceneAnalysis, "add", None)
     with closing(
         open_catalogue(planes / "videos", rows=PLANE_ROWS, cache_dir=cache, scene=True, processes=0)
     ) as catalogue:
-        assert catalogue.scene_digest == expected(planes)["scene_digest"]
+        assert (catalogue.scene_digest == expected(planes)["scene_digest"]) == is_present
+        assert plane_digests(catalogue, None) == expected(planes)["streams"]
 
 
 @pytest.mark.slow
-def test_a_state_with_labels_and_scenes_continues(planes: Path) -> None:
+def test_a_state_with_labels_and_scenes_continues_or_is_refused(planes: Path) -> None:
     was, state = expected(planes)["labelled"], json.loads((planes / "state.json").read_text())
     with LocalServer(planes / "videos", workers=1, flags=STREAM_FLAGS) as server:
+        if not has_same_analysis(planes):
+            with pytest.raises(StateMismatch, match="so does a release that analyses scenes in another way"):
+                labelled(server.address, state)
+            return
         batches = labelled(server.address, state)
     found = [digest(batch.arrays[name].numpy()) for batch in batches for name in batch.arrays]
     assert found == was[len(batches[0].arrays) :]

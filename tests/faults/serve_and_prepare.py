@@ -31,7 +31,7 @@ def main(clips: Path, folder: Path) -> None:
         epoch = [digest(batch) for batch in epoch_of(server.address)]
         said = server.last_lines()
     prepare = [sys.executable, "-m", "v2v_server.commands.prepare", str(clips), str(folder / "prepared")]
-    settings = ["--codec", "h264", "--workers", "2", "--cache-dir", str(folder / "another cache"), "--floor", "0"]
+    settings = ["--workers", "2", "--cache-dir", str(folder / "another cache")]
     status = subprocess.run([*prepare, *settings], stdout=subprocess.DEVNULL, check=False).returncode
     print(json.dumps({"lock": lock, "epoch": epoch, "prepared": status, "said": said}))
 

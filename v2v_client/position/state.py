@@ -82,7 +82,8 @@ class StreamIdentity:
         remedies = {
             "numerics_version": "serve with the release that the state was saved with",
             "spec_digest": "ask for the recipe and options that were saved",
-            "catalogue_digest": "serve the same folder of videos (added, removed or changed files alter it)",
+            "catalogue_digest": "serve the same folder of videos (added, removed or changed files alter it; "
+            "with scenes, so does a release that analyses scenes in another way)",
             "sequences": "serve the same folder of videos",
             "sidecars": "request the same arrays, and serve the same files beside the videos",
         }
