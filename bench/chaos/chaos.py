@@ -164,6 +164,7 @@ def add_flags(parser: Parser) -> None:
     add_positive(parser, "--every", 3.5, "mean time between faults, seconds")
     parser.add_argument("--faults", metavar="KIND,KIND", help=f"only these kinds, of {', '.join(WEIGHTS)}")
     parser.add_argument("--cache", action="store_true", help="keep decoded clips, and damage them")
+    parser.add_argument("--share", action="store_true", help="make equal samples once for all consumers")
     parser.add_argument("--keys", action="store_true", help="require keys: all connections are encrypted")
     add_whole(parser, "--remakes", 300, "samples to make again and compare")
     add_whole(parser, "--seed", 0, "of the faults", least=0)
@@ -176,7 +177,7 @@ def measure(asked: argparse.Namespace) -> Report:
         cache = folder / "decoded" if asked.cache else None
         fleet = Fleet(
             folder / "run", videos, asked.workers, asked.consumers, LEASE_SECONDS, clip_cache=cache,
-            keyed=asked.keys,
+            keyed=asked.keys, server_flags=("--share-gib", "0.25") if asked.share else (),
         )  # fmt: skip
         # Two SIGSEGVs quarantine a video: one video must remain.
         most_segv = sum(path.suffix.lower() in VIDEO_SUFFIXES for path in videos.rglob("*")) - 1

@@ -22,8 +22,8 @@ from v2v_protocol.errors import V2VError
 from v2v_protocol.write_aside import write_aside_and_rename
 
 _SMALL = {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}
-# Small samples in large numbers, the paper's 40 voxel grids of 128 x 128, and a slow consumer of siblings, colour and
-# labels.
+# Small samples in large numbers, the paper's 40 voxel grids of 128 x 128, and a slow consumer of siblings, sub-steps,
+# colour and labels.
 PROFILES = (
     Profile({"recipe": _SMALL, "max_sequences_per_video": 100}, seed=1, batch_size=4, think_seconds=0.02, save_every=5),
     Profile({"recipe": {"preset": "paper"}}, seed=2, batch_size=1),
@@ -33,6 +33,7 @@ PROFILES = (
             "voxel_dtype": "int16",
             "samples_per_decode": 3,
             "sibling_spacing": 3,
+            "substep_px": 0.5,
         },
         seed=2**63 + 5,
         batch_size=3,
