@@ -379,7 +379,7 @@ def test_a_server_whose_words_were_lost_is_asked_again(tmp_path: Path, sockets: 
 
 
 def test_a_folder_without_keys_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no keys in .*: create them with v2v-keys init --dir"):
+    with pytest.raises(UsageError, match=r"no keys in .*: create them with v2v-keys init --dir"):
         Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*", keys=KeyFolder(tmp_path))
 
 
