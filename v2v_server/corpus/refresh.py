@@ -69,7 +69,7 @@ def refresh_index(
             "probes every video again. Make room or give write access, delete the file if it is damaged, or choose "
             "another place with V2V_CACHE_DIR"
         )
-        if notice is not None:
+        if notice is not None and "locked" in str(error):  # the outcome of a wait that was said
             notice(f"the catalogue's index {path} cannot be used ({error}): probing every video again", is_urgent=True)
         return *_refreshed(None, source, ids, scenes, processes, progress, notice), [note]
     if store.replaced_version is None:
