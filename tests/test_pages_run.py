@@ -19,7 +19,7 @@ from tests.clips import panned_luma, write_clip
 from tests.test_commands import MODULES, ROOT
 
 VIDEOS = ("my.mp4", "VIDEO", "bigbuckbunny.mp4")
-FOLDERS = ("DIR", "CLIPS", "CORPUS", "webvid10k", "my-videos", "clips")
+FOLDERS = ("smaller", "DIR", "CLIPS", "CORPUS", "webvid10k", "my-videos", "clips")
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob("docs/guides/*.md"))]
 SMALLER = {
     "v2v-preview": ["--seeds", "1"],
