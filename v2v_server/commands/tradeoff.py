@@ -72,7 +72,7 @@ def _parser() -> Parser:
     )  # fmt: skip
     work.add_argument(
         "--budget-minutes", type=float, default=8.0, metavar="X",
-        help="time for everything (default 8): forms that do not fit are left out, then places, then rounds; "
+        help="minutes for everything (default 8): forms that do not fit are left out, then places, then rounds; "
         "the source, one place and one round are always measured",
     )  # fmt: skip
     wishes = parser.group("Wish")
