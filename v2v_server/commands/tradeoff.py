@@ -100,7 +100,7 @@ def _check(asked: argparse.Namespace) -> None:
     asked.forms = [name.strip() for name in asked.forms.split(",")]
     for name in asked.forms:
         if name not in STORES:
-            raise UsageError(f"--forms {name!r}: choose one of {', '.join(STORES)}")
+            raise UsageError(f"--forms {name!r}: choose from {', '.join(STORES)}")
 
 
 def _run(asked: argparse.Namespace) -> int:
