@@ -1,4 +1,4 @@
-"""What is not served of a file is said: a last picture that is cut short, other sizes and tracks, other levels."""
+"""Test that a remark names what is not served: a last picture that is cut short, other sizes, tracks and levels."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from v2v_server.corpus.sources.source import VideoSource
 
 LARGEST_FILE_BYTES, MOST_BYTES, MOST_FILES, MOST_FOLDERS = 4 << 30, 64 << 30, 1 << 20, 1 << 12
-"""Limits of one sidecar, which is otherwise not read."""
+"""Limits of one sidecar. A larger one is not read."""
 MOST_LENT_BYTES = 256 << 20
 """Limit of the files of a folder that one clip needs: they are held in memory."""
 _BLOCK_BYTES = 1 << 20
