@@ -167,7 +167,7 @@ def chosen(text: str | None, possible: Iterable[str], flag: str) -> tuple[str, .
     """
     words = tuple(possible) if text is None else tuple(text.split(","))
     if unknown := set(words) - set(possible):
-        raise UsageError(f"{flag} {','.join(sorted(unknown))}: choose of {', '.join(possible)}")
+        raise UsageError(f"{flag} {','.join(sorted(unknown))}: choose from {', '.join(possible)}")
     return words
 
 

@@ -41,7 +41,7 @@ def main() -> int:
         "--picture", required=True, metavar="FILE.png", help="PNG to write; training.png and training/ go next to it"
     )
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=10.0, help="duration of streaming without training")
+    parser.add_argument("--seconds", type=float, default=10.0, help="seconds to stream without training")
     parser.add_argument("--training-seconds", type=float, default=60.0)
     arguments = parser.parse_args()
     picture = Path(arguments.picture)

@@ -50,7 +50,7 @@ def _wait_for_feeders() -> None:
 def _send_error(queue: Any, error: Exception, unsent: Any) -> None:
     """Send the error in place of a batch, before all that was queued after it. Called by the queue's thread."""
     if get_worker_info() is None or not (isinstance(unsent, tuple) and type(unsent[0]) is int and len(unsent) == 2):
-        _print_error(error, unsent)  # another queue's
+        _print_error(error, unsent)  # of another queue
         return
     number, batch = unsent
     refusal = UsageError(

@@ -1,9 +1,9 @@
 """Name, create and open the memory that a consumer shares with the workers of its own host. I/O, Linux.
 
 A consumer keeps an *arena*, an anonymous file in memory (memfd_create(2)), for each batch that it fills. With each
-sample that it requests it names a *slot* of the arena, the batch's row. A worker that can open the arena makes the
-sample there and sends only the header. A worker on another host or of another user sends the arrays in the message. The
-consumer does not need to know which it is.
+sample that it requests it names a *slot* of the arena, the batch's row. A worker that can open the arena, or gets
+its descriptor from the server, makes the sample there and sends only the header. Any other worker sends the arrays in
+the message. The consumer does not need to know which it is.
 
 An arena must not be reused too early: a worker that was given up may resume and write. So
 

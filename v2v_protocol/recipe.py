@@ -140,7 +140,7 @@ class Recipe:
     start: str = word(
         "uniform", STARTS,
         "residual of each pixel at the start of a clip, between its thresholds: uniform, as in the paper's code; "
-        "triangular, as in a camera that has run for long; zero, as if each pixel had just fired",
+        "triangular, as in a camera that has run for a long time; zero, as if each pixel had just fired",
     )  # fmt: skip
     noise_sigma: Range = span(
         (0.0, 0.1), 0.0, 1e6, "standard deviation of the noise, per frame, or per square root of a second",
@@ -156,8 +156,8 @@ class Recipe:
 
     rate_draw: str = word(
         "uniform", ("uniform", "log"),
-        "draw effects in Hz uniformly from their range, or uniformly in the logarithm (as many below 1 as above 1 of "
-        "0.1 to 10)",
+        "draw effects in Hz uniformly from their range, or uniformly in its logarithm: from 0.1 to 10, half of the "
+        "draws are below 1",
     )  # fmt: skip
     threshold_mismatch_sigma: Range = span(
         (0.0, 0.0), 0.0, 1.0, "standard deviation of each pixel's thresholds, as a share of the nominal ones",
@@ -194,8 +194,8 @@ class Recipe:
             low, high = getattr(self, name)
             if low == 0.0 < high:
                 raise RecipeError(
-                    f"recipe {name} = {format_value((low, high))}: a range that is drawn in its logarithm begins above "
-                    "0: raise its lower end, or set rate_draw to uniform"
+                    f"recipe {name} = {format_value((low, high))}: a range that is drawn in its logarithm must begin "
+                    "above 0: raise its lower end, or set rate_draw to uniform"
                 )
         if not self.is_timed and self.frames_needed > _LARGEST_FRAMES:
             raise RecipeError(

@@ -222,7 +222,7 @@ class Provenance:
         left_out: effects of the draw that were not simulated (``tolerance`` of the spec); the others were.
         substeps: parts that the clip's steps were divided into along the motion, undivided steps included; 0: the spec
             states no ``substep_px``, so no motion was used.
-        remark: what is not served of the video, or not as it is meant; empty for most.
+        remark: what of the video is not served, or served with wrong grey levels; empty for most.
     """
 
     id: SampleId

@@ -115,7 +115,7 @@ def check_output(
 
 def _input_reason(path: Path, inputs: Iterable[str | os.PathLike[str]]) -> str:
     """Return why a resolved path is an input; "" if it is none."""
-    from v2v_protocol.sample import ARRAYS, sidecar_endings  # takes NumPy, which a command's --help does without
+    from v2v_protocol.sample import ARRAYS, sidecar_endings  # lazily: it loads NumPy, which --help does not need
 
     labels = sidecar_endings(tuple(ARRAYS))
     if path.name.endswith(labels) or any(f"{each.name}/".endswith(labels) for each in path.parents):

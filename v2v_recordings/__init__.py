@@ -1,7 +1,7 @@
 """Read recordings of event cameras, form by form.
 
 items.py         what readers yield: sensor size, chunks of events, pictures, flow
-reading.py       a recording of any form, its size checked, its clock made one
+reading.py       detects the form of a recording, checks its size, puts its events on one clock
 forms.py         the known forms, and which of them a path has
 ijrr.py          IJRR: text and PNGs in a zip or folder; or one text file
 evaid.py         EVAID-R: text and pictures in a zip or folder

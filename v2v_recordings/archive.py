@@ -49,7 +49,7 @@ class Archive:
                 self._zip = zipfile.ZipFile(path)
             except (OSError, zipfile.BadZipFile) as error:
                 raise UsageError(
-                    f"{path} is neither a folder nor a complete zip file: {error}; if it was cut, load it again"
+                    f"{path} is neither a folder nor a complete zip file: {error}; if it was cut, download it again"
                 ) from error
             found = {entry.filename: entry.file_size for entry in self._zip.infolist() if not entry.is_dir()}
         self.bytes_of = {name: size for name, size in found.items() if not posixpath.basename(name).startswith("._")}

@@ -162,7 +162,7 @@ def _header(path: Path) -> bytes:
 
 
 def _clock(path: Path, word: np.dtype[Any], begin: int) -> tuple[int, list[int]]:
-    """Return the first (upper bits of a) time, us, and the bytes at which the time steps back and does not go round."""
+    """Return the first (upper bits of a) time, us, and the bytes at which it steps back without wrapping around."""
     bits = 32 if word == DAT_WORD else 8 * word.itemsize - 4
     unit_us, first, last, resets = TIME_HIGH_US[word.itemsize], 0, None, list[int]()
     for start in range(begin, path.stat().st_size, LOOKED_THROUGH_WORDS * word.itemsize):
@@ -183,7 +183,7 @@ def _clock(path: Path, word: np.dtype[Any], begin: int) -> tuple[int, list[int]]
 def _parts(path: Path, edges: list[int], folder: Path) -> Iterator[Path]:
     """Yield the file; or, if the sensor's clock is reset in it, a file in ``folder`` for each stretch of one clock.
 
-    faery takes a clock that steps back for one that went round.
+    faery takes a clock that steps back for one that wrapped around.
 
     Args:
         edges: bytes at which the stretches begin; the header is before the first.

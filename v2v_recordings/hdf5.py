@@ -77,7 +77,7 @@ def events(
         listed = ", ".join(" x ".join(map(str, shape)) for shape in shapes)
         raise UsageError(
             f"{where}: columns of {', '.join(columns)} have {listed} entries of {', '.join(map(str, dtypes))}; they "
-            "must be numbers, as many in each; x and y must be integers"
+            "must be numbers, equally many; x and y must be integers"
         )
     (count,) = shapes[0]
     for start in range(0, count, READ_EVENTS):

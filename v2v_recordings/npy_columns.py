@@ -86,8 +86,8 @@ class _Column:
             raise UsageError(f"{where} is not an array of NumPy: {error}") from error
         count, *row = shape or (1,)
         if (number is not None and row != [2]) or (is_fortran and number is None and len(shape) > 1):
-            order = " in the order of Fortran" if is_fortran else ""
-            raise UsageError(f"{where} is {list(shape)}{order}: save events_xy as [N, 2], and others in the order of C")
+            order = " in Fortran order" if is_fortran else ""
+            raise UsageError(f"{where} is {list(shape)}{order}: save events_xy as [N, 2], and others in C order")
         self._stream, self._begin = stream, stream.tell()
         if is_fortran and number is not None:  # columns lie one after the other
             self._begin += number * count * self.dtype.itemsize

@@ -1,4 +1,4 @@
-"""Read a recording of any form: its form is found, its size checked, and its events are on one clock.
+"""Read a recording of any form: detect the form, check the size, and put all events on one clock.
 
 Events may be out of order: sensors send rows and packets late. A clock that is set back looks similar at first. The
 difference is how it ends. Late events end with a jump back to where the time was; after a reset, the time goes on from
@@ -66,12 +66,11 @@ class _Clock:
         self._has_others, self._reset = False, ""
 
     def check(self, is_timed: bool) -> None:
-        """Check that pictures and fields, which have times too, do not meet a reset."""
+        """Refuse pictures and flow fields in a recording whose clock was reset: they have times too."""
         self._has_others |= is_timed
         if self._has_others and self._reset:
             raise UsageError(
-                f"{self._path}: {self._reset}, and which of its pictures are on which clock is not known: split the "
-                "recording there"
+                f"{self._path}: {self._reset}, and its pictures may be on either clock: split the recording there"
             )
 
     def pass_on(self, chunk: EventChunk | None) -> Iterator[Item]:

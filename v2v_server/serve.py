@@ -107,7 +107,7 @@ def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None
     """Run a server until SIGINT or SIGTERM.
 
     Args:
-        times: logged once the first sample is sent, if they are to be.
+        times: of the start; logged on request once the first sample is sent.
         standbys: see :func:`v2v_server.supervise.pool.make_pool`.
 
     Raises:
@@ -340,7 +340,7 @@ class Server:
                     # Before anything that follows is sent.
                     todo.extendleft(reversed(self._corpus.record(record)))
                 case CheckVideo() as missing:
-                    # What a worker of this host cannot read of a sidecar, this host cannot: the loop reads none.
+                    # The loop reads no sidecar: one that a worker of this host cannot read is unreadable on this host.
                     is_here = bool(missing.sidecar) and self._catalogue.source.is_local and self._pool.is_local
                     is_here = is_here and self._pool.watches(self._name(missing.identity))
                     found = not is_here and self._corpus.check_video(missing)

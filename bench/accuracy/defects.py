@@ -110,7 +110,7 @@ class Made(NamedTuple):
 _CUTS = {"cuts": (50, 90), "jump": (35,)}
 _JUMP = np.r_[:35, 85:FRAMES]
 _UNSURE = frozenset({"jump", "single repeat"})
-"""Not part of the bar."""
+"""Defects that do not count for the bar."""
 _RATES = ("24 in 30", "3:2 pulldown", "twos")
 MADE = {
     "clean": Made("", lambda film, other, seed: film),

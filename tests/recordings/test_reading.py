@@ -257,7 +257,7 @@ def written_with_reset(path: Path, form: str) -> None:
 
 @pytest.mark.parametrize("form", ["evt2", "evt3", "dat"])
 def test_a_reset_clock_in_words_is_seen(tmp_path: Path, form: str) -> None:
-    """The package that decodes them takes a time that steps back for one that went round."""
+    """The package that decodes them takes a time that steps back for one that wrapped around."""
     path = tmp_path / f"a.{'dat' if form == 'dat' else 'raw'}"
     written_with_reset(path, form)
     done = convert(path, tmp_path / "a.h5")
@@ -411,7 +411,7 @@ def test_dsec_of_odd_offsets_cameras_and_columns(tmp_path: Path) -> None:
 
 
 def test_evreal_as_others_save_it(tmp_path: Path) -> None:
-    """Times of 1e9 s, xy in the order of C, polarities of -1 and 1, no metadata, nested, in capitals."""
+    """Times of 1e9 s, xy in C order, polarities of -1 and 1, no metadata, nested, in capitals."""
 
     def saved(values: np.ndarray) -> bytes:
         stream = io.BytesIO()
@@ -438,7 +438,7 @@ def test_evreal_as_others_save_it(tmp_path: Path) -> None:
     for name, values, said in (
         ("events_xy", np.stack([made.x, made.y]), r"events_xy.npy is \[2, 28\]: save events_xy as \[N, 2\]"),
         ("events_p", np.array([None] * 28), "28 entries of float64, uint16, uint16, object"),
-        ("images", np.asfortranarray(made.pictures), "images.npy is .* in the order of Fortran"),
+        ("images", np.asfortranarray(made.pictures), "images.npy is .* in Fortran order"),
     ):
         raw_forms.write_folder(tmp_path / name, members | {f"{name}.npy": saved(values)})
         with pytest.raises(UsageError, match=said):

@@ -229,13 +229,17 @@ def _parser() -> Parser:
     server.add_argument("--rows", help="with --videos: rows of the pictures to use, as for v2v-serve")
     stream.add_argument("--batch-size", type=int, default=12, metavar="N", help="samples in a batch (default 12)")
     measuring.add_argument(
-        "--seconds", type=float, default=20.0, metavar="S", help="time to measure, after warm-up (default 20)"
+        "--seconds", type=float, default=20.0, metavar="S", help="seconds to measure, after warm-up (default 20)"
     )
     measuring.add_argument(
         "--warmup-batches", type=int, default=4, metavar="N", help="batches received first and not timed (default 4)"
     )
     measuring.add_argument(
-        "--trainer-ms", type=float, default=0.0, metavar="MS", help="emulate a training step of this length (default 0)"
+        "--trainer-ms",
+        type=float,
+        default=0.0,
+        metavar="MS",
+        help="emulate a training step of this length, ms (default 0)",
     )
     stream.add_argument(
         "--arrays",
@@ -249,7 +253,7 @@ def _parser() -> Parser:
         type=float,
         default=60.0,
         metavar="S",
-        help="silence after which the server counts as lost (default 60)",
+        help="seconds of silence after which the server counts as lost (default 60)",
     )
     parser.add_output("Measuring", "--json", JSON, "write the records to this file")
     add_spec(parser)

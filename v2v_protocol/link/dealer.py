@@ -287,7 +287,7 @@ def diagnose(address: str) -> str:
         return f"nothing listens there ({error}): start v2v-serve, or correct host and port"
     if greeting[:1] == b"\xff":
         return "a server listens there, and does not answer yet"
-    return "another program listens there, or the server's page: give the address that v2v-serve calls ready"
+    return "another program listens there, or the server's page: give the address that v2v-serve prints when ready"
 
 
 def _greeting(address: str, seconds: float) -> bytes:

@@ -397,7 +397,7 @@ class Dispatcher:
             except ProtocolError as error:
                 # Our workers never send such a result; a worker that sends one would send more.
                 refused = ToWorker(identity, self._malformed(ProtocolError(f"malformed result: {error}")))
-                return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "answered nonsense"), now)]
+                return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "sent a malformed result"), now)]
             decoded = header.decoded
             if self._count(session, request, header, in_slot=len(payload) == 1):
                 self.counters.add(result, header.cpu_seconds)

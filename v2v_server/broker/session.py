@@ -7,10 +7,9 @@ Worker time is shared by deficit round robin (:mod:`v2v_server.broker.fair_queue
 this: the new session takes over the debt of the old one, and its abandoned requests count against its credit until the
 workers have finished them.
 
-Memory: a request is served while the samples that workers make for its session, and those that were sent and that its
-consumer has not read, are fewer than its credit, and while its unread bytes are below an equal share of
-MOST_IN_FLIGHT_BYTES, or one sample. So a consumer that never reads holds at most its credit, all of them together hold
-about that number of bytes, and none of them holds up the others.
+Memory: a session's samples in work and those that its consumer has not read are together at most its credit. Its
+unread bytes are at most an equal share of MOST_IN_FLIGHT_BYTES, or one sample. So a consumer that never reads holds at
+most its credit, all of them together hold about MOST_IN_FLIGHT_BYTES, and none delays the others.
 """
 
 from __future__ import annotations

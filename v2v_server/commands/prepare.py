@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     stored.add_argument(
         "--planes", choices=OPTIONAL, action="append", default=[],
-        help="also store what some streams read or else find again: "
+        help="also store what some streams read: "
         f"{', '.join(f'{name} (for {PLANES[name].serves})' for name in OPTIONAL)}; a video prepared without it is "
         "prepared again",
     )  # fmt: skip
@@ -74,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--workers", type=int, default=usable_cores(), metavar="N",
         help="number of processes (default: one per available core)",
     )  # fmt: skip
-    parser.add_output("Run", "--json", JSON, "also write a record of each video")
+    parser.add_output("Run", "--json", JSON, "also write a record of each video to this file")
     interrupted = "interrupted; run the same command to continue"
     return run_command(parser, _run, argv, failures=(V2VError,), interrupted=interrupted)
 

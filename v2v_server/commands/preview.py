@@ -37,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     videos = parser.group("Videos")
     videos.add_argument(
         "sources", nargs="+", metavar="VIDEO|DIR",
-        help="a video, a folder of videos, or a list file; of several, each gets a FILE with its name",
+        help="a video, a folder of videos, or a list file; with several, each gets a FILE-NAME of its own",
     )  # fmt: skip
     videos.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
     videos.add_argument("--list", metavar="FILE", help="list file that restricts a folder")

@@ -68,17 +68,17 @@ def _parser() -> Parser:
     )  # fmt: skip
     work.add_argument(
         "--forms", default=",".join(DEFAULT_FORMS), metavar="FORM,FORM",
-        help=f"ways to prepare the clips, of {', '.join(STORES)} (default {', '.join(DEFAULT_FORMS)})",
+        help=f"ways to prepare the clips, from {', '.join(STORES)} (default {', '.join(DEFAULT_FORMS)})",
     )  # fmt: skip
     work.add_argument(
         "--budget-minutes", type=float, default=8.0, metavar="X",
-        help="time for everything (default 8): forms that do not fit are left out, then places, then rounds; "
+        help="minutes for everything (default 8): forms that do not fit are left out, then places, then rounds; "
         "the source, one place and one round are always measured",
     )  # fmt: skip
     wishes = parser.group("Wish")
     wish = wishes.add_mutually_exclusive_group()
-    wish.add_argument("--target-rate", type=float, metavar="X", help="samples a core second to reach")
-    wish.add_argument("--max-error", type=float, metavar="X", help="largest voxel error, for example 0.05")
+    wish.add_argument("--target-rate", type=float, metavar="X", help="least number of samples a second of one core")
+    wish.add_argument("--max-error", type=float, metavar="X", help="largest voxel error, as a share: 0.05 is 5 %%")
     parser.add_output("Output", "--preset-out", (".yaml", ".yml"), "write the best setting for v2v-serve (.yaml)")
     parser.add_output("Output", "--json", JSON, "write the records")
     parser.add_output("Output", "--plot", (".png", ".pdf", ".svg"), "draw speed against error (needs matplotlib)")
@@ -100,7 +100,7 @@ def _check(asked: argparse.Namespace) -> None:
     asked.forms = [name.strip() for name in asked.forms.split(",")]
     for name in asked.forms:
         if name not in STORES:
-            raise UsageError(f"--forms {name!r}: choose of {', '.join(STORES)}")
+            raise UsageError(f"--forms {name!r}: choose from {', '.join(STORES)}")
 
 
 def _run(asked: argparse.Namespace) -> int:

@@ -195,7 +195,7 @@ class Catalogue:
         return Scene.from_bytes(self._stored(id, partial(self._store.figures, id, kind=self._scenes.kind)))
 
     def sidecar_files(self, id: str, ending: str, fingerprint: str, start: int, count: int) -> bytes | str:
-        """Return the second part of a folder in ``lease.sidecars``.
+        """Return the table of a folder's files in ``lease.sidecars``; or why the sidecar cannot be used.
 
         Raises:
             CorpusError, IndexUnreadable: see :meth:`frame_index`.
@@ -375,7 +375,7 @@ def _snapshot(
     if remarks := {videos.ids[at]: videos.remark[at] for at in np.flatnonzero(videos.remark).tolist()}:
         notes = [
             *notes,
-            f"{len(remarks)} videos are not served whole, or not as they are meant{format_problems(remarks)}",
+            f"{len(remarks)} videos are served in part, or with wrong grey levels{format_problems(remarks)}",
         ]
     if corpus.left_out:
         notes = [*notes, corpus.left_out]

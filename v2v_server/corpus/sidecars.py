@@ -72,7 +72,7 @@ def files_for_lease(data: bytes | None, fingerprint: str, start: int, count: int
             part = files_between(table, start, start + count)
             too_long = f"has too many files for a clip of {count} frames: the list of them has {len(part)} bytes"
             return part if len(part) <= _LARGEST_PART_BYTES else f"{too_long}; the limit is {_LARGEST_PART_BYTES}"
-    return "is not as in the index, which another program changed: start again to serve it as it is now"
+    return "differs from the index, which another program changed: restart the server to serve it as it is now"
 
 
 def collect_sidecars(

@@ -37,7 +37,7 @@ class VideoEntry:
         threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
         pieces: its pieces, see :func:`v2v_server.corpus.scenes.pieces.encoded_pieces`; None where the catalogue was
             opened without ``scene``.
-        remark: what is not served of it, or not as it is meant (:class:`v2v_server.video.probe.VideoFacts`).
+        remark: what of it is not served, or served with wrong grey levels (:class:`v2v_server.video.probe.VideoFacts`).
     """
 
     id: str
@@ -181,7 +181,7 @@ class CorpusFacts:
         digest: names this snapshot.
         scene_digest: names this snapshot together with the statistics of its videos; None without them.
         sidecars: the files beside the videos, by ending.
-        missing: arrays that prepared videos have not what they are made from, with the remedy.
+        missing: arrays that cannot be made from the prepared videos, with the remedy.
     """
 
     videos: Sequence[VideoEntry]
@@ -195,7 +195,7 @@ class CorpusFacts:
         """Check that the videos have what these arrays are made from.
 
         Raises:
-            UsageError: they have not.
+            UsageError: they do not.
         """
         for name in arrays:
             if name in self.missing:

@@ -28,7 +28,7 @@ _LONGEST_SECONDS = 30.0
 _LONGEST_VIDEO_SECONDS = 90.0
 """The first one may compile the kernels."""
 _Fields = tuple[tuple[float, ...], float, float, float, float, float, float, float]
-"""Of a Prediction."""
+"""Fields of a Prediction, in order."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -96,7 +96,7 @@ class _Excerpt:
 
 
 class _Found(NamedTuple):
-    """An excerpt, its frames that decode, their defects, what the levels of the video mean; why none decodes."""
+    """An excerpt: its frames that decode, their defects, what the video's levels mean; or why no frame decodes."""
 
     excerpt: _Excerpt
     frames: int = 0
@@ -106,7 +106,7 @@ class _Found(NamedTuple):
 
 
 def name_all(items: Sequence[object]) -> str:
-    """Return the texts of items in one line; the first hundred of them."""
+    """Return the texts of the first hundred items in one line, and the number of the others."""
     more = len(items) - _MOST_NAMED
     return "; ".join(map(str, items[:_MOST_NAMED])) + (f"; and {more} more" if more > 0 else "")
 

@@ -216,7 +216,7 @@ def _signal_note(catalogue: Catalogue, provenance: Provenance, recipe: Recipe) -
     with catalogue.source.open_pixels(id, provenance.fingerprint) as pixels:
         signal = pixels.signal(catalogue.frame_index(id))
     if DOLBY_VISION in provenance.remark:
-        return ""  # its levels are not what they are called
+        return ""  # the stated transfer does not hold for IPT-PQ
     if signal == SDR or recipe.light == "declared":
         return "" if signal == SDR else f"{id} has {signal}"
     return f"{id} has {signal}, and is read as {SDR}: --set light=declared uses what it has"

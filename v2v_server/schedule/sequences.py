@@ -298,8 +298,8 @@ def _all_cut(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal:
 
 
 def _frame_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec) -> tuple[int, int]:
-    """Return what each frame of a lease adds to the decoded frames of all its samples, without margins and in 8 bits,
-    and at most to the memory of its worker. Requested arrays decide nothing here: they never change which videos are
+    """Return the bytes that each frame of a lease adds: to the decoded frames of all its samples, without margins and
+    in 8 bits; and at most to its worker's memory. Requested arrays do not count: they never change which videos are
     shown.
 
     Frames are held whole until they are resized, however small the sample is. With scene "auto" those of all samples

@@ -67,7 +67,7 @@ def _span(catalogue: Catalogue, recipe: Recipe) -> tuple[str, list[str]]:
     coarse = np.count_nonzero(steps > recipe.voxel_seconds[1])
     warning = (
         f"warning: voxel_seconds = {recipe.voxel_seconds[1]:g} is shorter than the time between frames of {coarse} "
-        f"videos (at most {steps.max():.3g} s), and a grid of theirs lasts from frame to frame: raise voxel_seconds, "
+        f"videos (at most {steps.max():.3g} s), so each of their grids lasts from frame to frame: raise voxel_seconds, "
         "or serve videos with more frames a second"
     )
     return span, [warning] if coarse else []

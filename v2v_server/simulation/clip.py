@@ -76,7 +76,7 @@ def simulate(
         bits: 9 to 12 for frames of uint16 [n, H, W] with levels 0 .. 2**bits - 1.
         transfer: "pq", "hlg", "log100", "log316" or "linear" (``intensity.py``); "" uses gamma.
         start: "uniform" draws the residuals between -threshold_neg and threshold_pos, as the paper's code does,
-            "triangular" as a camera that has run for long has them; "zero" starts them at 0.
+            "triangular" as in a camera that has run for a long time; "zero" starts them at 0.
         effects: values of effects beyond the paper's model, by the recipe's names (``leak_hz=0.1``); zero is off.
 
     Returns:

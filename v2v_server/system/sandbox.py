@@ -2,7 +2,7 @@
 
 A file that exploits a flaw in the decoder can then read what its user can read, and use memory and time. But it
 
-    starts no program, accesses no other process, gains no other rights            seccomp
+    starts no program, traces no other process, gains no other rights              seccomp
     makes no socket, unless the process needs a network                            seccomp
     writes, creates and removes no file except below the given folders             Landlock
 

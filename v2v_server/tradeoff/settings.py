@@ -120,5 +120,5 @@ def _changed(spec: StreamSpec, key: str, value: str) -> StreamSpec:
         return dataclasses.replace(spec, recipe=recipe_setting(None, [f"{key}={value}"], spec.recipe.to_dict()))
     changed = StreamSpec.from_dict({key: parse_yaml(value)}, spec)
     if changed.samples_per_decode not in SAMPLES_PER_DECODE:
-        raise UsageError(f"--vary {key}={value}: choose of {', '.join(map(str, SAMPLES_PER_DECODE))}")
+        raise UsageError(f"--vary {key}={value}: choose from {', '.join(map(str, SAMPLES_PER_DECODE))}")
     return changed

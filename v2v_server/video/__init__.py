@@ -4,8 +4,8 @@ source       opening it, for sequential reading
 container    what its container states beyond that
 probe        what it holds
 packets      what a packet says without being decoded
-signs        whether packets may not be the frames
-listing      whether they are, by decoding
+signs        signs that a file's packets are not its frames
+listing      which frames decode
 frame_index  which frames it has, and where decoding may begin
 decode       a range of frames, exactly
 collect      the asked frames of one pass of a decoder

@@ -53,7 +53,7 @@ class VideoFacts:
         interlaced: whether the first picture, or any that is stored as two fields, says that its even and odd rows were
             taken at different times.
         content: 32 hexadecimal digits that name what the track stores: every packet, and when each frame is shown.
-        remark: what is not served of the file, or not as it is meant, and why; "" if all is.
+        remark: what of the file is not served, or served with wrong grey levels, and why; "" if all is.
     """
 
     frames: int

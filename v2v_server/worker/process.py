@@ -71,7 +71,7 @@ LONGEST_LEASE_SECONDS = 3600.0
 """Limit of processor time for one lease. The server gives up its own workers sooner, by wall-clock time; this limit
 ends hung workers on other hosts."""
 MOST_NAME_BYTES = 200
-"""What an operator may call a worker; with what is added to it a name has 255 at most."""
+"""Longest name that an operator may give a worker. With the suffix that makes it unique it has at most 255 bytes."""
 _LONGEST_ARENA_SECONDS = 1.0
 """Longest wait for a lease's arena, which is sent before the lease. Without it the sample goes into the message."""
 _LINGER_MS = 5000

@@ -375,7 +375,7 @@ def _step_seconds(lease: Lease, decoded: Decoded) -> tuple[npt.NDArray[np.float6
 
 
 def _most_bits(spec: StreamSpec) -> int | None:
-    """Return ``most_bits`` of :func:`decode_cuts`. Pictures between frames are made from 8 bits."""
+    """Return ``most_bits`` of a :class:`ClipRequest`. Pictures between frames are made from 8 bits."""
     if spec.recipe.light == "sdr":
         return None
     return SDR.bits if spec.substep_px else MOST_BITS

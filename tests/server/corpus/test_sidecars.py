@@ -242,7 +242,7 @@ def test_a_lease_names_only_the_files_of_its_frames(corpus: Path, kind: str) -> 
         table = catalogue.sidecar_files(MASKED, MASKS, mark, 2, 5)
         assert isinstance(table, bytes)
         assert catalogue.sidecar_files(MASKED, MASKS, "20-x", 2, 5) == (
-            "is not as in the index, which another program changed: start again to serve it as it is now"
+            "differs from the index, which another program changed: restart the server to serve it as it is now"
         )
     masks = corpus / "deep/b.x.masks"
     (masks / "1.png").write_bytes(b"a file of no frame of the lease")

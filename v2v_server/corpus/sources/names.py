@@ -1,4 +1,4 @@
-"""Names of files: which of them are videos'."""
+"""Recognise the names of video files."""
 
 from __future__ import annotations
 

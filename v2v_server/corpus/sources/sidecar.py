@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from v2v_server.corpus.sources.source import VideoSource
 
 LARGEST_FILE_BYTES, MOST_BYTES, MOST_FILES, MOST_FOLDERS = 4 << 30, 64 << 30, 1 << 20, 1 << 12
-"""Limits of one sidecar, which is otherwise not read."""
+"""Limits of one sidecar. A larger one is not read."""
 MOST_LENT_BYTES = 256 << 20
 """Limit of the files of a folder that one clip needs: they are held in memory."""
 _BLOCK_BYTES = 1 << 20
@@ -133,8 +133,8 @@ def state_text(states: Iterable[tuple[str, tuple[int, int, int]]]) -> str:
         found.append((name, state))
         total += state[0]
         if len(found) > MOST_FILES or state[0] > LARGEST_FILE_BYTES or total > MOST_BYTES:
-            what = f"has {len(found)} files or more, with {total} bytes or more: at most {MOST_FILES} files, each with"
-            raise OSError(errno.EFBIG, f"{what} {LARGEST_FILE_BYTES >> 30} GiB, and {MOST_BYTES >> 30} GiB in all")
+            what = f"has {len(found)} files or more, with {total} bytes or more: the limit is {MOST_FILES} files of"
+            raise OSError(errno.EFBIG, f"{what} {LARGEST_FILE_BYTES >> 30} GiB each, and {MOST_BYTES >> 30} GiB in all")
     return hashlib.sha256(repr(found).encode()).hexdigest()[:32] if found else ""
 
 

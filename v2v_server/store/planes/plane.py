@@ -49,7 +49,7 @@ class Plane:
         dtype: of a value, in little-endian order.
         values: values of a cell; together at most 32 bytes.
         cell_px: side of a cell, pixels.
-        serves: the array, or the field of the spec, whose streams read it; empty if each file has it that can.
+        serves: the array, or the field of the spec, whose streams read it; empty if every suitable file has it.
         remedy: what to do about a file without it; empty if a clip can be read without it.
     """
 
