@@ -216,7 +216,7 @@ def test_a_sidecar_beyond_the_limits_is_not_read(corpus: Path, processes: int, m
         open_catalogue(corpus, cache_dir=corpus.parent / "cache", processes=processes, notice=said.append)
     ) as catalogue:
         assert catalogue.facts.sidecars_of("a.mp4", ARRAYS) == {}
-        assert "with 42949672960 bytes or more: at most" in catalogue.sidecars[JSON].problems["a.mp4"]
+        assert "with 42949672960 bytes or more: the limit is" in catalogue.sidecars[JSON].problems["a.mp4"]
         assert any("1 sidecars cannot be read and count as missing (a.boxes.json: " in each for each in catalogue.notes)
     assert any(f"looking for sidecars {JSON}" in each for each in said)
 
