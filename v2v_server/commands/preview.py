@@ -71,10 +71,12 @@ def _run(arguments: argparse.Namespace) -> None:
         what = f'virtual cameras drawn from the recipe "{Path(arguments.recipe or "paper").stem}"'
     if arguments.seed is None:
         what += ", chosen where something moves"
-    stem = arguments.out.stem
-    named = {arguments.out.with_stem(f"{stem}-{Path(source).stem}"): source for source in arguments.sources}
-    if len(named) < len(arguments.sources):
-        raise UsageError("two of the videos have the same name: preview them one at a time")
+    stem, names = arguments.out.stem, [Path(source).stem for source in arguments.sources]
+    named = {
+        arguments.out.with_stem(f"{stem}-{name}"): source for name, source in zip(names, arguments.sources, strict=True)
+    }
+    if len(named) < len(names):
+        raise UsageError(f"two of the videos are named {max(names, key=names.count)}: preview them one at a time")
     for path, source in named.items():
         preview(
             source,
