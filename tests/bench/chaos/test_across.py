@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
 
 def test_nothing_is_lost_on_a_lossy_cable_that_is_cut(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     flags = ["--videos", str(clips(tmp_path / "clips")), "--consumers", "1", "--workers", "1", "--minutes", "0.15"]
-    flags += ["--every", "1", "--remakes", "10", "--faults", "consumer-kill,further-add", "--json", str(tmp_path / "o")]
+    flags += ["--every", "1", "--remakes", "10", "--faults", "consumer-kill,further-add", "--json", str(tmp_path / "o.json")]
     status = main(["chaos_across", *flags, "--loss", "0.02"])
     said = capfd.readouterr()
     if status == 2 and re.search(r"no (network namespace|second network)", said.err):
@@ -29,6 +29,6 @@ def test_nothing_is_lost_on_a_lossy_cable_that_is_cut(tmp_path: Path, capfd: pyt
     assert passed > 100
     assert lost > 0
     assert cuts > 0
-    (record,) = records(tmp_path / "o")
+    (record,) = records(tmp_path / "o.json")
     assert record["samples"] > 20
     assert [record[key] for key in FAILING] == [0] * len(FAILING)
