@@ -16,7 +16,16 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
 
 def test_nothing_is_lost_on_a_lossy_cable_that_is_cut(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     flags = ["--videos", str(clips(tmp_path / "clips")), "--consumers", "1", "--workers", "1", "--minutes", "0.15"]
-    flags += ["--every", "1", "--remakes", "10", "--faults", "consumer-kill,further-add", "--json", str(tmp_path / "o.json")]
+    flags += [
+        "--every",
+        "1",
+        "--remakes",
+        "10",
+        "--faults",
+        "consumer-kill,further-add",
+        "--json",
+        str(tmp_path / "o.json"),
+    ]
     status = main(["chaos_across", *flags, "--loss", "0.02"])
     said = capfd.readouterr()
     if status == 2 and re.search(r"no (network namespace|second network)", said.err):
