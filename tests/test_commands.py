@@ -30,7 +30,7 @@ MODULES = {
     "v2v-keys": "v2v_server.commands.keys",
     "v2v-tradeoff": "v2v_server.commands.tradeoff",
     "v2v-fit": "v2v_server.commands.fit",
-    "v2v-loadtest": "v2v_client.tools.loadtest",
+    "v2v-loadtest": "v2v_client.loadtest",
     "v2v-train": "trainer.train",
     "v2v-eval": "trainer.evaluation.cli",
     "v2v-convert": "trainer.convert.cli",

@@ -296,7 +296,7 @@ def test_all_commands_that_make_samples_take_the_flags_of_the_stream(program: st
 def test_an_address_without_a_server_is_explained_in_the_log_and_in_the_error(
     scheme: str, words: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("v2v_client.session.connection._REPORT_SECONDS", 0.2)
+    monkeypatch.setattr("v2v_client.connection._REPORT_SECONDS", 0.2)
     with HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as page, socket.create_server(("127.0.0.1", 0)) as unused:
         threading.Thread(target=page.serve_forever, args=(0.01,), daemon=True).start()
         free = unused.getsockname()[1]

@@ -5,21 +5,22 @@ from v2v_client import V2VStreamDataset
 for batch in V2VStreamDataset("tcp://127.0.0.1:5555", batch_size=12):
     batch.voxels  # int8 [B, T, bins, H, W]
 
-Modules and folders:
+Modules:
 
-    dataset     the dataset; its batch, delivery (samples to batches) and ordering; options: what a consumer may request
-    session/    conversation (pure: states, messages, times), connection (runs it over a link), link (the socket)
-    memory/     arena (workers of this host write there), slots (which sample has which row), buffers (reused)
-    position/   plan (which samples a consumer gets), state (what is saved), position (one copy), shared (all copies)
-    loaders     adjustments for other loaders and training loops
+    dataset       the dataset; batch: what it yields; delivery: samples to batches; options: what a consumer may request
+    conversation  the protocol, pure (states, messages, times); connection: runs it over a link
+    memory        arenas (workers of this host write there), slots (which sample has which row), buffers (reused)
+    position/     plan (which samples a consumer gets), state (what is saved), position (one copy), shared (all copies)
+    loaders       adjustments for loader workers
     representations  inputs of other networks, from the arrays of a batch
-    in_process  samples by index, without a server; notebook: their pictures
-    tools/      the load test; local_server: a server as a subprocess
+    in_process    samples by index, without a server
+    loadtest      the load test; local_server: a server as a subprocess
 """
 
 from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.in_process import V2VDataset
+from v2v_client.options import Patience
 from v2v_protocol.allocator import keep_freed_memory
 from v2v_protocol.errors import (
     NoWorkers,
@@ -38,6 +39,7 @@ from v2v_protocol.errors import (
 __all__ = [
     "Batch",
     "NoWorkers",
+    "Patience",
     "ProtocolError",
     "RecipeError",
     "RemoteError",

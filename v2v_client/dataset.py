@@ -15,18 +15,16 @@ from typing import Any, Never, Self, Unpack
 from torch.utils.data import IterableDataset, get_worker_info
 
 from v2v_client.batch import Batch
+from v2v_client.connection import Connector, ConsumerId, addresses
 from v2v_client.delivery import deliver
 from v2v_client.loaders import end_with_parent, send_before_exit
 from v2v_client.local_server import LocalServer, recipe_flags
-from v2v_client.memory.buffers import BatchBuffers
-from v2v_client.options import Labels, Options, check_labels, require_arguments, require_labels
+from v2v_client.memory import BatchBuffers
+from v2v_client.options import Labels, Options, Patience, check_labels, require_arguments, require_labels
 from v2v_client.position.plan import Consumer, EpochPlan
 from v2v_client.position.position import Iteration, Position
 from v2v_client.position.state import ResumeState, StreamIdentity
 from v2v_client.ranks import distributed_rank
-from v2v_client.session.brokers import addresses
-from v2v_client.session.connector import Connector, ConsumerId
-from v2v_client.session.liveness import Patience
 from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import RepeatedSamplesWarning, StateMismatch, UsageError
 from v2v_protocol.recipe import Recipe
@@ -66,7 +64,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
 
     Args:
         address: the server's ``tcp://host:port``, or those of several servers of the same videos, as a list or
-            separated by commas. Each rank uses its own server (:mod:`v2v_client.session.brokers`). If that one is lost,
+            separated by commas. Each rank uses its own server (:mod:`v2v_client.connection`). If that one is lost,
             it continues with another: no sample is lost or repeated.
         batch_size: samples in one rank's batch.
         arrays: names in ``v2v_protocol.sample.ARRAYS`` to receive. The choice does not affect their content.

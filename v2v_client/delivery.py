@@ -1,4 +1,16 @@
-"""Assemble samples into batches. Rows are filled in any order; batches leave in order."""
+"""Assemble samples into batches: rows are filled in any order, and batches leave in order.
+
+The :class:`ReorderWindow` (pure) requests samples ahead in batch order. Two limits hold at any time:
+
+    samples requested and not received                      <= credit
+    samples requested and not yet part of a taken batch     <= credit + batch size
+
+The second bounds memory while one late sample delays its batch: at most ceil(credit / batch size) + 2 batches have
+buffers. It always leaves space for one whole batch, so even with a small credit the first batch can be completed.
+
+Samples that were not requested, and second copies, are counted and dropped. Requests repeated after a disconnect can
+cause both.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +21,134 @@ from dataclasses import dataclass, field
 import torch
 
 from v2v_client.batch import Batch
-from v2v_client.memory.buffers import BatchBuffers, BatchMemory
-from v2v_client.ordering import ReorderWindow
+from v2v_client.connection import Connection
+from v2v_client.conversation import Arrival
+from v2v_client.memory import BatchBuffers, BatchMemory
 from v2v_client.position.plan import EpochPlan
 from v2v_client.position.state import ResumeState
-from v2v_client.session.connection import Connection
-from v2v_client.session.conversation import Arrival
+from v2v_protocol.errors import LimitExceeded
 from v2v_protocol.messages import SampleHeader
+
+_REQUESTS_A_CREDIT = 8
+"""A request asks for at least 1/8 of the credit, so up to 1/8 of the credit may stay unused."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Hold where a sample belongs: the number of its batch, and the row in it."""
+
+    batch: int
+    row: int
+
+
+class ReorderWindow:
+    """Track which samples of one epoch are requested and received, without their bytes.
+
+    Args:
+        batches: numbers of the batches to deliver, in order.
+        indices: returns the global indices of a batch's samples; batches are disjoint.
+        batch_size: samples in each batch.
+        credit: maximum number of samples requested and not received.
+
+    Attributes:
+        duplicates: arrivals of a sample that had arrived before.
+        strays: arrivals of a sample that was never requested.
+
+    Raises:
+        LimitExceeded: the credit is below 1.
+    """
+
+    def __init__(
+        self, batches: Sequence[int], indices: Callable[[int], tuple[int, ...]], batch_size: int, credit: int
+    ) -> None:
+        if credit < 1:
+            raise LimitExceeded(f"credit = {credit} samples: at least 1 is needed to request any")
+        self._batches = batches
+        self._indices = indices
+        self._batch_size = batch_size
+        self._credit = credit
+        self._asking = 0  # place in ``batches`` of the batch being asked for
+        self._unasked: list[int] = []  # the rest of that batch, next one last
+        self._taken = 0  # batches delivered
+        self._places: dict[int, Place] = {}  # samples asked for, until their batch is taken
+        self._outstanding: dict[int, None] = {}  # of those, the ones not received, in the order asked
+        self._missing: dict[int, int] = {}  # batch -> rows not received
+        self.duplicates = 0
+        self.strays = 0
+
+    @property
+    def finished(self) -> bool:
+        """Return whether every batch was taken."""
+        return self._taken == len(self._batches)
+
+    @property
+    def outstanding(self) -> tuple[int, ...]:
+        """Return the samples requested and not received, in the order of the requests."""
+        return tuple(self._outstanding)
+
+    def ask(self) -> tuple[int, ...]:
+        """Return the indices to request now, within both limits. They count as requested from here on.
+
+        Returns no indices while there are only few and other samples are under way: one request per arriving sample
+        would cost the server as much as the sample does.
+        """
+        asked: list[int] = []
+        allowed = min(
+            self._credit - len(self._outstanding),
+            self._credit + self._batch_size - len(self._places),
+        )
+        if allowed < self._credit // _REQUESTS_A_CREDIT and self._outstanding:
+            return ()
+        while len(asked) < allowed:
+            if not self._unasked and not self._begin_batch():
+                break
+            index = self._unasked.pop()
+            batch = self._batches[self._asking - 1]
+            self._places[index] = Place(batch, self._batch_size - len(self._unasked) - 1)
+            self._outstanding[index] = None
+            asked.append(index)
+        return tuple(asked)
+
+    def _begin_batch(self) -> bool:
+        if self._asking == len(self._batches):
+            return False
+        batch = self._batches[self._asking]
+        self._unasked = list(reversed(self._indices(batch)))
+        self._missing[batch] = len(self._unasked)
+        self._asking += 1
+        return True
+
+    def place(self, index: int) -> Place:
+        """Return where a requested sample belongs."""
+        return self._places[index]
+
+    def receive(self, index: int) -> Place | None:
+        """Record an arrived sample and return its place, or None if it must be dropped."""
+        if index not in self._outstanding:
+            # A second copy of a sample whose batch has left counts as a stray: remembering all delivered samples
+            # would cost unbounded memory.
+            if index in self._places:
+                self.duplicates += 1
+            else:
+                self.strays += 1
+            return None
+        del self._outstanding[index]
+        place = self._places[index]
+        self._missing[place.batch] -= 1
+        return place
+
+    def take(self) -> int | None:
+        """Remove the next batch from the window and return its number; None if it is not complete."""
+        if self.finished:
+            return None
+        batch = self._batches[self._taken]
+        if self._missing.get(batch) != 0:
+            return None
+        del self._missing[batch]
+        for index in self._indices(batch):
+            del self._places[index]
+        self._taken += 1
+        return batch
 
 
 @dataclass(slots=True)

@@ -16,8 +16,7 @@ import torch
 from torch.utils.data import Dataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from v2v_client import notebook
-from v2v_client.batch import Batch
+from v2v_client.batch import Batch, draw_samples, html_image, to_pil_image, try_png
 from v2v_client.options import Labels, check_labels, require_arguments, require_labels
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
@@ -53,16 +52,16 @@ class ShownSample(Sample):
             UsageError: voxels or frames were not requested, the file cannot be written, or pillow or av is not
                 installed.
         """
-        return notebook.to_pil_image(self._picture(), path)
+        return to_pil_image(self._picture(), path)
 
     def _picture(self) -> Any:
-        return notebook.draw_samples([(self.arrays, self.provenance)], self.recipe, self.title)
+        return draw_samples([(self.arrays, self.provenance)], self.recipe, self.title)
 
     def _repr_png_(self) -> bytes | None:
-        return notebook.try_png(self._picture)
+        return try_png(self._picture)
 
     def _repr_html_(self) -> str:
-        return Sample._repr_html_(self) + notebook.html_image(self._repr_png_())
+        return Sample._repr_html_(self) + html_image(self._repr_png_())
 
 
 class V2VDataset(Dataset[Sample]):

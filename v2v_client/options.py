@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from v2v_client.position.state import StreamIdentity
@@ -19,6 +20,37 @@ Labels = Literal["required", "optional"]
 # Fields left to the server may have any value, so an option that fits at least one of them is accepted here.
 _ANY = StreamSpec(samples_per_decode=MOST_SAMPLES_PER_DECODE, scene="auto")
 _LONGEST = Recipe(voxels_per_clip=1_000_000, bins=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """Hold a consumer's timeouts.
+
+    Attributes:
+        ping_seconds: silence after which the server is pinged, and the interval of further pings. It is at most half of
+            ``timeout_seconds``, so that the server is always pinged before it counts as lost.
+        rewant_seconds: time without an answer to any request after which all are sent again, although the server is
+            alive: a network interruption can lose messages in either direction. If nothing was received in that time,
+            a new connection is opened. The interval doubles each time, up to ``timeout_seconds``, so that a slow
+            network is neither flooded nor abandoned before it can answer.
+        timeout_seconds: silence after which the server counts as lost, and time without a sample after which a server
+            without workers does.
+        takeover_seconds: with several brokers, silence after which the next one is tried. ServerLost is raised after
+            ``timeout_seconds``, once each of them has had its turn.
+
+    Raises:
+        UsageError: a time is not positive.
+    """
+
+    timeout_seconds: float = 60.0
+    ping_seconds: float = 2.0
+    rewant_seconds: float = 10.0
+    takeover_seconds: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name in ("timeout_seconds", "ping_seconds", "rewant_seconds", "takeover_seconds"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"{name} = {getattr(self, name)!r}: give a positive number of seconds")
 
 
 class Options:

@@ -142,7 +142,7 @@ _GROUPS: dict[str, dict[str, tuple[str, str, str]]] = {
         "serve": ("v2v_server.commands.serve", "server", "stream samples to trainers"),
         "worker": ("v2v_server.commands.worker", "server", "work for a server on another host"),
         "top": ("v2v_server.commands.top", "server", "show a running server on a terminal"),
-        "loadtest": ("v2v_client.tools.loadtest", "client", "measure how fast a server feeds a trainer"),
+        "loadtest": ("v2v_client.loadtest", "client", "measure how fast a server feeds a trainer"),
     },
     "Manage a corpus": {
         "prepare": ("v2v_server.commands.prepare", "server", "decode videos once, into a store that reads fast"),

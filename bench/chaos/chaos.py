@@ -35,7 +35,7 @@ from bench.frame import Column, Record, Report, add_positive, add_whole, beyond,
 from tests.leftovers import abandoned_memory, shared_memory
 from tests.oracles.stream import check
 from tests.oracles.stream_log import BatchLine, Kill, read_log, recovery_seconds
-from v2v_client.tools.loadtest import percentile
+from v2v_client.loadtest import percentile
 from v2v_protocol.command import Parser
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.names import VIDEO_SUFFIXES

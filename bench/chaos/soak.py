@@ -20,9 +20,9 @@ from typing import Any
 
 from bench.frame import Column, Record, Report, add_positive, add_videos, add_whole, beyond
 from bench.processes import Fit, fit, roles_of, rss_mib
+from v2v_client import loadtest
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_client.tools import loadtest
 from v2v_protocol.command import Parser
 
 _POINT_SECONDS = 1.0

@@ -41,9 +41,8 @@ from bench.frame import (
 from bench.processes import cpu_seconds
 from bench.speed.released import ReleasedStyleDataset
 from tests.oracles.leases import open_leases
-from v2v_client import V2VStreamDataset
+from v2v_client import V2VStreamDataset, loadtest
 from v2v_client.local_server import LocalServer
-from v2v_client.tools import loadtest
 from v2v_protocol.command import Parser
 from v2v_protocol.presets import STREAM_PRESETS
 from v2v_protocol.spec import StreamSpec

@@ -27,7 +27,7 @@ from v2v_client import (
     UsageError,
     V2VStreamDataset,
 )
-from v2v_client.session.liveness import Patience
+from v2v_client.options import Patience
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.messages import Denied
 from v2v_protocol.recipe import Recipe

@@ -12,7 +12,8 @@ from PIL import Image
 from torch.utils.data import DataLoader
 
 from tests.clips import panned_luma, write_clip
-from v2v_client import UsageError, V2VDataset, V2VStreamDataset, notebook
+from v2v_client import UsageError, V2VDataset, V2VStreamDataset
+from v2v_client.batch import _drawing, draw_samples
 from v2v_client.position.state import ResumeState, StreamIdentity
 from v2v_pictures.colours import BRIGHTER
 from v2v_protocol.recipe import Recipe
@@ -93,15 +94,15 @@ def test_pauses_of_unknown_length_are_not_marked(dataset: V2VDataset, monkeypatc
     sample, titles = dataset[0], []
     params = dataclasses.replace(sample.provenance.params, pauses=((1, 4),))
     paused = dataclasses.replace(sample.provenance, params=params)
-    sheet = notebook._drawing("sheet")
+    sheet = _drawing("sheet")
 
     def draw(cameras: list, title: str) -> np.ndarray:
         titles.append((title, any(camera.paused.any() for camera in cameras)))
         return np.zeros((1, 1, 3), np.uint8)
 
     monkeypatch.setattr(sheet, "draw_sheet", draw)
-    notebook.draw_samples([(sample.arrays, paused)], None, "T")
-    notebook.draw_samples([(sample.arrays, paused)], dataset.spec.recipe, "T")
+    draw_samples([(sample.arrays, paused)], None, "T")
+    draw_samples([(sample.arrays, paused)], dataset.spec.recipe, "T")
     assert titles == [("T (pauses are not marked)", False), ("T", True)]
 
 
@@ -110,7 +111,7 @@ def test_a_streamed_batch_knows_its_recipe(dataset: V2VDataset, monkeypatch: pyt
     stream = StreamIdentity(dataset.spec.to_dict(), dataset.spec.digest, "", 1, len(dataset))
     state = ResumeState(stream=stream, seed=0, epoch=0, origin=0, position=1, world_size=1, quarantine=0).to_dict()
     asked: list[Recipe | None] = []
-    monkeypatch.setattr(notebook, "draw_samples", lambda samples, recipe, title: asked.append(recipe))
+    monkeypatch.setattr("v2v_client.batch.draw_samples", lambda samples, recipe, title: asked.append(recipe))
     dataclasses.replace(batch, resume_state=state)._picture()
     batch._picture()
     assert asked == [dataset.spec.recipe, None]

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from v2v_client.ordering import ReorderWindow
+from v2v_client.delivery import ReorderWindow
 from v2v_protocol.errors import LimitExceeded
 
 

@@ -10,7 +10,7 @@ from tests.faults.proxy import Proxy, Way
 from tests.stream.conftest import SMALL, digest, epoch_of
 from v2v_client import ServerLost, V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_client.session.liveness import Patience
+from v2v_client.options import Patience
 
 pytestmark = pytest.mark.timeout(60)
 

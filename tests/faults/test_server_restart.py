@@ -17,7 +17,7 @@ from tests.clips import panned_luma, write_clip
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
 from v2v_client import ServerLost, StateMismatch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_client.session.liveness import Patience
+from v2v_client.options import Patience
 
 pytestmark = pytest.mark.timeout(120)
 

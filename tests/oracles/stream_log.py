@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_client.tools.schedule_check import ScheduleCheck
+from v2v_client.loadtest import ScheduleCheck
 from v2v_protocol.errors import UsageError
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.sample import Provenance

@@ -14,7 +14,7 @@ from tests.stream.conftest import SMALL, SMALL_FLAGS, epoch_of
 from tests.stream.test_loaders import singles
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_client.session.liveness import Patience
+from v2v_client.options import Patience
 
 FORK = multiprocessing.get_context("fork")
 RANKS = 4

@@ -12,7 +12,7 @@ from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from tests.server.peers import CREDIT, DEADLINE, peers, sample_frames
-from v2v_client.memory.slots import Answer, Slots
+from v2v_client.memory import Answer, Slots
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
 from v2v_protocol.messages import (
     Denied,

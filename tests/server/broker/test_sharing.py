@@ -11,7 +11,7 @@ from hypothesis import settings
 from tests.server.broker.test_interleaving import WithSlots, walk
 from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import Peers, peers
-from v2v_client.memory.server_memory import open_sample
+from v2v_client.memory import open_sample
 from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.messages import Hello, Lease, SampleHeader, Want
 from v2v_protocol.sample import Form, array_layout

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 
 from tests.server.peers import frames_of
-from v2v_client.memory.server_memory import open_sample
+from v2v_client.memory import open_sample
 from v2v_protocol.arena import ArenaName, Slot, open_memory
 from v2v_protocol.messages import SampleHeader
 from v2v_protocol.wire import Frames, decode

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from v2v_client.memory.arena import Arena
+from v2v_client.memory import Arena
 from v2v_protocol.arena import ArenaName, Slot
 from v2v_protocol.errors import ProtocolError
 from v2v_server.worker.logbook import IDLE, Logbook, note, take_arena

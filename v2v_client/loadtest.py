@@ -10,7 +10,7 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,7 +21,6 @@ from rich.table import Table
 from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_client.tools.schedule_check import ScheduleCheck
 from v2v_protocol.command import INTERRUPTED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
@@ -359,3 +358,57 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+class ScheduleCheck:
+    """Count lost, repeated, unexpected and misplaced samples.
+
+    Args:
+        sequences: N, the sequences of an epoch.
+        batch_size: b, the samples of a batch.
+        first_epoch: the epoch consumed first, from its beginning.
+
+    Attributes:
+        duplicated: number of samples that came again.
+        foreign: number of samples that are not in the schedule.
+        out_of_order: number of samples that did not follow their predecessor.
+    """
+
+    def __init__(self, sequences: int, batch_size: int, first_epoch: int) -> None:
+        self._per_epoch = sequences // batch_size * batch_size
+        self._first_epoch = first_epoch
+        self._complete = 0  # every ordinal below was seen
+        self._beyond: set[int] = set()  # ordinals seen above the first gap
+        self._previous = -1
+        self._highest = -1
+        self.duplicated = 0
+        self.foreign = 0
+        self.out_of_order = 0
+
+    @property
+    def lost(self) -> int:
+        """Return the number of missing samples before the last one received."""
+        return self._highest + 1 - self._complete - len(self._beyond)
+
+    @property
+    def faultless(self) -> bool:
+        """Return whether each sample came once and in order."""
+        return not (self.lost or self.duplicated or self.foreign or self.out_of_order)
+
+    def observe(self, epoch: int, indices: Iterable[int]) -> None:
+        """Record a received batch."""
+        for index in indices:
+            if epoch < self._first_epoch or not 0 <= index < self._per_epoch:
+                self.foreign += 1
+                continue
+            ordinal = (epoch - self._first_epoch) * self._per_epoch + index
+            self.out_of_order += ordinal != self._previous + 1
+            self._previous = ordinal
+            if ordinal < self._complete or ordinal in self._beyond:
+                self.duplicated += 1
+                continue
+            self._highest = max(self._highest, ordinal)
+            self._beyond.add(ordinal)
+            while self._complete in self._beyond:
+                self._beyond.remove(self._complete)
+                self._complete += 1

@@ -1,28 +1,35 @@
-"""Run a conversation (:mod:`v2v_client.session.conversation`) with a server over a link.
+"""Run a conversation (:mod:`v2v_client.conversation`) with a server over a link.
 
 Memory: the socket has no high-water mark, because the credit is the limit. The server never has more than ``credit``
 answers under way, so at most credit x sample bytes wait here, or twice that shortly after requests were repeated.
 Workers on this host write samples into slots of this process (:mod:`v2v_client.memory`) instead.
 
 A connection belongs to the process that opened it. Its ZeroMQ context is created on opening, never before a fork.
+
+All brokers make the same samples, so the choice between them only distributes load. Consumers (the loader workers of
+all ranks, in the order of the ranks) are assigned to the list in contiguous blocks. If the launcher numbers ranks host
+by host, and the list has one broker per host in the same order, every host uses its own broker. The consumers of a lost
+broker are spread over all others.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import logging
 import os
+import platform
 import secrets
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import replace
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from v2v_client.memory.server_memory import open_sample
-from v2v_client.position.state import StreamIdentity
-from v2v_client.session.conversation import WAIT_REPORT_SECONDS, Arrival, Conversation
-from v2v_client.session.liveness import ListeningClock, Patience
-from v2v_client.session.states import Event, State
+from v2v_client.conversation import WAIT_REPORT_SECONDS, Arrival, Conversation, Event, ListeningClock, State
+from v2v_client.memory import open_sample
+from v2v_client.options import Options, Patience
+from v2v_client.position.state import ResumeState, StreamIdentity
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.link.dealer import Dealer, diagnose
@@ -303,3 +310,134 @@ class Connection:
         if self._link is None:
             raise ServerLost(f"{self._address}: this connection is closed")
         return self._link
+
+
+@dataclass(frozen=True, slots=True)
+class ConsumerId:
+    """Hold which of a stream's consumers a process is.
+
+    Attributes:
+        rank, world_size: number of the rank, and of ranks.
+        worker: number of the loader worker; None outside of one.
+        workers: number of loader workers of each rank; 1 without any.
+    """
+
+    rank: int
+    world_size: int
+    worker: int | None = None
+    workers: int = 1
+
+    @property
+    def name(self) -> str:
+        """Return the name that status displays show."""
+        of_loader = "" if self.worker is None else f", loader worker {self.worker} of {self.workers}"
+        return f"rank {self.rank} of {self.world_size}{of_loader}"
+
+
+@dataclass(frozen=True, slots=True)
+class Connector:
+    """Hold what all connections of a dataset have in common.
+
+    Attributes:
+        brokers: addresses of the servers.
+        options: the requested stream.
+        arrays, batch_size, seed, compress, keys, patience: see :class:`v2v_client.dataset.V2VStreamDataset`.
+    """
+
+    brokers: tuple[str, ...]
+    options: Options
+    arrays: tuple[str, ...]
+    batch_size: int
+    seed: int
+    compress: bool
+    keys: str | None
+    patience: Patience
+
+    def connection(
+        self,
+        member: ConsumerId,
+        state: ResumeState,
+        *,
+        brokers: Sequence[str] | None = None,
+        patience: Patience | None = None,
+    ) -> Connection:
+        """Return a connection that is not open yet.
+
+        Args:
+            member: the consumer that it is for.
+            state: where the consumer starts; its stream is pinned.
+            brokers: None tries all, in the order of this consumer.
+            patience: None uses that of the dataset.
+
+        Raises:
+            StateMismatch: the options contradict the pinned stream.
+        """
+        consumer, consumers = member.rank * member.workers + (member.worker or 0), member.world_size * member.workers
+        hello = Hello(
+            self.options.spec(state.stream, "this dataset's stream"),
+            self.arrays,
+            self.batch_size,
+            self.seed,
+            quarantine=state.quarantine,
+            stride=self.batch_size * consumers,
+            name=member.name,
+            host=platform.node(),
+            packed=self.compress,
+        )
+        return Connection(
+            brokers or order(self.brokers, consumer, consumers),
+            hello,
+            state.epoch,
+            pinned=state.stream,
+            pinned_by="this dataset" if state.is_beginning else "the saved state",
+            patience=patience or self.patience,
+            transport=functools.partial(Dealer, keys=self.keys),
+        )
+
+    def compare(self, connection: Connection, member: ConsumerId, state: ResumeState) -> None:
+        """Compare an open connection with the first other broker that answers, which is the same for nearly all ranks.
+
+        Raises:
+            StateMismatch: the two brokers offer different streams.
+        """
+        patience = dataclasses.replace(self.patience, timeout_seconds=self.patience.takeover_seconds)
+        for broker in self.brokers if len(self.brokers) > 1 else ():
+            if broker == connection.address:
+                continue
+            try:
+                with closing(self.connection(member, state, brokers=(broker,), patience=patience)) as other:
+                    other.open()
+                    connection.stream.require_same(other.stream, ours=connection.address, theirs=broker)
+            except ServerLost as lost:
+                _log.warning("cannot compare %s with %s before it takes over: %s", connection.address, broker, lost)
+                continue
+            return
+
+
+def addresses(given: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the addresses of a list or of a comma-separated text.
+
+    Raises:
+        UsageError: there is no address, or one occurs twice.
+    """
+    texts = given.split(",") if isinstance(given, str) else given
+    found = tuple(text.strip() for text in texts)
+    if not found or not all(found):
+        raise UsageError(f"address {given!r}: give tcp://host:port, or several of them")
+    if len(set(found)) < len(found):
+        raise UsageError(f"address {given!r}: a broker occurs twice; give each once")
+    return found
+
+
+def order(brokers: Sequence[str], consumer: int, consumers: int) -> tuple[str, ...]:
+    """Return all brokers, in the order in which a consumer tries them.
+
+    Args:
+        brokers: their addresses, the same list for every consumer.
+        consumer: the consumer's number, 0 <= consumer < consumers.
+        consumers: number of consumers.
+    """
+    home = consumer * len(brokers) // consumers
+    others = [*brokers[home + 1 :], *brokers[:home]]
+    first = consumer % len(others) if others else 0
+    return (brokers[home], *others[first:], *others[:first])

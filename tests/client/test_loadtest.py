@@ -4,7 +4,7 @@ import os
 import pytest
 
 from tests.client.fake_server import FakeServer
-from v2v_client.tools import loadtest
+from v2v_client import loadtest
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec_flags import recipe_changes
 

@@ -1,14 +1,14 @@
 """Implement the consumer's side of the protocol as a state machine with three states.
 
 It is pure: messages in, messages out. The time is passed in, as seconds of listening
-(:class:`v2v_client.session.liveness.ListeningClock`).
+(:class:`ListeningClock`).
 
 Entering a state, even from itself, sends messages:
 
     GREETING    sends Hello, and repeats it at growing intervals until Welcome arrives, because either may be lost
     WELCOMED    sends all unanswered requests again, and may send more
 
-:data:`v2v_client.session.states.TRANSITIONS` defines which event leads from one state to another. After a restart, the
+:data:`TRANSITIONS` defines which event leads from one state to another. After a restart, the
 server does not know the consumer and denies its requests. The consumer then sends Hello with the resolved spec, and the
 server must offer the same stream as before. Repeated requests can make a sample arrive twice; the reorder window drops
 the second one.
@@ -19,20 +19,21 @@ answers but has no worker to make a sample (NoWorkers); and messages that break 
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 from typing import Any
 
 import numpy.typing as npt
+import zstandard
 
-from v2v_client.memory.slots import Answer, Slots
+from v2v_client.memory import Answer, Slots
+from v2v_client.options import Patience
 from v2v_client.position.state import StreamIdentity
-from v2v_client.session.liveness import Patience, WorkerShortage
-from v2v_client.session.packing import unpack
-from v2v_client.session.states import TRANSITIONS, Event, State
 from v2v_protocol.arena import NO_SLOT, Slot
-from v2v_protocol.errors import ProtocolError, RemoteError, SampleUnavailable, ServerLost
+from v2v_protocol.errors import NoWorkers, ProtocolError, RemoteError, SampleUnavailable, ServerLost
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import (
     Denied,
@@ -399,3 +400,140 @@ class Conversation:
                 f"{header.quarantine}, and its provenance names {provenance.quarantine!r:.40}"
             )
         return provenance
+
+
+class State(Enum):
+    """List the states of a conversation."""
+
+    CLOSED = auto()  # before Hello, or after Goodbye
+    GREETING = auto()  # Hello was sent
+    WELCOMED = auto()  # the server has answered Hello
+
+
+class Event(Enum):
+    """List the events that change the state."""
+
+    OPENED = auto()  # a link is open
+    WELCOME = auto()  # the server answered Hello
+    FORGOTTEN = auto()  # the server does not know the session: it was restarted, or the consumer was silent too long
+    DISCONNECTED = auto()  # the network was interrupted and is back: messages under way in either direction may be lost
+    UNANSWERED = auto()  # the server is alive, but no request was answered for a while: messages may be lost
+    SILENCE = auto()  # nothing was received for the same time: the link may be broken and is opened again
+    LEFT = auto()  # the consumer leaves: Goodbye
+
+
+# Events without an entry change nothing.
+TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
+    State.CLOSED: {
+        Event.OPENED: State.GREETING,
+    },
+    State.GREETING: {
+        Event.WELCOME: State.WELCOMED,
+        Event.DISCONNECTED: State.GREETING,
+        Event.SILENCE: State.GREETING,
+        Event.LEFT: State.CLOSED,
+    },
+    State.WELCOMED: {
+        Event.WELCOME: State.WELCOMED,
+        Event.FORGOTTEN: State.GREETING,
+        Event.DISCONNECTED: State.WELCOMED,
+        Event.UNANSWERED: State.WELCOMED,
+        Event.SILENCE: State.GREETING,
+        Event.LEFT: State.CLOSED,
+    },
+}
+
+
+_STOPPED_SECONDS = 1.0
+"""If a wait exceeds its deadline by this much, the process was stopped."""
+_WARN_SECONDS = 5.0
+"""A server without workers is logged after this time."""
+
+_log = logging.getLogger(__name__)
+
+
+class ListeningClock:
+    """Measure the seconds spent listening. ``now`` is the caller's monotonic clock, in seconds."""
+
+    def __init__(self, now: float) -> None:
+        self._away = 0.0
+        self._paused = now
+
+    def time(self, now: float) -> float:
+        """Return the seconds of listening so far, from an arbitrary origin."""
+        return now - self._away
+
+    def listen(self, now: float) -> None:
+        """Start listening. The time since :meth:`pause` does not count."""
+        self._away += max(0.0, now - self._paused)
+
+    def pause(self, now: float) -> None:
+        """Stop listening."""
+        self._paused = now
+
+    def wake(self, now: float, due: float) -> None:
+        """End a wait for messages that was to end at ``due`` at the latest.
+
+        If ``due`` is over 1 s ago, this process was stopped (in a terminal, by a batch system) and could not receive;
+        the excess does not count.
+        """
+        if now - due > _STOPPED_SECONDS:
+            self._away += now - due
+
+
+class WorkerShortage:
+    """Measure how long a server that answers has had no worker to make a requested sample.
+
+    Args:
+        now: seconds of listening.
+        limit_seconds: time after which the consumer gives up.
+    """
+
+    def __init__(self, now: float, limit_seconds: float) -> None:
+        self._since = now
+        self._limit_seconds = limit_seconds
+        self._warned = False
+
+    def end(self, now: float) -> None:
+        """Record that the server answered a request, or was replaced."""
+        self._since = now
+
+    def check(self, address: str, trouble: str, now: float) -> None:
+        """Record the trouble that a server reports with its workers; log it after 5 s.
+
+        Args:
+            address: of the server.
+            trouble: why no sample can be made; empty if there is no trouble, or no request.
+
+        Raises:
+            NoWorkers: there has been trouble for ``limit_seconds``.
+        """
+        if not trouble:
+            self._since, self._warned = now, False
+            return
+        waited = now - self._since
+        text = f"{address}: no sample for {waited:.0f} s, because {trouble}"
+        if waited >= self._limit_seconds:
+            raise NoWorkers(f"{text}; or wait longer with timeout_seconds (now {self._limit_seconds:g})")
+        if waited >= _WARN_SECONDS and not self._warned:
+            self._warned = True
+            _log.warning("%s; giving up after %g s (timeout_seconds)", text, self._limit_seconds)
+
+
+def unpack(frame: Buffer, size: int) -> Buffer:
+    """Return the bytes of an array.
+
+    Args:
+        frame: a zstd frame that states its content size.
+        size: of the array, in bytes. No more than this is ever allocated.
+
+    Raises:
+        ProtocolError: it is not a zstd frame, or it holds another number of bytes.
+    """
+    try:
+        stated = zstandard.frame_content_size(frame)
+        if stated == size:
+            return zstandard.ZstdDecompressor().decompress(frame)
+    except zstandard.ZstdError as error:
+        raise ProtocolError(f"sample: a compressed array is damaged: {error}") from None
+    raise ProtocolError(f"sample: a compressed array states {stated} bytes; it has {size}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from v2v_client.memory.slots import Answer, Slots
+from v2v_client.memory import Answer, Slots
 from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.messages import Want
 

@@ -17,9 +17,9 @@ import zmq.sugar.socket
 
 from tests.client.fake_server import SPEC, FakeServer
 from tests.waiting import until
-from v2v_client.session.connection import Connection
-from v2v_client.session.liveness import Patience
-from v2v_client.session.states import Event
+from v2v_client.connection import Connection
+from v2v_client.conversation import Event
+from v2v_client.options import Patience
 from v2v_protocol.link import dealer
 from v2v_protocol.messages import Hello
 from v2v_protocol.sample import DEFAULT_ARRAYS

@@ -11,9 +11,8 @@ import pytest
 
 from tests.client.fake_server import SPEC, FakeServer
 from v2v_client import V2VStreamDataset
-from v2v_client.session.brokers import addresses, order
-from v2v_client.session.connection import Connection
-from v2v_client.session.liveness import Patience
+from v2v_client.connection import Connection, addresses, order
+from v2v_client.options import Patience
 from v2v_protocol.errors import ServerLost, StateMismatch, UsageError
 from v2v_protocol.messages import Hello
 from v2v_protocol.sample import DEFAULT_ARRAYS

@@ -1,6 +1,6 @@
 import pytest
 
-from v2v_client.tools.schedule_check import ScheduleCheck
+from v2v_client.loadtest import ScheduleCheck
 
 
 def epochs(*wanted, sequences=11, batch=2):

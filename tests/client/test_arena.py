@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v2v_client.memory.arena import Arena, open_arena
+from v2v_client.memory import Arena, open_arena
 from v2v_protocol.arena import MOST_SLOTS, NO_SLOT, ArenaName, Slot, array_offsets
 from v2v_protocol.errors import ProtocolError
 from v2v_server.worker.output_buffer import slot_arrays
@@ -140,7 +140,7 @@ def test_the_callback_runs_once_a_batch_is_unreferenced(arena: Arena) -> None:
 
 def test_another_process_of_this_user_can_write(arena: Arena) -> None:
     code = (
-        "import sys; from tests.client.memory.test_arena import Slot, write; "
+        "import sys; from tests.client.test_arena import Slot, write; "
         "sys.exit(not write(Slot(sys.argv[1], int(sys.argv[2])), 4))"
     )
     slot = arena.slot(3)

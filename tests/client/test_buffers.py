@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from v2v_client.memory.buffers import BatchBuffers, BatchMemory
+from v2v_client.memory import BatchBuffers, BatchMemory
 
 
 def address(array: np.ndarray) -> int:
