@@ -10,7 +10,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("v2v_protocol", "v2v_pictures", "v2v_recordings", "v2v_server", "v2v_client", "trainer")
 MAY_UNPICKLE = {
-    "v2v_client/position/shared.py",  # a descriptor that only this process and its loader workers have
+    "v2v_client/passes.py",  # a descriptor that only this process and its loader workers have
     "trainer/unpickle.py",  # weights, by an unpickler that knows a closed list of names
 }
 CALLS = {"eval", "exec", "os.system", "os.popen", "pickle.load", "pickle.loads", "marshal.loads", "yaml.unsafe_load"}
@@ -46,7 +46,7 @@ def calls() -> list[Call]:
 
 
 def test_received_data_is_never_executed() -> None:
-    assert {call.path for call in calls() if call.function in CALLS} == {"v2v_client/position/shared.py"}
+    assert {call.path for call in calls() if call.function in CALLS} == {"v2v_client/passes.py"}
 
 
 def test_no_channel_between_processes_unpickles() -> None:

@@ -10,7 +10,7 @@ Modules:
     dataset       the dataset; batch: what it yields; delivery: samples to batches; options: what a consumer may request
     conversation  the protocol, pure (states, messages, times); connection: runs it over a link
     memory        arenas (workers of this host write there), slots (which sample has which row), buffers (reused)
-    position/     plan (which samples a consumer gets), state (what is saved), position (one copy), shared (all copies)
+    position      which samples a consumer gets, and the state that is saved; passes: shared with loader workers
     loaders       adjustments for loader workers
     representations  inputs of other networks, from the arrays of a batch
     in_process    samples by index, without a server

@@ -29,7 +29,7 @@ from typing import Any, Protocol
 from v2v_client.conversation import WAIT_REPORT_SECONDS, Arrival, Conversation, Event, ListeningClock, State
 from v2v_client.memory import open_sample
 from v2v_client.options import Options, Patience
-from v2v_client.position.state import ResumeState, StreamIdentity
+from v2v_client.position import ResumeState, StreamIdentity
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.link.dealer import Dealer, diagnose

@@ -31,7 +31,7 @@ import zstandard
 
 from v2v_client.memory import Answer, Slots
 from v2v_client.options import Patience
-from v2v_client.position.state import StreamIdentity
+from v2v_client.position import StreamIdentity
 from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.errors import NoWorkers, ProtocolError, RemoteError, SampleUnavailable, ServerLost
 from v2v_protocol.liveness import Liveness

@@ -24,8 +24,7 @@ from v2v_client.batch import Batch
 from v2v_client.connection import Connection
 from v2v_client.conversation import Arrival
 from v2v_client.memory import BatchBuffers, BatchMemory
-from v2v_client.position.plan import EpochPlan
-from v2v_client.position.state import ResumeState
+from v2v_client.position import EpochPlan, ResumeState
 from v2v_protocol.errors import LimitExceeded
 from v2v_protocol.messages import SampleHeader
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from v2v_client.position.state import StreamIdentity
+from v2v_client.position import StreamIdentity
 from v2v_protocol.errors import SampleUnavailable, UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, array_layout

@@ -15,7 +15,7 @@ from tests.client.fake_server import SPEC, expected
 from v2v_client.connection import Connection
 from v2v_client.conversation import TRANSITIONS, Conversation, Event, ListeningClock, State
 from v2v_client.options import Patience
-from v2v_client.position.state import StreamIdentity
+from v2v_client.position import StreamIdentity
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import NoWorkers, ServerLost, UsageError
 from v2v_protocol.messages import Denied, ErrorCode, Goodbye, Hello, Message, Ping, Pong, SampleHeader, Want, Welcome

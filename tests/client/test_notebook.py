@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 from tests.clips import panned_luma, write_clip
 from v2v_client import UsageError, V2VDataset, V2VStreamDataset
 from v2v_client.batch import _drawing, draw_samples
-from v2v_client.position.state import ResumeState, StreamIdentity
+from v2v_client.position import ResumeState, StreamIdentity
 from v2v_pictures.colours import BRIGHTER
 from v2v_protocol.recipe import Recipe
 from v2v_server.simulation import simulate

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v2v_client.position.state import LoaderShare, ResumeState, StreamIdentity
+from v2v_client.position import LoaderShare, ResumeState, StreamIdentity
 from v2v_protocol.errors import StateMismatch, UsageError
 
 STATE = ResumeState(

@@ -8,9 +8,8 @@ from collections.abc import Iterator
 import pytest
 import torch.utils.data._utils.worker as torch_worker
 
-from v2v_client.position.plan import Consumer
-from v2v_client.position.position import Iteration, Position
-from v2v_client.position.state import ResumeState, StreamIdentity
+from v2v_client.passes import Iteration, Position
+from v2v_client.position import Consumer, ResumeState, StreamIdentity
 from v2v_protocol.errors import UsageError
 
 STREAM = StreamIdentity({}, "spec", "catalogue", 1, sequences=24)

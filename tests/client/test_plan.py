@@ -4,8 +4,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from v2v_client.position.plan import Consumer, EpochPlan
-from v2v_client.position.state import ResumeState
+from v2v_client.position import Consumer, EpochPlan, ResumeState
 from v2v_protocol.errors import UsageError
 
 SEQUENCES = st.integers(0, 300)

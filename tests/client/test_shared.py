@@ -1,4 +1,4 @@
-"""Test the record between processes."""
+"""Test the table between processes."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ import pickle
 import signal
 import threading
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import torch.utils.data._utils.worker as torch_worker
 
-from v2v_client.position.record import Record, Start
-from v2v_client.position.shared import Shared
-from v2v_client.position.state import ResumeState
+from v2v_client.passes import Shared, Start, Table
+from v2v_client.position import ResumeState
 
 FORK = multiprocessing.get_context("fork")
-RECORD = Record(Start(ResumeState(None, 7, 3, 0, 0, 1)))
+SPAWN = multiprocessing.get_context("spawn")
+TABLE = Table(Start(ResumeState(None, 7, 3, 0, 0, 1)))
 
 
 def test_ranks_that_get_a_dataset_from_one_process_each_have_their_own_epochs() -> None:
     """torch.multiprocessing.spawn and notebook launchers do this. Ranks that are seeded alike name their
     passes alike."""
-    shared = Shared(RECORD)
-    with shared.change() as record:
-        record.begin("before", 0, 1)
+    shared = Shared(TABLE)
+    with shared.change() as table:
+        table.begin("before", 0, 1)
     for _ in range(2):
         assert _forked(_rank, shared) == (3, 4)
     assert shared.read().start.state.epoch == 3
@@ -39,10 +39,10 @@ def _rank(shared: Shared) -> tuple[int, int]:
 
 def _loader_worker(shared: Shared) -> int:
     torch_worker._worker_info = torch_worker.WorkerInfo(id=0, num_workers=1, seed=7, dataset=None)
-    with shared.change() as record:
-        begun, _ = record.begin("pass", 0, 1)
-        epoch = begun.start.state.epoch
-        record.finish(begun.number, 0)
+    with shared.change() as table:
+        number, _ = table.begin("pass", 0, 1)
+        epoch = table.passes[number].start.state.epoch
+        table.deliver(number, 0, finished=True)
     return epoch
 
 
@@ -64,25 +64,49 @@ def _forked(function: Callable[[Shared], Any], shared: Shared) -> Any:
 
 
 def test_a_rank_that_is_spawned_has_its_own_epochs() -> None:
-    shared = Shared(RECORD)
-    spawned = Shared.__new__(Shared)
-    descriptor = SimpleNamespace(detach=lambda: os.dup(shared._descriptor))
-    spawned.__setstate__({"descriptor": descriptor, "process": os.getpid() + 1})
-    with spawned.change() as record:
-        record.set_epoch(4)
-    assert (shared.read().start.state.epoch, spawned.read().start.state.epoch) == (3, 4)
+    """Its loader workers, which are forked or spawned in turn, have those of the rank."""
+    shared = Shared(TABLE)
+    here, there = SPAWN.Pipe()
+    process = SPAWN.Process(target=_spawned_rank, args=(shared, there))
+    process.start()
+    there.close()
+    assert here.recv() == (3, 4)
+    process.join()
+    process.close()
+    here.close()
+    assert shared.read().start.state.epoch == 3
 
 
-def test_a_copy_is_a_record_of_its_own() -> None:
-    shared = Shared(RECORD)
+def _spawned_rank(shared: Shared, there: Any) -> None:
+    there.send(_rank(shared))
+
+
+def test_tables_of_ended_ranks_do_not_fill_the_file() -> None:
+    """A notebook may launch ranks again and again with one dataset."""
+    shared = Shared(TABLE)
+    with shared.change() as table:
+        table.set_epoch(5)
+    for rank in range(100):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(os, "getpid", lambda rank=rank: 1_000_000 + rank)
+            with shared.change() as table:
+                assert table.start.state.epoch == 5
+                table.set_epoch(rank)
+    size = os.fstat(shared._descriptor).st_size
+    assert size % (1 << 30) < 80 * len(pickle.dumps(TABLE))
+    assert shared.read().start.state.epoch == 5
+
+
+def test_a_copy_is_a_table_of_its_own() -> None:
+    shared = Shared(TABLE)
     copied = pickle.loads(pickle.dumps(shared))
-    with copied.change() as record:
-        record.set_epoch(4)
+    with copied.change() as table:
+        table.set_epoch(4)
     assert (shared.read().start.state.epoch, copied.read().start.state.epoch) == (3, 4)
 
 
 def test_changes_of_many_threads_and_processes_are_all_kept() -> None:
-    shared = Shared(RECORD)
+    shared = Shared(TABLE)
     threads = [threading.Thread(target=_count_up, args=(shared,)) for _ in range(3)]
     for thread in threads:
         thread.start()
@@ -95,8 +119,8 @@ def test_changes_of_many_threads_and_processes_are_all_kept() -> None:
 
 def _count_up(shared: Shared) -> None:
     for _ in range(50):
-        with shared.change() as record:
-            record.set_epoch(record.start.state.epoch + 1)
+        with shared.change() as table:
+            table.set_epoch(table.start.state.epoch + 1)
 
 
 def _count_up_as_a_loader_worker(shared: Shared) -> None:
@@ -104,14 +128,14 @@ def _count_up_as_a_loader_worker(shared: Shared) -> None:
     _count_up(shared)
 
 
-def test_a_process_that_is_killed_in_a_change_leaves_no_lock_and_the_record_as_it_was() -> None:
-    shared = Shared(RECORD)
+def test_a_process_that_is_killed_in_a_change_leaves_no_lock_and_the_table_as_it_was() -> None:
+    shared = Shared(TABLE)
     here, there = FORK.Pipe()
 
     def run() -> None:
         torch_worker._worker_info = torch_worker.WorkerInfo(id=0, num_workers=1, seed=7, dataset=None)
-        with shared.change() as record:
-            record.set_epoch(9)
+        with shared.change() as table:
+            table.set_epoch(9)
             shared._write = _stopped(there)  # type: ignore[method-assign]
 
     process = FORK.Process(target=run)
@@ -127,7 +151,7 @@ def test_a_process_that_is_killed_in_a_change_leaves_no_lock_and_the_record_as_i
 
 
 def _stopped(there: Any) -> Callable[..., None]:
-    def write(record: Record, *, half: int) -> None:
+    def write(tables: dict[int, Table], *, at: int) -> None:
         there.send("about to write")
         signal.pause()
 
