@@ -5,7 +5,7 @@
 The kernel does not show its residual, so ``dense.trace`` goes through the clip again, in the arithmetic the kernel
 chose, and has to come to the very same counts. Its residual closes the balance. The right side is summed without error:
 log intensities cancel but for the first and last, thresholds and counts multiply as fractions, normals add by ``fsum``.
-What is left must be below ``precision.error_bound``.
+What is left must be below ``error_bound``.
 """
 
 from __future__ import annotations
@@ -24,9 +24,14 @@ from v2v_protocol.bounds import most_events
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.intensity import log_table, log_table_float64
-from v2v_server.simulation.precision import AUTO, Real, choose, error_bound, noise_sum
+from v2v_server.simulation.precision import AUTO, Real, choose, noise_sum
 from v2v_server.simulation.voxel import rounding_tolerance
 from v2v_server.video.luma import SDR, Signal
+
+
+def error_bound(real: Real, events: float, smaller_threshold: float) -> float:
+    """Return the largest error of a pixel's events and residual, log units, given exact change and noise."""
+    return 4.0 * float(np.finfo(real).eps) * events * smaller_threshold
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tests.oracles import extremes_in_time as in_time
-from tests.oracles.balance import Camera, balance, imbalance, trace_of
+from tests.oracles.balance import Camera, balance, error_bound, imbalance, trace_of
 from tests.oracles.dense import trace
 from tests.oracles.noise import standard_normals
 from v2v_protocol.bounds import most_events
@@ -29,7 +29,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.draw import draw, noise_key_of_seed
 from v2v_server.simulation.intensity import log_table, log_table_float64
-from v2v_server.simulation.precision import LIMITS, error_bound
+from v2v_server.simulation.precision import LIMITS
 from v2v_server.simulation.voxel import rounding_tolerance
 from v2v_server.video.luma import SDR, Signal
 

@@ -21,6 +21,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from packaging.requirements import Requirement
+
 from v2v_protocol.command import version_of
 from v2v_server.system.process import usable_cores
 from v2v_server.system.sandbox import can_confine
@@ -41,9 +43,6 @@ names = [torch.cuda.get_device_name(n) for n in range(torch.cuda.device_count())
 print(json.dumps([torch.__version__, names]))
 """
 _TORCH_SECONDS = 120.0
-_NAME = re.compile(r"([A-Za-z0-9_.-]+)(?:\[([a-z]+)\])?")
-_FLOOR = re.compile(r">=([0-9.]+)")
-_EXTRA = re.compile(r"extra == ['\"]([a-z]+)['\"]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +75,7 @@ def look_around(port: int, videos: str | None, recipe: str, rows: str, cache_dir
     yield from _installation(missing)
     if not missing["server"]:
         yield from _libraries()
-    if _is_here("torch", None):
+    if _is_here(Requirement("torch")):
         yield _torch()
     yield from _machine()
     yield _port(port)
@@ -91,34 +90,27 @@ def look_around(port: int, videos: str | None, recipe: str, rows: str, cache_dir
 
 
 def _missing(part: str) -> list[str]:
-    """List the requirements of an extra that are not installed, or too old, with their lowest versions."""
+    """List the requirements of an extra that are not installed, or of another version than it allows."""
     try:
         requirements = metadata.requires("v2v-stream") or []
     except metadata.PackageNotFoundError:
         return []
     wanting = []
-    for requirement in requirements:
-        extra, named, stated = _EXTRA.search(requirement), _NAME.match(requirement), _FLOOR.search(requirement)
-        if extra is None or extra[1] != part or named is None:
+    for requirement in map(Requirement, requirements):
+        if requirement.marker is None or not requirement.marker.evaluate({"extra": part}):
             continue
-        (name, of_ours), floor = named.groups(), stated and stated[1]
-        if of_ours:
-            wanting += _missing(of_ours)
-        elif not _is_here(name, floor):
-            wanting.append(f"{name}>={floor}" if floor else name)
+        if requirement.name == "v2v-stream":
+            wanting += [name for extra in sorted(requirement.extras) for name in _missing(extra)]
+        elif not _is_here(requirement):
+            wanting.append(f"{requirement.name}{requirement.specifier}")
     return wanting
 
 
-def _is_here(name: str, floor: str | None) -> bool:
+def _is_here(requirement: Requirement) -> bool:
     try:
-        found = metadata.version(name)
+        return requirement.specifier.contains(metadata.version(requirement.name), prereleases=True)
     except metadata.PackageNotFoundError:
         return False
-    return floor is None or _numbers(found) >= _numbers(floor)
-
-
-def _numbers(version: str) -> list[int]:
-    return [int(number) for number in re.findall(r"\d+", version.split("+")[0])]
 
 
 def _installation(missing: dict[str, list[str]]) -> Iterator[Finding]:

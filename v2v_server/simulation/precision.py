@@ -87,11 +87,6 @@ def check_thresholds(threshold_pos: float, threshold_neg: float) -> None:
             raise UsageError(f"{name} = {value!r}: give a number from {low:.3g} to {high:.3g}")
 
 
-def error_bound(real: Real, events: float, smaller_threshold: float) -> float:
-    """Return the largest error of a pixel's events and residual, log units, given exact change and noise."""
-    return 4.0 * float(np.finfo(real).eps) * events * smaller_threshold
-
-
 def noise_sum(noise_sigma: float, hot_pixel_sigma: float, step_seconds: npt.NDArray[np.float64]) -> float:
     """Return the standard deviations of noise and hot drift, summed over the steps, log units."""
     first = float(step_seconds[0])

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.oracles.balance import Camera, arithmetic, balance, imbalance, trace_of
+from tests.oracles.balance import Camera, arithmetic, balance, error_bound, imbalance, trace_of
 from tests.oracles.extremes import Finding, Row, record_of, refused, rows, texture
 from tests.oracles.noise import standard_normals, start_uniforms
 from tests.server.simulation import oracle, reference
@@ -21,7 +21,7 @@ from v2v_protocol.sample import SampleParams
 from v2v_server.simulation import noise, simulate, simulate_clip
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.intensity import log_table_float64
-from v2v_server.simulation.precision import AUTO, LIMITS, choose, error_bound
+from v2v_server.simulation.precision import AUTO, LIMITS, choose
 from v2v_server.simulation.voxel import rounding_tolerance
 
 
