@@ -29,7 +29,7 @@ from v2v_recordings.items import EventChunk, FlowField, Item, Note, Picture, Sen
 FLUSH_EVENTS = 1 << 19
 REORDER_EVENTS = 1 << 17
 H5_CHUNK = 1 << 16
-COLUMNS = {"ts": np.float64, "xs": np.uint16, "ys": np.uint16, "ps": np.bool_}
+_COLUMNS = {"ts": np.float64, "xs": np.uint16, "ys": np.uint16, "ps": np.bool_}
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class RecordingWriter:
             self._file = self._files.enter_context(h5py.File(partial, "w"))
         except OSError as error:
             raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
-        for name, dtype in COLUMNS.items():
+        for name, dtype in _COLUMNS.items():
             self._file.create_dataset(
                 f"events/{name}", (0,), dtype, maxshape=(None,), chunks=(H5_CHUNK,), compression="gzip",
                 compression_opts=1, shuffle=True,
