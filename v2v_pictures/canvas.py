@@ -11,16 +11,16 @@ from PIL import ImageDraw, ImageFont
 
 from v2v_pictures.colours import Image
 
-Colour = tuple[int, int, int]
+Rgb = tuple[int, int, int]
 
-PAPER: Colour = (255, 255, 255)
-INK: Colour = (28, 30, 34)
-SOFT: Colour = (104, 108, 116)
-LINE: Colour = (186, 190, 198)
-SHADE: Colour = (241, 242, 245)
-MARK: Colour = (173, 96, 0)
+PAPER: Rgb = (255, 255, 255)
+INK: Rgb = (28, 30, 34)
+SOFT: Rgb = (104, 108, 116)
+LINE: Rgb = (186, 190, 198)
+SHADE: Rgb = (241, 242, 245)
+MARK: Rgb = (173, 96, 0)
 """Orange as dark as a projector needs: 4.7 times less light than paper."""
-PAUSED: Colour = (196, 199, 207)
+PAUSED: Rgb = (196, 199, 207)
 
 TITLE_PT, HEADING_PT, TEXT_PT = 26, 20, 16
 MARGIN_PX, GAP_PX = 28, 8
@@ -65,7 +65,7 @@ class Canvas:
         self._page.paste(scaled, (x + (width_px - size[0]) // 2, y + (height_px - size[1]) // 2))
         self._draw.rectangle((x - 1, y - 1, x + width_px, y + height_px), outline=LINE)
 
-    def box(self, left: float, top: float, right: float, bottom: float, colour: Colour) -> None:
+    def box(self, left: float, top: float, right: float, bottom: float, colour: Rgb) -> None:
         """Fill a rectangle, without its right column and bottom row; draw nothing below one whole pixel."""
         left, top, right, bottom = map(round, (left, top, right, bottom))
         if right > left and bottom > top:

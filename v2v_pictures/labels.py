@@ -7,10 +7,10 @@ import numpy.typing as npt
 
 from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import Canvas, Colour
+from v2v_pictures.canvas import Canvas, Rgb
 from v2v_pictures.colours import Image
 
-_COLOURS: tuple[Colour, ...] = (
+_COLOURS: tuple[Rgb, ...] = (
     (0, 128, 70),
     (190, 110, 0),
     (120, 50, 170),
@@ -24,7 +24,7 @@ _NO_OBJECT = (0, 255)
 _TEXT_PT = 12
 
 
-def class_colour(category: int) -> Colour:
+def class_colour(category: int) -> Rgb:
     """Return the colour of a class."""
     return _COLOURS[category % len(_COLOURS)]
 

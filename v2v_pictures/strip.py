@@ -8,7 +8,7 @@ import numpy as np
 
 from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import Canvas, Colour
+from v2v_pictures.canvas import Canvas, Rgb
 from v2v_pictures.colours import BRIGHTER, DARKER
 
 LABEL_PX, TICKS_PX = 22, 24
@@ -90,6 +90,6 @@ def _ticks(page: Canvas, grids: int, left: int, width: int, top: int, picks: Seq
         page.text(left + width, top, str(grids), colour=canvas.SOFT, anchor="ra")
 
 
-def _pale(colour: Colour) -> Colour:
+def _pale(colour: Rgb) -> Rgb:
     red, green, blue = (round(part + _PALE * (255 - part)) for part in colour)
     return red, green, blue
