@@ -22,7 +22,7 @@ ERROR_KEY = f"voxel_error_at_{ERROR_THRESHOLD:g}"
 """The error that settings are judged by."""
 
 Record = Mapping[str, Any]
-Columns = Sequence[tuple[str, str, str, float]]
+_Columns = Sequence[tuple[str, str, str, float]]
 """Key of a record, title, format, and the factor from SI units to what is shown."""
 _WIDTH = 200
 _MARKERS = dict(zip(SAMPLES_PER_DECODE, "o^s", strict=True))
@@ -30,13 +30,13 @@ _MARKERS = dict(zip(SAMPLES_PER_DECODE, "o^s", strict=True))
 BATCH = 12
 """Samples of the batch whose processor time is shown."""
 
-_ERRORS: Columns = (
+_ERRORS: _Columns = (
     ("way", "per cent, at c", "{}", 1),
     *((f"voxel_error_at_{c:g}", f"voxels {c:g}", "{:.2f}", 100) for c in (0.05, 0.2, 0.5, 1, 2)),
     *((f"count_error_at_{c:g}", f"count {c:g}", "{:+.2f}", 100) for c in (0.05, 0.2, 1)),
     ("bins_changed_at_0.2", "bins 0.2", "{:.2f}", 100),
 )
-_SETTINGS: Columns = (
+_SETTINGS: _Columns = (
     ("name", "", "{}", 1),
     ("samples_per_core_second", "samples/core s", "{:.2f}", 1),
     ("speed_ratio", "x first", "{:.2f}", 1),
@@ -48,14 +48,14 @@ _SETTINGS: Columns = (
     ("predicted_signed", "wrong", "{:.0f}", 100),
     ("dominated_by", "dominated by", "{}", 1),
 )
-_PARTS: Columns = (
+_PARTS: _Columns = (
     ("way", "CPU ms of a sample, from the source", "{}", 1),
     ("decode_seconds", "decode, motion", "{:.1f}", 1e3),
     ("view_seconds", "view, levels", "{:.1f}", 1e3),
     ("kernel_seconds", "kernel", "{:.1f}", 1e3),
     ("substeps_per_step", "sub-steps a step", "{:.2f}", 1),
 )
-_DIVERSITY: Columns = (
+_DIVERSITY: _Columns = (
     ("name", "correlation between", "{}", 1),
     ("pairs", "pairs", "{}", 1),
     ("pixel_correlation", "pixels", "{:.3f}", 1),
@@ -123,7 +123,7 @@ def tables(records: Sequence[Record]) -> str:
     return "\n".join(parts)
 
 
-def format_table(records: Sequence[Record], columns: Columns) -> str:
+def format_table(records: Sequence[Record], columns: _Columns) -> str:
     """Format records as a table; a missing value is a dash."""
     table = Table(box=None, pad_edge=False)
     for number, (_, title, _, _) in enumerate(columns):
