@@ -30,7 +30,7 @@ SYSTEMATIC = {
     "refractory_seconds": 0.25,
 }
 """Errors, as shares, that a bootstrap does not see: seen on simulated cameras (``python -m bench fit``)."""
-DARKEST = 0.1
+_DARKEST = 0.1
 """Light that the corner frequency keeps in the dark (``effects/photoreceptor.py``)."""
 LEAST_INCREMENTS = 1000
 _SOLVED = ("threshold_pos", "threshold_neg", "photoreceptor_hz")
@@ -110,7 +110,7 @@ def _rows(given: Increments, log_eps: float, solved: Doubles) -> tuple[Doubles, 
     change = np.log(log_eps + light[1]) - np.log(log_eps + light[0])
     sensitivity = GAMMA * light / (light + log_eps) / given.grey
     positive, negative = np.maximum(solved[:2], 1e-4)
-    lag = given.speed * (1.0 + DARKEST) / (2.0 * math.pi * (light + DARKEST))
+    lag = given.speed * (1.0 + _DARKEST) / (2.0 * math.pi * (light + _DARKEST))
     lag = lag * np.where(given.speed > 0, positive, negative)
     counted = np.abs(given.on) + np.abs(given.off)
     columns = np.stack([given.on, -given.off, lag[1] - lag[0], given.seconds], axis=1)
