@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-METRICS = ("mse", "ssim_range2", "lpips_alex")
+_METRICS = ("mse", "ssim_range2", "lpips_alex")
 """Names of the paper's three columns in this project."""
 
 _DATA_SETS = ("HQF", "EVAID", "IJRR", "MVSEC")
@@ -42,7 +42,7 @@ _TABLE: dict[str, tuple[Triple, Triple, Triple, Triple]] = {
 
 RESULTS: dict[str, dict[str, dict[str, float]]] = {
     method: {
-        data_set: dict(zip(METRICS, triple, strict=True)) for data_set, triple in zip(_DATA_SETS, triples, strict=True)
+        data_set: dict(zip(_METRICS, triple, strict=True)) for data_set, triple in zip(_DATA_SETS, triples, strict=True)
     }
     for method, triples in _TABLE.items()
 }
