@@ -54,7 +54,7 @@ Range = tuple[float, float]
 
 LARGEST_SIDE_PX = 16_384
 LARGEST_SCALE = 100.0
-EFFECTS = "Effects beyond the paper's model; zero is off"
+EFFECTS_SECTION = "Effects beyond the paper's model; zero is off"
 """The group of fields that switch on an effect where the upper end of their range is above zero."""
 TIME_UNITS = ("Hz", "s")
 """An effect in one of these needs the time between frames."""
@@ -161,7 +161,7 @@ class Recipe:
     )  # fmt: skip
     threshold_mismatch_sigma: Range = span(
         (0.0, 0.0), 0.0, 1.0, "standard deviation of each pixel's thresholds, as a share of the nominal ones",
-        group=EFFECTS,
+        group=EFFECTS_SECTION,
     )  # fmt: skip
     shot_noise_hz: Range = span(
         (0.0, 0.0), 0.0, 1e4,
@@ -406,7 +406,7 @@ class Recipe:
 
 def effect_settings() -> dict[str, Setting]:
     """Return the fields of a recipe that switch on an effect beyond the paper's model."""
-    return {name: setting for name, setting in settings_of(Recipe).items() if setting.group == EFFECTS}
+    return {name: setting for name, setting in settings_of(Recipe).items() if setting.group == EFFECTS_SECTION}
 
 
 PRESETS: dict[str, Recipe] = {name: Recipe(**fields) for name, fields in PRESET_FIELDS.items()}

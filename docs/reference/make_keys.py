@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.presets import PRESET_FIELDS, STREAM_PRESETS
-from v2v_protocol.recipe import EFFECTS, Recipe
+from v2v_protocol.recipe import EFFECTS_SECTION, Recipe
 from v2v_protocol.settings import Setting, settings_of
 from v2v_protocol.spec import StreamSpec
 from v2v_server.config import ServeConfig
@@ -95,7 +95,9 @@ def _section(title: str, cls: type[Any]) -> Iterator[str]:
 def _sources() -> Iterator[str]:
     """List the fields of each source but the one of most fields."""
     fields = [
-        name for name, setting in settings_of(Recipe).items() if not setting.is_hidden and setting.group != EFFECTS
+        name
+        for name, setting in settings_of(Recipe).items()
+        if not setting.is_hidden and setting.group != EFFECTS_SECTION
     ]
     yield f"### Sources\n\nFields and defaults are those of {_SHIPPED}, but for:\n\n| source | fields |\n|---|---|"
     for source in dict.fromkeys(SOURCES[name] for name in fields):
