@@ -16,7 +16,7 @@ from v2v_recordings.archive import Archive
 from v2v_recordings.items import ConvertOptions, Item, Progress, to_ns
 from v2v_recordings.text_events import read_texts
 
-EVENTS = "events.txt"
+_EVENTS = "events.txt"
 IMAGES = "images.txt"
 TEXT_SUFFIXES = (".txt", ".csv")
 
@@ -24,7 +24,7 @@ TEXT_SUFFIXES = (".txt", ".csv")
 def recognises(path: Path) -> bool:
     """Return whether the path is a text file, or an archive with ``events.txt``."""
     is_text = path.is_file() and path.suffix.lower() in TEXT_SUFFIXES
-    return is_text or archives.holds(path, lambda archive: archive.named(EVENTS))
+    return is_text or archives.holds(path, lambda archive: archive.named(_EVENTS))
 
 
 def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
@@ -34,11 +34,11 @@ def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[It
         UsageError: a part is missing or malformed.
     """
     with Archive(path) as archive:
-        events = path.name if archive.is_single else archive.find(EVENTS)
+        events = path.name if archive.is_single else archive.find(_EVENTS)
         pictures = _listed_pictures(archive)
         if pictures:
             yield archive.size(pictures[0][1])
-        yield from read_texts(archive, [events or EVENTS], pictures, options.time_unit, progress)
+        yield from read_texts(archive, [events or _EVENTS], pictures, options.time_unit, progress)
 
 
 def _listed_pictures(archive: Archive) -> list[tuple[int, str]]:
