@@ -10,7 +10,7 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
 from v2v_protocol.spec_flags import add_spec, recipe_setting, spec_fields
-from v2v_server.offline.event_files import FORMS
+from v2v_server.offline.event_files import EVENT_WRITERS
 from v2v_server.offline.remake import simulate_to_file
 
 
@@ -44,7 +44,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         "Output", "--out", (".npz",), "output file for the arrays and the provenance (JSON)", required=True
     )
     parser.add_output("Output", "--picture", (".png",), "also write a picture of frames and voxels")
-    parser.add_output("Output", "--events", tuple(FORMS), f"also write the events with their times: {', '.join(FORMS)}")
+    parser.add_output(
+        "Output",
+        "--events",
+        tuple(EVENT_WRITERS),
+        f"also write the events with their times: {', '.join(EVENT_WRITERS)}",
+    )
     out.add_argument(
         "--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME",
         help=f"of {', '.join(ARRAYS)} (default {','.join(DEFAULT_ARRAYS)})",

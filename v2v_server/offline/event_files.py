@@ -33,7 +33,7 @@ def write_events(path: Path, events: EventList) -> None:
         # The package faery tells the format by the ending.
         aside = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix.lower()}")
         with write_aside_and_rename(path, partial=aside) as partial:
-            FORMS[path.suffix.lower()](partial, events)
+            EVENT_WRITERS[path.suffix.lower()](partial, events)
     except (OSError, RuntimeError) as error:  # the latter is faery's, for instance for a full disk
         raise UsageError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
 
@@ -45,9 +45,9 @@ def check_event_file(path: Path) -> None:
         UsageError: see :func:`write_events`.
     """
     ending = path.suffix.lower()
-    if ending not in FORMS:
-        raise UsageError(f"{path}: unknown ending; events go into a file that ends in {', '.join(FORMS)}")
-    if package := _PACKAGES.get(FORMS[ending]):
+    if ending not in EVENT_WRITERS:
+        raise UsageError(f"{path}: unknown ending; events go into a file that ends in {', '.join(EVENT_WRITERS)}")
+    if package := _PACKAGES.get(EVENT_WRITERS[ending]):
         _package(package, path)
 
 
@@ -85,7 +85,7 @@ def _faery(path: Path, events: EventList) -> None:
         path.with_name(f"{path.name}.write").unlink(missing_ok=True)  # faery's own temporary file
 
 
-FORMS: dict[str, Callable[[Path, EventList], None]] = {
+EVENT_WRITERS: dict[str, Callable[[Path, EventList], None]] = {
     ".h5": _hdf5, ".hdf5": _hdf5, ".npz": _npz, ".raw": _faery, ".aedat4": _faery, ".es": _faery, ".dat": _faery,
 }  # fmt: skip
 """Writers by the ending of the name."""

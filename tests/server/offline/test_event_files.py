@@ -14,7 +14,7 @@ from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
 from v2v_server.commands import simulate as command
-from v2v_server.offline.event_files import FORMS, write_events
+from v2v_server.offline.event_files import EVENT_WRITERS, write_events
 from v2v_server.simulation import simulate
 from v2v_server.simulation.result import Voxels
 
@@ -47,7 +47,7 @@ def read(path: Path) -> EventList:
     return EventList(table["x"], table["y"], table["t"].astype(np.int64), table["on"], *stream.dimensions())
 
 
-@pytest.mark.parametrize("ending", FORMS)
+@pytest.mark.parametrize("ending", EVENT_WRITERS)
 def test_what_is_read_is_what_was_written(ending: str, tmp_path: Path) -> None:
     path, events = tmp_path / f"events{ending}", some_events()
     write_events(path, events)
@@ -68,7 +68,7 @@ def test_the_index_of_milliseconds_is_that_of_dsec(tmp_path: Path) -> None:
         assert index == 0 or t[index - 1] < ms * 1000
 
 
-@pytest.mark.parametrize("ending", FORMS)
+@pytest.mark.parametrize("ending", EVENT_WRITERS)
 def test_no_events_make_a_file_too(ending: str, tmp_path: Path) -> None:
     none = simulate(np.zeros((6, 4, 4), np.uint8), threshold_pos=1.0, start_residual=0.0).to_events(100)
     write_events(tmp_path / f"none{ending}", none)
