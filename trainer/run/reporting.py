@@ -29,7 +29,7 @@ from v2v_protocol.write_aside import write_aside_and_rename
 
 METRICS = "metrics.jsonl"
 CONFIGURATION = "config.yaml"
-FRAMES_PER_SECOND = 8
+_FRAMES_PER_SECOND = 8
 
 
 class Meter:
@@ -209,7 +209,7 @@ class Reporter:
                 sheet = add_header(contact_sheet(film), panels, f"step {step}", time_runs_down=True)
                 path = self._out / "previews" / f"step-{step:07d}-{number}"
                 path.with_suffix(".png").write_bytes(png_bytes(sheet))
-                with Video(path.with_suffix(".mp4"), FRAMES_PER_SECOND) as video:
+                with Video(path.with_suffix(".mp4"), _FRAMES_PER_SECOND) as video:
                     for image in film:
                         video.add(add_header(image, panels))
                 self._board.picture(f"preview/{number}", sheet, step)
