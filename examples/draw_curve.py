@@ -15,7 +15,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from trainer.run.reporting import METRICS, read_metrics
+from trainer.run.reporting import METRICS_FILE, read_metrics
 
 SHARE = 0.05
 """Weight of a new reading in the smoothed loss."""
@@ -27,7 +27,7 @@ def curves(runs: Sequence[Path], part: str = "total") -> tuple[dict[float, float
     held_out: dict[float, float] = {}
     begun, smooth = 0, 0.0
     for run in runs:
-        records = read_metrics(run / METRICS)
+        records = read_metrics(run / METRICS_FILE)
         for record in records:
             step = begun + record["step"]
             if part in record:

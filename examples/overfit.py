@@ -20,7 +20,7 @@ import av
 import cv2
 import numpy as np
 
-from trainer.run.reporting import METRICS, read_metrics
+from trainer.run.reporting import METRICS_FILE, read_metrics
 from trainer.train import main as train
 
 SIDE_PX = 32
@@ -75,7 +75,7 @@ def overfit(name: str, clips: Path, out: Path, **changes: Any) -> list[tuple[int
     flags = [text for setting in given for text in ("--set", setting)]
     if train([str(configuration), "--videos", str(clips), "--out", str(out), *flags]):
         raise SystemExit(1)
-    return [(record["step"], record["total"]) for record in read_metrics(out / METRICS) if "total" in record]
+    return [(record["step"], record["total"]) for record in read_metrics(out / METRICS_FILE) if "total" in record]
 
 
 _TINY = f"""

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 from examples import draw_curve
-from trainer.run.reporting import METRICS
+from trainer.run.reporting import METRICS_FILE
 
 
 def logged(folder: Path, losses: list[float]) -> Path:
     folder.mkdir()
     records = [{"step": step, "epoch": 0, "total": loss} for step, loss in enumerate(losses, start=1)]
     records.append({"step": len(losses), "epoch": 0, "held_out_total": 7.0})
-    (folder / METRICS).write_text("".join(json.dumps(record) + "\n" for record in records))
+    (folder / METRICS_FILE).write_text("".join(json.dumps(record) + "\n" for record in records))
     return folder
 
 

@@ -19,7 +19,7 @@ from trainer.config_file import load_config
 from trainer.models import NETWORKS, FireNet, VoxelNetwork
 from trainer.models.sequence import Guide, Settings
 from trainer.run.checkpoint import LAST, load_checkpoint
-from trainer.run.reporting import METRICS, read_metrics
+from trainer.run.reporting import METRICS_FILE, read_metrics
 from trainer.train import main
 from trainer.weights import load_into, load_network
 
@@ -102,7 +102,7 @@ def test_a_restarted_run_drops_readings_of_the_ended_one(server: FakeServer, tmp
 
 def test_a_truncated_reading_is_ignored(server: FakeServer, whole: Path, tmp_path: Path) -> None:
     run = trained(tmp_path, server.address, "run", run__steps=3)
-    with (run / METRICS).open("a", encoding="utf-8") as file:
+    with (run / METRICS_FILE).open("a", encoding="utf-8") as file:
         file.write('{"step": 4, "epo')
     trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=4)
     assert losses(run) == losses(whole)[:4]
@@ -229,7 +229,7 @@ def test_flow_is_scored_and_drawn_as_well(server: FakeServer, tmp_path: Path) ->
         loss__flow="stream", loss__valid="consistent",
     )  # fmt: skip
     assert server.hellos[-1].arrays == ("voxels", "flow", "flow_valid")
-    judged = [record for record in read_metrics(run / METRICS) if "held_out_total" in record]
+    judged = [record for record in read_metrics(run / METRICS_FILE) if "held_out_total" in record]
     assert [record["step"] for record in judged] == [0, 1, 2]
     assert all(record["held_out_end_point_error_px"] > 0 for record in judged)
     sheet = cv2.imread(str(run / "previews" / "step-0000002-0.png"))

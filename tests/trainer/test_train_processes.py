@@ -27,7 +27,7 @@ from trainer.feed import held_out_batch
 from trainer.learner import build
 from trainer.run.checkpoint import BEST, LAST, load_checkpoint
 from trainer.run.distributed import Ranks
-from trainer.run.reporting import METRICS, read_metrics
+from trainer.run.reporting import METRICS_FILE, read_metrics
 from trainer.train import main
 
 ROOT = Path(__file__).parents[2]
@@ -109,7 +109,7 @@ def test_two_ranks_with_validation_go_on_after_a_kill_as_if_there_had_been_none(
         return [*TORCHRUN, "-m", "trainer.train", *given]
 
     def records(out: str) -> list[dict[str, object]]:
-        found = read_metrics(tmp_path / out / METRICS)
+        found = read_metrics(tmp_path / out / METRICS_FILE)
         return [{name: value for name, value in each.items() if name not in OF_THE_CLOCK} for each in found]
 
     whole = subprocess.run(command("whole"), cwd=ROOT, capture_output=True, text=True, check=False)

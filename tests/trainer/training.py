@@ -11,7 +11,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from trainer.run.reporting import METRICS, read_metrics
+from trainer.run.reporting import METRICS_FILE, read_metrics
 from trainer.train import main
 
 SMALL: dict[str, Any] = {
@@ -62,7 +62,7 @@ def losses(out: Path) -> list[dict[str, Any]]:
     """What every reading said, apart from the time it took."""
     return [
         {name: value for name, value in record.items() if name not in OF_THE_CLOCK}
-        for record in read_metrics(out / METRICS)
+        for record in read_metrics(out / METRICS_FILE)
         if "total" in record
     ]
 

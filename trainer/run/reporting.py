@@ -27,7 +27,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
 from v2v_protocol.write_aside import write_aside_and_rename
 
-METRICS = "metrics.jsonl"
+METRICS_FILE = "metrics.jsonl"
 CONFIGURATION = "config.yaml"
 _FRAMES_PER_SECOND = 8
 
@@ -106,9 +106,9 @@ class Reporter:
         self._progress = Progress("training", "steps", console=self._console, shows_rate=False) if has_bar else None
         self._last_note = ""
         if speaks:
-            with self._writing(METRICS):
+            with self._writing(METRICS_FILE):
                 out.mkdir(parents=True, exist_ok=True)
-                _drop_after(out / METRICS, step)
+                _drop_after(out / METRICS_FILE, step)
             with self._writing("tensorboard"):
                 self._board = Board(out / "tensorboard", step + 1 if step else 0)
 
@@ -179,8 +179,8 @@ class Reporter:
         return any(name.startswith("validation_") for name in names)
 
     def _records(self) -> list[dict[str, Any]]:
-        with self._writing(METRICS):
-            return read_metrics(self._out / METRICS) if (self._out / METRICS).exists() else []
+        with self._writing(METRICS_FILE):
+            return read_metrics(self._out / METRICS_FILE) if (self._out / METRICS_FILE).exists() else []
 
     def configuration(self, config: TrainConfig) -> None:
         """Write all keys of the run to a file that ``v2v-train`` takes."""
@@ -191,7 +191,7 @@ class Reporter:
     def _write(self, record: Mapping[str, Any]) -> None:
         if self._board is None:
             return
-        with self._writing(METRICS), (self._out / METRICS).open("a", encoding="utf-8") as file:
+        with self._writing(METRICS_FILE), (self._out / METRICS_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")
         with self._writing("tensorboard"):
             for name, value in record.items():

@@ -17,7 +17,7 @@ from tests.trainer.training import arguments, losses, refused, trained
 from trainer.evaluation.cli import main as evaluate
 from trainer.evaluation.evaluate import evaluate_sequence
 from trainer.run.checkpoint import LAST, load_checkpoint
-from trainer.run.reporting import METRICS, read_metrics
+from trainer.run.reporting import METRICS_FILE, read_metrics
 from trainer.train import main
 
 
@@ -26,7 +26,7 @@ def test_a_held_out_batch_is_scored(
 ) -> None:
     run = trained(tmp_path, server.address, "run", run__steps=12, run__judge_every=5)
     assert losses(run) == losses(whole)
-    judged = [record for record in read_metrics(run / METRICS) if "held_out_total" in record]
+    judged = [record for record in read_metrics(run / METRICS_FILE) if "held_out_total" in record]
     assert [record["step"] for record in judged] == [0, 5, 10, 12]
     assert judged[-1]["held_out_total"] < judged[0]["held_out_total"]
     assert f"held out {judged[-2]['held_out_total']:.4f}  loss" in capsys.readouterr().out
@@ -42,17 +42,17 @@ def test_the_best_network_on_recordings_is_kept(server: FakeServer, whole: Path,
     assert losses(run)[:12] == losses(whole)
 
     def scored() -> dict[int, float]:
-        return {r["step"]: r["validation_mse"] for r in read_metrics(run / METRICS) if "validation_mse" in r}
+        return {r["step"]: r["validation_mse"] for r in read_metrics(run / METRICS_FILE) if "validation_mse" in r}
 
     assert list(scored()) == [10, 20]
     first_best = min(scored(), key=scored().__getitem__)
     assert load_checkpoint(run / "best.pt").step == first_best
-    record = next(record for record in read_metrics(run / METRICS) if "validation_mse" in record)
+    record = next(record for record in read_metrics(run / METRICS_FILE) if "validation_mse" in record)
     assert 0 < record["validation_correlation_lacking"] < 2
     trained(tmp_path, server.address, "run", "run/last.pt", run__steps=43, **validation)
     assert list(scored()) == [10, 20, 30, 40]
     assert load_checkpoint(run / "best.pt").step == min(scored(), key=scored().__getitem__)
-    assert [r["step"] for r in read_metrics(run / METRICS) if blank in r] == [10]  # it does not change
+    assert [r["step"] for r in read_metrics(run / METRICS_FILE) if blank in r] == [10]  # it does not change
     said = trainer_evaluation_means(run / "best.pt", tmp_path / "recordings")
     assert said["mse"] == pytest.approx(min(scored().values()), rel=1e-6)
 
@@ -65,7 +65,7 @@ def test_a_validation_that_did_not_end_comes_first_when_the_run_goes_on(
     settings: dict[str, Any] = {"run__validate": str(tmp_path / "recordings"), "run__steps": 7}
 
     def scored(run: Path) -> list[dict[str, float]]:
-        return [record for record in read_metrics(run / METRICS) if "validation_mse" in record]
+        return [record for record in read_metrics(run / METRICS_FILE) if "validation_mse" in record]
 
     whole = trained(tmp_path, server.address, "whole", **settings)
     with monkeypatch.context() as patched:

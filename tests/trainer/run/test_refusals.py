@@ -13,7 +13,7 @@ import torch
 from tests.client.fake_server import FakeServer
 from tests.trainer.training import arguments, losses, refused, same, trained
 from trainer.run.checkpoint import LAST, epoch_name, load_checkpoint, prune_epochs, require_fresh, save_checkpoint
-from trainer.run.reporting import METRICS
+from trainer.run.reporting import METRICS_FILE
 from trainer.train import main
 from v2v_protocol.errors import UsageError
 
@@ -186,7 +186,7 @@ def test_a_lost_server_costs_no_steps(tmp_path: Path, capsys: pytest.CaptureFixt
         message = refused(tmp_path, server.address, capsys, stream__timeout_seconds=2.0)
     assert "nothing received" in message
     assert load_checkpoint(tmp_path / "run" / LAST).step == len(losses(tmp_path / "run")) == 3
-    assert (tmp_path / "run" / METRICS).is_file()
+    assert (tmp_path / "run" / METRICS_FILE).is_file()
 
 
 def test_an_unreachable_server_leaves_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

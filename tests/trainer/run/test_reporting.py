@@ -14,7 +14,7 @@ import torch
 
 from trainer.config import TrainConfig
 from trainer.run.distributed import Ranks
-from trainer.run.reporting import METRICS, Meter, Reporter, read_metrics
+from trainer.run.reporting import METRICS_FILE, Meter, Reporter, read_metrics
 from v2v_protocol.errors import UsageError
 
 ALONE = Ranks(0, 1, torch.device("cpu"))
@@ -69,7 +69,7 @@ def test_a_malformed_line_is_reported(tmp_path: Path, damaged: str) -> None:
 
 def test_a_reading_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     reporter = Reporter(tmp_path, speaks=True)
-    (tmp_path / METRICS).symlink_to("/dev/full")
+    (tmp_path / METRICS_FILE).symlink_to("/dev/full")
     with reporter, pytest.raises(UsageError, match=r"metrics\.jsonl: No space left"):
         reporter.metrics(1, 0, 0.1, {"total": 1.0})
 
@@ -95,7 +95,7 @@ def test_a_full_disk_is_said_in_one_line_with_a_remedy(
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     reporter = Reporter(tmp_path, speaks=True)
     if name == "tensorboard":
-        (tmp_path / METRICS).symlink_to("/dev/null")
+        (tmp_path / METRICS_FILE).symlink_to("/dev/null")
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
     try:
         with pytest.raises(UsageError) as caught, reporter:
@@ -133,11 +133,11 @@ def test_a_full_disk_costs_no_readings(tmp_path: Path, monkeypatch: pytest.Monke
     def full(_descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
-    path = tmp_path / METRICS
+    path = tmp_path / METRICS_FILE
     path.write_text('{"step": 1}\n{"step": 2}\n{"st')
     old = path.read_bytes()
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(UsageError, match=r"metrics\.jsonl: No space left on device; .* then start the run again"):
         Reporter(tmp_path, speaks=True, step=1)
     assert path.read_bytes() == old
-    assert [entry.name for entry in tmp_path.iterdir()] == [METRICS]
+    assert [entry.name for entry in tmp_path.iterdir()] == [METRICS_FILE]
