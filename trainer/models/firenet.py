@@ -15,7 +15,7 @@ from trainer.models.blocks import ConvGRU, ConvLayer, RecurrentLayer, ResidualBl
 from trainer.models.sequence import Guide, Padding, Settings, VoxelNetwork, predict
 from v2v_protocol.errors import UsageError
 
-GREY = 0.5
+_GREY = 0.5
 """Initial bias of the prediction: the middle of the range of pictures."""
 
 PLUS = {
@@ -39,7 +39,7 @@ class _FireUNet(nn.Module):
             [RecurrentLayer(ResidualBlock(base_channels), ConvGRU(base_channels)), ResidualBlock(base_channels)]
         )
         self.pred = ConvLayer(base_channels, 1, 1, relu=False)
-        nn.init.constant_(self.pred.conv2d.bias, GREY)  # type: ignore[arg-type]
+        nn.init.constant_(self.pred.conv2d.bias, _GREY)  # type: ignore[arg-type]
 
     def forward(
         self, x: Tensor, states: tuple[Tensor | None, Tensor | None], steps: int
