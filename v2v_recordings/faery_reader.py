@@ -40,7 +40,7 @@ LATEST_US = 10_000
 """The upper bits may step back by at most this without a reset."""
 LOOKED_THROUGH_WORDS = 1 << 20
 LONGEST_LINE_BYTES = 1 << 12
-GREY = {"RGB": cv2.COLOR_RGB2GRAY, "RGBA": cv2.COLOR_RGBA2GRAY}
+_TO_GREY = {"RGB": cv2.COLOR_RGB2GRAY, "RGBA": cv2.COLOR_RGBA2GRAY}
 
 
 def recognises_aedat4(path: Path) -> bool:
@@ -206,8 +206,8 @@ def _events(packet: npt.NDArray[Any]) -> EventChunk:
 
 def _frame(frame: Any, size: SensorSize, path: Path) -> Picture:
     pixels = frame.pixels
-    if frame.format in GREY:
-        pixels = cv2.cvtColor(pixels, GREY[frame.format])
+    if frame.format in _TO_GREY:
+        pixels = cv2.cvtColor(pixels, _TO_GREY[frame.format])
     if pixels.dtype != np.uint8 or pixels.shape != (size.height, size.width):
         raise UsageError(
             f"{path}: a frame is {frame.format} {list(pixels.shape)} at ({frame.offset_x}, {frame.offset_y}); only "
