@@ -17,7 +17,7 @@ from v2v_pictures import colours
 from v2v_pictures.canvas import SOFT, Canvas
 
 CAPTION_PX = 18
-INK = (60, 60, 60)
+_INK = (60, 60, 60)
 FONT_SCALE = 0.4
 _LEGEND_PX, _LEGEND_WIDTH_PX, _RAMP_PX = 96, 560, 120
 
@@ -42,7 +42,7 @@ def draw_step(step: Step, origin_seconds: float, *, with_camera: bool = True) ->
     tiles = []
     for panel, text in zip(panels[:shown], texts[:shown], strict=True):
         tile = cv2.copyMakeBorder(panel, 0, CAPTION_PX, 0, GAP_PX, cv2.BORDER_CONSTANT, value=(255, 255, 255))
-        cv2.putText(tile, text, (2, height + 13), cv2.FONT_HERSHEY_SIMPLEX, FONT_SCALE, INK, 1, cv2.LINE_AA)
+        cv2.putText(tile, text, (2, height + 13), cv2.FONT_HERSHEY_SIMPLEX, FONT_SCALE, _INK, 1, cv2.LINE_AA)
         tiles.append(tile)
     return np.hstack(tiles)
 
