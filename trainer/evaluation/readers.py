@@ -31,7 +31,7 @@ CLOCK_SLACK_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
-class Image:
+class RecordedImage:
     """Hold a picture's key in the file, its time in s, and the index of the first event at its time or later."""
 
     key: str
@@ -47,7 +47,7 @@ class EventWindow:
     stop: int
     begin: float
     end: float
-    target: Image | None
+    target: RecordedImage | None
 
 
 @contextlib.contextmanager
@@ -158,7 +158,7 @@ class Recording:
             )
         return columns
 
-    def _list_images(self, as_published: bool) -> tuple[Image, ...]:
+    def _list_images(self, as_published: bool) -> tuple[RecordedImage, ...]:
         group = self._file.get("images", {})
         keys = sorted(group)
         if not keys:
@@ -200,8 +200,12 @@ class Recording:
             "event_idx with --as-published"
         )
 
-    def _make_images(self, keys: Sequence[str], times: Sequence[float], indices: Sequence[int]) -> tuple[Image, ...]:
-        return tuple(Image(f"images/{key}", time, index) for key, time, index in zip(keys, times, indices, strict=True))
+    def _make_images(
+        self, keys: Sequence[str], times: Sequence[float], indices: Sequence[int]
+    ) -> tuple[RecordedImage, ...]:
+        return tuple(
+            RecordedImage(f"images/{key}", time, index) for key, time, index in zip(keys, times, indices, strict=True)
+        )
 
     def _repair_times(self, times: Sequence[float]) -> list[float]:
         """Replace each time that is not later than its predecessor by the mean of its neighbours."""
@@ -240,11 +244,11 @@ class Recording:
         SensorSize(int(stated[1]), int(stated[0])).require_usable(str(self.path))
         return int(stated[0]), int(stated[1])
 
-    def flow_fields(self) -> list[Image]:
+    def flow_fields(self) -> list[RecordedImage]:
         """Return the flow fields in order of their keys. Their event indices are 0."""
         with _reading(self.path):
             group = self._file.get("flow", {})
-            return [Image(f"flow/{key}", float(group[key].attrs["timestamp"]), 0) for key in sorted(group)]
+            return [RecordedImage(f"flow/{key}", float(group[key].attrs["timestamp"]), 0) for key in sorted(group)]
 
     def flow(self, window: EventWindow) -> npt.NDArray[np.float32]:
         """Read the field that is the target of a window, [2, H, W] (x, y) px; NaN or 0 where it is not known.
@@ -275,7 +279,7 @@ class Recording:
             )
         return _in_order(events, window, self.path)
 
-    def image(self, image: Image) -> npt.NDArray[np.uint8]:
+    def image(self, image: RecordedImage) -> npt.NDArray[np.uint8]:
         """Read the pixels of a picture, uint8 [H, W].
 
         Raises:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 from skimage.exposure import equalize_hist
 
-from trainer.evaluation.readers import EventWindow, Image, Recording
+from trainer.evaluation.readers import EventWindow, RecordedImage, Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.models import VoxelNetwork
 from v2v_protocol.errors import UsageError
@@ -109,7 +109,7 @@ def _stretch(pictures: npt.NDArray[np.float32], stretch: Stretch) -> npt.NDArray
     return pictures.clip(0, 1)
 
 
-def _latest(images: Sequence[Image], time: float) -> Image | None:
+def _latest(images: Sequence[RecordedImage], time: float) -> RecordedImage | None:
     """Return the last picture that is not later than ``time``; None before the first."""
     position = bisect.bisect_right(images, time, key=lambda image: image.time)
     return images[position - 1] if position else None

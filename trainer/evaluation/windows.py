@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 
 from trainer.evaluation.data_sets import TimeRange
-from trainer.evaluation.readers import CLOCK_SLACK_SECONDS, EventWindow, Image, Recording
+from trainer.evaluation.readers import CLOCK_SLACK_SECONDS, EventWindow, RecordedImage, Recording
 from v2v_protocol.errors import UsageError
 
 
@@ -48,7 +48,7 @@ def picture_windows(
     ]
 
 
-def _images_in(recording: Recording, time_range: TimeRange | None, later: int = 0) -> list[Image]:
+def _images_in(recording: Recording, time_range: TimeRange | None, later: int = 0) -> list[RecordedImage]:
     images = list(recording.images)
     if time_range is not None and images:
         start, end = time_range
@@ -164,7 +164,7 @@ def windows_of_events(recording: Recording, events: int, time_range: TimeRange |
     )
 
 
-def _scored_span(recording: Recording, time_range: TimeRange | None) -> tuple[float, float, list[Image]]:
+def _scored_span(recording: Recording, time_range: TimeRange | None) -> tuple[float, float, list[RecordedImage]]:
     first, last = recording.span
     images = _images_in(recording, time_range)
     if time_range is not None and recording.images:
@@ -173,13 +173,13 @@ def _scored_span(recording: Recording, time_range: TimeRange | None) -> tuple[fl
     return first, last, images
 
 
-def _with_targets(windows: Sequence[EventWindow], images: Sequence[Image]) -> list[EventWindow]:
+def _with_targets(windows: Sequence[EventWindow], images: Sequence[RecordedImage]) -> list[EventWindow]:
     """Make each picture the target of the window whose end is nearest to it, at most half a window away.
 
     If several pictures have the same window, the nearest becomes its target.
     """
     ends = [window.end for window in windows]
-    nearest: dict[int, tuple[float, Image]] = {}
+    nearest: dict[int, tuple[float, RecordedImage]] = {}
     for image in images:
         after = bisect.bisect_left(ends, image.time)
         places = [place for place in (after - 1, after) if 0 <= place < len(ends)]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tests.trainer.losses.test_lpips import heads_file, random_metric, torchvision_like
 from tests.trainer.models import numpy_networks
 from trainer.evaluation.metrics import METRICS, make_metrics, mse, ssim
-from trainer.evaluation.readers import EventWindow, Image
+from trainer.evaluation.readers import EventWindow, RecordedImage
 from trainer.evaluation.reconstruct import Step
 from trainer.evaluation.score import SequenceScore, SequenceScorer, mean_over_sequences
 from v2v_protocol.errors import UsageError
@@ -111,7 +111,7 @@ def test_correlation_ignores_brightness_and_contrast_and_is_0_for_a_blank() -> N
 def test_a_blank_is_scored_as_a_baseline() -> None:
     target = np.random.default_rng(1).integers(0, 256, (9, 11), dtype=np.uint8)
     scorer = SequenceScorer(make_metrics(["mse", "correlation"], {}))
-    window = EventWindow(0, 0, 0.0, 1.0, Image("a", 1.0, 0))
+    window = EventWindow(0, 0, 0.0, 1.0, RecordedImage("a", 1.0, 0))
     scorer.add(Step(window, 0, np.zeros((5, 9, 11), np.float32), (target / 255).astype(np.float32), target, 1.0))
     score = scorer.score("set", "one", 0)
     assert score.means == pytest.approx({"mse": 0, "correlation": 1}, abs=1e-6)
