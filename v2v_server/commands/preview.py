@@ -10,7 +10,7 @@ from pathlib import Path
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.spec_flags import add_spec, recipe_setting, spec_fields
-from v2v_server.offline.preview import KINDS, Shot, preview
+from v2v_server.offline.preview import PICTURE_SUFFIXES, Shot, preview
 
 _MOST_CAMERAS = 32
 
@@ -43,7 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     videos.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
     videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     out = parser.group("Output")
-    parser.add_output("Output", "--out", KINDS, f"picture, film or page: {', '.join(KINDS)}", required=True)
+    parser.add_output(
+        "Output", "--out", PICTURE_SUFFIXES, f"picture, film or page: {', '.join(PICTURE_SUFFIXES)}", required=True
+    )
     out.add_argument(
         "--moments", type=int, default=1, metavar="N", help="number of voxel grids of each camera (default 1)"
     )

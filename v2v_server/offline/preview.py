@@ -39,7 +39,7 @@ from v2v_server.video.probe import DOLBY_VISION
 
 LABELS = ("boxes", "masks")
 """Arrays that are drawn if the videos have their sidecars."""
-KINDS = (".png", ".mp4", ".gif", ".html")
+PICTURE_SUFFIXES = (".png", ".mp4", ".gif", ".html")
 _SMALLEST_CROP_PX = 16
 _GIF_EVERY = 2  # every other bin: half the size
 
@@ -93,7 +93,7 @@ def preview(
         CorpusError: no video can be used, even with short clips and small crops.
         SampleUnavailable, VideoUnreadable: see :func:`v2v_server.offline.remake.remake`.
     """
-    check_output("--out", out, KINDS, [source])  # before any work
+    check_output("--out", out, PICTURE_SUFFIXES, [source])  # before any work
     scene = StreamSpec.from_dict({**spec, "recipe": shots[0].recipe}).scene != "off"
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
     cameras: list[Camera] = []
