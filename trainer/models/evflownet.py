@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from trainer.models.blocks import ConvLayer, ResidualBlock, UpsampleConvLayer
 from trainer.models.sequence import Guide, Padding, Settings, VoxelNetwork, predict
 
-LEVELS = 4
+_LEVELS = 4
 
 
 class _UNet(nn.Module):
@@ -30,7 +30,7 @@ class _UNet(nn.Module):
 
     def __init__(self, bins: int, base_channels: int) -> None:
         super().__init__()
-        widths = [base_channels * 2**level for level in range(LEVELS + 1)]
+        widths = [base_channels * 2**level for level in range(_LEVELS + 1)]
         self.encoders = nn.ModuleList(
             ConvLayer(fine, coarse, 3, stride=2) for fine, coarse in itertools.pairwise([bins, *widths[1:]])
         )
@@ -72,7 +72,7 @@ class EVFlowNet(VoxelNetwork):
         normalize_voxels: bool = False,
         padding: Padding = "bottom-right",
     ) -> None:
-        super().__init__(bins=bins, size_multiple=2**LEVELS, normalizes=normalize_voxels, padding=padding)
+        super().__init__(bins=bins, size_multiple=2**_LEVELS, normalizes=normalize_voxels, padding=padding)
         self.unet = _UNet(bins, base_channels)
 
     def unroll(self, x: Tensor, _state: Any, _steps: int, _guide: Guide | None) -> tuple[Tensor, tuple[()]]:
