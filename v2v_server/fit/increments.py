@@ -22,7 +22,7 @@ from v2v_server.fit.recording import Recorded
 Doubles = npt.NDArray[np.float64]
 DARKEST_GREY, BRIGHTEST_GREY = 4, 251
 """Grey levels outside are clipped, or too coarse in log intensity."""
-LONGEST_SECONDS = 0.5
+_LONGEST_SECONDS = 0.5
 """Longest increment: noise accumulates with time."""
 STILL_SECONDS = 0.5
 """A recording that stands still as a whole for this long needs no other still time."""
@@ -83,7 +83,7 @@ def increments_of(recording: Recorded, refractory_seconds: float, longest_us: fl
     table = np.empty((9, min(most, MOST_INCREMENTS)))
     count = _walk_frames(
         recording.first, recording.t_us, recording.p, recording.frames, recording.frame_us, stride, longest_us,
-        1e6 * refractory_seconds, 1e6 * LONGEST_SECONDS, table,
+        1e6 * refractory_seconds, 1e6 * _LONGEST_SECONDS, table,
     )  # fmt: skip
     pixel, begin, end, grey_1, grey_2, on, off, speed_1, speed_2 = table[:, :count]
     quarter = _quarter(recording, begin)
