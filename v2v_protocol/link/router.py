@@ -33,7 +33,7 @@ MOST_QUEUED = 512
 """Messages queued for one peer at which it is disconnected."""
 MOST_UNREAD = 4
 """Messages queued from one peer. Beyond that its connection is not read, so only this peer waits."""
-MOST_FRAMES = 64
+MOST_MESSAGE_FRAMES = 64
 """Frames of a message; the largest in use has a dozen. A peer that sends more is disconnected."""
 HANDSHAKE_MS = 3000
 """Time limit of a handshake, after which ZeroMQ disconnects the peer."""
@@ -188,7 +188,7 @@ class Router:
             identity = frame = self.socket.recv(_NOBLOCK, copy=False)
             while frame.more:  # recv_multipart queries the socket instead, which takes longer
                 frame = self.socket.recv(_NOBLOCK, copy=False)
-                if len(frames) <= MOST_FRAMES:
+                if len(frames) <= MOST_MESSAGE_FRAMES:
                     frames.append(frame if frames else frame.bytes)
         except zmq.Again:
             return None  # the connection has just ended, and its message is gone
@@ -203,7 +203,7 @@ class Router:
             self._users[sender] = user
             if not self._gate.admits(self._side, user):
                 return None  # the next review disconnects it
-        if len(frames) > MOST_FRAMES:
+        if len(frames) > MOST_MESSAGE_FRAMES:
             self.disconnect(sender)
             return None
         return kind(sender, frames, user)

@@ -21,7 +21,7 @@ import zmq
 
 from tests.waiting import until
 from v2v_protocol.link import guard
-from v2v_protocol.link.router import MOST_FRAMES
+from v2v_protocol.link.router import MOST_MESSAGE_FRAMES
 from v2v_protocol.messages import Ping, Pong
 from v2v_protocol.wire import encode
 from v2v_server.broker.actions import ToConsumer, ToWorker
@@ -420,10 +420,10 @@ def test_a_message_of_too_many_frames_is_dropped_and_ends_its_connection(
     peer = consumer(sockets, b"c")
     peer.send_multipart(encode(Ping()))
     next_from(sockets, FromConsumer)
-    peer.send_multipart([b""] * (MOST_FRAMES + 1))
+    peer.send_multipart([b""] * (MOST_MESSAGE_FRAMES + 1))
     assert next_from(sockets, ConsumerGone) == ConsumerGone(b"c")
     other = consumer(sockets, b"d")
-    other.send_multipart([b""] * MOST_FRAMES)
+    other.send_multipart([b""] * MOST_MESSAGE_FRAMES)
     arrival = next_from(sockets, FromConsumer)
     assert isinstance(arrival, FromConsumer)
-    assert len(arrival.frames) == MOST_FRAMES
+    assert len(arrival.frames) == MOST_MESSAGE_FRAMES
