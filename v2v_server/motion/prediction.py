@@ -31,7 +31,7 @@ from v2v_server.simulation.voxel import FINE_STEPS
 
 SUBSTEP_PX, THRESHOLD = 1.0, 0.2
 """``substep_px`` and contrast threshold that predictions are for."""
-MOST_FRAMES = 33
+_MOST_FRAMES = 33
 """Frames that a prediction is made from: a fraction of a second's work."""
 _SHORTEST = math.ceil(SUBSTEP_PX * UNITS_PER_PX / 2)
 _GAMMA, _LOG_EPS = 2.2, 1e-3
@@ -133,8 +133,8 @@ def predict(pictures: Frames) -> Prediction:
         pictures: [n, h, w] uint8, n >= 2 consecutive frames as a camera sees them; of more than MOST_FRAMES those in
             the middle are used.
     """
-    first_used = max(0, (len(pictures) - MOST_FRAMES) // 2)
-    pictures = pictures[first_used : first_used + MOST_FRAMES]
+    first_used = max(0, (len(pictures) - _MOST_FRAMES) // 2)
+    pictures = pictures[first_used : first_used + _MOST_FRAMES]
     count, height, width = pictures.shape
     vectors = motions(pictures)
     levels = levels_between(pictures, (0, 0, height, width), np.arange(count), SUBSTEP_PX, vectors)
