@@ -74,7 +74,7 @@ _HELP = {
 """Texts of metrics that several fields share, each under its own label."""
 STATIC = Path(__file__).parent / "static"
 EVENT_SECONDS = 0.5
-MOST_STREAMS = 64
+MOST_EVENT_STREAMS = 64
 """Browsers that receive every status. One that stops reading occupies its connection and the memory of one status."""
 
 
@@ -318,9 +318,9 @@ class Pages:
 
     async def events(self, request: Request) -> Response:
         """Stream every status: ``event: state``, or ``event: trouble`` if the server does not answer."""
-        if self._streams >= MOST_STREAMS:
+        if self._streams >= MOST_EVENT_STREAMS:
             return PlainTextResponse(
-                f"too many viewers: {MOST_STREAMS} are connected, the limit; close one and reload\n", 503
+                f"too many viewers: {MOST_EVENT_STREAMS} are connected, the limit; close one and reload\n", 503
             )
         return StreamingResponse(self._events(), media_type="text/event-stream")
 

@@ -11,7 +11,7 @@ import pytest
 from tests.server.page.asked import Answer, FakeClient, ask, asked
 from tests.server.peers import peers
 from tests.server.status.services import Published, published
-from v2v_server.page.app import FRESH_SECONDS, MOST_STREAMS, App, Source, make_app
+from v2v_server.page.app import FRESH_SECONDS, MOST_EVENT_STREAMS, App, Source, make_app
 
 
 def app_of(service: Published | None) -> App:
@@ -84,7 +84,7 @@ def test_events_say_that_the_server_is_gone() -> None:
 def test_a_crowd_of_browsers_is_sent_away_and_those_that_leave_make_room(service: Published) -> None:
     async def crowd() -> tuple[int, int]:
         app = app_of(service)
-        many = [asyncio.create_task(asked(app, "/events", most_parts=10**6)) for _ in range(MOST_STREAMS)]
+        many = [asyncio.create_task(asked(app, "/events", most_parts=10**6)) for _ in range(MOST_EVENT_STREAMS)]
         while (refused := (await asked(app, "/events", most_parts=1)).status) == 200:
             await asyncio.sleep(0)  # they are still coming in
         for one in many:
