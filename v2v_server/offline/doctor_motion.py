@@ -19,7 +19,7 @@ from v2v_server.system.process import usable_cores
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import Window
 
-MOST_VIDEOS = 6
+_MOST_VIDEOS = 6
 _SIDE_PX = 256
 """Largest side of the part in the middle of the picture that is looked at."""
 _FRAMES = 33
@@ -56,7 +56,7 @@ def look_at_motion(
         partial(_predicted, catalogue.source), _middles(catalogue), usable_cores(),
         lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES, compile_cache(),
     )  # fmt: skip
-    results = Progress.over("looking at motion", "videos", results, min(MOST_VIDEOS, len(catalogue.videos)))
+    results = Progress.over("looking at motion", "videos", results, min(_MOST_VIDEOS, len(catalogue.videos)))
     found = {
         middle.id: result
         for middle, result in results
@@ -80,7 +80,7 @@ def look_at_motion(
 
 
 def _middles(catalogue: Catalogue) -> Iterator[_Middle]:
-    for video, index, (top, left, rows, columns) in spread_videos(catalogue, MOST_VIDEOS, _LONGEST_SECONDS):
+    for video, index, (top, left, rows, columns) in spread_videos(catalogue, _MOST_VIDEOS, _LONGEST_SECONDS):
         count = min(len(index), _FRAMES)
         start = (len(index) - count) // 2 if index.seekable else 0
         height, width = min(rows, _SIDE_PX), min(columns, _SIDE_PX)
