@@ -41,7 +41,7 @@ from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.orientation import Window
 from v2v_server.video.probe import DOLBY_VISION
 
-MOST_VIDEOS = 12
+_MOST_VIDEOS = 12
 SECONDS_OF_EACH = 8
 _MOST_FRAMES = 400
 _ASSUMED_RATE = 30.0
@@ -142,8 +142,8 @@ def look_at_pictures(
     if not catalogue.source.is_local:
         yield "ok", "pictures", "not looked at: these videos lie on another host", ""
         return {}
-    looked = _found(catalogue.source, _excerpts(catalogue, MOST_VIDEOS), usable_cores())
-    looked = Progress.over("looking at pictures", "videos", looked, min(MOST_VIDEOS, len(catalogue.videos)))
+    looked = _found(catalogue.source, _excerpts(catalogue, _MOST_VIDEOS), usable_cores())
+    looked = Progress.over("looking at pictures", "videos", looked, min(_MOST_VIDEOS, len(catalogue.videos)))
     results = sorted(looked, key=lambda each: each.excerpt.id)
     found, sequences = [each for each in results if each.frames], _sequences_of(results, frames_needed)
     text = f"looked at {len(found)} of {len(catalogue.videos)} videos, at most {SECONDS_OF_EACH} s and "
