@@ -52,8 +52,8 @@ KNOWN_SECONDS = 15.0
 
 AsgiMessage: TypeAlias = MutableMapping[str, Any]
 Receive: TypeAlias = Callable[[], Awaitable[AsgiMessage]]
-Send: TypeAlias = Callable[[AsgiMessage], Awaitable[None]]
-App: TypeAlias = Callable[[AsgiMessage, Receive, Send], Awaitable[None]]
+AsgiSend: TypeAlias = Callable[[AsgiMessage], Awaitable[None]]
+App: TypeAlias = Callable[[AsgiMessage, Receive, AsgiSend], Awaitable[None]]
 HEADERS = {
     "content-security-policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; "
@@ -158,7 +158,7 @@ class Guard:
         self._names = {"localhost", platform.node().lower(), *(name.lower() for name in names)} - {""}
         self._headers = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
 
-    async def __call__(self, scope: AsgiMessage, receive: Receive, send: Send) -> None:
+    async def __call__(self, scope: AsgiMessage, receive: Receive, send: AsgiSend) -> None:
         """Handle a request, see ASGI."""
         if scope["type"] != "http":
             if scope["type"] == "lifespan":
