@@ -28,7 +28,7 @@ from v2v_server.system.process import usable_cores
 from v2v_server.system.sandbox import can_confine
 
 OK, NOTE, BAD = "ok", "note", "bad"
-PARTS = ("server", "client", "trainer")
+EXTRAS = ("server", "client", "trainer")
 """Extras of the distribution: where the videos are, where the GPU is, and there with the paper's networks."""
 DECODERS = ("h264", "hevc", "vp8", "vp9", "libdav1d", "mpeg4", "mjpeg")
 ENCODERS = ("libx264",)
@@ -70,7 +70,7 @@ def look_around(port: int, videos: str | None, recipe: str, rows: str, cache_dir
     """
     yield Finding(OK, "version", f"{version_of('v2v-stream')}, Python {sys.version.split()[0]}, {sys.platform}")
     missing: dict[str, list[str]] = {}
-    for part in PARTS:
+    for part in EXTRAS:
         missing[part] = _missing(part)
     yield from _installation(missing)
     if not missing["server"]:
