@@ -20,7 +20,7 @@ LINE: Rgb = (186, 190, 198)
 SHADE: Rgb = (241, 242, 245)
 MARK: Rgb = (173, 96, 0)
 """Orange as dark as a projector needs: 4.7 times less light than paper."""
-PAUSED: Rgb = (196, 199, 207)
+PAUSED_INK: Rgb = (196, 199, 207)
 
 TITLE_PT, HEADING_PT, TEXT_PT = 26, 20, 16
 MARGIN_PX, GAP_PX = 28, 8
@@ -109,7 +109,7 @@ class Canvas:
         stripes = Pictures.new("RGB", (max(1, round(right - left)), height), SHADE)
         pen = ImageDraw.Draw(stripes)
         for start in range(-height, stripes.width, 7):
-            pen.line((start, height, start + height, 0), fill=PAUSED, width=2)
+            pen.line((start, height, start + height, 0), fill=PAUSED_INK, width=2)
         self._page.paste(stripes, (round(left), round(top)))
 
     def image(self) -> Image:

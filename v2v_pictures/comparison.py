@@ -62,7 +62,7 @@ def _draw(page: Canvas, panel: Curves, left: int, top: int, width: int) -> None:
     edges = left + width * np.arange(count + 1) / count
     heights = bottom - _PANEL_PX * panel.measured / highest
     for number in range(count):
-        page.box(edges[number] + 1, heights[number], edges[number + 1] - 1, bottom, canvas.PAUSED)
+        page.box(edges[number] + 1, heights[number], edges[number + 1] - 1, bottom, canvas.PAUSED_INK)
         page.text(
             (edges[number] + edges[number + 1]) / 2, bottom + 4, panel.ticks[number], colour=canvas.SOFT, anchor="ma"
         )

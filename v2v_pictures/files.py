@@ -18,7 +18,7 @@ from v2v_pictures.colours import BRIGHTER, DARKER, Image
 from v2v_protocol.write_aside import write_file
 
 _GIF_COLOURS, _GIF_COMMON, _GIF_STEP = 96, 24, 8
-_GIF_EXACT = (canvas.PAPER, canvas.INK, canvas.SOFT, canvas.LINE, canvas.MARK, canvas.PAUSED, BRIGHTER, DARKER)
+_GIF_EXACT = (canvas.PAPER, canvas.INK, canvas.SOFT, canvas.LINE, canvas.MARK, canvas.PAUSED_INK, BRIGHTER, DARKER)
 _QUALITY = "20"  # x264's rate factor: no visible loss of thin red and blue lines
 
 

@@ -18,7 +18,7 @@ from PIL import Image as Pictures
 from tests.pictures.cameras import camera, has, record_texts, without_noise
 from tests.protocol.test_sample import PARAMS, PROVENANCE
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import INK, MARGIN_PX, MARK, PAUSED, Canvas, beginning, shortened, text_width
+from v2v_pictures.canvas import INK, MARGIN_PX, MARK, PAUSED_INK, Canvas, beginning, shortened, text_width
 from v2v_pictures.colours import BRIGHTER, DARKER, draw_events, draw_grey, full_colour
 from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write_png
 from v2v_pictures.film import draw_film
@@ -95,8 +95,8 @@ def test_a_sheet_has_a_panel_for_each_bin_and_one_scale() -> None:
 def test_pauses_are_hatched_and_named() -> None:
 
     voxels = np.ones((10, 5, 16, 16), np.int8)
-    assert has(draw_sheet([camera(voxels, pauses=((1, 20),))], "t"), PAUSED) > has(
-        draw_sheet([camera(voxels)], "t"), PAUSED
+    assert has(draw_sheet([camera(voxels, pauses=((1, 20),))], "t"), PAUSED_INK) > has(
+        draw_sheet([camera(voxels)], "t"), PAUSED_INK
     )
 
 
