@@ -17,7 +17,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
-from v2v_server.flow.methods import AUTO, STILL, Estimator, Field, Picture, choose, estimator, one_thread
+from v2v_server.flow.methods import AUTO, STILL, Estimator, Field, GreyPicture, choose, estimator, one_thread
 from v2v_server.simulation.draw import resized_size
 from v2v_server.simulation.view import Frames, Window, crop_place, crop_region, resized
 from v2v_server.system.opencv import cv2
@@ -170,20 +170,20 @@ class _Pictures:
         if params.scale != 1.0:
             self._size = resized_size(self._size[0], self._size[1], params.scale)
             self._region = crop_region(params, recipe, self._size[0], self._size[1], margin_px)
-        self._made: dict[int, Picture] = {}
+        self._made: dict[int, GreyPicture] = {}
         if self._region.height_px < self._top + self._height or self._region.width_px < self._left + self._width:
             raise UsageError(
                 f"frames of {frames.shape[2]}x{frames.shape[1]} pixels at scale {params.scale} do not hold a crop of "
                 f"{self._width}x{self._height} with its margin: decode the window that source_window() names"
             )
 
-    def pair(self, earlier: int, later: int) -> tuple[Picture, Picture]:
+    def pair(self, earlier: int, later: int) -> tuple[GreyPicture, GreyPicture]:
         # The later picture of a pair is usually the earlier picture of the next; older ones are not needed again.
         self._made = {number: self._made[number] if number in self._made else self._make(self._frames[number])
                       for number in (earlier, later)}  # fmt: skip
         return self._made[earlier], self._made[later]
 
-    def _make(self, frame: Picture) -> Picture:
+    def _make(self, frame: GreyPicture) -> GreyPicture:
         if self._scale == 1.0:
             return np.ascontiguousarray(frame)
         whole = resized(frame, self._size, self._scale)

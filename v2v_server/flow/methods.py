@@ -31,11 +31,11 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_server.system.opencv import cv2
 
-Picture = npt.NDArray[np.uint8]
+GreyPicture = npt.NDArray[np.uint8]
 """[h, w] uint8, C-contiguous."""
 Field = npt.NDArray[np.float32]
 """[h, w, 2] float32, (x, y), px."""
-Estimator = Callable[[Picture, Picture], Field]
+Estimator = Callable[[GreyPicture, GreyPicture], Field]
 """estimate(A, B): the field on the grid of A that leads to B. The result does not depend on earlier calls. It holds
 buffers, so each thread needs its own."""
 
@@ -69,7 +69,7 @@ def dis(preset: int, finest_scale: int, refinements: int | None = None) -> Estim
     if refinements is not None:
         search.setVariationalRefinementIterations(refinements)
 
-    def estimate(first: Picture, second: Picture) -> Field:
+    def estimate(first: GreyPicture, second: GreyPicture) -> Field:
         # A small picture makes OpenCV lower the finest scale, also for the pictures that follow.
         search.setFinestScale(finest_scale)
         field: Field = search.calc(first, second, None)  # type: ignore[call-overload]
@@ -101,7 +101,7 @@ def estimator(name: str) -> Estimator:
     return METHODS[name]()
 
 
-def choose(first: Picture, second: Picture) -> str:
+def choose(first: GreyPicture, second: GreyPicture) -> str:
     """Return the method that "auto" uses for a pair of [h, w] uint8 pictures."""
     change = cv2.subtract(first, second, dtype=cv2.CV_32F)
     if float(np.abs(_shrunk(change, _BLOCK_PX)).max()) <= STILL_GREY_LEVELS:
@@ -124,7 +124,7 @@ def guarded(estimate: Estimator, smallest_side_px: int) -> Estimator:
     is enlarged by repeating its border: methods fail on smaller ones, some with a segmentation fault.
     """
 
-    def safe(first: Picture, second: Picture) -> Field:
+    def safe(first: GreyPicture, second: GreyPicture) -> Field:
         height, width = first.shape
         if np.array_equal(first, second):
             return np.zeros((height, width, 2), np.float32)

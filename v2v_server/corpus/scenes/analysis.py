@@ -51,7 +51,7 @@ from v2v_server.corpus.scenes.scene import (
 )
 from v2v_server.corpus.scenes.steps import change_of, duplicated, is_cut
 from v2v_server.corpus.scenes.stretches import is_flat, is_still, pieces_of
-from v2v_server.flow.methods import ULTRAFAST, Picture, dis, one_thread
+from v2v_server.flow.methods import ULTRAFAST, GreyPicture, dis, one_thread
 
 DARK_BELOW_LEVEL = 16
 CLIPPED_FROM_LEVEL = 250
@@ -94,8 +94,10 @@ class SceneAnalysis:
         self._search = dis(ULTRAFAST, 1)
         self._frames = 0
         self._blocks: list[npt.NDArray[np.int64]] = []  # of the last four frames, 1/64 grey level each
-        self._last: Picture | None = None
-        self._reduced: tuple[int, Picture] | None = None  # a frame from which motion is to be measured, and its number
+        self._last: GreyPicture | None = None
+        self._reduced: tuple[int, GreyPicture] | None = (
+            None  # a frame from which motion is to be measured, and its number
+        )
         self._means: list[float] = []
         self._variances: list[float] = []
         self._light: list[int] = []  # 1/64 grey level
@@ -112,13 +114,13 @@ class SceneAnalysis:
         self._shares: list[tuple[int, float, float]] = []  # (frame, dark, clipped)
         self._noises: list[tuple[int, float]] = []
 
-    def add(self, picture: Picture) -> None:
+    def add(self, picture: GreyPicture) -> None:
         """Add the next frame: [h, w] uint8, full-range luma, upright, of the size of the others."""
         # OpenCV has work only in the first two of four frames.
         with one_thread() if self._frames % LAG_FRAMES < 2 else nullcontext():
             self._add(np.ascontiguousarray(picture))
 
-    def _add(self, picture: Picture) -> None:
+    def _add(self, picture: GreyPicture) -> None:
         number, self._frames = self._frames, self._frames + 1
         blocks = block_sums(picture)
         self._means.append(float(blocks.mean()) / 64)
@@ -146,7 +148,7 @@ class SceneAnalysis:
             self._measure_motion(number, picture)
         self._last = picture
 
-    def _measure_motion(self, number: int, picture: Picture) -> None:
+    def _measure_motion(self, number: int, picture: GreyPicture) -> None:
         reduced = _reduced(picture)
         if self._reduced is None:
             self._reduced = (number, reduced)
@@ -223,7 +225,7 @@ class SceneAnalysis:
         )
 
 
-def analyse(pictures: Iterable[Picture]) -> Scene:
+def analyse(pictures: Iterable[GreyPicture]) -> Scene:
     """Analyse the frames of a video; the first 4096 of them, which are read one by one."""
     analysis = SceneAnalysis()
     for picture in islice(pictures, MOST_FRAMES):
@@ -231,7 +233,7 @@ def analyse(pictures: Iterable[Picture]) -> Scene:
     return analysis.scene()
 
 
-def block_sums(picture: Picture) -> npt.NDArray[np.int64]:
+def block_sums(picture: GreyPicture) -> npt.NDArray[np.int64]:
     """Return the means of the 8 x 8 blocks of a picture in 1/64 grey level, without partial blocks."""
     height, width = picture.shape
     if height < _BLOCK_PX or width < _BLOCK_PX:
@@ -256,7 +258,7 @@ def _unexplained(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) ->
     return (after * before - both**2) / (before * second.size**2) if before else after / second.size**2
 
 
-def _is_combed(picture: Picture, change: npt.NDArray[np.int64]) -> bool:
+def _is_combed(picture: GreyPicture, change: npt.NDArray[np.int64]) -> bool:
     """Return whether two fields of different times are woven together.
 
     Args:
@@ -302,7 +304,7 @@ def _parts(values: npt.NDArray[np.float32], axis: int) -> list[npt.NDArray[np.fl
     return [values.take(range(start, end), axis) for start, end in zip(starts, ends, strict=True)]
 
 
-def _noise(first: Picture, second: Picture) -> float:
+def _noise(first: GreyPicture, second: GreyPicture) -> float:
     """Return the standard deviation of one pixel's noise in grey levels.
 
     It is measured in the middle half of the rows, in the tenth of the blocks whose difference varies least. Motion adds
@@ -318,7 +320,7 @@ def _noise(first: Picture, second: Picture) -> float:
     return float(np.sqrt(np.quantile(variance, _STILLEST) / 2))
 
 
-def _reduced(picture: Picture) -> Picture:
+def _reduced(picture: GreyPicture) -> GreyPicture:
     height, width = (max(1, side // _SHRINK) for side in picture.shape)
     part = picture[: height * _SHRINK, : width * _SHRINK]
     return cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
