@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.motion.lanes import BLOCK_PX, CELL_PX, block_difference
-from v2v_server.motion.pyramid import PAD_PX, Cells, Picture, Pyramid, compiled
+from v2v_server.motion.pyramid import PAD_PX, Cells, GreyPicture, Pyramid, compiled
 from v2v_server.video.orientation import Window
 
 Vectors = npt.NDArray[np.int16]
@@ -111,7 +111,7 @@ def without_slow(vectors: Vectors, shortest: int) -> Vectors:
     return vectors * (x * x + y * y >= shortest * shortest)[..., None, :, :]
 
 
-def _parents(cells: Cells, level: Picture) -> Cells:
+def _parents(cells: Cells, level: GreyPicture) -> Cells:
     """Return the cells of the next coarser level, given with its padding, that a search for some cells looks at."""
     sides = []
     for first, count, side in zip(cells[:2], cells[2:], level.shape, strict=True):
@@ -122,7 +122,7 @@ def _parents(cells: Cells, level: Picture) -> Cells:
     return Cells(top, left, rows, columns)
 
 
-def _scaled(first: list[Picture], second: list[Picture]) -> list[Picture]:
+def _scaled(first: list[GreyPicture], second: list[GreyPicture]) -> list[GreyPicture]:
     """Return the second pyramid with the brightness of the first."""
     within = slice(PAD_PX, -PAD_PX)
     mine, other = (int(levels[-1][within, within].sum(dtype=np.int64)) for levels in (first, second))

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from v2v_server.motion.lanes import CELL_PX
 from v2v_server.video.orientation import Window
 
-Picture = npt.NDArray[np.uint8]
+GreyPicture = npt.NDArray[np.uint8]
 PAD_PX = 16
 """Border of a level: its edge repeated."""
 _LEVELS = 4
@@ -45,18 +45,18 @@ class Pyramid:
         self,
         height: int,
         width: int,
-        read: Callable[[Window], Picture],
+        read: Callable[[Window], GreyPicture],
         raw: Callable[[Window], npt.NDArray[Any]] | None = None,
     ) -> None:
         self.height, self.width, self._read, self._raw = height, width, read, raw
-        self._part: tuple[Window, Picture] | None = None
+        self._part: tuple[Window, GreyPicture] | None = None
         self._bytes: tuple[Window, bytes] | None = None
 
     @classmethod
-    def of(cls, picture: Picture) -> Pyramid:
+    def of(cls, picture: GreyPicture) -> Pyramid:
         """Return the pyramid of a [h, w] uint8 picture. It is not copied, so it may not change."""
 
-        def part(window: Window) -> Picture:
+        def part(window: Window) -> GreyPicture:
             top, left, rows, columns = window
             return np.ascontiguousarray(picture[top : top + rows, left : left + columns])
 
@@ -74,7 +74,7 @@ class Pyramid:
             self._bytes = window, self._raw(window).tobytes()
         return self._bytes and self._bytes[1]
 
-    def part(self, window: Window) -> Picture:
+    def part(self, window: Window) -> GreyPicture:
         """Return a part of the picture; the last one is kept."""
         if self._part is None or self._part[0] != window:
             self._part = window, self._read(window)
@@ -86,7 +86,7 @@ class Pyramid:
         return Cells(0, 0, -(-self.height // CELL_PX), -(-self.width // CELL_PX))
 
     @cached_property
-    def levels(self) -> list[Picture]:
+    def levels(self) -> list[GreyPicture]:
         """Return the picture and its rounded means of four, each with PAD_PX more on each side."""
         picture = self.part((0, 0, self.height, self.width))
         levels = [padded(picture)]

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from v2v_server.motion.lanes import CELL_PX, WEIGHT_BITS, warp_cell
 from v2v_server.motion.matching import Vectors
-from v2v_server.motion.pyramid import PAD_PX, Picture, compiled
+from v2v_server.motion.pyramid import PAD_PX, GreyPicture, compiled
 
 FineGrey = npt.NDArray[np.uint16]
 _FRACTIONS = 32
@@ -42,8 +42,8 @@ _WEIGHTS = _cubic_weights()
 
 
 def between(
-    first: Picture,
-    second: Picture,
+    first: GreyPicture,
+    second: GreyPicture,
     vectors: Vectors,
     shortest: int,
     top: int,
