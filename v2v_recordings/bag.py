@@ -20,7 +20,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_recordings.archive import starts_with
 from v2v_recordings.faery_reader import read_prophesee
-from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, Progress, SensorSize
+from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, ReadProgress, SensorSize
 
 EVENT_ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 EVENT_PACKETS = "event_camera_msgs/msg/EventPacket"
@@ -37,7 +37,7 @@ def recognises(path: Path) -> bool:
     return starts_with(path, b"#ROSBAG V")
 
 
-def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
+def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
     """Yield events and pictures of a bag.
 
     Times of EventPackets start at the stamp of the first packet and advance by the sensor's clock.
@@ -115,7 +115,7 @@ def _read_packets(messages: Messages, events: str, path: Path) -> Iterator[Item]
             yield item
 
 
-def _messages(bag: Any, topics: tuple[str | None, ...], progress: Progress) -> Messages:
+def _messages(bag: Any, topics: tuple[str | None, ...], progress: ReadProgress) -> Messages:
     wanted = [connection for connection in bag.connections if connection.topic in topics]
     total = sum(connection.msgcount for connection in wanted)
     for number, (connection, _, raw) in enumerate(bag.messages(connections=wanted), start=1):

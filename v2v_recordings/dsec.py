@@ -27,7 +27,7 @@ from v2v_protocol.errors import UsageError
 from v2v_recordings import archive as archives
 from v2v_recordings import hdf5
 from v2v_recordings.archive import Archive
-from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, Note, Picture, Progress, SensorSize
+from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, Note, Picture, ReadProgress, SensorSize
 
 if TYPE_CHECKING:
     import h5py
@@ -51,7 +51,7 @@ def recognises(path: Path) -> bool:
     return hdf5.holds(path, "events/t")
 
 
-def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
+def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
     """Yield the items of one camera: of a folder with two, that of ``options``.
 
     Raises:

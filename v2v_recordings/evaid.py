@@ -9,7 +9,7 @@ from pathlib import Path
 from v2v_protocol.errors import UsageError
 from v2v_recordings import archive as archives
 from v2v_recordings.archive import Archive
-from v2v_recordings.items import ConvertOptions, Item, Progress, SensorSize
+from v2v_recordings.items import ConvertOptions, Item, ReadProgress, SensorSize
 from v2v_recordings.text_events import read_texts
 
 TIMES = "timestamps.txt"
@@ -22,7 +22,7 @@ def recognises(path: Path) -> bool:
     return archives.holds(path, lambda archive: archive.named(TIMES) and _members(archive, "event", (".txt",)))
 
 
-def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
+def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
     """Yield the items of one recording. The event files are read in the order of their names.
 
     Raises:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings.archive import starts_with
-from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, Progress, SensorSize
+from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, ReadProgress, SensorSize
 
 ES_HEAD_BYTES, ES_EVENT_BYTES, ES_LONGEST_STEP_US = 20, 5, 127
 """Bytes before the first event and of an event; a longer time between two events is bytes of 0xff of this length."""
@@ -58,7 +58,7 @@ def recognises_es(path: Path) -> bool:
     return starts_with(path, b"Event Stream")
 
 
-def read_aedat4(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
+def read_aedat4(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
     """Yield events and frames of a file's first camera. A frame's time is the middle of its exposure.
 
     Raises:
@@ -83,7 +83,7 @@ def read_aedat4(path: Path, options: ConvertOptions, progress: Progress) -> Iter
             yield Note(f"cut: packet {number + 1} is incomplete; the {number} before it are read")
 
 
-def read_prophesee(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
+def read_prophesee(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
     """Yield events of a file. The sensor's size is in its header or in ``options``.
 
     Event words of EVT hold only the lower bits of a time; the upper bits are words of their own, many per millisecond.
@@ -122,7 +122,7 @@ def read_prophesee(path: Path, options: ConvertOptions, progress: Progress) -> I
     yield from _cut_note(path, begin, word.itemsize)
 
 
-def read_es(path: Path, _options: ConvertOptions, progress: Progress) -> Iterator[Item]:
+def read_es(path: Path, _options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
     """Yield events of an Event Stream file of a camera without grey levels.
 
     Raises:

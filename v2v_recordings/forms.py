@@ -8,7 +8,7 @@ from pathlib import Path
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings import bag, dsec, evaid, faery_reader, ijrr, layout_h5, mvsec, npy_columns
-from v2v_recordings.items import ConvertOptions, Item, Progress
+from v2v_recordings.items import ConvertOptions, Item, ReadProgress
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class RawForm:
 
     title: str
     recognises: Callable[[Path], bool]
-    read: Callable[[Path, ConvertOptions, Progress], Iterator[Item]]
+    read: Callable[[Path, ConvertOptions, ReadProgress], Iterator[Item]]
     published_shift: int = 0
 
 

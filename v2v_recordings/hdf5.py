@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.items import EventChunk, Note, Picture, Progress, SensorSize, to_ns
+from v2v_recordings.items import EventChunk, Note, Picture, ReadProgress, SensorSize, to_ns
 
 if TYPE_CHECKING:
     import h5py
@@ -62,7 +62,7 @@ A slice has fewer rows than asked for if the file is cut.
 
 
 def events(
-    columns: Mapping[str, Column], where: str, progress: Progress, *, ns_per_unit: float, offset_ns: int = 0
+    columns: Mapping[str, Column], where: str, progress: ReadProgress, *, ns_per_unit: float, offset_ns: int = 0
 ) -> Iterator[EventChunk | Note]:
     """Yield events whose times, x, y and polarities (above 0 for brighter) are in columns, in this order.
 

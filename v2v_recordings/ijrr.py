@@ -13,7 +13,7 @@ import numpy as np
 from v2v_protocol.errors import UsageError
 from v2v_recordings import archive as archives
 from v2v_recordings.archive import Archive
-from v2v_recordings.items import ConvertOptions, Item, Progress, to_ns
+from v2v_recordings.items import ConvertOptions, Item, ReadProgress, to_ns
 from v2v_recordings.text_events import read_texts
 
 _EVENTS = "events.txt"
@@ -27,7 +27,7 @@ def recognises(path: Path) -> bool:
     return is_text or archives.holds(path, lambda archive: archive.named(_EVENTS))
 
 
-def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
+def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
     """Yield the items of one recording.
 
     Raises:

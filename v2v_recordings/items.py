@@ -17,7 +17,7 @@ from v2v_protocol.errors import UsageError
 
 MOST_SENSOR_PIXELS = 1 << 24
 """Limit of a stated sensor's size: 4096 x 4096. Some arrays have an entry for each pixel."""
-Progress = Callable[[int, int | None], None]
+ReadProgress = Callable[[int, int | None], None]
 """Progress callback: called with the amount read so far (bytes or messages), and the total if it is known."""
 
 

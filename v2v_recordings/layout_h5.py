@@ -17,7 +17,7 @@ import numpy as np
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings import hdf5
-from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, FlowField, Item, Picture, Progress, to_ns
+from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, FlowField, Item, Picture, ReadProgress, to_ns
 
 
 def recognises(path: Path) -> bool:
@@ -25,7 +25,7 @@ def recognises(path: Path) -> bool:
     return hdf5.holds(path, "events/ts")
 
 
-def read(path: Path, _options: ConvertOptions, progress: Progress) -> Iterator[Item]:
+def read(path: Path, _options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
     """Yield the items of a recording.
 
     Raises:

@@ -26,7 +26,7 @@ import numpy as np
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings import hdf5
-from v2v_recordings.items import ConvertOptions, EventChunk, FlowField, Item, Progress, SensorSize, to_ns
+from v2v_recordings.items import ConvertOptions, EventChunk, FlowField, Item, ReadProgress, SensorSize, to_ns
 
 if TYPE_CHECKING:
     import h5py
@@ -41,7 +41,7 @@ def recognises(path: Path) -> bool:
     return hdf5.holds(path, "davis")
 
 
-def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
+def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
     """Yield the items of one camera of a recording.
 
     Raises:

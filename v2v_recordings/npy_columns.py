@@ -28,7 +28,7 @@ from v2v_protocol.errors import UsageError
 from v2v_recordings import archive as archives
 from v2v_recordings import hdf5
 from v2v_recordings.archive import Archive
-from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, Progress, SensorSize
+from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, ReadProgress, SensorSize
 
 FOLDER = ("events_ts.npy", "events_xy.npy", "events_p.npy")
 NPZ = ("t.npy", "x.npy", "y.npy", "p.npy")
@@ -42,7 +42,7 @@ def recognises(path: Path) -> bool:
     )
 
 
-def read(path: Path, options: ConvertOptions, progress: Progress) -> Iterator[Item]:
+def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
     """Yield the items of a recording.
 
     Raises:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings.forms import FORMS, recognise
-from v2v_recordings.items import ConvertOptions, EventChunk, FlowField, Item, Note, Picture, Progress, SensorSize
+from v2v_recordings.items import ConvertOptions, EventChunk, FlowField, Item, Note, Picture, SensorSize
 
 LATE_NS = 10_000_000
 """Events that are earlier than others before them by at most this are late in any case."""

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings.archive import Archive
-from v2v_recordings.items import NS_PER_UNIT, EventChunk, Item, Note, Picture, Progress, SensorSize, to_ns
+from v2v_recordings.items import NS_PER_UNIT, EventChunk, Item, Note, Picture, ReadProgress, SensorSize, to_ns
 
 BLOCK_BYTES = 1 << 22
 COMMENT = re.compile(rb"^[ \t]*#[^\r\n]*", re.MULTILINE)
@@ -26,7 +26,7 @@ TIME_WITH_A_FRACTION = re.compile(rb"^[ \t]*[-+\d]*(\.|[eE]-)", re.MULTILINE)
 
 
 def read_texts(
-    archive: Archive, events: list[str], pictures: list[tuple[int, str]], time_unit: str | None, progress: Progress
+    archive: Archive, events: list[str], pictures: list[tuple[int, str]], time_unit: str | None, progress: ReadProgress
 ) -> Iterator[Item]:
     """Yield the events of an archive's texts, one text after the other, then its pictures.
 

@@ -13,7 +13,7 @@ from trainer.convert.writer import RecordingWriter, Written
 from trainer.evaluation import layout
 from v2v_protocol.errors import UsageError
 from v2v_recordings.forms import FORMS, recognise
-from v2v_recordings.items import ConvertOptions, Progress
+from v2v_recordings.items import ConvertOptions, ReadProgress
 from v2v_recordings.reading import read_items
 
 EVENT_SUFFIXES = (*layout.SUFFIXES, ".npz", ".raw", ".aedat4", ".es", ".dat", ".bag")
@@ -59,7 +59,7 @@ def convert(
         form: key of FORMS; None recognises it.
         options: information that the recording lacks; None for the defaults.
         overwrite: whether to replace an existing destination.
-        progress: see :data:`v2v_recordings.items.Progress`.
+        progress: see :data:`v2v_recordings.items.ReadProgress`.
 
     Raises:
         UsageError: the source is missing, damaged or of an unknown form; or the destination exists or lies in the
@@ -95,7 +95,7 @@ def convert(
 
 
 @contextlib.contextmanager
-def in_layout(data: Path, options: ConvertOptions, progress: Progress) -> Iterator[Path]:
+def in_layout(data: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Path]:
     """Yield a path whose recordings are in the layout, for ``v2v-eval``: ``data``, or a folder for as long as needed.
 
     Args:

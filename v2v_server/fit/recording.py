@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.items import ConvertOptions, EventChunk, Note, Picture, Progress, SensorSize
+from v2v_recordings.items import ConvertOptions, EventChunk, Note, Picture, SensorSize
 from v2v_recordings.reading import read_items
 
 MOST_PIXELS = 1 << 15

@@ -13,14 +13,14 @@ from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.windows import picture_windows
 from v2v_protocol.errors import UsageError
 from v2v_recordings.forms import FORMS, RawForm, recognise
-from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, Progress, SensorSize
+from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, ReadProgress, SensorSize
 
 
 def recognises(path: Path) -> bool:
     return path.suffix == ".toy"
 
 
-def read(path: Path, _options: ConvertOptions, progress: Progress) -> Iterator[Item]:
+def read(path: Path, _options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
     """Yield events from lines of ``t_ns x y p``, between two grey pictures."""
     t, x, y, p = np.loadtxt(path, dtype=np.int64).T
     yield SensorSize(6, 4)
