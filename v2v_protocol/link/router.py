@@ -120,7 +120,7 @@ class Received:
     user: str = ""
 
 
-R = TypeVar("R", bound=Received)
+_R = TypeVar("_R", bound=Received)
 
 
 class Router:
@@ -179,7 +179,7 @@ class Router:
             raise UsageError(f"{flag} {address}: {os.strerror(error.errno or 0)}; give {remedy}") from error
         return self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
-    def receive(self, kind: type[R]) -> R | None:
+    def receive(self, kind: type[_R]) -> _R | None:
         """Return an available message as a ``kind`` of :class:`Received`. One of a connection that may not stay, of a
         revoked key, or with more than MOST_FRAMES frames is dropped.
         """
