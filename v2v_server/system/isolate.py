@@ -34,7 +34,7 @@ from v2v_server.system.process import die_with_parent, limit_memory
 from v2v_server.system.sandbox import confine
 
 J = TypeVar("J")
-R = TypeVar("R")
+_R = TypeVar("_R")
 
 LARGEST_MESSAGE_BYTES = 64 << 20
 """Size limit of a job or result. The largest in use holds the frame index of a video of 2**24 frames."""
@@ -99,13 +99,13 @@ class Died:
 
 
 def run_isolated(
-    function: Callable[[J], R],
+    function: Callable[[J], _R],
     jobs: Iterable[J],
     processes: int,
     deadline_seconds: Callable[[J], float] | None = None,
     memory_bytes: int = 0,
     writable: Sequence[Path] | None = None,
-) -> Iterator[tuple[J, R | Died]]:
+) -> Iterator[tuple[J, _R | Died]]:
     """Yield (job, result) for every job, in order of completion.
 
     A process takes one job after another; a process that dies is replaced. All are ended with the iterator, and die
@@ -133,7 +133,7 @@ def run_isolated(
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise SystemExit(1)  # this is such a process, and imports a script without a main guard: its parent says so
     left = iter(jobs)
-    lanes: list[_Lane[J, R]] = []
+    lanes: list[_Lane[J, _R]] = []
     try:
         for job in left:
             lanes.append(_Lane(function, deadline_seconds, memory_bytes, writable))
@@ -166,8 +166,8 @@ def run_isolated(
 
 
 def run_twice(
-    function: Callable[[J], R], jobs: Iterable[J], processes: int, **limits: Any
-) -> Iterator[tuple[J, R | Died]]:
+    function: Callable[[J], _R], jobs: Iterable[J], processes: int, **limits: Any
+) -> Iterator[tuple[J, _R | Died]]:
     """Do the same, but try a job once more if its process died or its result is None: after all others, alone. The
     process may have been killed from outside, memory was too short for it and its neighbours, or storage failed.
     """
@@ -180,7 +180,7 @@ def run_twice(
     yield from run_isolated(function, suspects, min(processes, 1), **limits)
 
 
-def _wait(lanes: list[_Lane[J, R]]) -> list[Any]:
+def _wait(lanes: list[_Lane[J, _R]]) -> list[Any]:
     """Wait until there is a part of a result or a job is overdue, but not for long; return the readable sockets."""
     at_most = max(0.0, min(_LONGEST_WAIT_SECONDS, *(lane.patience for lane in lanes)))
     started = time.monotonic()
@@ -191,7 +191,7 @@ def _wait(lanes: list[_Lane[J, R]]) -> list[Any]:
     return readable
 
 
-class _Lane(Generic[J, R]):
+class _Lane(Generic[J, _R]):
     """One process and its job.
 
     Attributes:
@@ -201,7 +201,7 @@ class _Lane(Generic[J, R]):
 
     def __init__(
         self,
-        function: Callable[[J], R],
+        function: Callable[[J], _R],
         deadline_seconds: Callable[[J], float] | None,
         memory_bytes: int,
         writable: Sequence[Path] | None,
@@ -234,7 +234,7 @@ class _Lane(Generic[J, R]):
         except OSError:
             self._process.kill()  # it has died, or does not read: receive() finds the end
 
-    def receive(self) -> tuple[J, R | Died] | None:
+    def receive(self) -> tuple[J, _R | Died] | None:
         """Return the job and its result if the rest of it has arrived; None otherwise."""
         try:
             data = self.socket.recv(_CHUNK_BYTES)
@@ -250,7 +250,7 @@ class _Lane(Generic[J, R]):
             self._unpacker.feed(data)
             if not self._begun:
                 self._begun = self._unpacker.unpack() is None
-            result: R = _typed(_hints(self._function)["return"], self._unpacker.unpack())
+            result: _R = _typed(_hints(self._function)["return"], self._unpacker.unpack())
             if self._unpacker.read_bytes(1):
                 raise ValueError("more than one result")
         except msgpack.OutOfData:
@@ -259,7 +259,7 @@ class _Lane(Generic[J, R]):
             return self._job, replace(self._kill(), is_malformed=True)
         return self._job, result
 
-    def give_up(self) -> tuple[J, R | Died]:
+    def give_up(self) -> tuple[J, _R | Died]:
         return self._job, replace(self._kill(), exitcode=-signal.SIGKILL, overdue_seconds=self._allowed)
 
     def _kill(self) -> Died:
