@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from v2v_protocol.errors import V2VError
 
-Item = TypeVar("Item")
+_Item = TypeVar("_Item")
 
 _PATIENT_SIGNALS = 2
 """torchrun forwards the Ctrl-C that its processes already had from the terminal, so two signals may be one Ctrl-C."""
@@ -71,7 +71,7 @@ class StopRequest:
             return True
         return self._deadline is not None and time.monotonic() >= self._deadline
 
-    def next(self, items: Iterator[Item]) -> Item | None:
+    def next(self, items: Iterator[_Item]) -> _Item | None:
         """Return the next item; None at the end, or if a signal came while waiting for it."""
         try:
             try:
@@ -82,7 +82,7 @@ class StopRequest:
         except _StopWaiting:
             return None
 
-    def until(self, items: Iterable[Item]) -> Iterator[Item]:
+    def until(self, items: Iterable[_Item]) -> Iterator[_Item]:
         """Yield the items until the end, or until any rank wants to end or has no data.
 
         All ranks must have the same number of items.
