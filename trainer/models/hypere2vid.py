@@ -30,7 +30,7 @@ from trainer.models.e2vid import E2VID
 from trainer.models.sequence import Guide, Padding, Settings, predict
 
 ATOMS = 6
-SIDE_PX = 5
+_SIDE_PX = 5
 PER_SCALE = 6
 CONTEXT_CHANNELS = 32
 HIDDEN_CHANNELS = 64
@@ -78,7 +78,7 @@ def bases() -> Tensor:
     """Return the fixed functions [12, 25]: six of a 3 x 3 neighbourhood, then six of 5 x 5."""
     narrow = np.pad(fourier_bessel(1, 2.0)[:PER_SCALE], ((0, 0), (1, 1), (1, 1)))
     wide = fourier_bessel(2, 1.5)[:PER_SCALE]
-    return torch.from_numpy(np.concatenate([narrow, wide]).reshape(2 * PER_SCALE, SIDE_PX**2)).float()
+    return torch.from_numpy(np.concatenate([narrow, wide]).reshape(2 * PER_SCALE, _SIDE_PX**2)).float()
 
 
 class _ContextFusion(nn.Module):
@@ -127,8 +127,8 @@ class _DynamicConv(nn.Module):
     def forward(self, x: Tensor, coefficients: Tensor, functions: Tensor) -> Tensor:
         # An atom is a sum of functions, and convolution is linear. So the fixed functions are applied first, to the
         # whole picture at once, and the sum over them is taken at each pixel. This avoids 25 copies of x.
-        kernels = functions.view(-1, 1, SIDE_PX, SIDE_PX).to(x.dtype)
-        filtered = F.conv2d(x.flatten(0, 1).unsqueeze(1), kernels, padding=SIDE_PX // 2)
+        kernels = functions.view(-1, 1, _SIDE_PX, _SIDE_PX).to(x.dtype)
+        filtered = F.conv2d(x.flatten(0, 1).unsqueeze(1), kernels, padding=_SIDE_PX // 2)
         filtered = torch.unflatten(filtered, 0, x.shape[:2])
         by_atom = torch.einsum("bckhw,bmkhw->bcmhw", filtered, coefficients.to(filtered.dtype))
         return F.conv2d(by_atom.flatten(1, 2), self.compositional_coefficients, self.bias)
