@@ -20,7 +20,7 @@ from v2v_protocol.recipe import Recipe, effect_settings
 from v2v_server.fit.interval import Doubles
 from v2v_server.simulation.clip import simulate
 
-SIDE_PX = 32
+_SIDE_PX = 32
 DARK_GREY, BRIGHT_GREY = 70, 255
 _RAMP_GREYS = 40, 255
 _NOISE = ("shot_noise_hz", "leak_hz")
@@ -77,7 +77,7 @@ def table(columns: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def _events(camera: Mapping[str, float], greys: Doubles, frames_per_second: float) -> EventList:
-    frames = np.rint(greys).astype(np.uint8)[:, None, None] * np.ones((1, SIDE_PX, SIDE_PX), np.uint8)
+    frames = np.rint(greys).astype(np.uint8)[:, None, None] * np.ones((1, _SIDE_PX, _SIDE_PX), np.uint8)
     arguments: dict[str, Any] = dict(camera)
     made = simulate(frames, bins=1, frames_per_second=frames_per_second, **arguments)
     return made.to_events(1e6 / frames_per_second)
@@ -98,10 +98,10 @@ def _ramp_thresholds(camera: Mapping[str, float], seconds: float, *, falls: bool
 def _spans(events: EventList) -> tuple[Doubles, Doubles, Doubles]:
     """Return the times of the first and the last event of each pixel, us, and the number of its events."""
     place, t = events.y.astype(np.int64) * events.width_px + events.x, events.t.astype(np.float64)
-    first, last = np.full(SIDE_PX**2, np.inf), np.zeros(SIDE_PX**2)
+    first, last = np.full(_SIDE_PX**2, np.inf), np.zeros(_SIDE_PX**2)
     np.minimum.at(first, place, t)
     np.maximum.at(last, place, t)
-    return first, last, np.bincount(place, minlength=SIDE_PX**2).astype(np.float64)
+    return first, last, np.bincount(place, minlength=_SIDE_PX**2).astype(np.float64)
 
 
 def _ends(camera: Mapping[str, float]) -> tuple[float, float]:
@@ -116,7 +116,7 @@ def _mean(values: Doubles) -> float:
 
 def _rate(camera: Mapping[str, float], grey: int, seconds: float = 10.0) -> float:
     events = _events(camera, np.full(round(seconds * 50) + 1, float(grey)), 50.0)
-    return len(events) / seconds / SIDE_PX**2
+    return len(events) / seconds / _SIDE_PX**2
 
 
 def _latency_us(camera: Mapping[str, float], before: int, after: int) -> float:
