@@ -47,7 +47,7 @@ class Size:
     learned_upsampling: bool
 
 
-SIZES = {
+RAFT_SIZES = {
     "small": Size(
         features=(32, 32, 64, 96, 128), context=160, hidden=96, bottleneck=True, radius=3, correlation=(96,),
         motion=(64, 32), motion_out=82, kernels=((3, 3),), head=128, learned_upsampling=False,
@@ -202,7 +202,7 @@ class RAFT(Loop, nn.Module):
 
     def __init__(self, size: str, inputs: int = 3) -> None:
         super().__init__()
-        self.size = SIZES[size]
+        self.size = RAFT_SIZES[size]
         self.feature_encoder = _Encoder(self.size, inputs, self.size.features[-1], "instance")
         self.context_encoder = _Encoder(self.size, inputs, self.size.context, "batch" if size == "large" else "")
         self.update_block = _UpdateBlock(self.size)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tests.trainer.models.raft_pairs import HEIGHT, SAMPLED, WIDTH, formula_weights, pictures
 from trainer.losses.warp import warp
-from trainer.models.raft import RAFT, SIZES, look_up, torchvision_name
+from trainer.models.raft import RAFT, RAFT_SIZES, look_up, torchvision_name
 from trainer.models.raft_flow import RaftFlow
 from v2v_protocol.errors import UsageError
 
@@ -69,7 +69,7 @@ def saved(folder: Path, size: str, authors: bool = False) -> Path:
     return path
 
 
-@pytest.mark.parametrize("size", sorted(SIZES))
+@pytest.mark.parametrize("size", sorted(RAFT_SIZES))
 @pytest.mark.parametrize("authors", [False, True])
 def test_agrees_with_torchvision_in_both_layouts(size: str, authors: bool, tmp_path: Path) -> None:
     flow = RaftFlow(size, saved(tmp_path, size, authors))(*pictures())
@@ -87,7 +87,7 @@ def test_published_weights_agree_with_torchvision_and_find_the_motion() -> None:
     assert error[16:-16, 16:-16].median() < 0.25
 
 
-@pytest.mark.parametrize("size", sorted(SIZES))
+@pytest.mark.parametrize("size", sorted(RAFT_SIZES))
 def test_parameters(size: str) -> None:
     assert sum(value.numel() for value in RAFT(size).parameters()) == PARAMETERS[size]
     assert set(map(torchvision_name, RAFT(size).state_dict())) == set(RAFT(size).state_dict())
