@@ -21,7 +21,7 @@ from v2v_protocol.errors import UsageError
 
 UPDATES = 12
 SIZE_MULTIPLE_PX = 32
-SMALLEST_SIDE_PX = 64
+_SMALLEST_SIDE_PX = 64
 """With this size the coarsest of four correlations has one pixel."""
 
 
@@ -91,8 +91,8 @@ class ERAFT(VoxelNetwork):
     def _edges(self, height: int, width: int) -> tuple[int, int, int, int]:
         left, right, top, bottom = super()._edges(height, width)
         return (
-            left + max(0, SMALLEST_SIDE_PX - left - width - right), right,
-            top + max(0, SMALLEST_SIDE_PX - top - height - bottom), bottom,
+            left + max(0, _SMALLEST_SIDE_PX - left - width - right), right,
+            top + max(0, _SMALLEST_SIDE_PX - top - height - bottom), bottom,
         )  # fmt: skip
 
     @classmethod
