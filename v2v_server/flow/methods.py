@@ -41,7 +41,7 @@ buffers, so each thread needs its own."""
 
 ULTRAFAST, FAST, MEDIUM = range(3)
 """OpenCV's numbers, DISOPTICAL_FLOW_PRESET_*; using its names would import it."""
-SMALLEST_SIDE_PX = 64
+_SMALLEST_SIDE_PX = 64
 """OpenCV refuses pictures below 12 pixels, and reads outside its buffers on some larger ones: 16x300, 24x600."""
 
 AUTO, STILL, SLOW, MOVING = "auto", "zero", "dis-ultrafast", "dis-fast"
@@ -75,7 +75,7 @@ def dis(preset: int, finest_scale: int, refinements: int | None = None) -> Estim
         field: Field = search.calc(first, second, None)  # type: ignore[call-overload]
         return field
 
-    return guarded(estimate, SMALLEST_SIDE_PX)
+    return guarded(estimate, _SMALLEST_SIDE_PX)
 
 
 METHODS: Mapping[str, Callable[[], Estimator]] = MappingProxyType(
