@@ -45,7 +45,7 @@ from v2v_protocol.errors import ProtocolError
 from v2v_protocol.messages import Want
 from v2v_protocol.sample import Form, Layout, new_arrays
 
-Bytes = npt.NDArray[np.uint8]
+ByteArray = npt.NDArray[np.uint8]
 
 _DESCRIPTORS_AN_ARENA = 8
 """Allowed files per arena. An arena has two open files, its own and its mapping's, so all arenas together use at most
@@ -61,12 +61,12 @@ class _Loan:
 
     __slots__ = ("__array_interface__", "__weakref__")
 
-    def __init__(self, memory: Bytes) -> None:
+    def __init__(self, memory: ByteArray) -> None:
         address = memory.ctypes.data, False
         self.__array_interface__ = {"version": 3, "data": address, "shape": memory.shape, "typestr": "|u1"}
 
 
-def lend(memory: Bytes, back: Callable[[Bytes], object]) -> Bytes:
+def lend(memory: ByteArray, back: Callable[[ByteArray], object]) -> ByteArray:
     """Return another array of the same memory, and call ``back`` when it is no longer used.
 
     Args:
@@ -85,7 +85,7 @@ def batch_bytes(layout: Layout, slots: int) -> int:
     return array_offsets(Form.of(layout).sizes, slots)[-1]
 
 
-def batch_arrays(memory: Bytes, layout: Layout, slots: int) -> dict[str, npt.NDArray[Any]]:
+def batch_arrays(memory: ByteArray, layout: Layout, slots: int) -> dict[str, npt.NDArray[Any]]:
     """Return the rows of each array, [slots, ...], as views of a batch's memory."""
     sizes = Form.of(layout).sizes
     places = zip(layout.items(), sizes, array_offsets(sizes, slots), strict=False)  # the last offset is the total size
@@ -122,7 +122,7 @@ class Arena:
         self._descriptor = create_memory(memory_name, self._bytes)
         weakref.finalize(self, os.close, self._descriptor).atexit = False
         seal_memory(self._descriptor, content=False)
-        self._memory: Bytes | None = None  # mapped for an earlier batch and no longer in use
+        self._memory: ByteArray | None = None  # mapped for an earlier batch and no longer in use
         self._name = str(ArenaName(self.process, self._descriptor, slots, token))
         _arenas.add(self)
 
@@ -165,13 +165,13 @@ class Arena:
         if memory is None or not _is_unwritten(memory):
             memory = self._map()
 
-        def back(memory: Bytes) -> None:
+        def back(memory: ByteArray) -> None:
             self._memory = memory
             unused()
 
         return batch_arrays(lend(memory, back), self._layout, self._slots)
 
-    def _map(self) -> Bytes:
+    def _map(self) -> ByteArray:
         """Map the whole file privately, with all its pages."""
         mapping = mmap.mmap(self._descriptor, self._bytes, mmap.MAP_PRIVATE)
         with suppress(OSError):  # an older kernel maps each page as it is read
@@ -182,7 +182,7 @@ class Arena:
         return self._offsets[name] + row * self._sizes[name]
 
 
-def _is_unwritten(memory: Bytes) -> bool:
+def _is_unwritten(memory: ByteArray) -> bool:
     """Return whether no page of a private mapping was written to, so that it still shows the file.
 
     A page that was written to is a copy that no longer belongs to the file, which the kernel reports for each page
@@ -279,7 +279,7 @@ class BatchBuffers:
     def __init__(self) -> None:
         self._form: tuple[Layout, int, int] = {}, 0, 0
         # Deques: finalizers may run in any thread (that of DataLoader's pinning, say), and their methods are atomic.
-        self._free: deque[Bytes] = deque()
+        self._free: deque[ByteArray] = deque()
         self._arenas: deque[Arena] = deque()
 
     def shape(self, layout: Layout, batch_size: int, spare: int) -> None:
