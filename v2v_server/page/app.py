@@ -40,7 +40,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from v2v_protocol.errors import V2VError
-from v2v_server.status.parts import PARTS, Status, meanings_at, rows_at
+from v2v_server.status.parts import PARTS, StatusFields, meanings_at, rows_at
 from v2v_server.system.status_fields import GIB, Meaning
 
 FRESH_SECONDS = 0.4
@@ -205,7 +205,7 @@ class StatusCollector:
         status: the status; None if the server does not answer.
     """
 
-    def __init__(self, status: Status | None) -> None:
+    def __init__(self, status: StatusFields | None) -> None:
         self._status = status
 
     def collect(self) -> Iterator[Metric]:
@@ -225,7 +225,7 @@ class StatusCollector:
         yield from families.values()
 
 
-def exposition(status: Status | None, accept: str = "") -> tuple[bytes, str]:
+def exposition(status: StatusFields | None, accept: str = "") -> tuple[bytes, str]:
     """Return the metrics of a status, and their content type.
 
     Args:
@@ -238,7 +238,7 @@ def exposition(status: Status | None, accept: str = "") -> tuple[bytes, str]:
     return encode(registry), content_type
 
 
-def _add(families: dict[str, Any], place: str, key: str, meaning: Meaning, rows: list[Status]) -> None:
+def _add(families: dict[str, Any], place: str, key: str, meaning: Meaning, rows: list[StatusFields]) -> None:
     """Add the samples of one field to the family of its metric."""
     name = _PREFIXES.get(place, "v2v_") + (key if meaning.metric is None else meaning.metric)
     labels = _LABELS.get(place, {})
@@ -256,7 +256,7 @@ def _add(families: dict[str, Any], place: str, key: str, meaning: Meaning, rows:
         family.add_metric(label, value * (GIB if meaning.unit == "GiB" else 1))
 
 
-def _merged(key: str, labels: Mapping[str, str], rows: list[Status]) -> dict[tuple[str, ...], list[Any]]:
+def _merged(key: str, labels: Mapping[str, str], rows: list[StatusFields]) -> dict[tuple[str, ...], list[Any]]:
     """Return the known values of a field by the labels of their rows."""
     found: dict[tuple[str, ...], list[Any]] = {}
     for row in rows:

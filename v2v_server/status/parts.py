@@ -18,7 +18,7 @@ from v2v_server.store.quota import CachePart
 from v2v_server.system.status_fields import Meaning, counter, gauge, meanings, states, text
 
 STATUS_VERSION = 1
-Status: TypeAlias = Mapping[str, Any]
+StatusFields: TypeAlias = Mapping[str, Any]
 """A whole status as plain values, fit for JSON."""
 
 
@@ -152,7 +152,7 @@ def meanings_at(place: str) -> dict[str, Meaning]:
     return {name: meaning for part in PARTS[place] for name, meaning in meanings(part).items()}
 
 
-def rows_at(status: Status, place: str) -> list[Status]:
+def rows_at(status: StatusFields, place: str) -> list[StatusFields]:
     """Return the values at a place of :data:`PARTS`: one row, or those of a list, or none."""
     found: Any = status
     for key in filter(None, place.split(".")):
@@ -160,7 +160,7 @@ def rows_at(status: Status, place: str) -> list[Status]:
     return [] if found is None else list(found) if isinstance(found, list | tuple) else [found]
 
 
-def events(status: Status) -> list[str]:
+def events(status: StatusFields) -> list[str]:
     """Name the unusual events since the start, those that happened: "2 refused candidates"."""
     named = meanings_at("totals").items()
     return [

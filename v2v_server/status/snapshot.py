@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from v2v_protocol import PROTOCOL_VERSION, __version__
-from v2v_protocol.messages import Status as StatusMessage
+from v2v_protocol.messages import StatusFields as StatusMessage
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, encode
 from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
 from v2v_server.broker.counters import FaultTotal
@@ -33,7 +33,7 @@ from v2v_server.status.parts import (
     ConsumerPart,
     LoadPart,
     ServerPart,
-    Status,
+    StatusFields,
     WorkerPart,
 )
 from v2v_server.store.quota import cache_part
@@ -63,7 +63,7 @@ class Service:
 
     def status(
         self, window: TimeWindow, time: str, *, uptime_seconds: float, is_ready: bool, is_attended: bool
-    ) -> Status:
+    ) -> StatusFields:
         """Return the status at the end of a window.
 
         Args:
@@ -142,7 +142,7 @@ class Service:
         ]
 
 
-def to_json(status: Status, most_bytes: int = LARGEST_HEADER_BYTES - 1024) -> bytes:
+def to_json(status: StatusFields, most_bytes: int = LARGEST_HEADER_BYTES - 1024) -> bytes:
     """Encode a status, UTF-8. Fewer workers and consumers are listed if it is too large for a message otherwise."""
     plain = dict(status)
     while len(encoded := json.dumps(plain, ensure_ascii=False).encode(errors="replace")) > most_bytes:
@@ -248,7 +248,7 @@ class StatusPublisher:
         self._answer_at = now
         self.is_ready = False
 
-    def status(self, now: float) -> Status:
+    def status(self, now: float) -> StatusFields:
         """Return the current status."""
         return self._service.status(
             self._history.window(now),

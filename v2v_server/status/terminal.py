@@ -16,7 +16,7 @@ from rich.text import Text
 
 from v2v_protocol.programs import printable
 from v2v_protocol.progress import format_duration
-from v2v_server.status.parts import Status, events, meanings_at
+from v2v_server.status.parts import StatusFields, events, meanings_at
 from v2v_server.system.log import Log, write
 from v2v_server.system.status_fields import GIB
 
@@ -33,7 +33,7 @@ _TERMINAL_SECONDS, _LOG_SECONDS = 0.5, 10.0
 _MOST_CONSUMERS = 8
 
 
-def figures(status: Status) -> str:
+def figures(status: StatusFields) -> str:
     """Return rates and counts in one line."""
     totals, decodes = status["totals"], status["totals"]["decodes"]
     processes = max(status["worker_processes"], status["worker_count"])
@@ -54,7 +54,7 @@ def figures(status: Status) -> str:
     return "  ".join(filter(None, parts))
 
 
-def format_cache(status: Status) -> str:
+def format_cache(status: StatusFields) -> str:
     """Return how well the cache serves; empty if there is none, or it was not used yet."""
     cache = status["cache"]
     if cache is None or not (read := cache["hits"] + cache["misses"]):
@@ -63,7 +63,7 @@ def format_cache(status: Status) -> str:
     return f"cache {cache['hits'] / read:.0%} hits{held}" + (f" ({cache['trouble']})" if cache["trouble"] else "")
 
 
-def format_shutdown_summary(status: Status) -> list[str]:
+def format_shutdown_summary(status: StatusFields) -> list[str]:
     """Return lines on all that a server did.
 
     Args:
@@ -88,12 +88,12 @@ def format_shutdown_summary(status: Status) -> list[str]:
     return lines
 
 
-def line(status: Status) -> str:
+def line(status: StatusFields) -> str:
     """Return the status in one line, where there is no terminal."""
     return printable(f"{status['time']}  {figures(status)}  {status['waiting']['sentence']}")
 
 
-def draw(status: Status, note: str = "") -> RenderableType:
+def draw(status: StatusFields, note: str = "") -> RenderableType:
     """Draw the status as tables.
 
     Args:
@@ -124,7 +124,7 @@ def draw(status: Status, note: str = "") -> RenderableType:
     return Group(*parts)
 
 
-def consumers_table(count: int, consumers: Sequence[Status]) -> Table:
+def consumers_table(count: int, consumers: Sequence[StatusFields]) -> Table:
     """Draw how far each consumer is.
 
     Args:
@@ -150,7 +150,7 @@ def consumers_table(count: int, consumers: Sequence[Status]) -> Table:
     return table
 
 
-def _workers(status: Status) -> Table:
+def _workers(status: StatusFields) -> Table:
     table = _table(
         f"{status['worker_count']} workers", *("name", "host", "state", "clip", "busy", "cores", "GiB", "restarts")
     )
@@ -168,7 +168,7 @@ def _workers(status: Status) -> Table:
     return table
 
 
-def _shown(table: Table, rows: Sequence[Status]) -> Sequence[Status]:
+def _shown(table: Table, rows: Sequence[StatusFields]) -> Sequence[StatusFields]:
     if len(rows) > _MOST_ROWS:
         table.caption = f"and {len(rows) - _MOST_ROWS} more"
     return rows[:_MOST_ROWS]
@@ -209,7 +209,7 @@ class StatusView:
         """Return whether it is time to show the status again."""
         return now >= self._next
 
-    def show(self, now: float, status: Status) -> None:
+    def show(self, now: float, status: StatusFields) -> None:
         """Show the status."""
         self._next = now + (_LOG_SECONDS if self._console is None else _TERMINAL_SECONDS)
         if self._log.is_json:
@@ -237,7 +237,7 @@ class StatusView:
         return f"\x1b[{self._lines}F\x1b[J" if self._lines else ""
 
 
-def _for_programs(status: Status) -> dict[str, Any]:
+def _for_programs(status: StatusFields) -> dict[str, Any]:
     totals = status["totals"]
     gauges = {name: status[name] for name, meaning in meanings_at("").items() if meaning.kind == "gauge"}
     return {
@@ -251,7 +251,7 @@ def _for_programs(status: Status) -> dict[str, Any]:
     }
 
 
-def _drawn(console: Console, status: Status) -> str:
+def _drawn(console: Console, status: StatusFields) -> str:
     cores = sum(worker["cpu_share"] for worker in status["workers"])
     with console.capture() as drawn:
         console.print(Text(printable(status["waiting"]["sentence"]), style="bold"))

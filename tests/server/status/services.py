@@ -9,11 +9,11 @@ from typing import Any, cast
 from tests.server.named_corpus import corpus, video
 from tests.server.peers import Peers
 from tests.server.queues import Queues, ToyPool
-from v2v_protocol.messages import Status as StatusMessage
+from v2v_protocol.messages import StatusFields as StatusMessage
 from v2v_protocol.wire import decode
 from v2v_server.broker.actions import Action, SendStatus, ToConsumer, ToWorker
 from v2v_server.config import ServeConfig
-from v2v_server.status.parts import Status
+from v2v_server.status.parts import StatusFields
 from v2v_server.status.snapshot import Service, StatusPublisher, to_json
 
 WALL = "2024-02-29T12:00:00+00:00"
@@ -48,7 +48,7 @@ class Published:
     transport: Queues
     pool: ToyPool
 
-    def status(self) -> Status:
+    def status(self) -> StatusFields:
         return self.publisher.status(self.at.now)
 
     def plain(self) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import pytest
 from tests.server.peers import peers
 from tests.server.status.services import published
 from v2v_server.broker.counters import Counters
-from v2v_server.status.parts import Status
+from v2v_server.status.parts import StatusFields
 from v2v_server.status.terminal import StatusView
 from v2v_server.system.log import Log
 
@@ -22,7 +22,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def said(status: Status) -> str:
+def said(status: StatusFields) -> str:
     """Return the line of a status in a log."""
     stream = io.StringIO()
     StatusView(Log(), stream).show(0.0, status)
