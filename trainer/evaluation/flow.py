@@ -42,12 +42,12 @@ FlowImage = npt.NDArray[np.float32]
 
 HOOD_ROW = 190
 LARGE_PX = 3.0
-TITLES = {"aee_dense": "AEE", "aee_sparse": "AEE sparse", "3pe_dense": "3PE %", "3pe_sparse": "3PE % sparse"}
+_TITLES = {"aee_dense": "AEE", "aee_sparse": "AEE sparse", "3pe_dense": "3PE %", "3pe_sparse": "3PE % sparse"}
 
 
 @dataclass
 class FlowScore:
-    """Average the scores over the windows of a sequence, by the names of :data:`TITLES`. 3PE is in per cent."""
+    """Average the scores over the windows of a sequence, by the names of :data:`_TITLES`. 3PE is in per cent."""
 
     as_published: bool
     windows: int = 0
@@ -79,7 +79,7 @@ class FlowScore:
     @property
     def means(self) -> dict[str, float]:
         """Return the means by name. Scores without any counted pixel in any window are left out."""
-        return {name: float(np.mean(self._values[name])) for name in TITLES if name in self._values}
+        return {name: float(np.mean(self._values[name])) for name in _TITLES if name in self._values}
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def _draw(path: Path, grid: npt.NDArray[np.float32], truth: FlowImage, predictio
 def flow_table(name: str, scores: Mapping[str, Mapping[str, FlowScore]], compared: Sequence[str]) -> Table:
     """Format a block of rows per sequence: network, zeros, and the paper's values."""
     rows = Table(title=escape(name), title_justify="left")
-    for column in ("sequence", "windows", *TITLES.values()):
+    for column in ("sequence", "windows", *_TITLES.values()):
         rows.add_column(column, justify="left" if column == "sequence" else "right", no_wrap=True)
     for sequence, found in scores.items():
         for predictor, score in found.items():
@@ -177,7 +177,7 @@ def flow_table(name: str, scores: Mapping[str, Mapping[str, FlowScore]], compare
 
 
 def _numbers(values: Mapping[str, float]) -> list[str]:
-    return [f"{values[name]:.3f}" if math.isfinite(values.get(name, math.nan)) else "-" for name in TITLES]
+    return [f"{values[name]:.3f}" if math.isfinite(values.get(name, math.nan)) else "-" for name in _TITLES]
 
 
 def flow_records(
