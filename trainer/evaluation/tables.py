@@ -16,7 +16,7 @@ from trainer.evaluation.score import SequenceScore, mean_over_sequences
 from v2v_protocol.errors import UsageError
 from v2v_protocol.write_aside import write_aside_and_rename
 
-TITLES = {
+_TITLES = {
     "mse": "MSE",
     "ssim_range2": "SSIM (range 2)",
     "ssim": "SSIM",
@@ -40,7 +40,7 @@ def table(data_set: DataSet, scores: Sequence[SequenceScore], compared: Sequence
     rows.add_column("sequence", no_wrap=True)
     rows.add_column("frames", justify="right")
     for name in names:
-        rows.add_column(TITLES[name], justify="right")
+        rows.add_column(_TITLES[name], justify="right")
     for score in scores:
         rows.add_row(escape(score.sequence), str(score.frames), *(_number(score.means, name) for name in names))
     if not names:
