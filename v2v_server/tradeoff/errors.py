@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 
-Voxels = npt.NDArray[Any]
+VoxelArray = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Tally:
         return self.changed / self.bins if self.bins else None
 
 
-def compare(voxels: Voxels, reference: Voxels) -> Tally:
+def compare(voxels: VoxelArray, reference: VoxelArray) -> Tally:
     """Return the tally of two arrays of the same shape, signed event counts.
 
     Raises:
@@ -73,7 +73,7 @@ def compare(voxels: Voxels, reference: Voxels) -> Tally:
     )
 
 
-def _sum(values: Voxels) -> float:
+def _sum(values: VoxelArray) -> float:
     return float(values.sum(dtype=np.float64))
 
 
