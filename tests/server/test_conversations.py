@@ -42,7 +42,6 @@ from v2v_server.quarantine.file import read_quarantine
 from v2v_server.serve import Server
 from v2v_server.worker.conversation import (
     CREDIT,
-    Action,
     Inspect,
     Leave,
     Listen,
@@ -50,6 +49,7 @@ from v2v_server.worker.conversation import (
     Make,
     Readiness,
     Send,
+    WorkerAction,
     WorkerConversation,
 )
 
@@ -109,11 +109,11 @@ class Worker:
         self.kernels = False
         hello = WorkerHello(name.decode(), NUMERICS_VERSION, CREDIT)
         self.conversation = WorkerConversation(hello, "queue://workers", is_watched=True)
-        self.step: Action = Leave()
+        self.step: WorkerAction = Leave()
         world.queues.connect(name)
         self._take(self.conversation.start(world.now))
 
-    def _take(self, actions: list[Action]) -> None:
+    def _take(self, actions: list[WorkerAction]) -> None:
         *said, self.step = actions
         for action in said:
             if isinstance(action, Send):

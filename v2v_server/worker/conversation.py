@@ -118,7 +118,7 @@ class Leave:
     """End the conversation."""
 
 
-Action: TypeAlias = Send | Reconnect | Say | Listen | Inspect | Load | Make | Leave
+WorkerAction: TypeAlias = Send | Reconnect | Say | Listen | Inspect | Load | Make | Leave
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,19 +167,19 @@ class WorkerConversation:
 
     # --- events -------------------------------------------------------------------------------------------------------
 
-    def start(self, now: float) -> list[Action]:
+    def start(self, now: float) -> list[WorkerAction]:
         """Begin the conversation; call it when the worker is ready."""
         self._restart_silence(now)
         return [self._say_hello(), *self._next_actions(now)]
 
-    def on_messages(self, messages: Sequence[Any], now: float) -> list[Action]:
+    def on_messages(self, messages: Sequence[Any], now: float) -> list[WorkerAction]:
         """Handle the first frames of the received messages, oldest first; empty after a wait without messages.
 
         Raises:
             RemoteError: the server rejects this worker (another numerics version).
             VersionMismatch: the server speaks another version of the protocol.
         """
-        actions: list[Action] = []
+        actions: list[WorkerAction] = []
         if messages:
             self._restart_silence(now)
             for frame in messages:
@@ -192,7 +192,7 @@ class WorkerConversation:
             actions.append(self._say_hello())
         return actions + self._next_actions(now)
 
-    def on_inspected(self, readiness: Readiness, now: float) -> list[Action]:
+    def on_inspected(self, readiness: Readiness, now: float) -> list[WorkerAction]:
         """Report finished samples together with the lease that is begun next, and begin it."""
         if self._stopping:
             return self._next_actions(now)
@@ -214,12 +214,12 @@ class WorkerConversation:
             actions.append(Send(encode(Begun(lease.lease))))
         return [*actions, self._make(now)]
 
-    def on_kernels_loaded(self, now: float) -> list[Action]:
+    def on_kernels_loaded(self, now: float) -> list[WorkerAction]:
         """Continue after the kernels of the next lease are loaded."""
         self._restart_silence(now)
         return [Listen(0.0)] if self._away else self._next_actions(now)
 
-    def on_sample(self, frames: Frames, now: float, work: Result) -> list[Action]:
+    def on_sample(self, frames: Frames, now: float, work: Result) -> list[WorkerAction]:
         """Report a sample that is made.
 
         Args:
@@ -238,7 +238,7 @@ class WorkerConversation:
         )
         return [Inspect(self._leases[0]) if self._may_wait else Listen(0.0)]
 
-    def on_failure(self, error: VideoError | SidecarError, now: float) -> list[Action]:
+    def on_failure(self, error: VideoError | SidecarError, now: float) -> list[WorkerAction]:
         """Report at once that the video, or its sidecar, could not be used."""
         lease = self._done(now)
         if isinstance(error, SidecarError):
@@ -249,7 +249,7 @@ class WorkerConversation:
 
     # --- what the server says -----------------------------------------------------------------------------------------
 
-    def _handle(self, frame: Any) -> list[Action]:
+    def _handle(self, frame: Any) -> list[WorkerAction]:
         try:
             message: Message = decode(frame)
         except VersionMismatch:
@@ -277,8 +277,8 @@ class WorkerConversation:
                 pass
         return []
 
-    def _handle_silence(self, now: float) -> list[Action]:
-        actions: list[Action] = []
+    def _handle_silence(self, now: float) -> list[WorkerAction]:
+        actions: list[WorkerAction] = []
         if self._silence.ping_due(now):
             if self._silence.silence(now) >= _RECONNECT_SECONDS:
                 actions += [Reconnect(), self._say_hello()]
@@ -303,7 +303,7 @@ class WorkerConversation:
         self._unheard = True
         return Send(encode(self._hello))
 
-    def _next_actions(self, now: float) -> list[Action]:
+    def _next_actions(self, now: float) -> list[WorkerAction]:
         """Choose the next step; report finished samples unless the next lease may be begun."""
         if self._stopping:
             return [*self._results(), Send(encode(Goodbye())), Leave()]
@@ -324,7 +324,7 @@ class WorkerConversation:
         self._restart_silence(now)
         return lease
 
-    def _results(self, begins: int = 0) -> list[Action]:
+    def _results(self, begins: int = 0) -> list[WorkerAction]:
         """Report finished samples together with the lease that is begun next; 0 begins none."""
         if not self._unsent:
             return []

@@ -46,7 +46,6 @@ from v2v_server.system.sandbox import confine
 from v2v_server.system.start_times import StartTimes
 from v2v_server.worker.conversation import (
     CREDIT,
-    Action,
     Inspect,
     Listen,
     Load,
@@ -55,6 +54,7 @@ from v2v_server.worker.conversation import (
     Reconnect,
     Say,
     Send,
+    WorkerAction,
     WorkerConversation,
 )
 from v2v_server.worker.logbook import IDLE, note, take_arena
@@ -223,7 +223,7 @@ class Worker:
             self._link.disconnect(linger_ms=_LINGER_MS)
             self._link.close()
 
-    def _do(self, action: Action) -> None:
+    def _do(self, action: WorkerAction) -> None:
         if isinstance(action, Send):
             began = time.monotonic()
             self._link.send(action.frames)
@@ -235,7 +235,7 @@ class Worker:
         elif isinstance(action, Say):
             self._log.say(f"{self._name}: {action.text}", "warning", worker=self._name)
 
-    def _take(self, step: Action) -> list[Action]:
+    def _take(self, step: WorkerAction) -> list[WorkerAction]:
         """Carry out a step and return the conversation's next actions."""
         conversation = self._conversation
         match step:

@@ -26,7 +26,6 @@ from v2v_protocol.messages import (
 )
 from v2v_protocol.wire import Frames, decode, encode
 from v2v_server.worker.conversation import (
-    Action,
     Inspect,
     Leave,
     Listen,
@@ -36,6 +35,7 @@ from v2v_server.worker.conversation import (
     Reconnect,
     Say,
     Send,
+    WorkerAction,
     WorkerConversation,
 )
 
@@ -74,11 +74,11 @@ class Talk:
         self.compiled = True
         self.decoded: set[int] = set()
         self.conversation = WorkerConversation(HELLO, "tcp://there", is_watched=is_watched)
-        self.step: Action = Leave()
+        self.step: WorkerAction = Leave()
         self._take(self.conversation.start(self.now))
         assert self.said() == [HELLO]
 
-    def _take(self, actions: list[Action]) -> None:
+    def _take(self, actions: list[WorkerAction]) -> None:
         *before, self.step = actions
         assert isinstance(self.step, Listen | Inspect | Load | Make | Leave)
         for action in before:
