@@ -40,7 +40,7 @@ class Canvas:
         self._draw = ImageDraw.Draw(self._page)
 
     def text(
-        self, x: float, y: float, text: str, *, size: int = TEXT_PT, colour: Colour = INK, anchor: str = "la"
+        self, x: float, y: float, text: str, *, size: int = TEXT_PT, colour: Rgb = INK, anchor: str = "la"
     ) -> float:
         """Write one line and return where it ends. ``anchor`` is Pillow's: "la" left top, "ma" middle top, "ra"."""
         self._draw.text((x, y), text, fill=colour, font=_font(size), anchor=anchor)
@@ -72,16 +72,16 @@ class Canvas:
             self._draw.rectangle((left, top, right - 1, bottom - 1), fill=colour)
 
     def frame(
-        self, left: float, top: float, right: float, bottom: float, colour: Colour = LINE, width_px: int = 1
+        self, left: float, top: float, right: float, bottom: float, colour: Rgb = LINE, width_px: int = 1
     ) -> None:
         """Draw a rectangle's outline."""
         self._draw.rectangle(tuple(map(round, (left, top, right, bottom))), outline=colour, width=width_px)
 
-    def line(self, x0: float, y0: float, x1: float, y1: float, colour: Colour = LINE, width_px: int = 1) -> None:
+    def line(self, x0: float, y0: float, x1: float, y1: float, colour: Rgb = LINE, width_px: int = 1) -> None:
         """Draw a straight line."""
         self._draw.line((x0, y0, x1, y1), fill=colour, width=width_px)
 
-    def arrow(self, x0: float, y: float, x1: float, colour: Colour = SOFT) -> None:
+    def arrow(self, x0: float, y: float, x1: float, colour: Rgb = SOFT) -> None:
         """Draw a horizontal arrow to the right."""
         self._draw.line((x0, y, x1 - 8, y), fill=colour, width=2)
         self._draw.polygon(((x1, y), (x1 - 11, y - 5), (x1 - 11, y + 5)), fill=colour)
@@ -140,7 +140,7 @@ def beginning(text: str, width_px: float, size: int = TEXT_PT) -> str:
     return text + "..."
 
 
-def label(page: Canvas, x: int, y: int, text: str, colour: Colour = INK) -> None:
+def label(page: Canvas, x: int, y: int, text: str, colour: Rgb = INK) -> None:
     """Write text on a ground of its own, so that the panel below does not hide it."""
     page.box(x, y, x + text_width(text) + 10, y + 24, PAPER)
     page.text(x + 5, y + 2, text, colour=colour)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings.forms import FORMS, recognise
-from v2v_recordings.items import ConvertOptions, EventChunk, FlowField, Item, Note, Picture, SensorSize
+from v2v_recordings.items import ConvertOptions, EventChunk, FlowField, Item, Note, Picture, ReadProgress, SensorSize
 
 LATE_NS = 10_000_000
 """Events that are earlier than others before them by at most this are late in any case."""
@@ -29,7 +29,7 @@ GAP_NS = 1000
 
 
 def read_items(
-    path: Path, form: str | None, options: ConvertOptions, progress: Progress = lambda _done, _total: None
+    path: Path, form: str | None, options: ConvertOptions, progress: ReadProgress = lambda _done, _total: None
 ) -> Iterator[Item]:
     """Yield the items of a recording.
 

@@ -49,7 +49,7 @@ def convert(
     form: str | None = None,
     options: ConvertOptions | None = None,
     overwrite: bool = False,
-    progress: Progress = lambda _done, _total: None,
+    progress: ReadProgress = lambda _done, _total: None,
 ) -> Converted:
     """Convert one recording. The source is opened for reading only; the destination appears when it is complete.
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from v2v_recordings.items import ConvertOptions
+from v2v_recordings.items import ConvertOptions, ReadProgress
 from v2v_server.fit import estimators, regression
 from v2v_server.fit.increments import Still, increments_of, intervals_us, still_time
 from v2v_server.fit.interval import Doubles, Estimate, unknown
@@ -58,7 +58,7 @@ def fit(
     *,
     static: bool = False,
     options: ConvertOptions | None = None,
-    progress: Progress = lambda _done, _total: None,
+    progress: ReadProgress = lambda _done, _total: None,
 ) -> FittedCamera:
     """Fit a camera to a recording of events, with or without frames.
 

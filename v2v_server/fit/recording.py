@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.items import ConvertOptions, EventChunk, Note, Picture, SensorSize
+from v2v_recordings.items import ConvertOptions, EventChunk, Note, Picture, ReadProgress, SensorSize
 from v2v_recordings.reading import read_items
 
 MOST_PIXELS = 1 << 15
@@ -130,7 +130,7 @@ def recorded(
 
 
 def read_recording(
-    path: str | Path, options: ConvertOptions | None = None, progress: Progress = lambda _done, _total: None
+    path: str | Path, options: ConvertOptions | None = None, progress: ReadProgress = lambda _done, _total: None
 ) -> Recorded:
     """Read a recording of any form that ``v2v-convert`` reads, chunk by chunk.
 
