@@ -140,9 +140,9 @@ class Batch:
 
     @property
     def voxels_bilinear(self) -> torch.Tensor:
-        """Return the voxel grids with each event shared between the two bins next to its time, shaped like voxels.
+        """Return the voxel grids with each event shared between the two bins next to its time: [B, T, bins, H, W].
 
-        float16, or float32 if the spec's ``voxel_dtype`` is float32.
+        T is as for :attr:`voxels`. float16, or float32 if the spec's ``voxel_dtype`` is float32.
 
         Raises:
             UsageError: the dataset did not request this array.
@@ -330,13 +330,16 @@ _UNMARKED = " (pauses are not marked)"
 
 
 def to_png(image: npt.NDArray[np.uint8]) -> bytes:
-    """Encode the picture as PNG."""
+    """Encode a picture, [height, width, 3] RGB, as PNG."""
     encoded: bytes = _drawing("files").png_bytes(image)
     return encoded
 
 
 def try_png(draw: Callable[[], npt.NDArray[np.uint8]]) -> bytes | None:
-    """Return the drawn picture as PNG, or None if it cannot be drawn: the notebook then shows only text."""
+    """Return the picture that ``draw`` draws, [height, width, 3] RGB, as PNG.
+
+    None if it cannot be drawn: the notebook then shows only text.
+    """
     try:
         return to_png(draw())
     except UsageError:
@@ -352,6 +355,7 @@ def to_pil_image(image: npt.NDArray[np.uint8], path: str | os.PathLike[str] | No
     """Return the picture as a PIL image, which a notebook displays.
 
     Args:
+        image: [height, width, 3] RGB.
         path: PNG file to write as well; None writes no file.
 
     Raises:

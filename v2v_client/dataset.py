@@ -17,13 +17,12 @@ from torch.utils.data import IterableDataset, get_worker_info
 from v2v_client.batch import Batch
 from v2v_client.connection import Connector, ConsumerId, addresses
 from v2v_client.delivery import deliver
-from v2v_client.loaders import end_with_parent, send_before_exit
+from v2v_client.loaders import distributed_rank, end_with_parent, send_before_exit
 from v2v_client.local_server import LocalServer, recipe_flags
 from v2v_client.memory import BatchBuffers
 from v2v_client.options import Labels, Options, Patience, check_labels, require_arguments, require_labels
 from v2v_client.passes import Iteration, Position
 from v2v_client.position import Consumer, EpochPlan, ResumeState, StreamIdentity
-from v2v_client.ranks import distributed_rank
 from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import RepeatedSamplesWarning, StateMismatch, UsageError
 from v2v_protocol.recipe import Recipe

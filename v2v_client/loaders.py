@@ -1,4 +1,4 @@
-"""End loader workers properly: send what they have queued, say what cannot be sent, and end with their parent.
+"""Ask PyTorch for the rank, and end loader workers properly: send what is queued, or say why not; end with the parent.
 
 ``torch.utils.data.DataLoader`` sends batches in a daemon thread of each loader worker, which moves tensors into shared
 memory. It does not wait for that thread when a trainer leaves an epoch early. A forked worker just ends. A spawned
@@ -19,6 +19,7 @@ import time
 from multiprocessing.queues import Queue
 from typing import Any
 
+import torch.distributed
 from torch._utils import ExceptionWrapper
 from torch.utils.data import get_worker_info
 
@@ -79,3 +80,10 @@ def _wait_for_orphaned(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(_PARENT_SECONDS)
     os._exit(1)  # without a parent, no process can receive its batches
+
+
+def distributed_rank() -> tuple[int, int] | None:
+    """Return (rank, world size) of the default process group; None if there is none."""
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        return torch.distributed.get_rank(), torch.distributed.get_world_size()
+    return None

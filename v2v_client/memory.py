@@ -70,7 +70,7 @@ def lend(memory: ByteArray, back: Callable[[ByteArray], object]) -> ByteArray:
     """Return another array of the same memory, and call ``back`` when it is no longer used.
 
     Args:
-        memory: kept alive until then.
+        memory: [bytes], kept alive until then.
         back: called with the memory once nothing refers to the returned array. It may run in any thread, and does not
             run at the end of the process.
     """
@@ -135,7 +135,7 @@ class Arena:
 
         Args:
             row: 0 .. slots - 1.
-            arrays: C-contiguous, with dtypes and shapes of the layout.
+            arrays: C-contiguous, such as voxels [T, bins, H, W], with dtypes and shapes of the layout.
         """
         for name, array in arrays.items():
             offset, rest = self._offset(name, row), array.reshape(-1).view(np.uint8).data
@@ -144,7 +144,7 @@ class Arena:
                 offset, rest = offset + written, rest[written:]
 
     def get(self, row: int) -> dict[str, npt.NDArray[Any]]:
-        """Return a copy of the sample in a row."""
+        """Return a copy of the sample in a row: arrays by name, such as voxels [T, bins, H, W]."""
         sample = new_arrays(self._layout)
         for name, array in sample.items():
             offset, rest = self._offset(name, row), array.reshape(-1).view(np.uint8).data
@@ -248,7 +248,8 @@ class BatchMemory:
 
         Args:
             row: 0 .. batch size - 1.
-            arrays: copied into the row; None if a worker has written them into the row's slot.
+            arrays: copied into the row, such as voxels [T, bins, H, W]; None if a worker has written them into the
+                row's slot.
             slot_is_free: False if a worker may still write to that slot.
         """
         if not slot_is_free and self._arena is not None:
@@ -269,7 +270,7 @@ class BatchMemory:
             self._own[name][row] = array
 
     def finish(self) -> dict[str, npt.NDArray[Any]]:
-        """Return all rows of each array, once they are filled. Call this once, as the last call."""
+        """Return the rows of each array, [batch size, ...], once they are filled. Call this once, as the last call."""
         return self._own if self._arena is None else self._buffers.lend_arrays(self._arena)
 
 
@@ -304,7 +305,7 @@ class BatchBuffers:
         return BatchMemory(self, self._take_arena() if shared else None)
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return private arrays for a batch. Their memory comes back once nothing refers to them."""
+        """Return private arrays for a batch, [batch size, ...]. Their memory comes back once nothing refers to them."""
         layout, batch_size, _ = self._form
         try:
             memory = self._free.pop()
@@ -320,9 +321,9 @@ class BatchBuffers:
         return open_arena(*self._form[:2])
 
     def lend_arrays(self, arena: Arena) -> dict[str, npt.NDArray[Any]]:
-        """Return the arrays of an arena whose batch is complete. The arena comes back once nothing refers to them.
+        """Return the arrays, [batch size, ...], of an arena whose batch is complete.
 
-        An arena whose batch was never completed does not come back.
+        The arena comes back once nothing refers to them. An arena whose batch was never completed does not come back.
         """
         free, forks = self._arenas, _forks
 

@@ -75,6 +75,6 @@ def check_duration(total_us: float) -> None:
 
 
 def whole_edges(edges_us: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.int64]:
-    """Return the first whole microsecond at or after each moment. Roundings below 1e-6 microseconds do not count."""
+    """Return the first whole microsecond at or after each moment, [edges]; roundings below 1e-6 do not count."""
     first: npt.NDArray[np.int64] = np.ceil(np.round(edges_us, 6)).astype(np.int64)
     return first

@@ -255,8 +255,10 @@ class Recipe:
         return 1 if self.grids_per_frame else self.bins * self.frames_per_bin
 
     def steps_at(self, frames_per_second: npt.ArrayLike) -> npt.NDArray[np.int64]:
-        """Return ``steps_per_frame`` in videos of these rates. With ``voxel_seconds``: in the longest grid that the
-        recipe can draw, which may be more than MOST_STEPS_PER_GRID, and 0 where a rate is not above 0.
+        """Return ``steps_per_frame`` in videos of these rates, [videos].
+
+        With ``voxel_seconds``: in the longest grid that the recipe can draw, which may be more than
+        MOST_STEPS_PER_GRID, and 0 where a rate is not above 0.
         """
         if not self.is_timed:
             return np.asarray(self.steps_per_frame, np.int64)
@@ -265,14 +267,14 @@ class Recipe:
         return np.where(rates > 0.0, np.maximum(steps, 1.0), 0.0).astype(np.int64)
 
     def sequence_at(self, frames_per_second: npt.ArrayLike) -> npt.NDArray[np.int64]:
-        """Return ``frames_per_sequence`` of videos of these rates (:meth:`steps_at`)."""
+        """Return ``frames_per_sequence`` of videos of these rates, [videos] (:meth:`steps_at`)."""
         return self.steps_at(frames_per_second) * (self.spans * self.frame_stride)
 
     def reach_at(self, frames_per_second: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """Return the largest number of frames after its first one that a sample of videos of these rates may use.
 
-        With ``voxel_seconds`` twice :meth:`sequence_at`: where the frame rate varies, time stamps may be closer than
-        the average rate says.
+        Rates and result are [videos]. With ``voxel_seconds`` twice :meth:`sequence_at`: where the frame rate varies,
+        time stamps may be closer than the average rate says.
         """
         return self.sequence_at(frames_per_second) * (2 if self.is_timed else 1)
 

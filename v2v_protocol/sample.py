@@ -348,7 +348,7 @@ def layout_bytes(layout: Layout) -> int:
 
 
 def new_arrays(layout: Layout) -> dict[str, npt.NDArray[Any]]:
-    """Allocate arrays for one sample of that layout, with unspecified content."""
+    """Allocate arrays for one sample, such as voxels [T, bins, H, W], with unspecified content."""
     return {name: np.empty(shape, dtype) for name, (dtype, shape) in layout.items()}
 
 

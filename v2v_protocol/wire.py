@@ -132,6 +132,7 @@ def encode_sample(
     they are sent.
 
     Args:
+        arrays: of the sample, such as voxels [T, bins, H, W].
         slot: the slot that the lease named.
         in_slot: the arrays lie there, so only the header is sent.
         pack: compresses an array's bytes to a zstd frame that states its size; None sends them uncompressed.
@@ -244,7 +245,7 @@ def largest_frame_bytes(sizes: Iterable[int]) -> int:
 def decode_sample(
     header: SampleHeader, payload: Sequence[Buffer], unpack: Callable[[Buffer, int], Buffer] | None = None
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays behind a SampleHeader, as read-only views of the payload (no copy).
+    """Return the arrays behind a SampleHeader, such as voxels [T, bins, H, W], as views of the payload (read-only).
 
     Args:
         header, payload: of the sample.

@@ -148,7 +148,11 @@ class Dealer:
                 self._context.destroy(linger=0)
 
     def send(self, frames: Sequence[Any]) -> None:
-        """Queue a message. It is sent once the peer can be reached."""
+        """Queue a message. It is sent once the peer can be reached.
+
+        Raises:
+            ServerLost: the link is closed, or the system refuses to send.
+        """
         socket = self._open(self._socket)
         try:
             for frame in frames[:-1]:  # send_multipart combines flags of an enumeration, which takes longer
@@ -160,7 +164,11 @@ class Dealer:
             raise ServerLost(f"{self._address}: cannot send: {error}") from error
 
     def receive(self, seconds: float) -> Frames | None:
-        """Return the next message, or None if ``seconds`` passed or the monitor had an event instead."""
+        """Return the next message, or None if ``seconds`` passed or the monitor had an event instead.
+
+        Raises:
+            ServerLost: the link is closed, or the system refuses to receive.
+        """
         socket = self._open(self._socket)
         try:
             if socket in dict(self._poller.poll(math.ceil(seconds * 1000))):
