@@ -28,8 +28,7 @@ from v2v_recordings.forms import recognise
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, SensorSize
 from v2v_recordings.reading import LATE_NS, _Clock, read_items
 from v2v_server.fit.recording import read_recording
-from v2v_server.offline.event_files import FORMS as EXPORTS
-from v2v_server.offline.event_files import write_events
+from v2v_server.offline.event_files import EVENT_WRITERS, write_events
 
 
 def read(path: Path, options: ConvertOptions | None = None) -> list[Item]:
@@ -53,7 +52,7 @@ def listed(events: int = 500) -> EventList:
 
 
 @pytest.mark.parametrize("capitals", [False, True])
-@pytest.mark.parametrize("ending", EXPORTS)
+@pytest.mark.parametrize("ending", EVENT_WRITERS)
 def test_own_exports_are_read_back(tmp_path: Path, ending: str, capitals: bool) -> None:
     path, events = tmp_path / f"ev{ending.upper() if capitals else ending}", listed()
     write_events(path, events)
