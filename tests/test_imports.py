@@ -193,12 +193,30 @@ def test_what_a_fresh_interpreter_loads(module: str, without: tuple[str, ...]) -
     assert done.stdout.split() == []
 
 
-def test_no_two_classes_have_one_name() -> None:
-    """But for what the files of one seam have in common: every effect has its ``Tables``."""
-    found: dict[str, list[str]] = {}
+def test_no_two_classes_constants_or_aliases_have_one_name() -> None:
+    """But for what the files of one seam have in common, and what has the same definition: every effect has its
+    ``Tables``, every plane its ``PLANE``."""
+    found: dict[str, dict[str, str]] = {}
     for package in ("v2v_protocol", "v2v_pictures", "v2v_recordings", "v2v_server", "v2v_client", "trainer"):
         for path in modules(package):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.ClassDef) and "effects" not in path.parts:
-                    found.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
-    assert {name: paths for name, paths in found.items() if len(paths) > 1} == {}
+            if {"effects", "planes"} & set(path.parts):
+                continue
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            for node in (*tree.body, *(item for item in ast.walk(tree) if isinstance(item, ast.ClassDef))):
+                for name in public_names(node):
+                    source = "" if isinstance(node, ast.ClassDef) else ast.unparse(node)
+                    found.setdefault(name, {})[str(path.relative_to(ROOT))] = source or str(path)
+    del found["LATER_FIELDS"]  # of a recipe and of a spec
+    assert {name: list(used) for name, used in found.items() if len(set(used.values())) > 1} == {}
+
+
+def public_names(node: ast.stmt) -> list[str]:
+    """Return the classes, constants and aliases that a statement of a module defines."""
+    if isinstance(node, ast.ClassDef):
+        names = [node.name]
+    else:
+        targets = (
+            node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+        )
+        names = [item.id for target in targets for item in ast.walk(target) if isinstance(item, ast.Name)]
+    return [name for name in names if name[0].isupper()]
