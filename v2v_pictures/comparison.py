@@ -38,18 +38,24 @@ def draw_comparison(title: str, panels: Sequence[Curves], lines: Sequence[str]) 
     """Draw the page: [height, width, 3] uint8. Bars are measured, lines simulated; each panel has its own scale."""
     rows = -(-len(panels) // _COLUMNS)
     step = _PANEL_PX + 3 * _LINE_PX + 14
-    top = 2 * canvas.MARGIN_PX + 40
-    page = Canvas(_WIDTH_PX, top + rows * step + (len(lines) + 1) * _LINE_PX + canvas.MARGIN_PX)
-    page.title(canvas.MARGIN_PX, canvas.MARGIN_PX, title)
-    legend = page.text(canvas.MARGIN_PX, top - 26, "bars: measured", colour=MEASURED)
+    top = 2 * canvas.PAGE_MARGIN_PX + 40
+    page = Canvas(_WIDTH_PX, top + rows * step + (len(lines) + 1) * _LINE_PX + canvas.PAGE_MARGIN_PX)
+    page.title(canvas.PAGE_MARGIN_PX, canvas.PAGE_MARGIN_PX, title)
+    legend = page.text(canvas.PAGE_MARGIN_PX, top - 26, "bars: measured", colour=MEASURED)
     page.text(legend + 16, top - 26, "lines: simulated", colour=SIMULATED)
-    width = (_WIDTH_PX - (_COLUMNS + 1) * canvas.MARGIN_PX) // _COLUMNS
+    width = (_WIDTH_PX - (_COLUMNS + 1) * canvas.PAGE_MARGIN_PX) // _COLUMNS
     for number, panel in enumerate(panels):
         row, column = divmod(number, _COLUMNS)
-        _draw(page, panel, canvas.MARGIN_PX + column * (width + canvas.MARGIN_PX), top + row * step + _LINE_PX, width)
+        _draw(
+            page,
+            panel,
+            canvas.PAGE_MARGIN_PX + column * (width + canvas.PAGE_MARGIN_PX),
+            top + row * step + _LINE_PX,
+            width,
+        )
     for number, line in enumerate(lines):
-        fits = canvas.shortened(line[::-1], _WIDTH_PX - 2 * canvas.MARGIN_PX)[::-1]
-        page.text(canvas.MARGIN_PX, top + rows * step + number * _LINE_PX, fits)
+        fits = canvas.shortened(line[::-1], _WIDTH_PX - 2 * canvas.PAGE_MARGIN_PX)[::-1]
+        page.text(canvas.PAGE_MARGIN_PX, top + rows * step + number * _LINE_PX, fits)
     return page.image()
 
 

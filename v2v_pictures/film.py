@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import GAP_PX, MARGIN_PX, Canvas, label
+from v2v_pictures.canvas import GAP_PX, PAGE_MARGIN_PX, Canvas, label
 from v2v_pictures.colours import Image, draw_events, draw_grey
 from v2v_pictures.labels import labelled_panel
 from v2v_pictures.sheet import Scale, events_heading, flow_panel
@@ -34,7 +34,7 @@ def draw_film(
     """
     scale = Scale.of(cameras if whole is None else [whole, *cameras])
     columns = 2 + (cameras[0].flow is not None)
-    width = max(2 * MARGIN_PX + columns * (tile_px + GAP_PX) - GAP_PX, 2 * MARGIN_PX + _LEAST_WIDTH_PX)
+    width = max(2 * PAGE_MARGIN_PX + columns * (tile_px + GAP_PX) - GAP_PX, 2 * PAGE_MARGIN_PX + _LEAST_WIDTH_PX)
     block = _CAMERA_PX + _NAMES_PX + tile_px + GAP_PX + LABEL_PX + _STRIP_PX + TICKS_PX + _BETWEEN_PX
     grids, bins = cameras[0].voxels.shape[:2]
     first = _TITLE_PX
@@ -42,7 +42,7 @@ def draw_film(
         first += _NAMES_PX + _whole_size(whole, width, tile_px)[1] + _BETWEEN_PX
     for number in range(grids * bins):
         page = Canvas(width, first + len(cameras) * block)
-        page.title(MARGIN_PX, 16, title)
+        page.title(PAGE_MARGIN_PX, 16, title)
         if whole is not None:
             _draw_whole(page, whole, number, scale, tile_px)
         for place, camera in enumerate(cameras):
@@ -53,7 +53,7 @@ def draw_film(
 def _whole_size(whole: Camera, page_px: int, tile_px: int) -> tuple[int, int]:
     """Width and height of a panel of the whole picture, px: two beside each other."""
     height, width = whole.frames.shape[1:]
-    scale = min((page_px - 2 * MARGIN_PX - GAP_PX) / 2 / width, 1.25 * tile_px / height)
+    scale = min((page_px - 2 * PAGE_MARGIN_PX - GAP_PX) / 2 / width, 1.25 * tile_px / height)
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
@@ -61,7 +61,7 @@ def _draw_whole(page: Canvas, whole: Camera, number: int, scale: Scale, tile_px:
     """Draw the whole picture at one bin of the clip."""
     grid, bin_ = divmod(min(number, len(whole.paused) - 1), whole.voxels.shape[1])
     width, height = _whole_size(whole, page.width_px, tile_px)
-    left, top = (MARGIN_PX, MARGIN_PX + width + GAP_PX), _TITLE_PX
+    left, top = (PAGE_MARGIN_PX, PAGE_MARGIN_PX + width + GAP_PX), _TITLE_PX
     page.text(left[0], top, "The whole picture", size=canvas.HEADING_PT)
     page.text(left[1], top, f"its events: {whole.title}", size=canvas.HEADING_PT)
     page.panel(left[0], top + _NAMES_PX, draw_grey(whole.frames[grid]), width, height)
@@ -71,14 +71,14 @@ def _draw_whole(page: Canvas, whole: Camera, number: int, scale: Scale, tile_px:
 def _draw_camera(page: Canvas, camera: Camera, place: int, top: int, number: int, scale: Scale, tile_px: int) -> None:
     """Draw one camera at one bin of its clip."""
     grid, bin_ = divmod(number, camera.voxels.shape[1])
-    width = page.width_px - 2 * MARGIN_PX
-    x = page.text(MARGIN_PX, top, f"Camera {place + 1}", size=canvas.HEADING_PT)
+    width = page.width_px - 2 * PAGE_MARGIN_PX
+    x = page.text(PAGE_MARGIN_PX, top, f"Camera {place + 1}", size=canvas.HEADING_PT)
     page.text(x + 10, top, camera.title, size=canvas.HEADING_PT, colour=canvas.MARK)
-    x = float(MARGIN_PX)
+    x = float(PAGE_MARGIN_PX)
     if warning := camera.warning(range(len(camera.voxels))):
         x = page.text(x, top + 27, warning) + 18
-    page.text(x, top + 27, canvas.beginning(camera.describe(), width + MARGIN_PX - x), colour=canvas.SOFT)
-    left = [MARGIN_PX + column * (tile_px + GAP_PX) for column in range(3)]
+    page.text(x, top + 27, canvas.beginning(camera.describe(), width + PAGE_MARGIN_PX - x), colour=canvas.SOFT)
+    left = [PAGE_MARGIN_PX + column * (tile_px + GAP_PX) for column in range(3)]
     top += _CAMERA_PX
     page.text(left[0], top, "video frame", size=canvas.HEADING_PT)
     events_heading(page, left[1], top, "events:")
@@ -92,5 +92,12 @@ def _draw_camera(page: Canvas, camera: Camera, place: int, top: int, number: int
         page.text(left[2], top - _NAMES_PX, "optical flow", size=canvas.HEADING_PT)
         flow_panel(page, left[2], top, camera.flow[grid], scale.largest_px, tile_px)
     draw_strip(
-        page, camera, MARGIN_PX, top + tile_px + GAP_PX + LABEL_PX, width, _STRIP_PX, scale.highest_rate, cursor=number
+        page,
+        camera,
+        PAGE_MARGIN_PX,
+        top + tile_px + GAP_PX + LABEL_PX,
+        width,
+        _STRIP_PX,
+        scale.highest_rate,
+        cursor=number,
     )

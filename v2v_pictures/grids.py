@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_pictures import canvas
-from v2v_pictures.canvas import GAP_PX, MARGIN_PX, Canvas
+from v2v_pictures.canvas import GAP_PX, PAGE_MARGIN_PX, Canvas
 from v2v_pictures.colours import Image, draw_events, full_colour
 from v2v_pictures.sheet import MOST_BINS, SCALE_PX, bin_headings, draw_scale, events_heading
 
@@ -30,16 +30,16 @@ def draw_grids(voxels: npt.NDArray[Any], *, tile_px: int = 192) -> Image:
     shown = np.unique(np.linspace(0, grids - 1, _MOST_GRIDS).round().astype(int))
     full = full_colour([voxels[grid] for grid in shown])
     step = tile_px + GAP_PX
-    width = max(_LABEL_PX + bins * step, SCALE_PX) + 2 * MARGIN_PX
-    page = Canvas(width, MARGIN_PX + _HEADING_PX + len(shown) * step + _SCALE_PX)
-    left = [MARGIN_PX + _LABEL_PX + number * step for number in range(bins)]
-    events_heading(page, left[0], MARGIN_PX)
-    bin_headings(page, left, MARGIN_PX + 32, tile_px)
+    width = max(_LABEL_PX + bins * step, SCALE_PX) + 2 * PAGE_MARGIN_PX
+    page = Canvas(width, PAGE_MARGIN_PX + _HEADING_PX + len(shown) * step + _SCALE_PX)
+    left = [PAGE_MARGIN_PX + _LABEL_PX + number * step for number in range(bins)]
+    events_heading(page, left[0], PAGE_MARGIN_PX)
+    bin_headings(page, left, PAGE_MARGIN_PX + 32, tile_px)
     for row, grid in enumerate(shown):
-        top = MARGIN_PX + _HEADING_PX + row * step
-        page.text(MARGIN_PX, top + tile_px / 2, f"voxel grid {grid + 1}", anchor="lm")
-        page.text(MARGIN_PX, top + tile_px / 2 + 22, f"of {grids}", colour=canvas.SOFT, anchor="lm")
+        top = PAGE_MARGIN_PX + _HEADING_PX + row * step
+        page.text(PAGE_MARGIN_PX, top + tile_px / 2, f"voxel grid {grid + 1}", anchor="lm")
+        page.text(PAGE_MARGIN_PX, top + tile_px / 2 + 22, f"of {grids}", colour=canvas.SOFT, anchor="lm")
         for number, x in enumerate(left):
             page.panel(x, top, draw_events(voxels[grid, number], full), tile_px, tile_px)
-    draw_scale(page, full, MARGIN_PX, page.height_px - _SCALE_PX + 12)
+    draw_scale(page, full, PAGE_MARGIN_PX, page.height_px - _SCALE_PX + 12)
     return page.image()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import GAP_PX, MARGIN_PX, Canvas
+from v2v_pictures.canvas import GAP_PX, PAGE_MARGIN_PX, Canvas
 from v2v_pictures.colours import draw_events, draw_grey
 from v2v_pictures.strip import LABEL_PX, draw_strip
 
@@ -19,7 +19,7 @@ _HIGHEST_TILES = 1.75
 
 def overview_width(tile_px: int) -> int:
     """Return how wide a page must be, px."""
-    return 2 * MARGIN_PX + 2 * (2 * tile_px + GAP_PX) + 3 * GAP_PX + _LEAST_STRIP_PX
+    return 2 * PAGE_MARGIN_PX + 2 * (2 * tile_px + GAP_PX) + 3 * GAP_PX + _LEAST_STRIP_PX
 
 
 def overview_height(whole: Camera, tile_px: int) -> int:
@@ -42,7 +42,7 @@ def draw_overview(
     (grid,), (width, height) = whole.moments(1), _panel(whole, tile_px)
     bins = whole.voxels.shape[1]
     liveliest = max(range(bins), key=lambda bin_: float(whole.rates[:, grid * bins + bin_].sum()))
-    left = [MARGIN_PX, MARGIN_PX + width + 2 * GAP_PX]
+    left = [PAGE_MARGIN_PX, PAGE_MARGIN_PX + width + 2 * GAP_PX]
     page.text(left[0], top, "The whole picture", size=canvas.HEADING_PT)
     page.text(left[1], top, "its events", size=canvas.HEADING_PT)
     top += _TEXT_PX
@@ -59,7 +59,7 @@ def draw_overview(
     for (label_x, label_y), names in numbers.items():  # above all boxes
         canvas.label(page, label_x, label_y, ", ".join(names), canvas.MARK)
     x = left[1] + width + 3 * GAP_PX
-    strip_width = page.width_px - MARGIN_PX - x
+    strip_width = page.width_px - PAGE_MARGIN_PX - x
     lines = [whole.title, f"shown: bin {liveliest + 1} of voxel grid {grid + 1}"]
     if boxes:
         lines.append("boxes: where the cameras below look")

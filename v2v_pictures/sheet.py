@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import GAP_PX, MARGIN_PX, Canvas, label
+from v2v_pictures.canvas import GAP_PX, PAGE_MARGIN_PX, Canvas, label
 from v2v_pictures.colours import BRIGHTER, DARKER, Image, draw_events, draw_flow, draw_grey, draw_wheel, full_colour
 from v2v_pictures.labels import labelled_panel
 from v2v_pictures.overview import draw_overview, overview_height, overview_width, whole_panel
@@ -74,7 +74,7 @@ def draw_sheet(
     bins = min(cameras[0].voxels.shape[1], MOST_BINS)
     with_flow = cameras[0].flow is not None
     columns = 1 + bins + with_flow
-    width = 2 * MARGIN_PX + columns * (tile_px + GAP_PX) + 2 * 2 * GAP_PX
+    width = 2 * PAGE_MARGIN_PX + columns * (tile_px + GAP_PX) + 2 * 2 * GAP_PX
     strip_px = LABEL_PX + _STRIP_PX + TICKS_PX + GAP_PX
     block = _CAMERA_PX + strip_px + moments * (tile_px + GAP_PX) + _BETWEEN_PX
     first = _TITLE_PX
@@ -82,7 +82,7 @@ def draw_sheet(
         width, first = max(width, overview_width(tile_px)), first + overview_height(whole, tile_px)
     page = Canvas(width, first + _HEADING_PX + len(cameras) * block + _LEGEND_PX)
     left = _columns(bins, with_flow, tile_px)
-    page.title(MARGIN_PX, 18, title)
+    page.title(PAGE_MARGIN_PX, 18, title)
     if whole is not None:
         draw_overview(page, whole, cameras, _TITLE_PX, tile_px, scale.full, scale.highest_rate)
     _headings(page, left, bins, with_flow, tile_px, first)
@@ -91,11 +91,11 @@ def draw_sheet(
         picks = camera.moments(moments)
         _camera_line(page, camera, number, picks, top)
         top += _CAMERA_PX
-        strip_left = MARGIN_PX
+        strip_left = PAGE_MARGIN_PX
         if camera.whole is not None:
-            whole_panel(page, camera, MARGIN_PX, top, tile_px, strip_px - GAP_PX)
+            whole_panel(page, camera, PAGE_MARGIN_PX, top, tile_px, strip_px - GAP_PX)
             strip_left = left[1]
-        strip_width = page.width_px - MARGIN_PX - strip_left
+        strip_width = page.width_px - PAGE_MARGIN_PX - strip_left
         draw_strip(page, camera, strip_left, top + LABEL_PX, strip_width, _STRIP_PX, scale.highest_rate, picks)
         for row, pick in enumerate(picks):
             y = top + strip_px + row * (tile_px + GAP_PX)
@@ -109,7 +109,7 @@ def draw_sheet(
 def _columns(bins: int, with_flow: bool, tile_px: int) -> list[int]:
     """Left edges of the panels; the bins stand a little apart from frame and flow."""
     step = tile_px + GAP_PX
-    edges = [MARGIN_PX] + [MARGIN_PX + step + 2 * GAP_PX + number * step for number in range(bins)]
+    edges = [PAGE_MARGIN_PX] + [PAGE_MARGIN_PX + step + 2 * GAP_PX + number * step for number in range(bins)]
     return [*edges, edges[-1] + step + 2 * GAP_PX] if with_flow else edges
 
 
@@ -164,13 +164,13 @@ def flow_panel(page: Canvas, x: int, y: int, flow: npt.NDArray[np.generic], larg
 
 
 def _camera_line(page: Canvas, camera: Camera, number: int, picks: Sequence[int], top: int) -> None:
-    page.line(MARGIN_PX, top - 8, page.width_px - MARGIN_PX, top - 6, canvas.SHADE, 2)
-    x = page.text(MARGIN_PX, top, f"Camera {number + 1}", size=canvas.HEADING_PT)
+    page.line(PAGE_MARGIN_PX, top - 8, page.width_px - PAGE_MARGIN_PX, top - 6, canvas.SHADE, 2)
+    x = page.text(PAGE_MARGIN_PX, top, f"Camera {number + 1}", size=canvas.HEADING_PT)
     if camera.title:
         x = page.text(x + 10, top, camera.title, size=canvas.HEADING_PT, colour=canvas.MARK)
     if warning := camera.warning(picks):
         x = page.text(x + 18, top + 4, warning)
-    right = page.width_px - MARGIN_PX
+    right = page.width_px - PAGE_MARGIN_PX
     x = page.text(x + 18, top + 4, canvas.beginning(camera.describe(), right - x - 18), colour=canvas.SOFT)
     if right - x > _LEAST_SOURCE_PX:
         page.text(right, top + 4, canvas.shortened(camera.source, right - x - 24), colour=canvas.SOFT, anchor="ra")
@@ -189,9 +189,9 @@ def _moment(page: Canvas, camera: Camera, pick: int, scale: Scale, left: list[in
 
 
 def _legend(page: Canvas, cameras: Sequence[Camera], scale: Scale, top: int) -> None:
-    page.line(MARGIN_PX, top, page.width_px - MARGIN_PX, top, canvas.LINE)
-    draw_scale(page, scale.full, MARGIN_PX, top + 16)
-    x, y = MARGIN_PX + SCALE_PX + 44, top + 16
+    page.line(PAGE_MARGIN_PX, top, page.width_px - PAGE_MARGIN_PX, top, canvas.LINE)
+    draw_scale(page, scale.full, PAGE_MARGIN_PX, top + 16)
+    x, y = PAGE_MARGIN_PX + SCALE_PX + 44, top + 16
     page.hatch(x, y + 1, x + 46, y + 19)
     page.frame(x, y + 1, x + 46, y + 19)
     page.text(x + 58, y, "the camera is paused: its picture stands still, only noise fires")
@@ -207,7 +207,7 @@ def _legend(page: Canvas, cameras: Sequence[Camera], scale: Scale, top: int) -> 
     page.text(x, y + 80, said, colour=canvas.SOFT)
     if cameras[0].flow is not None:
         radius = 46
-        x = page.width_px - MARGIN_PX - 2 * radius - 1
+        x = page.width_px - PAGE_MARGIN_PX - 2 * radius - 1
         page.panel(x, top + 18, draw_wheel(radius), 2 * radius + 1, 2 * radius + 1)
         page.text(x - 14, y, "flow: where a pixel moves to", anchor="ra")
         page.text(x - 14, y + 28, f"rim: {scale.largest_px:.1f} px or more", colour=canvas.SOFT, anchor="ra")

@@ -18,7 +18,7 @@ from PIL import Image as Pictures
 from tests.pictures.cameras import camera, has, record_texts, without_noise
 from tests.protocol.test_sample import PARAMS, PROVENANCE
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import INK, MARGIN_PX, MARK, PAUSED_INK, Canvas, beginning, shortened, text_width
+from v2v_pictures.canvas import INK, MARK, PAGE_MARGIN_PX, PAUSED_INK, Canvas, beginning, shortened, text_width
 from v2v_pictures.colours import BRIGHTER, DARKER, draw_events, draw_grey, full_colour
 from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write_png
 from v2v_pictures.film import draw_film
@@ -177,7 +177,7 @@ def test_the_overview_marks_the_cameras_of_its_clip_only() -> None:
 def test_the_text_of_the_overview_ends_within_the_right_margin() -> None:
     page = Canvas(overview_width(80), 300)
     draw_overview(page, camera(np.zeros((2, 2, 30, 40), np.int8)), [], 10, 80, 1.0, 0.00012)
-    assert (page.image()[:, -MARGIN_PX // 2 :] == page.image()[0, 0]).all()
+    assert (page.image()[:, -PAGE_MARGIN_PX // 2 :] == page.image()[0, 0]).all()
 
 
 def test_cameras_with_one_box_share_its_label(monkeypatch: pytest.MonkeyPatch) -> None:
