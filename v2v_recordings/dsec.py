@@ -32,7 +32,7 @@ from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, Note, Pictur
 if TYPE_CHECKING:
     import h5py
 
-EVENTS, RECTIFY_MAP, TIMES = "events.h5", "rectify_map.h5", "timestamps.txt"
+_EVENTS, RECTIFY_MAP, TIMES = "events.h5", "rectify_map.h5", "timestamps.txt"
 LARGEST_RATIO = 2
 """Frames more than this much larger than the area with events cannot be of the same sensor."""
 OTHERS = {
@@ -46,7 +46,7 @@ def recognises(path: Path) -> bool:
     """Return whether the path is an HDF5 file with ``events/t``, or a folder with ``events.h5`` in it."""
     if path.is_dir():
         return archives.holds(
-            path, lambda archive: any(hdf5.holds(path / member, "events/t") for member in archive.named(EVENTS))
+            path, lambda archive: any(hdf5.holds(path / member, "events/t") for member in archive.named(_EVENTS))
         )
     return hdf5.holds(path, "events/t")
 
@@ -60,7 +60,7 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
     with Archive(path) as archive:
         other = OTHERS["left" if options.camera == "right" else "right"]
         members = [member for member in archive.bytes_of if archive.is_single or not other.search(member)]
-        found = [member for member in members if archive.is_single or posixpath.basename(member).lower() == EVENTS]
+        found = [member for member in members if archive.is_single or posixpath.basename(member).lower() == _EVENTS]
         if len(found) != 1:
             listed = f" ({', '.join(found[:3])}): convert each separately" if found else "; --camera chooses another"
             raise UsageError(f"{path} holds {len(found)} recordings of the {options.camera} camera{listed}")
