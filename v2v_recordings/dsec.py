@@ -32,7 +32,7 @@ from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, Note, Pictur
 if TYPE_CHECKING:
     import h5py
 
-_EVENTS, RECTIFY_MAP, TIMES = "events.h5", "rectify_map.h5", "timestamps.txt"
+_EVENTS, RECTIFY_MAP, _TIMES = "events.h5", "rectify_map.h5", "timestamps.txt"
 LARGEST_RATIO = 2
 """Frames more than this much larger than the area with events cannot be of the same sensor."""
 OTHERS = {
@@ -110,7 +110,7 @@ def _reach(file: h5py.File) -> SensorSize:
 
 def _frames(archive: Archive, members: list[str]) -> list[tuple[int, str]]:
     """Return the times of the frames, us, and their members."""
-    times = [member for member in members if member.lower().endswith(TIMES)]
+    times = [member for member in members if member.lower().endswith(_TIMES)]
     frames = [member for member in members if member.lower().endswith(".png")]
     folders = sorted({posixpath.dirname(member) for member in frames})
     # DSEC-Detection has the frames twice: as seen by the event camera ("distorted"), and rectified.
@@ -119,7 +119,7 @@ def _frames(archive: Archive, members: list[str]) -> list[tuple[int, str]]:
         return []
     if len(times) != 1 or len(folders) != 1:
         raise UsageError(
-            f"{archive.path} holds {len(folders)} folders of frames and {len(times)} files *{TIMES}: give a folder "
+            f"{archive.path} holds {len(folders)} folders of frames and {len(times)} files *{_TIMES}: give a folder "
             "with one of each"
         )
     frames = sorted(member for member in frames if posixpath.dirname(member) == folders[0])
