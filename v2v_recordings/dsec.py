@@ -32,7 +32,7 @@ from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, Note, Pictur
 if TYPE_CHECKING:
     import h5py
 
-_EVENTS, RECTIFY_MAP, _TIMES = "events.h5", "rectify_map.h5", "timestamps.txt"
+_EVENTS, _RECTIFY_MAP, _TIMES = "events.h5", "rectify_map.h5", "timestamps.txt"
 LARGEST_RATIO = 2
 """Frames more than this much larger than the area with events cannot be of the same sensor."""
 OTHERS = {
@@ -90,7 +90,7 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
 def _stated_size(file: h5py.File, path: Path) -> SensorSize | None:
     if {"width", "height"} <= file.attrs.keys():
         return hdf5.sensor_size([file.attrs["height"], file.attrs["width"]], path)
-    beside = path.with_name(RECTIFY_MAP)
+    beside = path.with_name(_RECTIFY_MAP)
     if not beside.is_file():
         return None
     with hdf5.open_hdf5(beside) as rectify:
