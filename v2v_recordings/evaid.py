@@ -12,14 +12,14 @@ from v2v_recordings.archive import Archive
 from v2v_recordings.items import ConvertOptions, Item, ReadProgress, SensorSize
 from v2v_recordings.text_events import read_texts
 
-TIMES = "timestamps.txt"
+_TIMES = "timestamps.txt"
 SHAPE = "shape.txt"
 PICTURES = (".png", ".jpg", ".jpeg")
 
 
 def recognises(path: Path) -> bool:
     """Return whether the path is an archive with ``timestamps.txt`` and a folder ``event``."""
-    return archives.holds(path, lambda archive: archive.named(TIMES) and _members(archive, "event", (".txt",)))
+    return archives.holds(path, lambda archive: archive.named(_TIMES) and _members(archive, "event", (".txt",)))
 
 
 def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
@@ -29,10 +29,10 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
         UsageError: a part is missing or malformed.
     """
     with Archive(path) as archive:
-        times_us = archive.integers(archive.find(TIMES) or TIMES)
+        times_us = archive.integers(archive.find(_TIMES) or _TIMES)
         events, pictures = _members(archive, "event", (".txt",)), _members(archive, "gt", PICTURES)
         if len(times_us) != len(pictures):
-            raise UsageError(f"{path}: {len(pictures)} pictures in gt/, but {len(times_us)} times in {TIMES}")
+            raise UsageError(f"{path}: {len(pictures)} pictures in gt/, but {len(times_us)} times in {_TIMES}")
         if (stated := archive.find(SHAPE)) is not None:
             shape = archive.integers(stated)
             if len(shape) != 2:
