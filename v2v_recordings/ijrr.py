@@ -17,7 +17,7 @@ from v2v_recordings.items import ConvertOptions, Item, ReadProgress, to_ns
 from v2v_recordings.text_events import read_texts
 
 _EVENTS = "events.txt"
-IMAGES = "images.txt"
+_IMAGES = "images.txt"
 TEXT_SUFFIXES = (".txt", ".csv")
 
 
@@ -43,7 +43,7 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
 
 def _listed_pictures(archive: Archive) -> list[tuple[int, str]]:
     """Return time (ns) and member of every line of ``images.txt``; an empty list without that file."""
-    listing = archive.find(IMAGES)
+    listing = archive.find(_IMAGES)
     if listing is None:
         return []
     with archive.open(listing) as stream:
@@ -58,7 +58,7 @@ def _listed_pictures(archive: Archive) -> list[tuple[int, str]]:
             t_ns = int(to_ns(np.array([float(seconds)]), where)[0])
         except ValueError:
             raise UsageError(f"{where}: {line!r} is not `seconds path`") from None
-        member = listing[: -len(IMAGES)] + name.strip().replace("\\", "/")
+        member = listing[: -len(_IMAGES)] + name.strip().replace("\\", "/")
         if member not in archive.bytes_of:
             raise UsageError(f"{where} names {name.strip()}, which does not exist")
         pictures.append((t_ns, member))
