@@ -32,7 +32,7 @@ from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, ReadProgress
 
 FOLDER = ("events_ts.npy", "events_xy.npy", "events_p.npy")
 NPZ = ("t.npy", "x.npy", "y.npy", "p.npy")
-METADATA, IMAGES, IMAGE_TIMES = "metadata.json", "images.npy", "images_ts.npy"
+METADATA, _IMAGES, IMAGE_TIMES = "metadata.json", "images.npy", "images_ts.npy"
 
 
 def recognises(path: Path) -> bool:
@@ -57,7 +57,7 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
         else:
             times, xy, polarities = FOLDER
             columns = {"t": column(times), "x": column(xy, 0), "y": column(xy, 1), "p": column(polarities)}
-        pictures = column(IMAGES) if archive.find(IMAGES) else None
+        pictures = column(_IMAGES) if archive.find(_IMAGES) else None
         if (member := archive.find(METADATA)) is not None:
             yield _metadata_size(archive, member)
         elif pictures is not None and len(pictures.shape) == 3:
@@ -66,7 +66,7 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
         unit = options.time_unit or ("s" if is_float else "us")
         yield from hdf5.events(columns, str(path), progress, ns_per_unit=NS_PER_UNIT[unit])
         if pictures is not None:
-            yield from hdf5.pictures(pictures, column(IMAGE_TIMES), f"{path}: {IMAGES}")
+            yield from hdf5.pictures(pictures, column(IMAGE_TIMES), f"{path}: {_IMAGES}")
 
 
 def _column(archive: Archive, files: contextlib.ExitStack, name: str, number: int | None = None) -> _Column:
