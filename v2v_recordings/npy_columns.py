@@ -32,7 +32,7 @@ from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, ReadProgress
 
 FOLDER = ("events_ts.npy", "events_xy.npy", "events_p.npy")
 NPZ = ("t.npy", "x.npy", "y.npy", "p.npy")
-METADATA, _IMAGES, IMAGE_TIMES = "metadata.json", "images.npy", "images_ts.npy"
+METADATA, _IMAGES, _IMAGE_TIMES = "metadata.json", "images.npy", "images_ts.npy"
 
 
 def recognises(path: Path) -> bool:
@@ -66,7 +66,7 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
         unit = options.time_unit or ("s" if is_float else "us")
         yield from hdf5.events(columns, str(path), progress, ns_per_unit=NS_PER_UNIT[unit])
         if pictures is not None:
-            yield from hdf5.pictures(pictures, column(IMAGE_TIMES), f"{path}: {_IMAGES}")
+            yield from hdf5.pictures(pictures, column(_IMAGE_TIMES), f"{path}: {_IMAGES}")
 
 
 def _column(archive: Archive, files: contextlib.ExitStack, name: str, number: int | None = None) -> _Column:
