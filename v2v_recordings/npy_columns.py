@@ -32,7 +32,7 @@ from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, ReadProgress
 
 FOLDER = ("events_ts.npy", "events_xy.npy", "events_p.npy")
 NPZ = ("t.npy", "x.npy", "y.npy", "p.npy")
-METADATA, _IMAGES, _IMAGE_TIMES = "metadata.json", "images.npy", "images_ts.npy"
+_METADATA, _IMAGES, _IMAGE_TIMES = "metadata.json", "images.npy", "images_ts.npy"
 
 
 def recognises(path: Path) -> bool:
@@ -58,7 +58,7 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
             times, xy, polarities = FOLDER
             columns = {"t": column(times), "x": column(xy, 0), "y": column(xy, 1), "p": column(polarities)}
         pictures = column(_IMAGES) if archive.find(_IMAGES) else None
-        if (member := archive.find(METADATA)) is not None:
+        if (member := archive.find(_METADATA)) is not None:
             yield _metadata_size(archive, member)
         elif pictures is not None and len(pictures.shape) == 3:
             yield SensorSize(*pictures.shape[:0:-1])
