@@ -17,7 +17,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
-from v2v_server.flow.methods import AUTO, STILL, Estimator, Field, GreyPicture, choose, estimator, one_thread
+from v2v_server.flow.methods import AUTO, STILL_METHOD, Estimator, Field, GreyPicture, choose, estimator, one_thread
 from v2v_server.simulation.draw import resized_size
 from v2v_server.simulation.view import Frames, Window, crop_place, crop_region, resized
 from v2v_server.system.opencv import cv2
@@ -105,8 +105,8 @@ def flow_for(
         for voxel in range(settings.first_voxel, count):
             start, end = ends[voxel : voxel + 2]
             planned = plan[voxel] if plan else settings.method
-            if start == end or (plan and planned == STILL):
-                methods.append(PAUSED if start == end else STILL)
+            if start == end or (plan and planned == STILL_METHOD):
+                methods.append(PAUSED if start == end else STILL_METHOD)
                 if valid is not None:
                     valid[voxel] = 1
                 continue

@@ -43,7 +43,7 @@ from v2v_server.corpus.scenes.scene import (
     Scene,
     Sides,
 )
-from v2v_server.flow.methods import AUTO, SLOW, SLOW_PX, STILL, STILL_GREY_LEVELS
+from v2v_server.flow.methods import AUTO, SLOW, SLOW_PX, STILL_GREY_LEVELS, STILL_METHOD
 from v2v_server.simulation.draw import resized_size
 from v2v_server.simulation.view import Window
 from v2v_server.worker.cleaning import CleanFrames
@@ -72,7 +72,7 @@ class FlowPlan:
     @property
     def still(self) -> bool:
         """Return whether no flow has to be estimated."""
-        return bool(self.methods) and all(name == STILL for name in self.methods)
+        return bool(self.methods) and all(name == STILL_METHOD for name in self.methods)
 
 
 def plan_flow(
@@ -134,14 +134,14 @@ def _overlaps(start_px: int, extent_px: int, side_px: int) -> list[int]:
 
 def _method(scene: Scene, earlier: int, later: int, tiles: npt.NDArray[np.bool_], scale: float) -> str:
     if earlier == later:
-        return STILL
+        return STILL_METHOD
     if later >= scene.end:
         return AUTO
     values = scene.values(earlier, later)
     dark = bool((values[:, DARK] >= DARK_SHARE).any())
     change = values[:, CHANGE][:, tiles].max() * max(1.0, (later - earlier) / LAG_FRAMES)
     if change <= (DARK_STILL_GREY_LEVELS if dark else STILL_GREY_LEVELS):
-        return STILL
+        return STILL_METHOD
     # NaN means unknown motion; every comparison with it is False.
     pace = values[:, MOTION][:, tiles] * scale * (later - earlier)
     if pace.max() < SLOW_PX:
@@ -172,14 +172,16 @@ def _touched(start_px: float, extent_px: int, side_px: float) -> npt.NDArray[np.
 
 def _kind(methods: tuple[str, ...]) -> str:
     """Name a clip after its most demanding voxel's method."""
-    kinds = {MOVING: "moving", AUTO: "mixed", SLOW: "slow", STILL: "still"}
+    kinds = {MOVING: "moving", AUTO: "mixed", SLOW: "slow", STILL_METHOD: "still"}
     return next(kind for name, kind in kinds.items() if name in methods)
 
 
 def _counted(methods: tuple[str, ...]) -> str:
     counts = Counter(methods)
     return ", ".join(
-        f"{'none' if name == STILL else name} {counts[name]}" for name in (STILL, SLOW, MOVING, AUTO) if counts[name]
+        f"{'none' if name == STILL_METHOD else name} {counts[name]}"
+        for name in (STILL_METHOD, SLOW, MOVING, AUTO)
+        if counts[name]
     )
 
 

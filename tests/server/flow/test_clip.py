@@ -21,7 +21,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_server.flow import FlowSettings, flow_for
-from v2v_server.flow.methods import STILL, Estimator, guarded
+from v2v_server.flow.methods import STILL_METHOD, Estimator, guarded
 from v2v_server.simulation.draw import draw, resized_size
 from v2v_server.simulation.view import Window, apply_view, source_window, without_margin
 
@@ -193,7 +193,7 @@ def test_a_still_clip_has_exactly_zero_flow(name: str) -> None:
     made = flow_for(frames, camera_params(), RECIPE, FlowSettings(name, margin_px=None))
     assert not made.flow.any()
     if name == "auto":
-        assert set(made.methods) == {STILL}
+        assert set(made.methods) == {STILL_METHOD}
 
 
 def test_the_same_bytes_again() -> None:

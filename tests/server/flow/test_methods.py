@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests.server.flow.fields import panned
 from v2v_protocol.errors import UsageError
-from v2v_server.flow.methods import METHODS, MOVING, SLOW, STILL, choose, estimator, guarded, one_thread
+from v2v_server.flow.methods import METHODS, MOVING, SLOW, STILL_METHOD, choose, estimator, guarded, one_thread
 
 ESTIMATING = sorted(set(METHODS) - {"zero"})
 INSIDE = np.s_[24:-24, 24:-24]
@@ -104,7 +104,7 @@ def test_an_unknown_method_is_named_with_the_known_ones() -> None:
 def test_auto_looks_at_the_motion() -> None:
     still = panned(1, 128, 160, 0, 0)[0]
     noise = np.random.default_rng(0).integers(-2, 3, still.shape)
-    assert choose(still, np.clip(still.astype(int) + noise, 0, 255).astype(np.uint8)) == STILL
+    assert choose(still, np.clip(still.astype(int) + noise, 0, 255).astype(np.uint8)) == STILL_METHOD
     moved = panned(2, 128, 160, 4, 1)
     assert choose(moved[0], moved[1]) == MOVING
     # A quarter of a pixel: the photograph enlarged four times, moved by one pixel and made small again.
