@@ -43,7 +43,7 @@ from v2v_server.corpus.scenes.scene import (
     Scene,
     Sides,
 )
-from v2v_server.flow.methods import AUTO, SLOW, SLOW_PX, STILL_GREY_LEVELS, STILL_METHOD
+from v2v_server.flow.methods import AUTO, SLOW_METHOD, SLOW_PX, STILL_GREY_LEVELS, STILL_METHOD
 from v2v_server.simulation.draw import resized_size
 from v2v_server.simulation.view import Window
 from v2v_server.worker.cleaning import CleanFrames
@@ -145,7 +145,7 @@ def _method(scene: Scene, earlier: int, later: int, tiles: npt.NDArray[np.bool_]
     # NaN means unknown motion; every comparison with it is False.
     pace = values[:, MOTION][:, tiles] * scale * (later - earlier)
     if pace.max() < SLOW_PX:
-        return SLOW
+        return SLOW_METHOD
     return AUTO if np.median(pace) < SLOW_PX else MOVING
 
 
@@ -172,7 +172,7 @@ def _touched(start_px: float, extent_px: int, side_px: float) -> npt.NDArray[np.
 
 def _kind(methods: tuple[str, ...]) -> str:
     """Name a clip after its most demanding voxel's method."""
-    kinds = {MOVING: "moving", AUTO: "mixed", SLOW: "slow", STILL_METHOD: "still"}
+    kinds = {MOVING: "moving", AUTO: "mixed", SLOW_METHOD: "slow", STILL_METHOD: "still"}
     return next(kind for name, kind in kinds.items() if name in methods)
 
 
@@ -180,7 +180,7 @@ def _counted(methods: tuple[str, ...]) -> str:
     counts = Counter(methods)
     return ", ".join(
         f"{'none' if name == STILL_METHOD else name} {counts[name]}"
-        for name in (STILL_METHOD, SLOW, MOVING, AUTO)
+        for name in (STILL_METHOD, SLOW_METHOD, MOVING, AUTO)
         if counts[name]
     )
 

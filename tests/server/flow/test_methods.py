@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests.server.flow.fields import panned
 from v2v_protocol.errors import UsageError
-from v2v_server.flow.methods import METHODS, MOVING, SLOW, STILL_METHOD, choose, estimator, guarded, one_thread
+from v2v_server.flow.methods import METHODS, MOVING, SLOW_METHOD, STILL_METHOD, choose, estimator, guarded, one_thread
 
 ESTIMATING = sorted(set(METHODS) - {"zero"})
 INSIDE = np.s_[24:-24, 24:-24]
@@ -110,7 +110,7 @@ def test_auto_looks_at_the_motion() -> None:
     # A quarter of a pixel: the photograph enlarged four times, moved by one pixel and made small again.
     large = cv2.resize(panned(1, 130, 170, 0, 0)[0], None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
     slow = [cv2.resize(large[:512, start : start + 640], (160, 128), interpolation=cv2.INTER_AREA) for start in (0, 1)]
-    assert choose(slow[0], slow[1]) == SLOW
+    assert choose(slow[0], slow[1]) == SLOW_METHOD
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 200), (9, 9), (20, 700)])
