@@ -44,7 +44,7 @@ ULTRAFAST, FAST, MEDIUM = range(3)
 _SMALLEST_SIDE_PX = 64
 """OpenCV refuses pictures below 12 pixels, and reads outside its buffers on some larger ones: 16x300, 24x600."""
 
-AUTO, STILL_METHOD, SLOW_METHOD, MOVING = "auto", "zero", "dis-ultrafast", "dis-fast"
+AUTO, STILL_METHOD, SLOW_METHOD, MOVING_METHOD = "auto", "zero", "dis-ultrafast", "dis-fast"
 _BLOCK_PX = 8
 STILL_GREY_LEVELS = 1.5
 _SHRINK = 4
@@ -82,7 +82,7 @@ METHODS: Mapping[str, Callable[[], Estimator]] = MappingProxyType(
     {
         STILL_METHOD: zero,
         SLOW_METHOD: partial(dis, ULTRAFAST, 2),
-        MOVING: partial(dis, FAST, 2),
+        MOVING_METHOD: partial(dis, FAST, 2),
         "dis-fast-lean": partial(dis, FAST, 2, 3),
         "dis-fast-1": partial(dis, FAST, 1),
     }
@@ -108,7 +108,7 @@ def choose(first: GreyPicture, second: GreyPicture) -> str:
         return STILL_METHOD
     field = dis(ULTRAFAST, 1)(_shrunk(first, _SHRINK), _shrunk(second, _SHRINK))
     pace = np.quantile(np.hypot(field[..., 0], field[..., 1]), _MOST_OF_THE_PICTURE) * _SHRINK
-    return SLOW_METHOD if pace < SLOW_PX else MOVING
+    return SLOW_METHOD if pace < SLOW_PX else MOVING_METHOD
 
 
 def _shrunk(picture: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:

@@ -10,7 +10,16 @@ from hypothesis import strategies as st
 
 from tests.server.flow.fields import panned
 from v2v_protocol.errors import UsageError
-from v2v_server.flow.methods import METHODS, MOVING, SLOW_METHOD, STILL_METHOD, choose, estimator, guarded, one_thread
+from v2v_server.flow.methods import (
+    METHODS,
+    MOVING_METHOD,
+    SLOW_METHOD,
+    STILL_METHOD,
+    choose,
+    estimator,
+    guarded,
+    one_thread,
+)
 
 ESTIMATING = sorted(set(METHODS) - {"zero"})
 INSIDE = np.s_[24:-24, 24:-24]
@@ -106,7 +115,7 @@ def test_auto_looks_at_the_motion() -> None:
     noise = np.random.default_rng(0).integers(-2, 3, still.shape)
     assert choose(still, np.clip(still.astype(int) + noise, 0, 255).astype(np.uint8)) == STILL_METHOD
     moved = panned(2, 128, 160, 4, 1)
-    assert choose(moved[0], moved[1]) == MOVING
+    assert choose(moved[0], moved[1]) == MOVING_METHOD
     # A quarter of a pixel: the photograph enlarged four times, moved by one pixel and made small again.
     large = cv2.resize(panned(1, 130, 170, 0, 0)[0], None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
     slow = [cv2.resize(large[:512, start : start + 640], (160, 128), interpolation=cv2.INTER_AREA) for start in (0, 1)]
