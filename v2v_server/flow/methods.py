@@ -39,7 +39,7 @@ Estimator = Callable[[GreyPicture, GreyPicture], Field]
 """estimate(A, B): the field on the grid of A that leads to B. The result does not depend on earlier calls. It holds
 buffers, so each thread needs its own."""
 
-ULTRAFAST, FAST, MEDIUM = range(3)
+DIS_ULTRAFAST, FAST, MEDIUM = range(3)
 """OpenCV's numbers, DISOPTICAL_FLOW_PRESET_*; using its names would import it."""
 _SMALLEST_SIDE_PX = 64
 """OpenCV refuses pictures below 12 pixels, and reads outside its buffers on some larger ones: 16x300, 24x600."""
@@ -81,7 +81,7 @@ def dis(preset: int, finest_scale: int, refinements: int | None = None) -> Estim
 METHODS: Mapping[str, Callable[[], Estimator]] = MappingProxyType(
     {
         STILL_METHOD: zero,
-        SLOW_METHOD: partial(dis, ULTRAFAST, 2),
+        SLOW_METHOD: partial(dis, DIS_ULTRAFAST, 2),
         MOVING_METHOD: partial(dis, FAST, 2),
         "dis-fast-lean": partial(dis, FAST, 2, 3),
         "dis-fast-1": partial(dis, FAST, 1),
@@ -106,7 +106,7 @@ def choose(first: GreyPicture, second: GreyPicture) -> str:
     change = cv2.subtract(first, second, dtype=cv2.CV_32F)
     if float(np.abs(_shrunk(change, _BLOCK_PX)).max()) <= STILL_GREY_LEVELS:
         return STILL_METHOD
-    field = dis(ULTRAFAST, 1)(_shrunk(first, _SHRINK), _shrunk(second, _SHRINK))
+    field = dis(DIS_ULTRAFAST, 1)(_shrunk(first, _SHRINK), _shrunk(second, _SHRINK))
     pace = np.quantile(np.hypot(field[..., 0], field[..., 1]), _MOST_OF_THE_PICTURE) * _SHRINK
     return SLOW_METHOD if pace < SLOW_PX else MOVING_METHOD
 

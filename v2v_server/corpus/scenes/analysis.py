@@ -51,7 +51,7 @@ from v2v_server.corpus.scenes.scene import (
 )
 from v2v_server.corpus.scenes.steps import change_of, duplicated, is_cut
 from v2v_server.corpus.scenes.stretches import is_flat, is_still, pieces_of
-from v2v_server.flow.methods import ULTRAFAST, GreyPicture, dis, one_thread
+from v2v_server.flow.methods import DIS_ULTRAFAST, GreyPicture, dis, one_thread
 
 DARK_BELOW_LEVEL = 16
 CLIPPED_FROM_LEVEL = 250
@@ -91,7 +91,7 @@ class SceneAnalysis:
     """Analyse a video frame by frame. Memory: three pictures, and some hundred bytes a frame."""
 
     def __init__(self) -> None:
-        self._search = dis(ULTRAFAST, 1)
+        self._search = dis(DIS_ULTRAFAST, 1)
         self._frames = 0
         self._blocks: list[npt.NDArray[np.int64]] = []  # of the last four frames, 1/64 grey level each
         self._last: GreyPicture | None = None
