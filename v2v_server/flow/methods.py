@@ -39,7 +39,7 @@ Estimator = Callable[[GreyPicture, GreyPicture], Field]
 """estimate(A, B): the field on the grid of A that leads to B. The result does not depend on earlier calls. It holds
 buffers, so each thread needs its own."""
 
-DIS_ULTRAFAST, DIS_FAST, MEDIUM = range(3)
+DIS_ULTRAFAST, DIS_FAST, DIS_MEDIUM = range(3)
 """OpenCV's numbers, DISOPTICAL_FLOW_PRESET_*; using its names would import it."""
 _SMALLEST_SIDE_PX = 64
 """OpenCV refuses pictures below 12 pixels, and reads outside its buffers on some larger ones: 16x300, 24x600."""

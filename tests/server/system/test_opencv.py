@@ -23,7 +23,7 @@ def test_it_is_opencv() -> None:
 def test_presets_have_opencvs_numbers() -> None:
     assert methods.DIS_ULTRAFAST == real.DISOPTICAL_FLOW_PRESET_ULTRAFAST
     assert methods.DIS_FAST == real.DISOPTICAL_FLOW_PRESET_FAST
-    assert methods.MEDIUM == real.DISOPTICAL_FLOW_PRESET_MEDIUM
+    assert methods.DIS_MEDIUM == real.DISOPTICAL_FLOW_PRESET_MEDIUM
 
 
 @pytest.mark.parametrize(
