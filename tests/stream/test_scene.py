@@ -22,7 +22,7 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.remake import remake
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.schedule.summary import corpus_summary
-from v2v_server.worker.scene_choice import MOVING
+from v2v_server.worker.scene_choice import LEAN_METHOD
 
 Luma = npt.NDArray[np.uint8]
 ARRAYS = ("voxels", "frames", "flow", "flow_valid")
@@ -61,10 +61,10 @@ def test_a_still_a_dark_and_a_fast_clip_get_different_decisions(catalogue: Catal
     assert still.startswith("still; flow none 4; motion 0.00 px a frame, at most 0.00; change 0.00")
     assert "(a dark scene)" in dark
     assert not dark.startswith("still")
-    assert fast.startswith(f"moving; flow {MOVING} 4; ")
+    assert fast.startswith(f"moving; flow {LEAN_METHOD} 4; ")
     assert not samples["a-still.mkv"].arrays["flow"].any()
     assert samples["a-still.mkv"].arrays["flow_valid"].all()
-    asked = StreamSpec(recipe=STEADY, shuffle=False, flow_method=MOVING)
+    asked = StreamSpec(recipe=STEADY, shuffle=False, flow_method=LEAN_METHOD)
     by_name = remake(catalogue, asked, seed=3, epoch=0, index=4, arrays=ARRAYS)
     chosen = remake(catalogue, AUTO, seed=3, epoch=0, index=4, arrays=ARRAYS)
     assert chosen.provenance.video == by_name.provenance.video == "c-fast.mkv"

@@ -48,7 +48,7 @@ from v2v_server.simulation.draw import resized_size
 from v2v_server.simulation.view import Window
 from v2v_server.worker.cleaning import CleanFrames
 
-MOVING = "dis-fast-lean"
+LEAN_METHOD = "dis-fast-lean"
 TOLERANCE_PX = 0.05
 """Largest addition of the choice to the median endpoint error of "auto", over a corpus (docs/scene.md)."""
 DARK_SHARE = 0.9
@@ -146,7 +146,7 @@ def _method(scene: Scene, earlier: int, later: int, tiles: npt.NDArray[np.bool_]
     pace = values[:, MOTION][:, tiles] * scale * (later - earlier)
     if pace.max() < SLOW_PX:
         return SLOW_METHOD
-    return AUTO if np.median(pace) < SLOW_PX else MOVING
+    return AUTO if np.median(pace) < SLOW_PX else LEAN_METHOD
 
 
 def _tiles(params: SampleParams, recipe: Recipe, picture: Window, sides: Sides) -> npt.NDArray[np.bool_]:
@@ -172,7 +172,7 @@ def _touched(start_px: float, extent_px: int, side_px: float) -> npt.NDArray[np.
 
 def _kind(methods: tuple[str, ...]) -> str:
     """Name a clip after its most demanding voxel's method."""
-    kinds = {MOVING: "moving", AUTO: "mixed", SLOW_METHOD: "slow", STILL_METHOD: "still"}
+    kinds = {LEAN_METHOD: "moving", AUTO: "mixed", SLOW_METHOD: "slow", STILL_METHOD: "still"}
     return next(kind for name, kind in kinds.items() if name in methods)
 
 
@@ -180,7 +180,7 @@ def _counted(methods: tuple[str, ...]) -> str:
     counts = Counter(methods)
     return ", ".join(
         f"{'none' if name == STILL_METHOD else name} {counts[name]}"
-        for name in (STILL_METHOD, SLOW_METHOD, MOVING, AUTO)
+        for name in (STILL_METHOD, SLOW_METHOD, LEAN_METHOD, AUTO)
         if counts[name]
     )
 

@@ -15,7 +15,7 @@ from v2v_server.corpus.scenes.scene import CHANGE, COLUMNS, CONTRAST, DARK, MOTI
 from v2v_server.simulation.draw import choose_crop
 from v2v_server.simulation.view import Window
 from v2v_server.worker.cleaning import CleanFrames
-from v2v_server.worker.scene_choice import MOVING, FlowPlan, crop_weight, plan_flow
+from v2v_server.worker.scene_choice import LEAN_METHOD, FlowPlan, crop_weight, plan_flow
 
 RECIPE = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=32)
 AUTO = StreamSpec(recipe=RECIPE, scene="auto")
@@ -54,7 +54,7 @@ def test_still_slow_moving_and_dark_clips_are_decided_apart() -> None:
     # A voxel spans five frames: 0.09 px a frame are less than half a pixel, 0.11 more.
     assert methods(scene(0.0, 1.1)) == ("zero",) * 4
     assert methods(scene(0.09, 3.0)) == ("dis-ultrafast",) * 4
-    assert methods(scene(0.11, 3.0)) == (MOVING,) * 4
+    assert methods(scene(0.11, 3.0)) == (LEAN_METHOD,) * 4
     # 1.1 grey levels over four frames are nothing in daylight, and motion in the dark.
     assert methods(scene(0.09, 1.1, dark=0.95)) == ("dis-ultrafast",) * 4
     assert methods(scene(0.11, 0.1, dark=0.95)) == ("zero",) * 4
@@ -63,18 +63,18 @@ def test_still_slow_moving_and_dark_clips_are_decided_apart() -> None:
 def test_change_and_motion_grow_with_the_time_between_two_frames() -> None:
     long = StreamSpec(recipe=RECIPE.replace(voxels_per_clip=2, frames_per_bin=2), scene="auto")
     assert methods(scene(0.0, 1.1), spec=long) == ("dis-ultrafast",) * 2
-    assert methods(scene(0.09, 3.0), spec=long) == (MOVING,) * 2
+    assert methods(scene(0.09, 3.0), spec=long) == (LEAN_METHOD,) * 2
     strided = StreamSpec(recipe=RECIPE.replace(voxels_per_clip=2, frame_stride=2), scene="auto")
-    assert methods(scene(0.09, 3.0), spec=strided) == (MOVING,) * 2
+    assert methods(scene(0.09, 3.0), spec=strided) == (LEAN_METHOD,) * 2
 
 
 def test_enlarged_pictures_move_more() -> None:
-    assert methods(scene(0.09, 3.0), scale=1.3) == (MOVING,) * 4
+    assert methods(scene(0.09, 3.0), scale=1.3) == (LEAN_METHOD,) * 4
 
 
 def test_a_pause_takes_its_part_of_the_motion_away() -> None:
     # Voxel 0 is one long pause; voxel 1 advances by three frames only: 3 x 0.11 < 0.5.
-    assert methods(scene(0.11, 3.0), pauses=((1, 7),)) == ("zero", "dis-ultrafast", MOVING, MOVING)
+    assert methods(scene(0.11, 3.0), pauses=((1, 7),)) == ("zero", "dis-ultrafast", LEAN_METHOD, LEAN_METHOD)
 
 
 def test_only_the_segments_between_the_frames_count() -> None:
@@ -82,9 +82,9 @@ def test_only_the_segments_between_the_frames_count() -> None:
     values[1, MOTION], values[1, CHANGE] = 640, 640  # frames 16 .. 31
     what = Scene(0, 64, shots(64), values)
     # Frames 0 5 10 15 20: the last voxel reaches into the segment that moves, half of what it touches.
-    assert methods(what) == ("zero", "zero", "zero", MOVING)
+    assert methods(what) == ("zero", "zero", "zero", LEAN_METHOD)
     assert methods(what, start=32) == ("zero",) * 4
-    assert methods(what, start=12) == (MOVING,) * 4
+    assert methods(what, start=12) == (LEAN_METHOD,) * 4
 
 
 @pytest.mark.parametrize("tile", range(TILES**2))
@@ -95,7 +95,7 @@ def test_only_the_tiles_that_the_crop_touches_count(tile: int) -> None:
     for other in range(TILES**2):
         row, column = divmod(other, TILES)
         found = methods(what, crop_top_px=32 * row, crop_left_px=32 * column)
-        assert found == ((MOVING,) * 4 if other == tile else ("zero",) * 4)
+        assert found == ((LEAN_METHOD,) * 4 if other == tile else ("zero",) * 4)
         doubled = methods(what, crop_top_px=64 * row, crop_left_px=64 * column, scale=2.0)
         assert (set(doubled) == {"zero"}) == (other != tile)
 
@@ -112,7 +112,7 @@ def test_what_was_not_looked_at_is_left_to_the_look_at_each_pair() -> None:
     assert methods(scene(0.0, 0.0, segments=1)) == ("zero", "zero", "zero", "auto")
     unknown = scene(0.0, 3.0).segments.copy()
     unknown[:, MOTION] = 65535
-    assert methods(Scene(0, 64, shots(64), unknown)) == (MOVING,) * 4
+    assert methods(Scene(0, 64, shots(64), unknown)) == (LEAN_METHOD,) * 4
 
 
 def test_lead_voxels_have_no_flow() -> None:
@@ -127,7 +127,7 @@ def test_reasons_state_the_figures() -> None:
     values[:, MOTION], values[:, CHANGE], values[:, DARK], values[:, NOISE] = 2.0, 40.0, 0.95, 1.5
     made = plan(Scene.of(shots(64), values), pauses=((1, 5),))
     assert made.reason == (
-        f"moving; flow none 1, {MOVING} 3; motion 2.00 px a frame, at most 2.00; change 40.00, flicker 0.00, noise "
+        f"moving; flow none 1, {LEAN_METHOD} 3; motion 2.00 px a frame, at most 2.00; change 40.00, flicker 0.00, noise "
         "1.50 grey levels; dark 95.0% (a dark scene), clipped 0.0%"
     )
     assert "not looked at" in plan(Scene.unknown()).reason
