@@ -202,21 +202,24 @@ def test_no_two_classes_constants_or_aliases_have_one_name() -> None:
             if {"effects", "planes"} & set(path.parts):
                 continue
             tree = ast.parse(path.read_text(encoding="utf-8"))
-            for node in (*tree.body, *(item for item in ast.walk(tree) if isinstance(item, ast.ClassDef))):
-                for name in public_names(node):
-                    source = "" if isinstance(node, ast.ClassDef) else ast.unparse(node)
-                    found.setdefault(name, {})[str(path.relative_to(ROOT))] = source or str(path)
+            names = [item.name for item in ast.walk(tree) if isinstance(item, ast.ClassDef)]
+            defined = dict.fromkeys(names, str(path)) | constants(tree)
+            for name, definition in defined.items():
+                if name[0].isupper():
+                    found.setdefault(name, {})[str(path.relative_to(ROOT))] = definition
     del found["LATER_FIELDS"]  # of a recipe and of a spec
     assert {name: list(used) for name, used in found.items() if len(set(used.values())) > 1} == {}
 
 
-def public_names(node: ast.stmt) -> list[str]:
-    """Return the classes, constants and aliases that a statement of a module defines."""
-    if isinstance(node, ast.ClassDef):
-        names = [node.name]
-    else:
-        targets = (
-            node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
-        )
-        names = [item.id for target in targets for item in ast.walk(target) if isinstance(item, ast.Name)]
-    return [name for name in names if name[0].isupper()]
+def constants(tree: ast.Module) -> dict[str, str]:
+    """Return the definition of each constant and alias of a module."""
+    found: dict[str, str] = {}
+    for node in tree.body:
+        if isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                several = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
+                pairs = zip(target.elts, node.value.elts, strict=True) if several else [(target, node.value)]
+                for place, value in pairs:
+                    stored = [item for item in ast.walk(place) if isinstance(item, ast.Name)]
+                    found |= {item.id: ast.unparse(value) for item in stored if isinstance(item.ctx, ast.Store)}
+    return found

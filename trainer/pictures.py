@@ -16,7 +16,7 @@ from v2v_pictures import colours, files
 from v2v_pictures.canvas import SOFT, Canvas
 from v2v_protocol.errors import UsageError
 
-_GAP_PX = 4
+PANEL_GAP_PX = 4
 SMALLEST_TILE_PX = 128
 LEAST_COUNT = 1e-3
 """Smaller sums are rounding errors of interpolated events that cancel, and are drawn as 0."""
@@ -59,7 +59,7 @@ def side_by_side(panels: Sequence[Image]) -> Image:
     """Join films [T, H, W, 3] side by side. Small ones are enlarged by an integer factor."""
     factor = max(1, -(-SMALLEST_TILE_PX // min(panels[0].shape[1:3])))
     tiles = [panel.repeat(factor, axis=1).repeat(factor, axis=2) for panel in panels]
-    edge = ((0, 0), (0, _GAP_PX), (0, _GAP_PX), (0, 0))
+    edge = ((0, 0), (0, PANEL_GAP_PX), (0, PANEL_GAP_PX), (0, 0))
     return np.concatenate([np.pad(tile, edge, constant_values=255) for tile in tiles], axis=2)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from trainer.pictures import (
-    _GAP_PX,
+    PANEL_GAP_PX,
     Video,
     add_header,
     contact_sheet,
@@ -63,7 +63,7 @@ def test_a_film_is_large_enough_to_see() -> None:
     steps, height, width = 7, 20, 30
     film = side_by_side([np.zeros((steps, height, width, 3), np.uint8)] * 3)
     factor = 7  # 7 x 20 px is the first multiple that is not below 128 px
-    assert film.shape == (steps, factor * height + _GAP_PX, 3 * (factor * width + _GAP_PX), 3)
+    assert film.shape == (steps, factor * height + PANEL_GAP_PX, 3 * (factor * width + PANEL_GAP_PX), 3)
     assert contact_sheet(film, steps=3).shape == (3 * film.shape[1], film.shape[2], 3)
     assert contact_sheet(film[:2], steps=5).shape[0] == 2 * film.shape[1]
 

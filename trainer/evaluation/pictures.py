@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from trainer.evaluation.reconstruct import Step
-from trainer.pictures import _GAP_PX, EVENTS, Image, add_header, draw_events, draw_grey
+from trainer.pictures import PANEL_GAP_PX, EVENTS, Image, add_header, draw_events, draw_grey
 from v2v_pictures import colours
 from v2v_pictures.canvas import SOFT, Canvas
 
@@ -41,7 +41,7 @@ def draw_step(step: Step, origin_seconds: float, *, with_camera: bool = True) ->
     shown = len(panels) if with_camera else len(panels) - 1
     tiles = []
     for panel, text in zip(panels[:shown], texts[:shown], strict=True):
-        tile = cv2.copyMakeBorder(panel, 0, CAPTION_PX, 0, _GAP_PX, cv2.BORDER_CONSTANT, value=(255, 255, 255))
+        tile = cv2.copyMakeBorder(panel, 0, CAPTION_PX, 0, PANEL_GAP_PX, cv2.BORDER_CONSTANT, value=(255, 255, 255))
         cv2.putText(tile, text, (2, height + 13), cv2.FONT_HERSHEY_SIMPLEX, FONT_SCALE, _INK, 1, cv2.LINE_AA)
         tiles.append(tile)
     return np.hstack(tiles)

@@ -61,7 +61,7 @@ def dis(preset: int, finest_scale: int, refinements: int | None = None) -> Estim
     """Return a guarded estimator: dense inverse search with a preset's number of iterations and patch stride.
 
     Args:
-        preset: ULTRAFAST, FAST or MEDIUM.
+        preset: DIS_ULTRAFAST, DIS_FAST or DIS_MEDIUM.
         finest_scale: the pyramid level that matching ends at; 0 is the full picture.
         refinements: iterations of the variational refinement; None: the preset's, 5 (ultrafast: 0).
     """

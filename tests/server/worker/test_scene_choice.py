@@ -127,8 +127,8 @@ def test_reasons_state_the_figures() -> None:
     values[:, MOTION], values[:, CHANGE], values[:, DARK], values[:, NOISE] = 2.0, 40.0, 0.95, 1.5
     made = plan(Scene.of(shots(64), values), pauses=((1, 5),))
     assert made.reason == (
-        f"moving; flow none 1, {LEAN_METHOD} 3; motion 2.00 px a frame, at most 2.00; change 40.00, flicker 0.00, noise "
-        "1.50 grey levels; dark 95.0% (a dark scene), clipped 0.0%"
+        f"moving; flow none 1, {LEAN_METHOD} 3; motion 2.00 px a frame, at most 2.00; change 40.00, flicker 0.00, "
+        "noise 1.50 grey levels; dark 95.0% (a dark scene), clipped 0.0%"
     )
     assert "not looked at" in plan(Scene.unknown()).reason
 
