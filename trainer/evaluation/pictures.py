@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from trainer.evaluation.reconstruct import Step
-from trainer.pictures import PANEL_GAP_PX, EVENTS, Image, add_header, draw_events, draw_grey
+from trainer.pictures import EVENTS, PANEL_GAP_PX, Image, add_header, draw_events, draw_grey
 from v2v_pictures import colours
 from v2v_pictures.canvas import SOFT, Canvas
 
