@@ -9,7 +9,7 @@ import base64
 import dataclasses
 import importlib
 import os
-from collections.abc import Callable, KeysView, Mapping, Sequence
+from collections.abc import KeysView, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Never
@@ -28,8 +28,45 @@ from v2v_protocol.spec import StreamSpec
 _SHOWN = 3
 
 
+class Drawn:
+    """Give a notebook the picture that ``_picture`` draws, [height, width, 3] uint8 RGB."""
+
+    __slots__ = ()
+
+    def _picture(self) -> npt.NDArray[np.uint8]:
+        raise NotImplementedError
+
+    def show(self, path: str | os.PathLike[str] | None = None) -> Any:
+        """Draw a picture of the sample, or of the first 3 samples of the batch, which a notebook displays.
+
+        Args:
+            path: PNG file to write as well; None writes no file.
+
+        Returns:
+            A PIL image.
+
+        Raises:
+            UsageError: there are no voxels or no frames, the file cannot be written, or pillow or av is not installed.
+        """
+        image = self._picture()
+        if path is not None:
+            _drawing("files").write_png(Path(path), image)
+        return _imported("PIL.Image").fromarray(image)
+
+    def _repr_png_(self) -> bytes | None:
+        try:
+            encoded: bytes = _drawing("files").png_bytes(self._picture())
+        except UsageError:  # it cannot be drawn: the notebook then shows only text
+            return None
+        return encoded
+
+    def _html_image(self) -> str:
+        encoded = self._repr_png_()
+        return "" if encoded is None else f'<img src="data:image/png;base64,{base64.b64encode(encoded).decode()}">'
+
+
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Batch:
+class Batch(Drawn):
     """Hold the samples of one batch, in the order of the epoch.
 
     Attributes:
@@ -85,21 +122,7 @@ class Batch:
         some = ", ".join(map(str, self.indices[:3])) + (", ..." if len(self) > 3 else "")
         return f"Batch({arrays}epoch {self.epoch}, indices {some})"
 
-    def show(self, path: str | os.PathLike[str] | None = None) -> Any:
-        """Draw the first 3 samples as a picture, which a notebook displays.
-
-        Args:
-            path: PNG file to write as well; None writes no file.
-
-        Returns:
-            A PIL image.
-
-        Raises:
-            UsageError: the batch has no voxels or no frames, or pillow or av is not installed.
-        """
-        return to_pil_image(self._picture(), path)
-
-    def _picture(self) -> Any:
+    def _picture(self) -> npt.NDArray[np.uint8]:
         spec = self.resume_state.get("spec")
         recipe = None if spec is None else StreamSpec.from_dict(spec).recipe
         count = min(_SHOWN, len(self))
@@ -109,12 +132,9 @@ class Batch:
         ]
         return draw_samples(samples, recipe, f"{count} of {len(self)} samples, epoch {self.epoch}")
 
-    def _repr_png_(self) -> bytes | None:
-        return try_png(self._picture)
-
     def _repr_html_(self) -> str:
         rows = {name: f"{tensor.dtype} {list(tensor.shape)} {tensor.device}" for name, tensor in self.arrays.items()}
-        return html_table(f"Batch of {len(self)}, epoch {self.epoch}", rows) + html_image(self._repr_png_())
+        return html_table(f"Batch of {len(self)}, epoch {self.epoch}", rows) + self._html_image()
 
     @property
     def voxels(self) -> torch.Tensor:
@@ -327,43 +347,6 @@ def draw_samples(
 
 
 _UNMARKED = " (pauses are not marked)"
-
-
-def to_png(image: npt.NDArray[np.uint8]) -> bytes:
-    """Encode a picture, [height, width, 3] RGB, as PNG."""
-    encoded: bytes = _drawing("files").png_bytes(image)
-    return encoded
-
-
-def try_png(draw: Callable[[], npt.NDArray[np.uint8]]) -> bytes | None:
-    """Return the picture that ``draw`` draws, [height, width, 3] RGB, as PNG.
-
-    None if it cannot be drawn: the notebook then shows only text.
-    """
-    try:
-        return to_png(draw())
-    except UsageError:
-        return None
-
-
-def html_image(encoded: bytes | None) -> str:
-    """Return an HTML image element for a PNG, or "" for None."""
-    return "" if encoded is None else f'<img src="data:image/png;base64,{base64.b64encode(encoded).decode()}">'
-
-
-def to_pil_image(image: npt.NDArray[np.uint8], path: str | os.PathLike[str] | None) -> Any:
-    """Return the picture as a PIL image, which a notebook displays.
-
-    Args:
-        image: [height, width, 3] RGB.
-        path: PNG file to write as well; None writes no file.
-
-    Raises:
-        UsageError: the file cannot be written, or pillow or av is not installed.
-    """
-    if path is not None:
-        _drawing("files").write_png(Path(path), image)
-    return _imported("PIL.Image").fromarray(image)
 
 
 def _drawing(name: str) -> Any:

@@ -24,7 +24,6 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
 
 from v2v_client.conversation import WAIT_REPORT_SECONDS, Arrival, Conversation, Event, ListeningClock, State
 from v2v_client.memory import open_sample
@@ -35,7 +34,7 @@ from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.link.dealer import Dealer, diagnose
 from v2v_protocol.messages import Hello, SampleHeader
 from v2v_protocol.sample import Layout, Provenance
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames, decode, encode, largest_frame_bytes
+from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, largest_frame_bytes
 
 _GOODBYE_LINGER_MS = 250
 """Time that closing may spend on sending the Goodbye. Without it the server would go on making requested samples."""
@@ -44,28 +43,6 @@ _REPORT_SECONDS = 5.0
 _NO_SLOTS: Mapping[int, Slot] = {}
 
 _log = logging.getLogger(__name__)
-
-
-class Transport(Protocol):
-    """The interface of :class:`Dealer`, which tests implement with queues. After ``close`` methods raise ServerLost."""
-
-    def connect(self, largest_frame_bytes: int, *, again: bool = False) -> None:
-        """See :meth:`Dealer.connect`."""
-
-    def disconnect(self, *, linger_ms: int) -> None:
-        """See :meth:`Dealer.disconnect`."""
-
-    def send(self, frames: Sequence[Any]) -> None:
-        """See :meth:`Dealer.send`."""
-
-    def receive(self, seconds: float) -> Frames | None:
-        """See :meth:`Dealer.receive`."""
-
-    def has_reconnected(self) -> bool:
-        """See :meth:`Dealer.has_reconnected`."""
-
-    def close(self) -> None:
-        """See :meth:`Dealer.close`."""
 
 
 class Connection:
@@ -81,6 +58,9 @@ class Connection:
         patience: timeouts for pinging, repeating requests and giving up; None for the defaults.
         clock: monotonic, in seconds.
         transport: creates the link to an address.
+
+    Attributes:
+        address: of the current broker.
     """
 
     def __init__(
@@ -93,29 +73,24 @@ class Connection:
         pinned_by: str = "this dataset",
         patience: Patience | None = None,
         clock: Callable[[], float] = time.monotonic,
-        transport: Callable[[str], Transport] = Dealer,
+        transport: Callable[[str], Dealer] = Dealer,
     ) -> None:
         hello = replace(hello, secret=secrets.token_bytes(32))
         self._brokers = (address,) if isinstance(address, str) else tuple(address)
         self._moves = 0  # changes of broker since the last sample
-        self._address = self._brokers[0]
+        self.address = self._brokers[0]
         self._is_pinned = pinned is not None
         self._patience = patience or Patience()
         self._clock = clock
         self._listening = ListeningClock(clock())
         self._transport = transport
         self._process = os.getpid()
-        self._link: Transport | None = None
+        self._link: Dealer | None = None
         self._largest_frame_bytes = LARGEST_HEADER_BYTES
         self._conversation = Conversation(
-            self._address, hello, epoch, pinned=pinned, pinned_by=pinned_by, patience=self._patience, now=self._now()
+            self.address, hello, epoch, pinned=pinned, pinned_by=pinned_by, patience=self._patience, now=self._now()
         )
         self._last_sample = self._now()  # initially the time of creation
-
-    @property
-    def address(self) -> str:
-        """Return the address of the current broker."""
-        return self._address
 
     @property
     def stream(self) -> StreamIdentity:
@@ -153,7 +128,7 @@ class Connection:
             StateMismatch: the server offers another stream than the pinned one.
             UsageError: the address is malformed, or an array is unknown.
         """
-        self._link = self._transport(self._address)
+        self._link = self._transport(self.address)
         try:
             if not self._is_pinned:
                 self._link.connect(self._largest_frame_bytes)
@@ -173,13 +148,13 @@ class Connection:
         while self._conversation.state is not State.WELCOMED:
             if not is_reported and self._conversation.silence(self._now()) >= _REPORT_SECONDS:
                 is_reported, limit = True, self._patience.timeout_seconds
-                _log.warning("%s: %s; giving up after %g s", self._address, diagnose(self._address), limit)
+                _log.warning("%s: %s; giving up after %g s", self.address, diagnose(self.address), limit)
             try:
                 self._step(wait=True)
             except ServerLost as lost:
-                raise ServerLost(f"{lost}; {diagnose(self._address)}") from lost
+                raise ServerLost(f"{lost}; {diagnose(self.address)}") from lost
 
-    def _leave(self, link: Transport) -> None:
+    def _leave(self, link: Dealer) -> None:
         """Send Goodbye, without waiting for a silent server."""
         quiet = self._conversation.silence(self._now()) >= self._patience.ping_seconds
         self._conversation.outbox.clear()
@@ -268,13 +243,13 @@ class Connection:
                 f"v2v-serve there, or wait longer with timeout_seconds (now {self._patience.timeout_seconds:g})"
             )
         self._moves += 1
-        lost = self._address
-        self._address = self._brokers[(self._brokers.index(lost) + 1) % len(self._brokers)]
-        _log.warning("%s: %s; %s takes over", lost, reason, self._address)
-        old, self._link = self._open_link(), self._transport(self._address)
+        lost = self.address
+        self.address = self._brokers[(self._brokers.index(lost) + 1) % len(self._brokers)]
+        _log.warning("%s: %s; %s takes over", lost, reason, self.address)
+        old, self._link = self._open_link(), self._transport(self.address)
         old.close()
         self._link.connect(self._largest_frame_bytes)
-        self._conversation.move(self._address, now)
+        self._conversation.move(self.address, now)
 
     def _exchange(self, *, wait: bool) -> tuple[Arrival | None, bool]:
         link, conversation = self._open_link(), self._conversation
@@ -296,19 +271,19 @@ class Connection:
         self._send(link)
         return arrival, frames is None
 
-    def _send(self, link: Transport) -> None:
+    def _send(self, link: Dealer) -> None:
         outbox, self._conversation.outbox = self._conversation.outbox, []
         for message in outbox:
             link.send(encode(message))
 
-    def _open_link(self) -> Transport:
+    def _open_link(self) -> Dealer:
         if os.getpid() != self._process:
             raise UsageError(
                 f"this iterator belongs to process {self._process}, and process {os.getpid()} was forked from it: call "
                 "iter() in the process that takes the batches (DataLoader workers do)"
             )
         if self._link is None:
-            raise ServerLost(f"{self._address}: this connection is closed")
+            raise ServerLost(f"{self.address}: this connection is closed")
         return self._link
 
 

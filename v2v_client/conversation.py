@@ -90,7 +90,6 @@ class Conversation:
         stream: the stream that the server offers; set in WELCOMED.
         layout: dtype and shape of each array of one sample; set in WELCOMED.
         credit: maximum number of samples requested and not received.
-        strays: number of dropped samples: of another epoch, or that cannot be read.
         waited_seconds: time spent waiting for samples since the last Hello. It is sent with each request, once a second
             while waiting, and with Goodbye.
     """
@@ -137,7 +136,6 @@ class Conversation:
         self.state = State.CLOSED
         self.outbox: list[Message] = []
         self.credit = 0
-        self.strays = 0
         self.waited_seconds = 0.0
         self._wait_reported_at = now
         if pinned is not None:
@@ -321,7 +319,6 @@ class Conversation:
                         "unavailable",
                         f"{self._address} cannot make sample {message.index} of epoch {message.epoch}: {message.text}",
                     )
-                self.strays += 1
             case _:
                 raise ProtocolError(
                     f"{self._address} sent {type(message).__name__}, which servers do not send to consumers"
@@ -343,7 +340,6 @@ class Conversation:
 
     def _sample(self, header: SampleHeader, frames: list[Buffer]) -> Arrival | None:
         if header.epoch != self._epoch:
-            self.strays += 1
             return None
         form = self.form
         if (header.names, header.dtypes, header.shapes) != (form.names, form.dtypes, form.shapes):
@@ -360,7 +356,6 @@ class Conversation:
             del self._asked[header.index]
             self._queued.appendleft(header.index)  # without a slot, it comes in a message
         if is_gone or answer is Answer.NOWHERE:
-            self.strays += 1
             self._ask_for_more(again)
             return None
         self._hello = replace(self._hello, quarantine=max(self._hello.quarantine or 0, header.quarantine))

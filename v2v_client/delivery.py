@@ -8,7 +8,7 @@ The :class:`ReorderWindow` (pure) requests samples ahead in batch order. Two lim
 The second bounds memory while one late sample delays its batch: at most ceil(credit / batch size) + 2 batches have
 buffers. It always leaves space for one whole batch, so even with a small credit the first batch can be completed.
 
-Samples that were not requested, and second copies, are counted and dropped. Requests repeated after a disconnect can
+Samples that were not requested, and second copies, are dropped. Requests repeated after a disconnect can
 cause both.
 """
 
@@ -49,10 +49,6 @@ class ReorderWindow:
         batch_size: samples in each batch.
         credit: maximum number of samples requested and not received.
 
-    Attributes:
-        duplicates: arrivals of a sample that had arrived before.
-        strays: arrivals of a sample that was never requested.
-
     Raises:
         LimitExceeded: the credit is below 1.
     """
@@ -72,8 +68,6 @@ class ReorderWindow:
         self._places: dict[int, Place] = {}  # samples asked for, until their batch is taken
         self._outstanding: dict[int, None] = {}  # of those, the ones not received, in the order asked
         self._missing: dict[int, int] = {}  # batch -> rows not received
-        self.duplicates = 0
-        self.strays = 0
 
     @property
     def finished(self) -> bool:
@@ -124,12 +118,6 @@ class ReorderWindow:
     def receive(self, index: int) -> Place | None:
         """Record an arrived sample and return its place, or None if it must be dropped."""
         if index not in self._outstanding:
-            # A second copy of a sample whose batch has left counts as a stray: remembering all delivered samples
-            # would cost unbounded memory.
-            if index in self._places:
-                self.duplicates += 1
-            else:
-                self.strays += 1
             return None
         del self._outstanding[index]
         place = self._places[index]

@@ -12,11 +12,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Unpack
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch.utils.data import Dataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from v2v_client.batch import Batch, draw_samples, html_image, to_pil_image, try_png
+from v2v_client.batch import Batch, Drawn, draw_samples
 from v2v_client.options import Labels, check_labels, require_arguments, require_labels
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
@@ -28,7 +30,7 @@ from v2v_protocol.spec_flags import read_recipe
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class ShownSample(Sample):
+class ShownSample(Drawn, Sample):
     """Hold a sample that a notebook can display.
 
     Attributes:
@@ -39,29 +41,11 @@ class ShownSample(Sample):
     recipe: Recipe
     title: str
 
-    def show(self, path: str | os.PathLike[str] | None = None) -> Any:
-        """Draw the sample as a picture, which a notebook displays.
-
-        Args:
-            path: PNG file to write as well; None writes no file.
-
-        Returns:
-            A PIL image.
-
-        Raises:
-            UsageError: voxels or frames were not requested, the file cannot be written, or pillow or av is not
-                installed.
-        """
-        return to_pil_image(self._picture(), path)
-
-    def _picture(self) -> Any:
+    def _picture(self) -> npt.NDArray[np.uint8]:
         return draw_samples([(self.arrays, self.provenance)], self.recipe, self.title)
 
-    def _repr_png_(self) -> bytes | None:
-        return try_png(self._picture)
-
     def _repr_html_(self) -> str:
-        return Sample._repr_html_(self) + html_image(self._repr_png_())
+        return Sample._repr_html_(self) + self._html_image()
 
 
 class V2VDataset(Dataset[Sample]):
