@@ -15,8 +15,10 @@ cause both.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 import torch
 
@@ -62,12 +64,11 @@ class ReorderWindow:
         self._indices = indices
         self._batch_size = batch_size
         self._credit = credit
-        self._asking = 0  # place in ``batches`` of the batch being asked for
-        self._unasked: list[int] = []  # the rest of that batch, next one last
+        self._unasked = ((index, Place(batch, row)) for batch in batches for row, index in enumerate(indices(batch)))
         self._taken = 0  # batches delivered
         self._places: dict[int, Place] = {}  # samples asked for, until their batch is taken
         self._outstanding: dict[int, None] = {}  # of those, the ones not received, in the order asked
-        self._missing: dict[int, int] = {}  # batch -> rows not received
+        self._received: Counter[int] = Counter()  # samples received of each batch, until it is taken
 
     @property
     def finished(self) -> bool:
@@ -85,31 +86,16 @@ class ReorderWindow:
         Returns no indices while there are only few and other samples are under way: one request per arriving sample
         would cost the server as much as the sample does.
         """
-        asked: list[int] = []
         allowed = min(
             self._credit - len(self._outstanding),
             self._credit + self._batch_size - len(self._places),
         )
         if allowed < self._credit // _REQUESTS_A_CREDIT and self._outstanding:
             return ()
-        while len(asked) < allowed:
-            if not self._unasked and not self._begin_batch():
-                break
-            index = self._unasked.pop()
-            batch = self._batches[self._asking - 1]
-            self._places[index] = Place(batch, self._batch_size - len(self._unasked) - 1)
-            self._outstanding[index] = None
-            asked.append(index)
+        asked = dict(islice(self._unasked, allowed))
+        self._places |= asked
+        self._outstanding |= dict.fromkeys(asked)
         return tuple(asked)
-
-    def _begin_batch(self) -> bool:
-        if self._asking == len(self._batches):
-            return False
-        batch = self._batches[self._asking]
-        self._unasked = list(reversed(self._indices(batch)))
-        self._missing[batch] = len(self._unasked)
-        self._asking += 1
-        return True
 
     def place(self, index: int) -> Place:
         """Return where a requested sample belongs."""
@@ -121,7 +107,7 @@ class ReorderWindow:
             return None
         del self._outstanding[index]
         place = self._places[index]
-        self._missing[place.batch] -= 1
+        self._received[place.batch] += 1
         return place
 
     def take(self) -> int | None:
@@ -129,9 +115,9 @@ class ReorderWindow:
         if self.finished:
             return None
         batch = self._batches[self._taken]
-        if self._missing.get(batch) != 0:
+        if self._received[batch] < self._batch_size:
             return None
-        del self._missing[batch]
+        del self._received[batch]
         for index in self._indices(batch):
             del self._places[index]
         self._taken += 1

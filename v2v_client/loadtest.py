@@ -11,6 +11,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -308,33 +309,27 @@ def run(arguments: argparse.Namespace) -> int:
         "trainer_seconds": arguments.trainer_ms / 1e3,
     }
     results = []
-    if arguments.connect:
-        dataset = _dataset(arguments, arguments.connect)
-        with Progress(arguments.connect, "%") as progress:
-            results.append(
-                measure(dataset, address=arguments.connect, workers=None, server=None, progress=progress, **options)
-            )
-    else:
+    if not arguments.connect:
         _dataset(arguments, "tcp://127.0.0.1:0")  # report wrong options before a server is started
-        for workers in arguments.workers or (1, 2):
-            with (
-                LocalServer(arguments.videos, workers=workers, flags=_server_flags(arguments)) as server,
-                Progress(f"{workers} workers", "%") as progress,
-            ):
-                dataset = _dataset(arguments, server.address)
-                results.append(
-                    measure(
-                        dataset, address=server.address, workers=workers, server=server, progress=progress, **options
-                    )
-                )
-            if results[-1][0]["interrupted"]:
-                break
+    for workers in (None,) if arguments.connect else arguments.workers or (1, 2):
+        local = (
+            None if workers is None else LocalServer(arguments.videos, workers=workers, flags=_server_flags(arguments))
+        )
+        with local or nullcontext() as server, Progress(arguments.connect or f"{workers} workers", "%") as progress:
+            address = arguments.connect if server is None else server.address
+            dataset = _dataset(arguments, address)
+            results.append(
+                measure(dataset, address=address, workers=workers, server=server, progress=progress, **options)
+            )
+        if results[-1][0]["interrupted"]:
+            break
     records = [record for record, _ in results]
     console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
     console.print(table(records, console.width))
     print(
         f"batch size {arguments.batch_size}; {arguments.warmup_batches} warm-up batches not timed; p50 and p99: time "
-        "between requesting and receiving a batch; CPU: " + _cpu_scope(arguments)
+        "between requesting and receiving a batch; CPU: this process, "
+        + ("and what the workers report of each sample (no broker)" if arguments.connect else "server and workers")
     )
     if arguments.json:
         write_json(arguments.json, records)
@@ -342,12 +337,6 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"interrupted after {records[-1]['seconds']:.1f} of {arguments.seconds:g} s", file=sys.stderr)
         return INTERRUPTED
     return 0 if all(check.faultless for _, check in results) else 1
-
-
-def _cpu_scope(arguments: argparse.Namespace) -> str:
-    if arguments.connect:
-        return "this process, and the time that the server's workers report for each sample (not its broker)"
-    return "this process, server and workers"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
