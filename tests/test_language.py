@@ -1,6 +1,8 @@
-"""Product code uses plain words, and pages hold no marks of an unfinished merge."""
+"""Product code uses plain words, docstrings say shapes and errors, and pages hold no marks of an unfinished merge."""
 
+import ast
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -19,6 +21,9 @@ FORBIDDEN = re.compile(
 )
 ALLOWED = ("so many specs share a table",)
 """Parts of lines that may use a forbidden word in another meaning."""
+
+ARRAY = re.compile(r"\b(?:NDArray|ndarray|Tensor|ByteArray)\b")
+SHAPE = re.compile(r"\[[\w ,.*+/()-]*\]")
 
 
 def found(path: Path) -> list[str]:
@@ -47,3 +52,30 @@ def test_pages_hold_no_marks_of_a_merge() -> None:
     assert [
         str(page) for page in pages for line in page.read_text("utf-8").splitlines() if line.startswith(marks)
     ] == []
+
+
+def public(body: list[ast.stmt], of_class: str = "") -> Iterator[tuple[ast.FunctionDef, str]]:
+    """Yield the public functions of a body, each with its docstring; a constructor has that of its class."""
+    for node in body:
+        name = getattr(node, "name", "_")
+        if isinstance(node, ast.ClassDef) and not name.startswith("_"):
+            yield from public(node.body, ast.get_docstring(node) or "")
+        elif isinstance(node, ast.FunctionDef) and (name == "__init__" or not name.startswith("_")):
+            yield node, of_class if name == "__init__" else ast.get_docstring(node) or ""
+
+
+def faults(path: Path) -> Iterator[str]:
+    """Yield the public functions of a file whose docstring lacks a shape or a ``Raises:``."""
+    for function, text in public(ast.parse(path.read_text("utf-8")).body):
+        returns = "" if function.returns is None else ast.unparse(function.returns)
+        raises = any(isinstance(node, ast.Raise) and node.exc for node in ast.walk(function))
+        if ARRAY.search(f"{ast.unparse(function.args)} {returns}") and not SHAPE.search(text):
+            yield f"{path.relative_to(ROOT)}:{function.lineno} {function.name}: arrays without a shape"
+        if raises and "Raises:" not in text:
+            yield f"{path.relative_to(ROOT)}:{function.lineno} {function.name}: raises without saying so"
+
+
+def test_public_docstrings_give_shapes_and_errors() -> None:
+    """Of two packages so far."""
+    checked = [path for path in sources() if path.relative_to(ROOT).parts[0] in ("v2v_client", "v2v_protocol")]
+    assert [fault for path in checked for fault in faults(path)] == []
