@@ -224,9 +224,8 @@ def test_no_two_classes_constants_or_aliases_have_one_name() -> None:
             if {"effects", "planes"} & set(path.parts):
                 continue
             tree = ast.parse(path.read_text(encoding="utf-8"))
-            names = [item.name for item in ast.walk(tree) if isinstance(item, ast.ClassDef)]
-            defined = dict.fromkeys(names, str(path)) | constants(tree)
-            for name, definition in defined.items():
+            classes = {item.name: str(path) for item in ast.walk(tree) if isinstance(item, ast.ClassDef)}
+            for name, definition in (classes | constants(tree)).items():
                 if name[0].isupper():
                     found.setdefault(name, {})[str(path.relative_to(ROOT))] = definition
     del found["LATER_FIELDS"]  # of a recipe and of a spec
@@ -242,6 +241,6 @@ def constants(tree: ast.Module) -> dict[str, str]:
                 several = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
                 pairs = zip(target.elts, node.value.elts, strict=True) if several else [(target, node.value)]
                 for place, value in pairs:
-                    stored = [item for item in ast.walk(place) if isinstance(item, ast.Name)]
-                    found |= {item.id: ast.unparse(value) for item in stored if isinstance(item.ctx, ast.Store)}
+                    names = (item for item in ast.walk(place) if isinstance(item, ast.Name))
+                    found |= {item.id: ast.unparse(value) for item in names if isinstance(item.ctx, ast.Store)}
     return found

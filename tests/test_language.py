@@ -67,11 +67,10 @@ def public(body: list[ast.stmt], of_class: str = "") -> Iterator[tuple[ast.Funct
 def faults(path: Path) -> Iterator[str]:
     """Yield the public functions of a file whose docstring lacks a shape or a ``Raises:``."""
     for function, text in public(ast.parse(path.read_text("utf-8")).body):
-        returns = "" if function.returns is None else ast.unparse(function.returns)
-        raises = any(isinstance(node, ast.Raise) and node.exc for node in ast.walk(function))
-        if ARRAY.search(f"{ast.unparse(function.args)} {returns}") and not SHAPE.search(text):
+        shaped = f"{ast.unparse(function.args)} {'' if function.returns is None else ast.unparse(function.returns)}"
+        if ARRAY.search(shaped) and not SHAPE.search(text):
             yield f"{path.relative_to(ROOT)}:{function.lineno} {function.name}: arrays without a shape"
-        if raises and "Raises:" not in text:
+        if any(isinstance(node, ast.Raise) and node.exc for node in ast.walk(function)) and "Raises:" not in text:
             yield f"{path.relative_to(ROOT)}:{function.lineno} {function.name}: raises without saying so"
 
 

@@ -1,171 +1,144 @@
-"""Test the states of one rank and of its loader workers, without a server."""
+"""Test which samples a consumer gets, and the states that it saves."""
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
 
 import pytest
-import torch.utils.data._utils.worker as torch_worker
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
-from v2v_client.passes import Iteration, Position
-from v2v_client.position import Consumer, ResumeState, StreamIdentity
-from v2v_protocol.errors import UsageError
+from v2v_client.position import Consumer, EpochPlan, LoaderShare, ResumeState, StreamIdentity
+from v2v_protocol.errors import StateMismatch, UsageError
 
-STREAM = StreamIdentity({}, "spec", "catalogue", 1, sequences=24)
-ALONE = Consumer(batch_size=4, rank=0, world_size=1)
-HALF = Consumer(batch_size=4, rank=1, world_size=2)
-BEGINNING = ResumeState(STREAM, 3, 7, 0, 0, 1)
-
-
-@pytest.fixture(autouse=True)
-def no_worker() -> Iterator[None]:
-    yield
-    torch_worker._worker_info = None
+SEQUENCES = st.integers(0, 300)
+RANKS = st.integers(1, 5)
+BATCH = st.integers(1, 7)
 
 
-def become_worker(worker: int, workers: int) -> None:
-    torch_worker._worker_info = torch_worker.WorkerInfo(id=worker, num_workers=workers, seed=50 + worker, dataset=None)
+def consumed(plans: list[EpochPlan]) -> list[int]:
+    return [index for plan in plans for batch in range(plan.batches) for index in plan.indices(batch)]
 
 
-def after(batch: int) -> ResumeState:
-    return ALONE.after(BEGINNING, ALONE.plan(STREAM, BEGINNING), batch, None)
+def ranks(sequences: int, world: int, batch: int, origin: int = 0, position: int = 0) -> list[EpochPlan]:
+    return [EpochPlan(sequences, world, rank, batch, origin, position) for rank in range(world)]
 
 
-def test_the_state_after_a_batch_is_where_the_rest_begins() -> None:
-    plan = ALONE.plan(STREAM, BEGINNING)
-    every = [plan.indices(batch) for batch in range(plan.batches)]
-    for batch in range(plan.batches - 1):
-        state = ALONE.after(BEGINNING, plan, batch, quarantine=2)
-        rest = ALONE.plan(STREAM, state)
-        assert [rest.indices(number) for number in range(rest.batches)] == every[batch + 1 :]
-        assert (state.seed, state.epoch, state.quarantine) == (3, 7, 2)
-    assert after(plan.batches - 1) == BEGINNING.at_epoch(8)
+def test_index_of_a_local_position_is_that_of_the_definition():
+    plan = EpochPlan(sequences=100, world_size=3, rank=2, batch_size=4)
+    assert plan.indices(1) == tuple(position * 3 + 2 for position in (4, 5, 6, 7))
 
 
-def test_another_world_size_takes_up_what_no_rank_consumed() -> None:
-    taken = HALF.adopt(after(0))
-    assert (taken.origin, taken.position, taken.world_size) == (4, 0, 2)
-    assert HALF.plan(STREAM, taken).indices(0) == (5, 7, 9, 11)
+@given(SEQUENCES, RANKS, BATCH, st.integers(1, 4))
+def test_ranks_and_loader_workers_take_the_prefix_once(sequences, world, batch, workers):
+    plans = ranks(sequences, world, batch)
+    assert len({plan.batches for plan in plans}) == 1
+    everything = sorted(consumed(plans))
+    assert everything == list(range(sequences - sequences % (world * batch)))
+    for plan in plans:
+        shares = [list(plan.batches_of_worker(worker, workers)) for worker in range(workers)]
+        assert sorted(number for share in shares for number in share) == list(range(plan.batches))
 
 
-@pytest.mark.parametrize("named", [False, True])
-def test_a_rest_without_a_global_batch_is_skipped_unless_its_epoch_is_named(named: bool) -> None:
-    position = Position(3, 0)
-    position.load(after(4), HALF)
-    if named:
-        position.set_epoch(7)
-    begun = position.begin(HALF)
-    assert begun.state.epoch == (7 if named else 8)
-    assert len(begun.batches(HALF.plan(STREAM, begun.state))) == (0 if named else 3)
-    position.finish(begun)
-    assert position.start(HALF).place == (8 if named else 9, 0, 0)
+@given(SEQUENCES, RANKS, BATCH, BATCH, st.integers(0, 40))
+def test_another_batch_size_goes_on_where_the_first_stopped(sequences, world, batch, other, taken):
+    plans = ranks(sequences, world, batch)
+    taken = min(taken, plans[0].batches)
+    position = taken * batch
+    before = [index for plan in plans for number in range(taken) for index in plan.indices(number)]
+    after = consumed(ranks(sequences, world, other, position=position))
+    both = sorted(before + after)
+    assert both == list(range(len(both)))
+    assert sequences - len(both) < world * other
 
 
-@pytest.mark.parametrize("here", [None, (0, 2), (1, 3)], ids=str)
-def test_a_share_belongs_to_one_loader_worker(here: tuple[int, int] | None) -> None:
-    state = Iteration(1, BEGINNING, worker=1, workers=2, in_loader=True).after(ALONE, 2, None)
-    become_worker(1, 2)
-    Position(3, 0).load(state, ALONE)
-    torch_worker._worker_info = None
-    if here is not None:
-        become_worker(*here)
-    Position(3, 0).load(BEGINNING, ALONE)
-    with pytest.raises(UsageError, match="loader worker 1 of 2"):
-        Position(3, 0).load(state, ALONE)
+@given(SEQUENCES, RANKS, RANKS, BATCH, BATCH, st.integers(0, 40))
+def test_another_world_size_goes_on_at_a_global_batch_boundary(sequences, world, other_world, batch, other, taken):
+    plans = ranks(sequences, world, batch)
+    taken = min(taken, plans[0].batches)
+    before = [index for plan in plans for number in range(taken) for index in plan.indices(number)]
+    saved = ResumeState(None, 0, 0, 0, taken * batch, world)
+    state = Consumer(other, 0, other_world).adopt(saved)
+    after = consumed(ranks(sequences, other_world, other, state.origin, state.position))
+    both = sorted(before + after)
+    assert both == list(range(len(both)))
+    assert sequences - len(both) < other_world * other
 
 
-def test_only_the_newest_iteration_affects_the_position() -> None:
-    position = Position(3, 0)
-    older, newer = position.begin(ALONE), position.begin(ALONE)
-    first, second = after(0), after(1)
-    position.reached(newer, ALONE, first, last=False)
-    position.reached(older, ALONE, second, last=True)
-    position.finish(older)
-    assert position.state(ALONE) == first
-    position.finish(newer)
-    assert position.state(ALONE) == ResumeState(None, 3, 1, 0, 0, 1)
+@given(SEQUENCES, RANKS, BATCH, st.integers(0, 40))
+def test_position_after_a_batch_resumes_at_the_next_one(sequences, world, batch, number):
+    plan = EpochPlan(sequences, world, world - 1, batch)
+    assume(number + 1 < plan.batches)
+    rest = EpochPlan(sequences, world, world - 1, batch, position=plan.position_after(number))
+    assert rest.indices(0) == plan.indices(number + 1)
+    assert rest.batches == plan.batches - number - 1
 
 
-def test_a_shallow_copy_moves_on_by_itself() -> None:
-    position = Position(3, 0)
-    begun = position.begin(ALONE)
-    position.reached(begun, ALONE, after(2), last=False)
-    other = copy.copy(position)
-    other.begin(ALONE)
-    assert position.state(ALONE) == after(2)
-    assert other.state(ALONE) == ResumeState(None, 3, 0, 0, 0, 1)
+def test_an_epoch_smaller_than_a_global_batch_says_so_with_the_numbers():
+    with pytest.raises(UsageError, match=r"23 sequences .* 3 x 8 = 24"):
+        EpochPlan(23, 3, 0, 8).require_batches()
+    EpochPlan(24, 3, 0, 8).require_batches()
 
 
-def test_the_world_size_is_that_of_the_consumer() -> None:
-    """The process group may be set up after the dataset was created."""
-    position = Position(3, 0)
-    begun = position.begin(HALF)
-    assert begun.state.world_size == position.state(HALF).world_size == 2
-    saved = HALF.after(begun.state, HALF.plan(STREAM, begun.state), 0, None)
-    assert (saved.position, saved.world_size) == (4, 2)
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"rank": 2, "world_size": 2},
+        {"world_size": 0},
+        {"batch_size": 0},
+        {"position": 11},
+        {"origin": -1},
+        {"origin": 8, "position": 3},
+    ],
+)
+def test_impossible_plans_are_refused(bad):
+    with pytest.raises(UsageError):
+        EpochPlan(**({"sequences": 10} | bad))
 
 
-def test_an_earlier_epoch_than_the_loaded_one_is_refused_until_a_pass_begins() -> None:
-    """Loops that count epochs from 0 after a resume would train on the same samples again."""
-    position = Position(3, 0)
-    position.load(after(0), ALONE)
-    with pytest.raises(UsageError, match=r"set_epoch\(0\): the loaded state is in epoch 7.*dataset\.epoch"):
-        position.set_epoch(0)
-    assert position.state(ALONE) == after(0)
-    position.set_epoch(7)
-    assert position.state(ALONE) == after(0)
-    position.load(after(0), ALONE)
-    position.begin(ALONE)
-    position.set_epoch(0)
-    assert position.start(ALONE).place == (0, 0, 0)
+def test_a_loader_worker_that_is_none_is_refused():
+    with pytest.raises(UsageError, match="worker 2 of 2"):
+        EpochPlan(10).batches_of_worker(2, 2)
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("batches", [1, 2])
-def test_passes_that_are_left_early_again_and_again_are_repeated_with_one_warning(workers: int, batches: int) -> None:
-    """A loop may take few batches: fewer than its loader workers prefetch, so that they look like one that inspects."""
-    position, warned = Position(3, 0), []
-    copies = [copy.copy(position) for _ in range(workers)] or [position]
-    for _ in range(4):
-        repeats = []
-        for worker, own in enumerate(copies):
-            if workers:
-                become_worker(worker, workers)
-            begun = own.begin(ALONE)
-            repeats.append(begun.repeats)
-            for count in range(1, batches + 1):
-                own.reached(begun, ALONE, after(count), last=False)
-        warned.append(sum(repeats))
-    assert warned == ([0, 1, 0, 0] if batches == 2 and not workers else [0, 0, 1, 0])
+STATE = ResumeState(
+    StreamIdentity({"recipe": {"gamma": 2.2}}, "s" * 64, "c" * 64, 1, 100), 3, 1, 0, 40, 2, LoaderShare(0, 2, 4, 5), 7
+).to_dict()
+SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary()
+VALUES = st.recursive(SCALARS, lambda inner: st.lists(inner) | st.dictionaries(st.text() | st.integers(), inner))
 
 
-def test_loader_workers_together_count_the_batches_of_a_pass() -> None:
-    """Two workers prefetch two batches each, and make one for each batch that the loop takes."""
-    position = Position(3, 0)
-    copies = [copy.copy(position) for _ in range(2)]
-    for taken, repeats in ((5, False), (6, True)):
-        position.set_epoch(taken)
-        for delivered, expected in ((taken, False), (0, repeats)):
-            for worker, own in enumerate(copies):
-                become_worker(worker, 2)
-                begun = own.begin(ALONE)
-                assert begun.repeats == (expected and worker == 0)
-                for count in range(1, (delivered + 1 - worker) // 2 + 1):
-                    own.reached(begun, ALONE, after(count), last=False)
+def test_a_state_comes_back() -> None:
+    assert ResumeState.from_dict(STATE).to_dict() == STATE
 
 
-def test_a_restored_loader_that_is_left_early_continues_where_it_was_restored() -> None:
-    position = Position(3, 0)
-    states = [Iteration(1, BEGINNING, worker, 2, True).after(ALONE, 2 - worker, None) for worker in range(2)]
-    for restored in (True, False):  # the second pass is made by new loader workers, which load nothing
-        for worker, state in enumerate(states):
-            own = copy.copy(position)
-            become_worker(worker, 2)
-            if restored:
-                own.load(state, ALONE)
-            else:
-                own._iterations = 1
-            begun = own.begin(ALONE)
-            assert list(begun.batches(ALONE.plan(STREAM, begun.state))) == ([4] if worker == 0 else [3, 5])
-            assert own.state(ALONE).place == (7, 0, 0)
+def test_only_a_stream_with_sidecars_pins_them() -> None:
+    assert "sidecars" not in STATE
+    with_sidecars = STATE | {"sidecars": "d" * 32}
+    assert ResumeState.from_dict(with_sidecars).to_dict() == with_sidecars
+    one, other = (ResumeState.from_dict(state).stream for state in (STATE, with_sidecars))
+    assert one is not None
+    assert other is not None
+    with pytest.raises(StateMismatch, match=r"sidecars: the state has d+, the server has ;"):
+        other.require_same(one, ours="the state", theirs="the server")
+
+
+@given(st.dictionaries(st.sampled_from([*STATE, "more"]), VALUES), st.sets(st.sampled_from(list(STATE))))
+def test_a_hostile_state_is_taken_or_refused_in_words(changed: dict[str, Any], missing: set[str]) -> None:
+    state = {name: value for name, value in (STATE | changed).items() if name not in missing}
+    with suppress(UsageError):
+        assert ResumeState.from_dict(state).to_dict().keys() == STATE.keys()
+
+
+@given(st.dictionaries(st.sampled_from(list(STATE["loader_worker"])) | st.text(), VALUES) | VALUES)
+def test_a_hostile_share_is_taken_or_refused_in_words(share: object) -> None:
+    with suppress(UsageError):
+        ResumeState.from_dict(STATE | {"loader_worker": share})
+
+
+@given(VALUES)
+def test_what_is_no_state_is_refused(value: Any) -> None:
+    with suppress(UsageError):
+        ResumeState.from_dict(value)
+        raise AssertionError(value)
