@@ -37,6 +37,7 @@ from multiprocessing.context import get_spawning_popen
 from multiprocessing.reduction import DupFd
 from typing import Any
 
+import psutil
 from torch.utils.data import get_worker_info
 
 from v2v_client.position import Consumer, EpochPlan, LoaderShare, ResumeState, StreamIdentity
@@ -44,8 +45,6 @@ from v2v_protocol.errors import UsageError
 
 _MOST_PASSES = 8
 """Passes that are remembered. Loader workers may still join and finish them."""
-_MOST_OWNERS = 64
-"""Processes besides the first that have a table of their own in the file."""
 _HEAD = struct.Struct("<QQ")
 _HALF_BYTES = 1 << 30
 """Space for each of two versions of the tables; the head names the valid one. Unused space takes no memory."""
@@ -231,7 +230,7 @@ class Shared:
                 owner = _owner()
                 if owner not in tables:
                     tables[owner] = copy.deepcopy(next(iter(tables.values())))
-                    for ended in list(tables)[1:-_MOST_OWNERS]:
+                    for ended in [other for other in list(tables)[1:-1] if not psutil.pid_exists(other)]:
                         del tables[ended]
                 yield tables[owner]
                 self._write(tables, at=3 * _HALF_BYTES - at)
