@@ -47,8 +47,7 @@ from v2v_server.offline.doctor_pictures import check_in_background
 from v2v_server.page.child import PageProcess
 from v2v_server.quarantine.file import quarantine_path, read_quarantine
 from v2v_server.quarantine.snapshots import Quarantine
-from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.schedule.summary import corpus_summary
+from v2v_server.schedule.sequences import SequenceTable, corpus_summary
 from v2v_server.status.snapshot import Service, StatusPublisher
 from v2v_server.status.terminal import StatusView, format_shutdown_summary
 from v2v_server.store.cache import make_cache
