@@ -51,12 +51,10 @@ from v2v_server.schedule.sequences import SequenceTable, corpus_summary
 from v2v_server.status.snapshot import Service, StatusPublisher
 from v2v_server.status.terminal import StatusView, format_shutdown_summary
 from v2v_server.store.cache import make_cache
-from v2v_server.supervise.child import Standby
-from v2v_server.supervise.pool import Pool, make_pool
-from v2v_server.supervise.scaling import Scaling, question_workers
-from v2v_server.system.log import Level, Log
+from v2v_server.supervise.local_host import Standby
+from v2v_server.supervise.pool import Pool, Scaling, make_pool, question_workers
+from v2v_server.system.log import Level, Log, StartTimes
 from v2v_server.system.process import keep_freed_memory, most_connections, open_many_files, usable_cores
-from v2v_server.system.start_times import StartTimes
 from v2v_server.system.status_fields import GIB
 from v2v_server.video.rows import Rows
 

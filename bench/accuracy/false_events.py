@@ -25,7 +25,7 @@ from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.simulation import simulate, simulate_log
 from v2v_server.simulation.variants import warm_up
 from v2v_server.video.rows import Rows
-from v2v_server.worker.cleaning import CleanFrames
+from v2v_server.worker.scene_choice import CleanFrames
 
 Film = npt.NDArray[np.uint8]
 THRESHOLD = 0.2

@@ -30,7 +30,7 @@ from v2v_server.corpus.sources.folder import Folder
 from v2v_server.quarantine.file import read_quarantine
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.serve import Server
-from v2v_server.supervise.scaling import question_workers
+from v2v_server.supervise.pool import question_workers
 
 VERDICT = QuarantineEntry(0, "v.mp4", "f", 0, "crash", "t")
 RECORD = AddToQuarantine(VERDICT, Request(b"c", 0, 0))

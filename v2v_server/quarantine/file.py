@@ -17,8 +17,7 @@ from v2v_protocol.errors import CorpusError
 from v2v_protocol.safe_json import parse_json
 from v2v_server.corpus.refresh import index_path
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
-from v2v_server.system.locks import lock
-from v2v_server.system.private import open_private
+from v2v_server.system.process import lock, open_private
 
 _LOCK_SECONDS = 2.0
 """Longest wait for the lock. Writers hold it for a moment, a process that was stopped for longer."""

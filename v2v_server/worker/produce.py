@@ -50,10 +50,27 @@ from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR
 from v2v_server.video.rows import Rows
-from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, makes, simulate
-from v2v_server.worker.cleaning import CleanFrames, frame_index, frame_times, most_frames, usable_window, within_rows
-from v2v_server.worker.scene_choice import FlowPlan, crop_weight, plan_flow
-from v2v_server.worker.sidecars import errors_of_sidecar, refused_sidecars, sidecar_files
+from v2v_server.worker.arrays import (
+    ARRAY_BUILDERS,
+    SampleContext,
+    SourceClip,
+    errors_of_sidecar,
+    makes,
+    refused_sidecars,
+    sidecar_files,
+    simulate,
+)
+from v2v_server.worker.scene_choice import (
+    CleanFrames,
+    FlowPlan,
+    crop_weight,
+    frame_index,
+    frame_times,
+    most_frames,
+    plan_flow,
+    usable_window,
+    within_rows,
+)
 
 
 @makes("frames_rgb")
@@ -253,7 +270,7 @@ def make_sample(
         lease: the work.
         decoded: its decoded clip.
         into: C-contiguous arrays of :func:`sample_layout` to fill; None allocates them.
-        sidecars: what :func:`v2v_server.worker.sidecars.open_sidecars` lends; needed if an array is made from one.
+        sidecars: what :func:`v2v_server.worker.arrays.open_sidecars` lends; needed if an array is made from one.
 
     Raises:
         SidecarError: this host cannot read a sidecar.

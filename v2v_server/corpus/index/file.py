@@ -18,7 +18,7 @@ from threading import Timer
 from typing import Any
 
 from v2v_server.corpus.sources.asking import Notice
-from v2v_server.system.private import make_private
+from v2v_server.system.process import make_private
 
 SCHEMA_VERSION = 6
 """Raise it with every change of the table or of what probing finds: an index of another version is made again."""

@@ -35,9 +35,7 @@ from v2v_server.corpus.sources.sidecar import fingerprint_of as sidecar_fingerpr
 from v2v_server.corpus.sources.sidecar import is_sidecar, state_text
 from v2v_server.corpus.sources.source import GONE, SourceOptions, State, VideoSource
 from v2v_server.store.quota import MOST_GIB, PARTIAL, QuotaFolder
-from v2v_server.system.locks import lock
-from v2v_server.system.private import make_private, open_private
-from v2v_server.system.process import cache_folder
+from v2v_server.system.process import cache_folder, lock, make_private, open_private
 from v2v_server.video.fingerprint import fingerprint as video_fingerprint
 from v2v_server.video.fingerprint import is_same_file
 
