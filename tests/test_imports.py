@@ -156,7 +156,7 @@ def test_server_folders_import_only_lower_folders() -> None:
 @pytest.mark.parametrize(
     "room",
     [
-        "corpus/index",
+        "corpus/scenes",
         "corpus/sources",
         *sorted(set(FLOORS) - {"config", "corpus_actions", "serve", "simulation", "motion", "flow", "offline"}),
     ],

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
 from v2v_protocol.safe_json import parse_json
-from v2v_server.corpus.refresh import index_path
+from v2v_server.corpus.catalogue import index_path
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.system.process import lock, open_private
 

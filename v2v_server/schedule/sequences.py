@@ -26,9 +26,8 @@ from v2v_protocol.recipe import LARGEST_SCALE, MOST_STEPS_PER_GRID, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.scenes.pieces import SplitVideos
 from v2v_server.corpus.scenes.scene import MOST_FRAMES, NO_BARS, Flag, Pieces, Sides, sides_of
-from v2v_server.corpus.videos import VideoEntry
+from v2v_server.corpus.videos import SplitVideos, VideoEntry
 from v2v_server.corpus.videos import Videos as CatalogueVideos
 from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.rows import Rows

@@ -29,8 +29,7 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoGone
 from v2v_protocol.programs import printable
 from v2v_server.corpus.manifest import MANIFEST_NAME
 from v2v_server.corpus.sources.bucket import Bucket, is_url
-from v2v_server.corpus.sources.listfile import ListEntry
-from v2v_server.corpus.sources.names import UNPRINTABLE, count_left_out, is_video_name
+from v2v_server.corpus.sources.listfile import UNPRINTABLE, ListEntry, count_left_out, is_video_name
 from v2v_server.corpus.sources.sidecar import fingerprint_of as sidecar_fingerprint
 from v2v_server.corpus.sources.sidecar import is_sidecar, state_text
 from v2v_server.corpus.sources.source import GONE, SourceOptions, State, VideoSource
