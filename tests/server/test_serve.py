@@ -21,9 +21,9 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import encode
 from v2v_server import serve as serve_module
 from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, GiveUp, ReportRefusal, ToConsumer, ToWorker
-from v2v_server.broker.counters import Counters
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause, Loss, Request
+from v2v_server.broker.state import Counters
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, CorpusPart
 from v2v_server.corpus.sources.folder import Folder

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import Result, WorkerHello
-from v2v_server.broker.counters import WorkDone
 from v2v_server.broker.leases import LeaseBook, runs_alone
 
 MOST_WORKERS = 4096
@@ -21,6 +20,45 @@ LONGEST_NAME = 100
 """Characters kept of the name that a peer gives itself or its host."""
 _MOST_STALE = 64
 """Stale entries that the heap may hold, besides one for each worker with free credit, before it is rebuilt."""
+
+
+_MOST_SECONDS = 86_400.0
+
+
+@dataclass(slots=True)
+class WorkDone:
+    """Totals of the time that samples took, as reported by the workers.
+
+    Attributes:
+        samples: number of samples.
+        cpu_seconds: processor time.
+        decode_seconds, simulate_seconds, handover_seconds: wall-clock time for decoding clips, for building the arrays,
+            and for delivering them to their consumers.
+    """
+
+    samples: int = 0
+    cpu_seconds: float = 0.0
+    decode_seconds: float = 0.0
+    simulate_seconds: float = 0.0
+    handover_seconds: float = 0.0
+
+    def add(self, result: Result, cpu_seconds: float) -> None:
+        """Add one sample."""
+        self.samples += 1
+        self.cpu_seconds += bounded_seconds(cpu_seconds)
+        self.decode_seconds += bounded_seconds(result.decode_seconds)
+        self.simulate_seconds += bounded_seconds(result.simulate_seconds)
+        self.handover_seconds += bounded_seconds(result.handover_seconds)
+
+    @property
+    def busy_seconds(self) -> float:
+        """Wall-clock time of all three parts."""
+        return self.decode_seconds + self.simulate_seconds + self.handover_seconds
+
+
+def bounded_seconds(said: float) -> float:
+    """Clip a duration that a worker reported to a plausible range: 0 to one day, seconds."""
+    return min(max(said, 0.0), _MOST_SECONDS)
 
 
 @dataclass(slots=True)

@@ -22,7 +22,7 @@ from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.sample import DEFAULT_ARRAYS, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.write_aside import write_aside_and_rename
-from v2v_server.broker.candidates import next_candidate
+from v2v_server.broker.grants import next_candidate
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.event_files import check_event_file, write_events

@@ -107,6 +107,9 @@ class Schedule:
         samples_per_decode: K.
         sibling_spacing: S; not 0 if K > 1.
 
+    Attributes:
+        table: the sequences.
+
     Raises:
         UsageError: K > 1 and S = 0.
     """
@@ -119,7 +122,7 @@ class Schedule:
                 f"samples_per_decode = {samples_per_decode} and sibling_spacing = 0: set sibling_spacing to the number "
                 "of samples from one batch to the next (batch size x ranks x loader workers)"
             )
-        self._table = table
+        self.table = table
         self._shuffle = shuffle
         self._views = samples_per_decode
         self._spacing = sibling_spacing if samples_per_decode > 1 else 1
@@ -141,7 +144,7 @@ class Schedule:
     @property
     def count(self) -> int:
         """Return the number of indices of an epoch."""
-        return self._table.count // self._spacing * self._spacing * self._views
+        return self.table.count // self._spacing * self._spacing * self._views
 
     def place(self, index: int) -> int:
         """Return the place of an index; siblings have the same place.
@@ -161,7 +164,7 @@ class Schedule:
             IndexError: index is outside 0 .. count-1.
         """
         place = self.place(index)
-        first = self._table[_permuted(self._table.count, seed, epoch, place) if self._shuffle else place]
+        first = self.table[_permuted(self.table.count, seed, epoch, place) if self._shuffle else place]
         tried = [first]
         for number in range(1, candidate + 1):
             tried.append(self._substitute(seed, epoch, place, number, {sequence.video.id for sequence in tried}))
@@ -169,7 +172,7 @@ class Schedule:
 
     def _substitute(self, seed: int, epoch: int, place: int, candidate: int, refused: set[str]) -> VideoSequence:
         for attempt in range(_MOST_ATTEMPTS):
-            sequence = self._table[hashed_below(self._table.count, seed, epoch, place, candidate, attempt)]
+            sequence = self.table[hashed_below(self.table.count, seed, epoch, place, candidate, attempt)]
             if sequence.video.id not in refused:
                 break
         return sequence

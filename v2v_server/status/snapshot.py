@@ -19,9 +19,9 @@ from v2v_protocol import PROTOCOL_VERSION, __version__
 from v2v_protocol.messages import Status as StatusMessage
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, encode
 from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
-from v2v_server.broker.counters import FaultTotal
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.session import Session
+from v2v_server.broker.state import FaultTotal
 from v2v_server.broker.transport import ServerTransport
 from v2v_server.broker.worker_registry import Member, clean_name
 from v2v_server.config import ServeConfig
@@ -87,7 +87,7 @@ class Service:
             "cache": None if cache is None else values(cache),
             "workers": self._workers(window),
             "consumers": [values(_consumer(each, window)) for each in list(self.dispatcher.sessions)[:MOST_SHOWN]],
-            "refusals": [values(each) for each in self.dispatcher.candidates.parts()],
+            "refusals": [values(each) for each in reversed(self.dispatcher.refusals)],
             "verdicts": [values(each) for each in self.quarantine.verdict_parts()],
         }
 

@@ -45,11 +45,11 @@ def test_a_hello_with_another_secret_changes_nothing() -> None:
 def test_the_secret_moves_a_session_to_a_new_connection_with_its_debt() -> None:
     at = peers()
     at.consumer_says(b"before", hello(OURS))
-    at.dispatcher.sessions.charge(b"before", 3.0)
+    at.dispatcher.sessions.queue.charge(b"before", 3.0)
     (welcome,) = at.consumer_says(b"after", hello(OURS))
     assert isinstance(welcome, Welcome)
     (session,) = at.dispatcher.sessions
-    assert (session.identity, at.dispatcher.sessions.balance_seconds(b"after")) == (b"after", -3.0)
+    assert (session.identity, at.dispatcher.sessions.queue.balance_seconds(b"after")) == (b"after", -3.0)
 
 
 def test_consumers_without_a_secret_stay_apart() -> None:
