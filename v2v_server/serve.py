@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
-from v2v_protocol.errors import CorpusError
+from v2v_protocol.errors import CorpusError, IndexUnreadable, V2VError, VideoChanged, VideoError, VideoGone
 from v2v_protocol.link.user import OwnUser
 from v2v_protocol.progress import Progress
+from v2v_protocol.wire import encode
 from v2v_protocol.write_aside import write_file
 from v2v_server.broker.actions import (
     Action,
@@ -38,15 +39,14 @@ from v2v_server.broker.actions import (
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause, Loss, Request
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, InFlight, ServerTransport, Sockets
-from v2v_server.broker.worker_registry import clean_name
+from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
 from v2v_server.config import ServeConfig
-from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus_actions import CorpusActions
+from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.offline.doctor_pictures import check_in_background
 from v2v_server.page.child import PageProcess
-from v2v_server.quarantine.file import quarantine_path, read_quarantine
-from v2v_server.quarantine.snapshots import Quarantine
+from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
+from v2v_server.quarantine.snapshots import QuarantineEntry
 from v2v_server.schedule.sequences import SequenceTable, corpus_summary
 from v2v_server.status.snapshot import Service, StatusPublisher
 from v2v_server.status.terminal import StatusView, format_shutdown_summary
@@ -67,6 +67,8 @@ _SOON_SECONDS = 5.0
 """Time after which blocked leases are reported."""
 _GIVE_BACK_SECONDS = 12.0
 """Time from the end of a connection until its memory is returned to the kernel; its session is forgotten by then."""
+_RECORD_SECONDS = 2.0
+"""Longest time to retry writing a quarantine entry while another process writes to the file."""
 _OWN_USER_RULE = (
     "without keys this server serves only root and its own user; make keys with v2v-keys init and give --keys, or give "
     "--insecure to serve every user of this host"
@@ -185,9 +187,7 @@ def _serve(
     sockets.has_session = dispatcher.has_session
     with stop_on_signals(stop):
         pool = make_pool(config, catalogue.source, label, worker_flags, keys, standbys)
-        server = Server(
-            config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file, page=page, times=times
-        )
+        server = Server(config, catalogue, dispatcher, sockets, pool, quarantine_file, page=page, times=times)
         try:
             if pool.is_local and (question := question_workers(config.most_workers, usable_cores())):
                 log.say(question, "warning")
@@ -212,7 +212,6 @@ class Server:
         dispatcher: decides what to do.
         transport: sockets of consumers and workers.
         pool: runs the workers' processes.
-        quarantine: the snapshots.
         quarantine_file: file that new entries are written to.
         clock: returns the time, seconds; None: a :class:`v2v_server.serve.Clock`.
         page: the status page; None: no page.
@@ -226,7 +225,6 @@ class Server:
         dispatcher: Dispatcher,
         transport: ServerTransport,
         pool: Pool,
-        quarantine: Quarantine,
         quarantine_file: Path,
         clock: Callable[[], float] | None = None,
         page: PageProcess | None = None,
@@ -241,12 +239,14 @@ class Server:
         self._transport = transport
         self._pool = pool
         self._clock = clock or Clock()
-        self._corpus = CorpusActions(catalogue, dispatcher, quarantine, quarantine_file, self._clock, self._say)
+        self._quarantine_file = quarantine_file
+        self._unreadable_said = -math.inf
+        self._unrecorded: list[tuple[AddToQuarantine, float]] = []  # until when each is tried
         self._next_tick = self._clock()
         is_fixed = config.least_workers == config.most_workers
         self._scaling = None if is_fixed else Scaling(*config.workers, config.scale_seconds)
         self._view = StatusView(self._log, sys.stderr)
-        service = Service(config, catalogue, dispatcher, pool, quarantine, transport)
+        service = Service(config, catalogue, dispatcher, pool, transport)
         self._publisher = StatusPublisher(service, self._clock(), utc_now)
         self._announced = False
         self._port_file: Path | None = None
@@ -277,7 +277,7 @@ class Server:
             self._next_tick = now + _TURN_SECONDS
             for name, stalled in self._pool.stalled(now).items():
                 self._dispatcher.worker_stalled(self._route(name), stalled)
-            self._carry_out(self._corpus.retry())
+            self._carry_out(self._retry())
             self._carry_out(self._dispatcher.tick(now))
             for death in self._pool.watch(now, self._dispatcher.counters.samples):
                 self._say(
@@ -328,24 +328,114 @@ class Server:
                 case SendLease() as grant:
                     if grant.lease.arena:
                         self._pool.lend(self._name(grant.worker), grant.lease.arena)
-                    todo.extendleft(reversed(self._corpus.complete(grant, todo)))
+                    todo.extendleft(reversed(self._complete(grant, todo)))
                 case Disconnect(identity):
                     self._transport.cut(identity)
                 case GiveUp() as hopeless:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
                 case AddToQuarantine() as record:
                     # Before anything that follows is sent.
-                    todo.extendleft(reversed(self._corpus.record(record)))
+                    todo.extendleft(reversed(self._record(record)))
                 case CheckVideo() as missing:
                     # The loop reads no sidecar: one that a worker of this host cannot read is unreadable on this host.
                     is_here = bool(missing.sidecar) and self._catalogue.source.is_local and self._pool.is_local
                     is_here = is_here and self._pool.watches(self._name(missing.identity))
-                    found = not is_here and self._corpus.check_video(missing)
+                    found = not is_here and self._check_video(missing)
                     todo.extend(dispatcher.video_checked(missing, found, now()))
                 case ReportRefusal(refusal, request):
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
                 case SendStatus() as request:
                     self._publisher.ask(request)
+
+    def _complete(self, grant: SendLease, todo: deque[Action]) -> list[Action]:
+        """Return the message of a lease, complete; if it cannot be completed, what the dispatcher does about it.
+
+        Args:
+            grant: the lease.
+            todo: later actions; leases among them are dropped if the index cannot be read at the moment.
+        """
+        try:
+            return [ToWorker(grant.worker, encode(complete_lease(grant.lease, self._catalogue, grant.spec)))]
+        except IndexUnreadable as error:
+            unsent = [grant, *(each for each in todo if isinstance(each, SendLease))]
+            later = [each for each in todo if not isinstance(each, SendLease)]
+            todo.clear()
+            todo.extend(later)
+            self._dispatcher.index_unreadable(unsent, str(error), self._clock())
+            return []
+        except V2VError as error:
+            return self._dispatcher.lease_refused(grant, str(error), self._clock())
+
+    def _record(self, record: AddToQuarantine, until: float | None = None) -> list[Action]:
+        """Write a quarantine entry. If that fails, the server continues and logs the consequence.
+
+        Args:
+            record: the entry.
+            until: time until which :meth:`_retry` repeats it while another process writes; None: for a short time.
+
+        Returns:
+            what the dispatcher does about it; nothing while it is retried.
+        """
+        entry, now = record.entry, self._clock()
+        until = now + _RECORD_SECONDS if until is None else until
+        latest = self._dispatcher.quarantine.latest
+        if (
+            self._dispatcher.quarantine.refusal(latest, entry.path, entry.fingerprint, entry.frame, entry.spec)
+            is not None
+        ):
+            # Another worker ended over it while the file was locked. A second entry would refuse the whole video.
+            return self._dispatcher.quarantine_recorded(record, [], now)
+        written: list[QuarantineEntry] = []
+        try:
+            written = write_entry(self._quarantine_file, entry, self._dispatcher.quarantine, wait_seconds=0.0)
+        except (OSError, CorpusError) as error:
+            if isinstance(error, BlockingIOError) and now < until:
+                self._unrecorded.append((record, until))
+                return []
+            self._say(
+                f"{entry.path} from frame {entry.frame}: {entry.reason}; the sequence is skipped once and will "
+                f"be tried again, because the quarantine cannot be written: {error}",
+                "error",
+                record.request,
+                video=entry.path,
+            )
+        for line in written:
+            self._say(f"quarantine: {line}", "warning", record.request, video=line.path)
+        return self._dispatcher.quarantine_recorded(record, written, now)
+
+    def _retry(self) -> list[Action]:
+        """Repeat the writing of entries that another process delayed. Call a few times a second."""
+        unrecorded, self._unrecorded = self._unrecorded, []
+        return [action for record, until in unrecorded for action in self._record(record, until)]
+
+    def _check_video(self, missing: CheckVideo) -> bool:
+        """Check the file against the catalogue. If it matches, warn (rate-limited, since all workers of a host fail
+        alike) that the worker's host does not have it.
+        """
+        try:
+            self._catalogue.check(missing.video, missing.fingerprint, missing.sidecar)
+        except (VideoChanged, VideoGone):
+            if not missing.sidecar:
+                self._catalogue.mark_stale(missing.video)
+            return False
+        except (VideoError, CorpusError):
+            return False
+        now = self._clock()
+        if now >= self._unreadable_said + REST_SECONDS:
+            self._unreadable_said = now
+            name = clean_name(self._dispatcher.registry.name_of(missing.identity))
+            is_local = self._catalogue.source.is_local
+            file = f"the sidecar {missing.sidecar} of {missing.video}" if missing.sidecar else missing.video
+            self._say(
+                f"worker {name} failed on {file}, which "
+                f"{'is on this host as catalogued' if is_local else 'is not known to be gone or changed'}: "
+                f"{missing.reason}; other workers make the sample, and this one gets no work for {REST_SECONDS:g} s. "
+                "Check --videos on its host",
+                "warning",
+                missing.request,
+                video=missing.video,
+            )
+        return True
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
         """End the process of a hung worker, if it is one of ours."""

@@ -182,7 +182,6 @@ class World:
             self.dispatcher,
             self.queues,
             self.supervisor,
-            quarantine,
             file,
             clock=lambda: self.now,
         )

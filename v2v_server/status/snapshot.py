@@ -26,7 +26,6 @@ from v2v_server.broker.transport import ServerTransport
 from v2v_server.broker.worker_registry import Member, clean_name
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.quarantine.snapshots import Quarantine
 from v2v_server.status.bottleneck import Bottleneck, History, Shares, TimeWindow, find_bottleneck
 from v2v_server.status.parts import (
     STATUS_VERSION,
@@ -58,7 +57,6 @@ class Service:
     catalogue: Catalogue
     dispatcher: Dispatcher
     pool: Pool
-    quarantine: Quarantine
     transport: ServerTransport
 
     def status(
@@ -81,14 +79,14 @@ class Service:
             **values(self._server(time, uptime_seconds, is_ready=is_ready)),
             **values(self.catalogue.part()),
             **values(self._load(window)),
-            **values(self.quarantine.part()),
+            **values(self.dispatcher.quarantine.part()),
             "waiting": values(self._bottleneck(shares, is_attended=is_attended)) | {"shares": values(shares)},
             "totals": values(counters) | values(FaultTotal(counters.faults)),
             "cache": None if cache is None else values(cache),
             "workers": self._workers(window),
             "consumers": [values(_consumer(each, window)) for each in list(self.dispatcher.sessions)[:MOST_SHOWN]],
             "refusals": [values(each) for each in reversed(self.dispatcher.refusals)],
-            "verdicts": [values(each) for each in self.quarantine.verdict_parts()],
+            "verdicts": [values(each) for each in self.dispatcher.quarantine.verdict_parts()],
         }
 
     def _server(self, time: str, uptime_seconds: float, *, is_ready: bool) -> ServerPart:
