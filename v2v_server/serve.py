@@ -326,8 +326,6 @@ class Server:
                     if not self._transport.send(message) and not self._pool.watches(self._name(message.identity)):
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
                 case SendLease() as grant:
-                    if grant.lease.arena:
-                        self._pool.lend(self._name(grant.worker), grant.lease.arena)
                     todo.extendleft(reversed(self._complete(grant, todo)))
                 case Disconnect(identity):
                     self._transport.cut(identity)
@@ -355,7 +353,7 @@ class Server:
             todo: later actions; leases among them are dropped if the index cannot be read at the moment.
         """
         try:
-            return [ToWorker(grant.worker, encode(complete_lease(grant.lease, self._catalogue, grant.spec)))]
+            frames = encode(complete_lease(grant.lease, self._catalogue, grant.spec))
         except IndexUnreadable as error:
             unsent = [grant, *(each for each in todo if isinstance(each, SendLease))]
             later = [each for each in todo if not isinstance(each, SendLease)]
@@ -365,6 +363,9 @@ class Server:
             return []
         except V2VError as error:
             return self._dispatcher.lease_refused(grant, str(error), self._clock())
+        if grant.lease.arena:
+            self._pool.lend(self._name(grant.worker), grant.lease.arena)
+        return [ToWorker(grant.worker, frames)]
 
     def _record(self, record: AddToQuarantine, until: float | None = None) -> list[Action]:
         """Write a quarantine entry. If that fails, the server continues and logs the consequence.

@@ -29,8 +29,7 @@ from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.video.rows import Rows
-from v2v_server.worker.arrays import open_sidecars
-from v2v_server.worker.produce import decode_for, make_sample
+from v2v_server.worker.produce import decode_for, make_sample, open_sidecars
 
 ROWS = Rows.parse("0.05:0.95")
 SIZE: Mapping[str, Any] = {"voxels_per_clip": 2, "bins": 3, "crop_height_px": 16, "crop_width_px": 20}

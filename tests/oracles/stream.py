@@ -27,8 +27,7 @@ from v2v_server.offline.leases import lease_for
 from v2v_server.offline.remake import remake
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
-from v2v_server.worker.arrays import open_sidecars
-from v2v_server.worker.produce import decode_for, make_sample
+from v2v_server.worker.produce import decode_for, make_sample, open_sidecars
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,6 @@ from v2v_protocol.messages import (
     Ping,
     Pong,
     Result,
-    SampleHeader,
     Stop,
     Want,
     Welcome,
@@ -70,7 +69,7 @@ from v2v_server.broker.grants import (
 from v2v_server.broker.leases import Cause, Loss, Request, Stall, judge
 from v2v_server.broker.session import Session
 from v2v_server.broker.state import Broker
-from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, bounded_seconds, clean_name
+from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, clean_name
 from v2v_server.quarantine.snapshots import QuarantineEntry
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import MOST_CLIP_BYTES, SequenceTable
@@ -320,10 +319,10 @@ class Dispatcher(Broker):
                 refused = ToWorker(identity, self._malformed(ProtocolError(f"malformed result: {error}")))
                 return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "sent a malformed result"), now)]
             decoded = header.decoded
-            if self._count(session, request, header, in_slot=len(payload) == 1):
+            actions += deliver(self, session, request, result.lease, header, payload)
+            if actions:
                 self.counters.add(result, header.cpu_seconds)
                 self.registry.worked(identity, result, header.cpu_seconds)
-                actions += deliver(self, session, request, result.lease, header, payload)
         self.registry.can_work(identity)
         self.leases.finished(result.lease, identity, now, decoded=decoded)
         self.leases.mark_begun(result.begins, identity, now)
@@ -351,16 +350,6 @@ class Dispatcher(Broker):
         debt = self.leases.debt(lease, worker, now)
         if debt is not None:
             self.sessions.queue.charge(*debt)
-
-    def _count(self, session: Session, request: Request, header: SampleHeader, *, in_slot: bool) -> bool:
-        """Count what was sent of a sample; return False if no session waits for it."""
-        if not self.sessions.mark_answered(request, bounded_seconds(header.cpu_seconds)):
-            self.counters.late_results += 1
-            return False
-        self.counters.decodes += header.decoded
-        self.counters.count_cache(header.cache)
-        self.counters.count_sent(session.batch_size, session.form.sizes, in_slot=in_slot)
-        return True
 
     def _take_back(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
         self.registry.remove(identity)

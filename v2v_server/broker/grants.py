@@ -31,6 +31,7 @@ from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, Repor
 from v2v_server.broker.leases import Request, runs_alone
 from v2v_server.broker.session import Session
 from v2v_server.broker.state import Broker, RefusalPart
+from v2v_server.broker.worker_registry import bounded_seconds
 from v2v_server.corpus.videos import CorpusFacts, VideoEntry
 from v2v_server.quarantine.snapshots import QuarantineEntry
 from v2v_server.schedule.epoch import MOST_CANDIDATES
@@ -39,18 +40,6 @@ from v2v_server.sharing.ring import SharedSample
 
 LONGEST_REASON = 500
 """Characters kept of a refusal's reason."""
-
-
-def under_snapshot(request: Request, session: Session) -> Request:
-    """Return the request under its session's snapshot.
-
-    Another snapshot may refuse other candidates. So the request starts again at the first candidate, as a later
-    remake of the sample does.
-    """
-    if request.snapshot == session.quarantine:
-        return request
-    deaths = 0 if request.candidate else request.deaths
-    return replace(request, snapshot=session.quarantine, candidate=0, refusals=(), deaths=deaths)
 
 
 def _quarantined(broker: Broker, session: Session, request: Request, snapshot: int) -> str | None:
@@ -191,7 +180,7 @@ def _give(broker: Broker, requests: list[Request], worker: bytes, now: float) ->
     actions: list[Action] = []
     good: list[Request] = []
     for request in requests:
-        current = under_snapshot(request, session)
+        current = session.current(request)
         reason = _quarantined(broker, session, current, session.quarantine)
         if reason is not None:
             actions += refuse(broker, current, None, reason, RefusalKind.QUARANTINED)
@@ -248,7 +237,7 @@ def answer_shared(broker: Broker, session: Session) -> list[Action]:
     actions: list[Action] = []
     taken, room = set[Request](), broker.sessions.room(session)
     for request in list(session.waiting):
-        if len(taken) < room and (answer := _share(broker, session, under_snapshot(request, session))) is not None:
+        if len(taken) < room and (answer := _share(broker, session, session.current(request))) is not None:
             actions += answer
             taken.add(request)
     broker.sessions.take_waiting(session, taken)
@@ -265,7 +254,16 @@ def deliver(
         lease: number of the lease.
         header: of the sample.
         payload: the frames of its message, with the header's.
+
+    Returns:
+        nothing if the sample is not wanted any more.
     """
+    if not broker.sessions.mark_answered(request, bounded_seconds(header.cpu_seconds)):
+        broker.counters.late_results += 1
+        return []
+    broker.counters.decodes += header.decoded
+    broker.counters.count_cache(header.cache)
+    broker.counters.count_sent(session.batch_size, session.form.sizes, in_slot=len(payload) == 1)
     if broker.ring is None:
         return [ToConsumer(request.session, payload)]
     key = sharing_key(session, request)

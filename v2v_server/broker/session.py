@@ -17,7 +17,7 @@ from __future__ import annotations
 import heapq
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import TypeAlias
 
@@ -293,6 +293,17 @@ class Session:
         self.waited_seconds += more
         self.totals.waited_seconds += more
         return more
+
+    def current(self, request: Request) -> Request:
+        """Return the request under the session's quarantine snapshot.
+
+        Another snapshot may refuse other candidates. So the request starts again at the first candidate, as a later
+        remake of the sample does.
+        """
+        if request.snapshot == self.quarantine:
+            return request
+        deaths = 0 if request.candidate else request.deaths
+        return replace(request, snapshot=self.quarantine, candidate=0, refusals=(), deaths=deaths)
 
     def sequence(self, request: Request) -> VideoSequence:
         """Return the sequence of the request's candidate."""

@@ -33,8 +33,7 @@ from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
-from v2v_server.worker.arrays import open_sidecars
-from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample
+from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample, open_sidecars
 
 _MOMENTS = 4
 """Voxel grids that a picture shows."""

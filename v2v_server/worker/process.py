@@ -59,7 +59,6 @@ from v2v_server.system.process import (
     take_long_turns,
 )
 from v2v_server.system.sandbox import confine
-from v2v_server.worker.arrays import open_sidecars, read_ahead, sidecar_files
 from v2v_server.worker.conversation import (
     CREDIT,
     Action,
@@ -74,7 +73,16 @@ from v2v_server.worker.conversation import (
     WorkerConversation,
 )
 from v2v_server.worker.logbook import IDLE, note, take_arena
-from v2v_server.worker.produce import Decoded, decode_for, kernels_of, make_sample, sample_layout
+from v2v_server.worker.produce import (
+    Decoded,
+    decode_for,
+    kernels_of,
+    make_sample,
+    open_sidecars,
+    read_ahead,
+    sample_layout,
+    sidecar_files,
+)
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 Find: TypeAlias = Callable[[ArenaName, bool], int]
