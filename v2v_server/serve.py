@@ -45,8 +45,7 @@ from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogu
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.offline.doctor_pictures import check_in_background
 from v2v_server.page.child import PageProcess
-from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
-from v2v_server.quarantine.snapshots import QuarantineEntry
+from v2v_server.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.schedule.sequences import SequenceTable, corpus_summary
 from v2v_server.status.snapshot import Service, StatusPublisher
 from v2v_server.status.terminal import StatusView, format_shutdown_summary

@@ -43,7 +43,7 @@ from v2v_server.broker.actions import (
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.corpus.catalogue import Catalogue, complete_lease
-from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
+from v2v_server.quarantine import Quarantine, QuarantineEntry
 
 DEADLINE = 60.0
 IDLE = 600.0

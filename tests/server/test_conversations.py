@@ -38,7 +38,7 @@ from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause
 from v2v_server.broker.transport import FromWorker
 from v2v_server.config import ServeConfig
-from v2v_server.quarantine.file import read_quarantine
+from v2v_server.quarantine import read_quarantine
 from v2v_server.serve import Server
 from v2v_server.worker.conversation import (
     CREDIT,

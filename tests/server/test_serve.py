@@ -27,8 +27,7 @@ from v2v_server.broker.state import Counters
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, CorpusPart
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.quarantine.file import read_quarantine
-from v2v_server.quarantine.snapshots import QuarantineEntry
+from v2v_server.quarantine import QuarantineEntry, read_quarantine
 from v2v_server.serve import Server
 from v2v_server.supervise.pool import question_workers
 

@@ -14,7 +14,7 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Frames, encode
 from v2v_server.broker.leases import Request
-from v2v_server.quarantine.snapshots import QuarantineEntry
+from v2v_server.quarantine import QuarantineEntry
 
 _LONGEST_TEXT = 2000
 """Characters of a denial. It quotes what the peer sent, which may be long, and must fit a header."""

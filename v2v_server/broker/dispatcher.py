@@ -70,7 +70,7 @@ from v2v_server.broker.leases import Cause, Loss, Request, Stall, judge
 from v2v_server.broker.session import Session
 from v2v_server.broker.state import Broker
 from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, clean_name
-from v2v_server.quarantine.snapshots import QuarantineEntry
+from v2v_server.quarantine import QuarantineEntry
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import MOST_CLIP_BYTES, SequenceTable
 

@@ -33,7 +33,7 @@ from v2v_server.broker.session import Session
 from v2v_server.broker.state import Broker, RefusalPart
 from v2v_server.broker.worker_registry import bounded_seconds
 from v2v_server.corpus.videos import CorpusFacts, VideoEntry
-from v2v_server.quarantine.snapshots import QuarantineEntry
+from v2v_server.quarantine import QuarantineEntry
 from v2v_server.schedule.epoch import MOST_CANDIDATES
 from v2v_server.schedule.sequences import VideoSequence
 from v2v_server.sharing.ring import SharedSample

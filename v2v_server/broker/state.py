@@ -16,7 +16,7 @@ from v2v_server.broker.leases import LeaseBook, Request
 from v2v_server.broker.session import Sessions
 from v2v_server.broker.worker_registry import WorkDone, Workers
 from v2v_server.corpus.videos import CorpusFacts
-from v2v_server.quarantine.snapshots import Quarantine
+from v2v_server.quarantine import Quarantine
 from v2v_server.schedule.sequences import Columns, SequenceTable
 from v2v_server.sharing.ring import SampleRing
 from v2v_server.system.status_fields import counter, meanings, short, text

@@ -27,8 +27,7 @@ from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.event_files import check_event_file, write_events
 from v2v_server.offline.leases import lease_for
-from v2v_server.quarantine.file import quarantine_path, read_quarantine
-from v2v_server.quarantine.snapshots import Quarantine
+from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.system.process import usable_cores

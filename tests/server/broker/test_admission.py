@@ -19,7 +19,7 @@ from v2v_server.broker.dispatcher import MOST_BATCH_SIZE, Dispatcher, admit
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.scene import Flag
 from v2v_server.corpus.videos import CorpusFacts, encoded_pieces
-from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
+from v2v_server.quarantine import Quarantine, QuarantineEntry
 from v2v_server.schedule import sequences
 from v2v_server.video.rows import Rows
 

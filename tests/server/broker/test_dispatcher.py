@@ -47,7 +47,7 @@ from v2v_server.broker.grants import work_seconds
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.broker.session import GONE_SECONDS, SILENT_SECONDS
 from v2v_server.broker.worker_registry import REST_SECONDS, SILENCE_SECONDS
-from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
+from v2v_server.quarantine import Quarantine, QuarantineEntry
 from v2v_server.schedule.epoch import MOST_CANDIDATES
 from v2v_server.video.frame_index import FrameIndex
 

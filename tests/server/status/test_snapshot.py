@@ -19,7 +19,7 @@ from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
 from v2v_server.broker.leases import Cause
 from v2v_server.broker.session import RETURN_SECONDS
 from v2v_server.broker.state import RefusalPart
-from v2v_server.quarantine.snapshots import QuarantineEntry
+from v2v_server.quarantine import QuarantineEntry
 from v2v_server.status.parts import STATUS_VERSION
 from v2v_server.status.snapshot import ANSWER_SECONDS, MOST_SHOWN, to_json
 

@@ -18,7 +18,7 @@ from v2v_server.broker.leases import ALONE_AFTER, Cause
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.offline import remake as remake_module
 from v2v_server.offline.remake import remake
-from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry, clearing
+from v2v_server.quarantine import Quarantine, QuarantineEntry, clearing
 
 TIME = "2024-02-29T12:00:00+00:00"
 BLAMING = (Cause.CRASHED, Cause.HUNG)

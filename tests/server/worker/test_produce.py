@@ -22,8 +22,7 @@ from v2v_server.commands.simulate import main as simulate
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.offline.leases import lease_for
 from v2v_server.offline.remake import remake
-from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
-from v2v_server.quarantine.snapshots import QuarantineEntry
+from v2v_server.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.worker import process as clips
