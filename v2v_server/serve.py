@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
-from v2v_protocol.errors import CorpusError, IndexUnreadable, V2VError, VideoChanged, VideoError, VideoGone
+from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoGone
 from v2v_protocol.link.user import OwnUser
 from v2v_protocol.progress import Progress
-from v2v_protocol.wire import encode
 from v2v_protocol.write_aside import write_file
 from v2v_server.broker.actions import (
     Action,
@@ -31,7 +30,6 @@ from v2v_server.broker.actions import (
     Disconnect,
     GiveUp,
     ReportRefusal,
-    SendLease,
     SendStatus,
     ToConsumer,
     ToWorker,
@@ -168,6 +166,7 @@ def _serve(
     dispatcher = Dispatcher(
         catalogue.facts,
         config.spec,
+        complete=lambda lease, spec: complete_lease(lease, catalogue, spec),
         quarantine=quarantine,
         wall_clock=utc_now,
         lease_deadline_seconds=config.lease_deadline_seconds,
@@ -322,10 +321,10 @@ class Server:
                     if not self._transport.send(message):
                         dispatcher.consumer_lost(message.identity)
                 case ToWorker() as message:
+                    if message.arena:
+                        self._pool.lend(self._name(message.identity), message.arena)
                     if not self._transport.send(message) and not self._pool.watches(self._name(message.identity)):
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
-                case SendLease() as grant:
-                    todo.extendleft(reversed(self._complete(grant, todo)))
                 case Disconnect(identity):
                     self._transport.cut(identity)
                 case GiveUp() as hopeless:
@@ -343,28 +342,6 @@ class Server:
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
                 case SendStatus() as request:
                     self._publisher.ask(request)
-
-    def _complete(self, grant: SendLease, todo: deque[Action]) -> list[Action]:
-        """Return the message of a lease, complete; if it cannot be completed, what the dispatcher does about it.
-
-        Args:
-            grant: the lease.
-            todo: later actions; leases among them are dropped if the index cannot be read at the moment.
-        """
-        try:
-            frames = encode(complete_lease(grant.lease, self._catalogue, grant.spec))
-        except IndexUnreadable as error:
-            unsent = [grant, *(each for each in todo if isinstance(each, SendLease))]
-            later = [each for each in todo if not isinstance(each, SendLease)]
-            todo.clear()
-            todo.extend(later)
-            self._dispatcher.index_unreadable(unsent, str(error), self._clock())
-            return []
-        except V2VError as error:
-            return self._dispatcher.lease_refused(grant, str(error), self._clock())
-        if grant.lease.arena:
-            self._pool.lend(self._name(grant.worker), grant.lease.arena)
-        return [ToWorker(grant.worker, frames)]
 
     def _record(self, record: AddToQuarantine, until: float | None = None) -> list[Action]:
         """Write a quarantine entry. If that fails, the server continues and logs the consequence.

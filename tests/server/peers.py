@@ -11,7 +11,6 @@ from typing import Any
 from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import NO_SLOT
-from v2v_protocol.errors import IndexUnreadable, V2VError
 from v2v_protocol.messages import (
     Begun,
     Denied,
@@ -36,7 +35,6 @@ from v2v_server.broker.actions import (
     CheckVideo,
     GiveUp,
     ReportRefusal,
-    SendLease,
     ToConsumer,
     ToWorker,
 )
@@ -156,8 +154,6 @@ class Peers:
                         self.owners[message.lease] = b"" if asked is None else asked.session
                     else:
                         self.told.setdefault(identity, []).append(message)
-                case SendLease() as grant:
-                    self._complete(grant, todo)
                 case GiveUp(identity, reason):
                     self.given_up.append(identity)
                     cause = Cause.UNEXPLAINED if identity in self.remote else Cause.HUNG
@@ -172,18 +168,6 @@ class Peers:
                 case CheckVideo() as missing:
                     found = missing.video not in self.gone
                     todo.extend(self.dispatcher.video_checked(missing, found, self.now))
-
-    def _complete(self, grant: SendLease, todo: deque[Action]) -> None:
-        try:
-            frames = encode(complete_lease(grant.lease, self.catalogue, grant.spec))
-            todo.appendleft(ToWorker(grant.worker, frames))
-        except IndexUnreadable as error:
-            unsent = [grant, *(each for each in todo if isinstance(each, SendLease))]
-            for each in unsent[1:]:
-                todo.remove(each)
-            self.dispatcher.index_unreadable(unsent, str(error), self.now)
-        except V2VError as error:
-            todo.extendleft(reversed(self.dispatcher.lease_refused(grant, str(error), self.now)))
 
     def _write(self, verdict: QuarantineEntry) -> list[QuarantineEntry]:
         if not self.writable:
@@ -308,6 +292,7 @@ def peers(
     dispatcher = Dispatcher(
         videos.facts,
         spec,
+        complete=lambda lease, spec: complete_lease(lease, videos, spec),
         lease_deadline_seconds=DEADLINE,
         session_idle_seconds=IDLE,
         max_credit_bytes=max_credit_bytes,

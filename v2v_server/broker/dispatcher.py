@@ -46,7 +46,6 @@ from v2v_server.broker.actions import (
     CheckVideo,
     Disconnect,
     GiveUp,
-    SendLease,
     SendStatus,
     ToConsumer,
     ToWorker,
@@ -63,7 +62,6 @@ from v2v_server.broker.grants import (
     deliver,
     forget_session,
     quarantine_candidate,
-    refuse,
     refuse_quarantined,
 )
 from v2v_server.broker.leases import Cause, Loss, Request, Stall, judge
@@ -387,29 +385,6 @@ class Dispatcher(Broker):
             if each.quarantine == before:
                 each.quarantine = self.quarantine.latest
         return [*refuse_quarantined(self, record.request, record.entry.reason), *assign(self, now)]
-
-    def index_unreadable(self, unsent: Sequence[SendLease], reason: str, now: float) -> None:
-        """Continue after leases that cannot be completed, because the index cannot be read at the moment.
-
-        No lease is granted until the next :meth:`tick`.
-
-        Args:
-            unsent: the actions, oldest first.
-            reason: why it cannot be read.
-            now: monotonic time, seconds.
-        """
-        self.blocked_reason = f"{reason}; retried ten times a second"
-        for grant in reversed(unsent):
-            request = self.leases.finished(grant.lease.lease, grant.worker, now)
-            if request is not None:
-                self.sessions.put_back(request)  # it comes first again
-
-    def lease_refused(self, unsent: SendLease, reason: str, now: float) -> list[Action]:
-        """Continue after a lease that can never be sent: the index of its video is damaged, belongs to another file, or
-        is too large.
-        """
-        request = self.leases.finished(unsent.lease.lease, unsent.worker, now)
-        return [*([] if request is None else refuse(self, request, None, reason)), *assign(self, now)]
 
     def video_checked(self, missing: CheckVideo, found: bool, now: float) -> list[Action]:
         """Continue after a :class:`CheckVideo`: blame the video, or the worker's host.

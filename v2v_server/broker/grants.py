@@ -21,13 +21,13 @@ from dataclasses import replace
 from typing import Any
 
 from v2v_protocol.arena import NO_SLOT
-from v2v_protocol.errors import ProtocolError
+from v2v_protocol.errors import IndexUnreadable, ProtocolError, V2VError
 from v2v_protocol.messages import Lease, SampleHeader, Unavailable
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.sample import Form
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import decode, encode, largest_packed_bytes
-from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, ReportRefusal, SendLease, ToConsumer
+from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, ReportRefusal, ToConsumer, ToWorker
 from v2v_server.broker.leases import Request, runs_alone
 from v2v_server.broker.session import Session
 from v2v_server.broker.state import Broker, RefusalPart
@@ -168,7 +168,11 @@ def assign_slow(broker: Broker, now: float) -> list[Action]:
         second = broker.registry.for_request(keep_one_empty=bool(broker.lone), other_than=worker)
         session = broker.sessions.get(request.session)
         if session is not None and second is not None and not runs_alone(request):
-            actions += _grant(broker, session, replace(request, slot=None), second, now)
+            granted = _grant(broker, session, replace(request, slot=None), second, now)
+            if granted is None:
+                broker.sessions.put_back(request)
+                break
+            actions += granted
     return actions
 
 
@@ -189,13 +193,24 @@ def _give(broker: Broker, requests: list[Request], worker: bytes, now: float) ->
         else:
             good.append(current)
     for place, request in enumerate(good):
-        actions += _grant(broker, session, request, worker, now, tuple(other.index for other in good[place + 1 :]))
+        granted = _grant(broker, session, request, worker, now, tuple(other.index for other in good[place + 1 :]))
+        if granted is None:
+            for each in reversed(good[place:]):
+                broker.sessions.put_back(each)
+            break
+        actions += granted
     return actions
 
 
 def _grant(
     broker: Broker, session: Session, request: Request, worker: bytes, now: float, siblings: tuple[int, ...] = ()
-) -> list[Action]:
+) -> list[Action] | None:
+    """Lease a request to a worker, or refuse its candidate if the index of its video is damaged, belongs to another
+    file, or is too large.
+
+    Returns:
+        None if the index cannot be read at the moment. No lease is granted until it is tried again.
+    """
     sequence = session.sequence(request)
     seconds = work_seconds(session.spec, session.arrays, sequence.video)
     number = broker.leases.grant(request, worker, now, seconds)
@@ -215,7 +230,14 @@ def _grant(
         siblings=siblings,
         packed=session.packed,
     )
-    return [SendLease(worker, lease, session.spec)]
+    try:
+        return [ToWorker(worker, encode(broker.complete(lease, session.spec)), lease.arena)]
+    except V2VError as error:
+        broker.leases.finished(number, worker, now)
+        if not isinstance(error, IndexUnreadable):
+            return refuse(broker, request, None, str(error))
+        broker.blocked_reason = f"{error}; retried ten times a second"
+        return None
 
 
 # --- sharing ------------------------------------------------------------------------------------------------------

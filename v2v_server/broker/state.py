@@ -9,6 +9,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 
 from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.messages import Lease
 from v2v_protocol.refusal import Refusal
 from v2v_protocol.sample import SampleId
 from v2v_protocol.spec import StreamSpec
@@ -128,6 +129,8 @@ class Broker:
     Attributes:
         facts: what is known of the videos, in memory.
         default_spec: the spec of a consumer that sends none.
+        complete: returns a lease with what the index on disk holds of its clip. It raises IndexUnreadable if that
+            cannot be read at the moment, and another V2VError if it never can.
         lease_deadline_seconds: a worker that is silent over one sample for longer than this, in addition to the time
             that the sample may take, is treated as hung.
         session_idle_seconds: a session that is silent for this long is dropped, even if it waits for samples. Its
@@ -156,6 +159,7 @@ class Broker:
     facts: CorpusFacts
     default_spec: StreamSpec
     _: KW_ONLY
+    complete: Callable[[Lease, StreamSpec], Lease]
     lease_deadline_seconds: float
     session_idle_seconds: float
     max_credit_bytes: int
