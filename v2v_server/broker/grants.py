@@ -168,9 +168,10 @@ def assign_slow(broker: Broker, now: float) -> list[Action]:
         second = broker.registry.for_request(keep_one_empty=bool(broker.lone), other_than=worker)
         session = broker.sessions.get(request.session)
         if session is not None and second is not None and not runs_alone(request):
-            granted = _grant(broker, session, replace(request, slot=None), second, now)
+            slotless = replace(request, slot=None)  # the first worker may still write to the slot
+            granted = _grant(broker, session, slotless, second, now)
             if granted is None:
-                broker.sessions.put_back(request)
+                broker.sessions.put_back(slotless)
                 break
             actions += granted
     return actions

@@ -194,9 +194,9 @@ class Sharing(WithSlots):
     def teardown(self) -> None:
         super().teardown()
         if hasattr(self, "at"):
-            grants = self.at.dispatcher._grants
-            assert grants._ring is not None
-            assert (grants._makers, grants._followers, grants._ring._lent) == ({}, {}, {})
+            broker = self.at.dispatcher
+            assert broker.ring is not None
+            assert (broker.makers, broker.followers, broker.ring.being_made) == ({}, {}, {})
 
 
 TestInterleavingOfSharing = Sharing.TestCase
