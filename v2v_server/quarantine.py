@@ -33,6 +33,8 @@ from v2v_server.system.status_fields import gauge, short, text
 
 VERDICTS_PER_VIDEO = 2
 _MOST_VERDICTS = 20
+_LOCK_SECONDS = 2.0
+"""Longest wait for the lock. Writers hold it for a moment, a process that was stopped for longer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,10 +177,6 @@ class Quarantine:
         if not 0 <= snapshot <= self.latest:
             raise CorpusError(f"quarantine snapshot {snapshot}: there are 0 .. {self.latest}")
         return max((number for number in self._clearings if number <= snapshot), default=0)
-
-
-_LOCK_SECONDS = 2.0
-"""Longest wait for the lock. Writers hold it for a moment, a process that was stopped for longer."""
 
 
 def quarantine_path(root: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None) -> Path:

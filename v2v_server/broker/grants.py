@@ -40,6 +40,10 @@ from v2v_server.sharing.ring import SharedSample
 
 LONGEST_REASON = 500
 """Characters kept of a refusal's reason."""
+_DECODE_SECONDS = 5e-8
+"""For each pixel of a frame: ten times the time of a slow codec on a slow core. The other limits are as generous."""
+_FLOW_SECONDS = 1e-6
+_SIMULATION_SECONDS = 1e-7
 
 
 def _quarantined(broker: Broker, session: Session, request: Request, snapshot: int) -> str | None:
@@ -399,12 +403,6 @@ def lease_for(
         packed=packed,
         sidecars=facts.sidecars_of(video.id, arrays),
     )
-
-
-_DECODE_SECONDS = 5e-8
-"""For each pixel of a frame: ten times the time of a slow codec on a slow core. The other limits are as generous."""
-_FLOW_SECONDS = 1e-6
-_SIMULATION_SECONDS = 1e-7
 
 
 def work_seconds(spec: StreamSpec, arrays: tuple[str, ...], video: VideoEntry) -> float:

@@ -52,6 +52,13 @@ from v2v_server.system.status_fields import gauge, text
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
 
+_KEPT_SLICES = 64
+_KEPT_LONG_FRAMES = 1 << 22
+"""Frames of the opened indexes that are kept, 32 MiB: two days at 25 a second; one index at least."""
+_SMALL_INDEX_BYTES = 4096
+"""Up to here an index goes into a lease as it is stored: to open it, cut it and pack it again would be a quarter of all
+that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB."""
+
 
 @dataclass(frozen=True)
 class Corpus:
@@ -228,14 +235,6 @@ def _gone(source: VideoSource, ids: Sequence[str], notice: Notice | None) -> lis
         if notice is not None:
             notice(f"looking for files that are gone from {source}: {done} of {len(ids)} that are not listed")
     return gone
-
-
-_KEPT_SLICES = 64
-_KEPT_LONG_FRAMES = 1 << 22
-"""Frames of the opened indexes that are kept, 32 MiB: two days at 25 a second; one index at least."""
-_SMALL_INDEX_BYTES = 4096
-"""Up to here an index goes into a lease as it is stored: to open it, cut it and pack it again would be a quarter of all
-that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,6 +63,8 @@ CREATE TABLE IF NOT EXISTS figures (
 )"""
 _SUMMARIES = "CREATE INDEX IF NOT EXISTS summaries ON figures (kind, version, id, fingerprint, summary)"
 """Summaries are read without the data beside them."""
+_FIGURE_COLUMNS = "kind", "version", "id", "fingerprint", "summary", "data"
+_NAME = re.compile(r"part-(\d+)-of-(\d+)\.sqlite3")
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +133,6 @@ class IndexRow:
 
 
 _COLUMNS = IndexRow.__slots__[:-1]
-_FIGURE_COLUMNS = "kind", "version", "id", "fingerprint", "summary", "data"
 
 
 def _insert(table: str, columns: Sequence[str]) -> str:
@@ -364,9 +365,6 @@ def _has_table(database: sqlite3.Connection, name: str) -> bool:
 def _blob(row: tuple[Any] | None) -> bytes | None:
     """Return what a query for one blob found; None if that is no blob, since another program changed it."""
     return row[0] if row is not None and isinstance(row[0], bytes) else None
-
-
-_NAME = re.compile(r"part-(\d+)-of-(\d+)\.sqlite3")
 
 
 @dataclass(frozen=True, slots=True, order=True)

@@ -37,6 +37,11 @@ _NUMBER_TYPES = "qqqqiidb"
 """Types of size, mtime, ctime, frames, width, height, rate and interlaced, in the letters of :mod:`array` and NumPy."""
 _UNREADABLE = (-1, 0, 0, "", 0, 0, 0, None, "", 0, "the index lost its record; start again to probe it", "", None)
 """The columns after the id where the index has no sound row. No file has a size of -1, so it is probed."""
+_Int32 = npt.NDArray[np.int32]
+Thresholds = tuple[float | None, float | None]
+NO_THRESHOLDS: Thresholds = (None, None)
+_ASKED = 16
+"""Prepared files that are checked for their planes."""
 
 
 class StringColumn(Sequence[str]):
@@ -256,9 +261,6 @@ def joined(
         unasked += [row[0] for row in chain((row,), left)]
 
 
-_Int32 = npt.NDArray[np.int32]
-
-
 def encoded_pieces(pieces: Pieces, frames: int) -> bytes:
     """Return the pieces of a video of ``frames`` frames, encoded; empty if all of them are one without flags and bars.
 
@@ -331,10 +333,6 @@ class SplitVideos:
         firsts = firsts_of(self.pieces, 0)
         firsts[self.bounds[:-1]] = 0
         return firsts
-
-
-Thresholds = tuple[float | None, float | None]
-NO_THRESHOLDS: Thresholds = (None, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -458,10 +456,6 @@ class Videos(Sequence[VideoEntry]):
             pieces=None if self.split is None else self.split.encoded(number),
             remark=record.remark,
         )
-
-
-_ASKED = 16
-"""Prepared files that are checked for their planes."""
 
 
 def missing_arrays(source: VideoSource, ids: Sequence[str]) -> dict[str, str]:

@@ -30,6 +30,9 @@ from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 _ROUNDS = 8
 _LEAST_HALF_BITS = 4
 _MASK64 = (1 << 64) - 1
+_MOST_ATTEMPTS = 16
+MOST_CANDIDATES = 8
+"""Candidates of one place. If this many random videos in a row are broken, a person must repair the corpus."""
 
 
 class Permutation:
@@ -91,11 +94,6 @@ def hashed_below(n: int, *words: int) -> int:
     """
     data = b"".join(word.to_bytes(8, "little") for word in words)
     return int.from_bytes(hashlib.blake2b(b"v2v candidate 1" + data, digest_size=8).digest(), "little") % n
-
-
-_MOST_ATTEMPTS = 16
-MOST_CANDIDATES = 8
-"""Candidates of one place. If this many random videos in a row are broken, a person must repair the corpus."""
 
 
 class Schedule:

@@ -40,6 +40,14 @@ _SKIPPED = {
     "cuts": Flag.UNSEEN,  # there are most likely more of them
 }
 _Int64 = npt.NDArray[np.int64]
+MOST_CLIP_BYTES = 2 << 30
+"""Largest size of the decoded frames of one lease without margins, in 8 bits."""
+MOST_LEASE_BYTES = 7 << 30
+"""Largest memory that one lease may take, with all that its spec may ask for; a worker has a GiB more."""
+_BLOCK = 256
+"""Videos whose sequences are counted again for a look-up. Larger blocks take more time, smaller ones more memory."""
+Videos = Sequence[VideoEntry]
+_SHOWN = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,17 +205,6 @@ def _hash(numbers: npt.NDArray[np.integer], starts: _Int64) -> npt.NDArray[np.fl
     mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return (mixed ^ (mixed >> np.uint64(31))) * 2.0**-64
-
-
-MOST_CLIP_BYTES = 2 << 30
-"""Largest size of the decoded frames of one lease without margins, in 8 bits."""
-MOST_LEASE_BYTES = 7 << 30
-"""Largest memory that one lease may take, with all that its spec may ask for; a worker has a GiB more."""
-_BLOCK = 256
-"""Videos whose sequences are counted again for a look-up. Larger blocks take more time, smaller ones more memory."""
-
-
-Videos = Sequence[VideoEntry]
 
 
 @dataclass(frozen=True, slots=True)
@@ -526,9 +523,6 @@ def _too_small(video: VideoEntry, rows: Rows, recipe: Recipe, sides: Sides = NO_
     )
     larger = f"resize_scale up to {scale:g}, or a smaller crop" if scale <= LARGEST_SCALE else "a smaller crop"
     return _unsuited(video, reason, larger)
-
-
-_SHOWN = 5
 
 
 def corpus_summary(

@@ -37,6 +37,10 @@ _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, 
 PROGRAM = (sys.executable, "-m", "v2v_server.commands.worker")
 Program = subprocess.Popen[bytes]
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+_MEMORY_SECONDS = 5.0
+"""Time after the kernel has killed a process for lack of memory in which a worker's SIGKILL is attributed to that."""
+_SHORTAGES = (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
+_AFTER_SHORTAGE_SECONDS = 5.0
 
 
 class Standby:
@@ -208,12 +212,6 @@ def out_of_memory_kills() -> int:
     except OSError:
         pass
     return 0
-
-
-_MEMORY_SECONDS = 5.0
-"""Time after the kernel has killed a process for lack of memory in which a worker's SIGKILL is attributed to that."""
-_SHORTAGES = (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
-_AFTER_SHORTAGE_SECONDS = 5.0
 
 
 def make_host(

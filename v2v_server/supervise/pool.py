@@ -33,6 +33,13 @@ _STALL_SECONDS = 1.0
 """Time from one check for stalled workers to the next."""
 _STALE_SECONDS = 15.0
 """Age at which an observation says nothing about a process any more."""
+_WAITING = 0.5
+_BUSY = 0.1
+_IDLE = 0.35
+_LEFT_BUSY = 0.8
+_GROWTH = 1.5
+_PARTS = 6
+_MANY_WORKERS_A_CORE = 4
 
 
 def crash_budget(workers: int) -> int:
@@ -315,15 +322,6 @@ def make_pool(
         ) from error
     key = None if keys is None or name == "local" else keys.lend(f"{name}-{label}", "worker")
     return Pool(engine.make_host(config, source.name, label, flags, key, [] if standbys is None else standbys), label)
-
-
-_WAITING = 0.5
-_BUSY = 0.1
-_IDLE = 0.35
-_LEFT_BUSY = 0.8
-_GROWTH = 1.5
-_PARTS = 6
-_MANY_WORKERS_A_CORE = 4
 
 
 @dataclass(frozen=True, slots=True)

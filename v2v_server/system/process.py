@@ -28,6 +28,7 @@ _TURN_SECONDS = 0.1  # the longest time slice that Linux grants
 MOST_CONNECTIONS = 4096 + 256
 _MOST_FILES = 1 << 16  # one connection per consumer and worker, and one logbook per worker
 _SCHED_ATTR_CALLS = {"x86_64": (315, 314), "aarch64": (275, 274)}  # numbers of sched_getattr and sched_setattr
+_LONGEST_PAUSE_SECONDS = 0.05
 
 
 def keep_freed_memory() -> bool:
@@ -219,9 +220,6 @@ def cache_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
             f"user {os.getuid()} has no home folder for the catalogue's index: give a folder with --cache-dir or "
             "V2V_CACHE_DIR"
         ) from error
-
-
-_LONGEST_PAUSE_SECONDS = 0.05
 
 
 def lock(descriptor: int, wait_seconds: float, file: str | os.PathLike[str]) -> None:

@@ -86,6 +86,20 @@ from v2v_server.worker.produce import (
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 Find: TypeAlias = Callable[[ArenaName, bool], int]
+_Place: TypeAlias = tuple[str, np.dtype[Any], tuple[int, ...], int, int]
+_SOON_FETCHED_BYTES = 32 << 20
+"""The worker keeps its leases while it fetches a video up to this size; it returns them for a larger one."""
+LARGEST_MEMORY_BYTES = MOST_LEASE_BYTES + (1 << 30)
+"""A worker that needs more ends. After three such ends its sample is refused for its spec."""
+LONGEST_LEASE_SECONDS = 3600.0
+"""Limit of processor time for one lease. The server gives up its own workers sooner, by wall-clock time; this limit
+ends hung workers on other hosts."""
+MOST_NAME_BYTES = 200
+"""Longest name that an operator may give a worker. With the suffix that makes it unique it has at most 255 bytes."""
+_LONGEST_ARENA_SECONDS = 1.0
+"""Longest wait for a lease's arena, which is sent before the lease. Without it the sample goes into the message."""
+_LINGER_MS = 5000
+"""Time that leaving may spend on sending the last sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,9 +224,6 @@ def _write(lease: Lease, buffer: OutputBuffer) -> bool:
     return True
 
 
-_Place: TypeAlias = tuple[str, np.dtype[Any], tuple[int, ...], int, int]
-
-
 @lru_cache(maxsize=16)  # the same for every sample of a stream
 def _places(layout: tuple[tuple[str, tuple[str, tuple[int, ...]]], ...], slots: int) -> tuple[list[_Place], int]:
     """Return (name, dtype, shape, bytes of one sample, offset of the first) of each array in an arena, and the
@@ -234,21 +245,6 @@ def _map(descriptor: int, offset: int, size: int) -> npt.NDArray[np.uint8]:
     flags = mmap.MAP_SHARED | mmap.MAP_POPULATE
     mapping = mmap.mmap(descriptor, offset - begin + size, flags, offset=begin)
     return np.frombuffer(mapping, np.uint8, size, offset - begin)
-
-
-_SOON_FETCHED_BYTES = 32 << 20
-"""The worker keeps its leases while it fetches a video up to this size; it returns them for a larger one."""
-LARGEST_MEMORY_BYTES = MOST_LEASE_BYTES + (1 << 30)
-"""A worker that needs more ends. After three such ends its sample is refused for its spec."""
-LONGEST_LEASE_SECONDS = 3600.0
-"""Limit of processor time for one lease. The server gives up its own workers sooner, by wall-clock time; this limit
-ends hung workers on other hosts."""
-MOST_NAME_BYTES = 200
-"""Longest name that an operator may give a worker. With the suffix that makes it unique it has at most 255 bytes."""
-_LONGEST_ARENA_SECONDS = 1.0
-"""Longest wait for a lease's arena, which is sent before the lease. Without it the sample goes into the message."""
-_LINGER_MS = 5000
-"""Time that leaving may spend on sending the last sample."""
 
 
 class Clips:

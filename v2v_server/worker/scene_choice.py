@@ -55,6 +55,12 @@ from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
 
 _LONGEST = np.iinfo(np.int16).max
+MOVING = "dis-fast-lean"
+TOLERANCE_PX = 0.05
+"""Largest addition of the choice to the median endpoint error of "auto", over a corpus (docs/scene.md)."""
+DARK_SHARE = 0.9
+"""A scene is dark if this share of it lies below grey level 16."""
+DARK_STILL_GREY_LEVELS = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,14 +176,6 @@ def frame_index(lease: Lease, count: int) -> FrameIndex:
     except (ProtocolError, UsageError) as error:
         raise VideoError(lease.video, None, f"its index from the server is damaged: {error}") from error
     return index
-
-
-MOVING = "dis-fast-lean"
-TOLERANCE_PX = 0.05
-"""Largest addition of the choice to the median endpoint error of "auto", over a corpus (docs/scene.md)."""
-DARK_SHARE = 0.9
-"""A scene is dark if this share of it lies below grey level 16."""
-DARK_STILL_GREY_LEVELS = 0.25
 
 
 @dataclass(frozen=True, slots=True)

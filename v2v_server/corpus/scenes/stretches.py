@@ -57,6 +57,41 @@ _LEAST_PER_MILLE = 30
 _LEAST_COUNT = 4
 _LONGEST_PERIOD = 12
 _NAMES = {(2, 1): "every picture twice", (5, 1): "24 in 30", (5, 3): "24 in 60, 3:2 pulldown", (6, 1): "25 in 30"}
+_DARKEST_PICTURE = 32
+"""Grey level up to which a side may be a bar."""
+_NOISE_LEVELS = 6
+_FIRST_LINES = 16
+"""Most pictures have no bars, which these lines tell."""
+_EDGE_PX = 8
+"""Coded with few bits, this part of a bar beside the picture is not flat."""
+_LEAST_PX = 4
+_LEAST_FLAT_PX = 2
+_MOST_SPREAD_PX = 2
+_LEAST_SHARE = 50
+"""Thinner ones than 1/50 of the picture's side do not count."""
+_STILL_CHANGE = 2 * 64
+"""Change of a block, 1/64 grey level."""
+_STILL_SHARE = 100
+"""One of that number of blocks may change by more."""
+_STILL_GAP = 2 * LAG_FRAMES
+"""Frames. A step at a keyframe of low quality, which shows nothing new, spoils the lag's frames and a few after it."""
+_STILL_FRAMES = 16
+_FLAT_SPREAD = 96
+"""1/64 grey level."""
+_FLAT_SHARE = 100
+_FLAT_FRAMES = 4
+_BRIGHT_FROM = 128 * 64
+_FADE_FRAMES = 6
+_FADE_SMOOTH = 2
+"""Frames on either side over which light is averaged."""
+_FADE_LEAST_CONTRAST = (4 * 64) ** 2
+_FADE_LEAST_STEP = 500
+"""Smaller changes than 1/500 of the light are none."""
+_FADE_RATIO = 8
+_COMBED_SHARE = 8
+_COMBED_COUNT = 2
+_COMBED_GAP = 24
+"""Frames between two that are combed: of 24 in 60 fields a second, not every picture is."""
 
 
 def change_of(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> int:
@@ -181,20 +216,6 @@ def runs_of(flags: npt.NDArray[np.bool_], least: int, most_gap: int = 0) -> Span
     return tuple((first, end) for first, end in runs if end - first >= least)
 
 
-_DARKEST_PICTURE = 32
-"""Grey level up to which a side may be a bar."""
-_NOISE_LEVELS = 6
-_FIRST_LINES = 16
-"""Most pictures have no bars, which these lines tell."""
-_EDGE_PX = 8
-"""Coded with few bits, this part of a bar beside the picture is not flat."""
-_LEAST_PX = 4
-_LEAST_FLAT_PX = 2
-_MOST_SPREAD_PX = 2
-_LEAST_SHARE = 50
-"""Thinner ones than 1/50 of the picture's side do not count."""
-
-
 def bars_of(picture: npt.NDArray[np.uint8]) -> Sides:
     """Return the bars of a picture at the top, bottom, left and right, in pixels.
 
@@ -250,31 +271,6 @@ def common_bars(found: Sequence[Sides], height: int, width: int) -> Sides:
     sizes = height, height, width, width
     least = [max(_LEAST_PX, size // _LEAST_SHARE) for size in sizes]
     return Sides(*(depth if depth >= limit else 0 for depth, limit in zip(depths, least, strict=True)))
-
-
-_STILL_CHANGE = 2 * 64
-"""Change of a block, 1/64 grey level."""
-_STILL_SHARE = 100
-"""One of that number of blocks may change by more."""
-_STILL_GAP = 2 * LAG_FRAMES
-"""Frames. A step at a keyframe of low quality, which shows nothing new, spoils the lag's frames and a few after it."""
-_STILL_FRAMES = 16
-_FLAT_SPREAD = 96
-"""1/64 grey level."""
-_FLAT_SHARE = 100
-_FLAT_FRAMES = 4
-_BRIGHT_FROM = 128 * 64
-_FADE_FRAMES = 6
-_FADE_SMOOTH = 2
-"""Frames on either side over which light is averaged."""
-_FADE_LEAST_CONTRAST = (4 * 64) ** 2
-_FADE_LEAST_STEP = 500
-"""Smaller changes than 1/500 of the light are none."""
-_FADE_RATIO = 8
-_COMBED_SHARE = 8
-_COMBED_COUNT = 2
-_COMBED_GAP = 24
-"""Frames between two that are combed: of 24 in 60 fields a second, not every picture is."""
 
 
 def is_still(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> bool:

@@ -36,6 +36,10 @@ _NO_VIDEO_SUFFIXES = frozenset({
 _MOST_SUFFIXES_SHOWN = 10
 
 UNPRINTABLE = "its name is not UTF-8 text, or holds control characters; rename it"
+LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
+_SUFFIX = re.compile(r"\.(?=.*[a-z]|26[45]$)[a-z0-9]+", re.IGNORECASE)
+_MOST_COLUMNS = 4
 
 
 def is_video_name(name: str) -> bool:
@@ -62,13 +66,6 @@ def left_out_note(left_out: Counter[str]) -> str:
         f"{left_out.total()} files have endings that are not looked at and were left out: {shown}"
         f"{f' and {more} other endings' if more > 0 else ''}. Name those that are videos in a list file to serve them"
     )
-
-
-LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
-
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
-_SUFFIX = re.compile(r"\.(?=.*[a-z]|26[45]$)[a-z0-9]+", re.IGNORECASE)
-_MOST_COLUMNS = 4
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,6 +42,17 @@ _TOGETHER, _MOST_TOGETHER = 64, 1024
 _SOON_SECONDS = 0.05
 _IN_TURN = 256
 """Parts that are asked many at a time before one alone is tried again."""
+KINDS = ("copies", "prepared", "folder")
+"""Files of the kinds of sources, in the order in which they are asked. The last one takes any name."""
+COPIES_GIB = 100.0
+"""Default limit of the folder of copies."""
+State = tuple[int, int, int]
+"""Size in bytes, and two numbers that change with the content: the times of the last modification and change of status,
+or a mark of an object's ETag and 0."""
+NO_STATE: State = (-1, 0, 0)
+"""The state cannot be told now."""
+GONE: State = (-2, 0, 0)
+"""There is no such file."""
 
 
 def is_said(done: int) -> bool:
@@ -105,20 +116,6 @@ def by_parts(question: Callable[[Sequence[Q]], A], files: Sequence[Q]) -> Genera
 
 if TYPE_CHECKING:
     from v2v_server.corpus.manifest import Manifest
-
-KINDS = ("copies", "prepared", "folder")
-"""Files of the kinds of sources, in the order in which they are asked. The last one takes any name."""
-
-COPIES_GIB = 100.0
-"""Default limit of the folder of copies."""
-
-State = tuple[int, int, int]
-"""Size in bytes, and two numbers that change with the content: the times of the last modification and change of status,
-or a mark of an object's ETag and 0."""
-NO_STATE: State = (-1, 0, 0)
-"""The state cannot be told now."""
-GONE: State = (-2, 0, 0)
-"""There is no such file."""
 
 
 @dataclass(frozen=True, slots=True)
