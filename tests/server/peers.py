@@ -29,15 +29,7 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.sample import array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, decode, encode, encode_map
-from v2v_server.broker.actions import (
-    Action,
-    AddToQuarantine,
-    CheckVideo,
-    GiveUp,
-    ReportRefusal,
-    ToConsumer,
-    ToWorker,
-)
+from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, GiveUp, ReportRefusal, ToConsumer, ToWorker
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.corpus.catalogue import Catalogue, complete_lease

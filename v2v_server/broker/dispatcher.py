@@ -12,12 +12,7 @@ from typing import Any
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
-from v2v_protocol.errors import (
-    CorpusError,
-    LimitExceeded,
-    ProtocolError,
-    UsageError,
-)
+from v2v_protocol.errors import CorpusError, LimitExceeded, ProtocolError, UsageError
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import (
     Begun,
@@ -162,10 +157,10 @@ class Dispatcher(Broker):
         if present is not None and (present.owner, present.user) != (owner, user):
             text = "this routing id belongs to the session of another consumer: connect with a random one"
             return _deny(identity, ErrorCode.MALFORMED, text)
-        if self.sessions.get(identity) is None and len(self.sessions) >= MOST_SESSIONS:
+        if present is None and len(self.sessions) >= MOST_SESSIONS:
             for silent in self.sessions.dispensable(now):
                 self.consumer_lost(silent)
-        if self.sessions.get(identity) is None and len(self.sessions) >= MOST_SESSIONS:
+        if present is None and len(self.sessions) >= MOST_SESSIONS:
             return _deny(identity, ErrorCode.BUSY, f"this server has {MOST_SESSIONS} consumers, its limit")
         try:
             workers = max(len(self.registry), self.expected_workers)
@@ -262,7 +257,7 @@ class Dispatcher(Broker):
 
     def stop_workers(self) -> list[ToWorker]:
         """Tell every worker to finish and leave."""
-        return [ToWorker(identity, encode(Stop())) for identity in self.registry.members()]
+        return [ToWorker(identity, encode(Stop())) for identity in self.registry.members]
 
     def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float, user: str) -> list[Action]:
         try:
@@ -289,7 +284,7 @@ class Dispatcher(Broker):
         """
         if len(name.encode()) > _LONGEST_NAME_BYTES:
             raise LimitExceeded(f"the name has {len(name.encode())} bytes; the limit is {_LONGEST_NAME_BYTES}")
-        members = self.registry.members()
+        members = self.registry.members
         before = [each for each in {identity, self.registry.named(name)} if each is not None and each in members]
         for each in before:
             is_own = members[each].owner == owner and (bool(owner) or each == identity)

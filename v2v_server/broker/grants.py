@@ -311,7 +311,7 @@ def _share(broker: Broker, session: Session, request: Request) -> list[Action] |
     if sample is not None:
         return _send_shared(broker, request, sample)
     maker = broker.makers.get(key)
-    if maker is None or not broker.leases.is_out(maker):
+    if maker not in broker.leases.out:
         return None
     broker.followers.setdefault(key, []).append(request)
     return []
@@ -333,7 +333,7 @@ def _release_followers(broker: Broker) -> None:
     if broker.ring is None:
         return
     broker.ring.release(broker.leases)
-    for key in [key for key, maker in broker.makers.items() if not broker.leases.is_out(maker)]:
+    for key in [key for key, maker in broker.makers.items() if maker not in broker.leases.out]:
         del broker.makers[key]
         for request in reversed(broker.followers.pop(key, [])):
             broker.sessions.put_back(request)
@@ -456,8 +456,6 @@ def check_result(payload: Sequence[Any], request: Request, form: Form) -> Sample
 def _fits(frames: Sequence[Any], sizes: tuple[int, ...], packed: bool) -> bool:
     """Return whether the frames may hold arrays of these sizes, bytes."""
     lengths = tuple(map(len, frames))
-    if not packed:
+    if not packed or len(lengths) != len(sizes):
         return lengths == sizes
-    if len(lengths) != len(sizes):
-        return False
     return all(0 < length <= largest_packed_bytes(size) for length, size in zip(lengths, sizes, strict=True))

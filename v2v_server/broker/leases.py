@@ -178,10 +178,6 @@ class LeaseBook:
     def __contains__(self, number: object) -> bool:
         return number in self._leases
 
-    def is_out(self, sample: tuple[bytes, int, int]) -> bool:
-        """Return whether a worker has a lease for a requested sample (:attr:`Request.sample`) that is still wanted."""
-        return sample in self.out
-
     def held_by(self, worker: bytes) -> int:
         """Return the number of clips that this worker has to decode for its leases.
 
@@ -190,15 +186,6 @@ class LeaseBook:
         """
         requests = [self._leases[number].request for number in self.held.get(worker, ())]
         return len({request.clip for request in requests if request is not None}) + requests.count(None)
-
-    def holds(self, worker: bytes) -> bool:
-        """Return whether this worker holds any lease."""
-        return worker in self.held
-
-    @property
-    def holders(self) -> int:
-        """Return the number of workers that hold any lease."""
-        return len(self.held)
 
     def take_changed(self) -> set[bytes]:
         """Return and clear the workers whose leases have changed since the last call, including leases that were

@@ -233,4 +233,4 @@ class Broker:
     @property
     def idle_share(self) -> float:
         """Share of the workers that hold no lease: 0 to 1."""
-        return max(0.0, 1.0 - self.leases.holders / max(len(self.registry), 1)) if self.registry else 0.0
+        return max(0.0, 1.0 - len(self.leases.held) / max(len(self.registry), 1)) if self.registry else 0.0

@@ -27,14 +27,7 @@ from v2v_server.broker.worker_registry import Member, clean_name
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.status.bottleneck import Bottleneck, History, Shares, TimeWindow, find_bottleneck
-from v2v_server.status.parts import (
-    STATUS_VERSION,
-    ConsumerPart,
-    LoadPart,
-    ServerPart,
-    Status,
-    WorkerPart,
-)
+from v2v_server.status.parts import STATUS_VERSION, ConsumerPart, LoadPart, ServerPart, Status, WorkerPart
 from v2v_server.store.quota import cache_part
 from v2v_server.supervise.pool import Pool
 from v2v_server.system.status_fields import GIB, short, values
@@ -133,7 +126,7 @@ class Service:
         )
 
     def _workers(self, window: TimeWindow) -> list[dict[str, Any]]:
-        members, restarts = self.dispatcher.registry.members(), self.pool.restarts
+        members, restarts = self.dispatcher.registry.members, self.pool.restarts
         return [
             values(_worker(self.dispatcher, identity, member, restarts.get(member.name.encode()), window))
             for identity, member in list(members.items())[:MOST_SHOWN]
@@ -161,7 +154,7 @@ def _worker(
     elif dispatcher.registry.is_resting(identity):
         state = "resting"
     else:
-        state = "working" if leases.holds(identity) else "idle"
+        state = "working" if identity in leases.held else "idle"
     return WorkerPart(
         name=clean_name(member.name),
         host=member.host,

@@ -19,10 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import (
-    UsageError,
-    VideoError,
-)
+from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec

@@ -65,13 +65,7 @@ from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR
 from v2v_server.video.rows import Rows
-from v2v_server.worker.arrays import (
-    ARRAY_BUILDERS,
-    SampleContext,
-    SourceClip,
-    makes,
-    simulate,
-)
+from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, makes, simulate
 from v2v_server.worker.scene_choice import (
     CleanFrames,
     FlowPlan,

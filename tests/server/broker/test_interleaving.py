@@ -294,7 +294,7 @@ class Interleaving(RuleBasedStateMachine):
         if at is None:
             return
         book = at.dispatcher.leases
-        for identity in list(at.dispatcher.registry.members()):
+        for identity in list(at.dispatcher.registry.members):
             lonely = any(runs_alone(request) for request in book.requests_of(identity))
             assert not lonely or book.held_by(identity) == 1
 

@@ -114,7 +114,7 @@ def test_the_secret_of_a_worker_moves_its_name_and_returns_its_leases() -> None:
     at.consumer_says(b"c", hello(OURS))
     at.want(0, 1)
     assert enter(at, b"2", "worker", OURS) == ""
-    assert list(at.dispatcher.registry.members()) == [b"2"]
+    assert list(at.dispatcher.registry.members) == [b"2"]
     assert at.dispatcher.registry.named("worker") == b"2"
     assert len(at.leases[b"2"]) == 2
     at.work_off(b"2")
@@ -125,7 +125,7 @@ def test_no_key_holds_the_name_of_a_worker_of_this_host() -> None:
     at = peers()
     assert enter(at, b"1", "w1-0.1", THEIRS, "gpu-1") == ""
     assert enter(at, b"2", "w1-0.1", OURS) == ""
-    assert list(at.dispatcher.registry.members()) == [b"2"]
+    assert list(at.dispatcher.registry.members) == [b"2"]
     assert enter(at, b"1", "w1-0.1", THEIRS, "gpu-1") != ""
 
 
