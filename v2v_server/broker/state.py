@@ -1,5 +1,6 @@
 """What the broker knows, as one value. The functions of :mod:`v2v_server.broker.grants` and the handlers of
-:mod:`v2v_server.broker.dispatcher` change it; all other parts only read. No I/O.
+:mod:`v2v_server.broker.dispatcher` change it; all other parts only read. No I/O, but for the index of the corpus, which
+:attr:`Broker.complete` reads.
 """
 
 from __future__ import annotations
