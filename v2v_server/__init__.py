@@ -6,7 +6,7 @@
     status/       what the operator sees
     supervise/    start and restart workers
     broker/       which worker makes which sample for which consumer
-    quarantine/   sequences that brought workers down
+    quarantine.py sequences that brought workers down
     worker/       from a lease to its sample
     schedule/     which sequence each index is made from
     corpus/       which videos exist

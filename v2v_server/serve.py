@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.allocator import give_back_freed_memory
-from v2v_protocol.errors import CorpusError
+from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoGone
 from v2v_protocol.link.user import OwnUser
 from v2v_protocol.progress import Progress
 from v2v_protocol.write_aside import write_file
@@ -30,7 +30,6 @@ from v2v_server.broker.actions import (
     Disconnect,
     GiveUp,
     ReportRefusal,
-    SendLease,
     SendStatus,
     ToConsumer,
     ToWorker,
@@ -38,26 +37,21 @@ from v2v_server.broker.actions import (
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause, Loss, Request
 from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, InFlight, ServerTransport, Sockets
-from v2v_server.broker.worker_registry import clean_name
+from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
 from v2v_server.config import ServeConfig
-from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.corpus.scenes.picture_check import check_in_background
-from v2v_server.corpus_actions import CorpusActions
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.page.child import PageProcess
-from v2v_server.quarantine.file import quarantine_path, read_quarantine
-from v2v_server.quarantine.snapshots import Quarantine
-from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.schedule.summary import corpus_summary
+from v2v_server.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
+from v2v_server.schedule.sequences import SequenceTable, corpus_summary
 from v2v_server.status.snapshot import Service, StatusPublisher
 from v2v_server.status.terminal import StatusView, format_shutdown_summary
 from v2v_server.store.cache import make_cache
-from v2v_server.supervise.child import Standby
-from v2v_server.supervise.pool import Pool, make_pool
-from v2v_server.supervise.scaling import Scaling, question_workers
-from v2v_server.system.log import Level, Log
+from v2v_server.supervise.local_host import Standby
+from v2v_server.supervise.pool import Pool, Scaling, make_pool, question_workers
+from v2v_server.system.log import Level, Log, StartTimes
 from v2v_server.system.process import keep_freed_memory, most_connections, open_many_files, usable_cores
-from v2v_server.system.start_times import StartTimes
 from v2v_server.system.status_fields import GIB
 from v2v_server.video.rows import Rows
 
@@ -70,6 +64,8 @@ _SOON_SECONDS = 5.0
 """Time after which blocked leases are reported."""
 _GIVE_BACK_SECONDS = 12.0
 """Time from the end of a connection until its memory is returned to the kernel; its session is forgotten by then."""
+_RECORD_SECONDS = 2.0
+"""Longest time to retry writing a quarantine entry while another process writes to the file."""
 _OWN_USER_RULE = (
     "without keys this server serves only root and its own user; make keys with v2v-keys init and give --keys, or give "
     "--insecure to serve every user of this host"
@@ -170,6 +166,7 @@ def _serve(
     dispatcher = Dispatcher(
         catalogue.facts,
         config.spec,
+        complete=lambda lease, spec: complete_lease(lease, catalogue, spec),
         quarantine=quarantine,
         wall_clock=utc_now,
         lease_deadline_seconds=config.lease_deadline_seconds,
@@ -188,9 +185,7 @@ def _serve(
     sockets.has_session = dispatcher.has_session
     with stop_on_signals(stop):
         pool = make_pool(config, catalogue.source, label, worker_flags, keys, standbys)
-        server = Server(
-            config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file, page=page, times=times
-        )
+        server = Server(config, catalogue, dispatcher, sockets, pool, quarantine_file, page=page, times=times)
         try:
             if pool.is_local and (question := question_workers(config.most_workers, usable_cores())):
                 log.say(question, "warning")
@@ -215,7 +210,6 @@ class Server:
         dispatcher: decides what to do.
         transport: sockets of consumers and workers.
         pool: runs the workers' processes.
-        quarantine: the snapshots.
         quarantine_file: file that new entries are written to.
         clock: returns the time, seconds; None: a :class:`v2v_server.serve.Clock`.
         page: the status page; None: no page.
@@ -229,7 +223,6 @@ class Server:
         dispatcher: Dispatcher,
         transport: ServerTransport,
         pool: Pool,
-        quarantine: Quarantine,
         quarantine_file: Path,
         clock: Callable[[], float] | None = None,
         page: PageProcess | None = None,
@@ -244,12 +237,14 @@ class Server:
         self._transport = transport
         self._pool = pool
         self._clock = clock or Clock()
-        self._corpus = CorpusActions(catalogue, dispatcher, quarantine, quarantine_file, self._clock, self._say)
+        self._quarantine_file = quarantine_file
+        self._unreadable_said = -math.inf
+        self._unrecorded: list[tuple[AddToQuarantine, float]] = []  # until when each is tried
         self._next_tick = self._clock()
         is_fixed = config.least_workers == config.most_workers
         self._scaling = None if is_fixed else Scaling(*config.workers, config.scale_seconds)
         self._view = StatusView(self._log, sys.stderr)
-        service = Service(config, catalogue, dispatcher, pool, quarantine, transport)
+        service = Service(config, catalogue, dispatcher, pool, transport)
         self._publisher = StatusPublisher(service, self._clock(), utc_now)
         self._announced = False
         self._port_file: Path | None = None
@@ -280,7 +275,7 @@ class Server:
             self._next_tick = now + _TURN_SECONDS
             for name, stalled in self._pool.stalled(now).items():
                 self._dispatcher.worker_stalled(self._route(name), stalled)
-            self._carry_out(self._corpus.retry())
+            self._carry_out(self._retry())
             self._carry_out(self._dispatcher.tick(now))
             for death in self._pool.watch(now, self._dispatcher.counters.samples):
                 self._say(
@@ -326,29 +321,98 @@ class Server:
                     if not self._transport.send(message):
                         dispatcher.consumer_lost(message.identity)
                 case ToWorker() as message:
+                    if message.arena:
+                        self._pool.lend(self._name(message.identity), message.arena)
                     if not self._transport.send(message) and not self._pool.watches(self._name(message.identity)):
                         todo.extend(dispatcher.worker_unreachable(message.identity, now()))
-                case SendLease() as grant:
-                    if grant.lease.arena:
-                        self._pool.lend(self._name(grant.worker), grant.lease.arena)
-                    todo.extendleft(reversed(self._corpus.complete(grant, todo)))
                 case Disconnect(identity):
                     self._transport.cut(identity)
                 case GiveUp() as hopeless:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
                 case AddToQuarantine() as record:
                     # Before anything that follows is sent.
-                    todo.extendleft(reversed(self._corpus.record(record)))
+                    todo.extendleft(reversed(self._record(record)))
                 case CheckVideo() as missing:
                     # The loop reads no sidecar: one that a worker of this host cannot read is unreadable on this host.
                     is_here = bool(missing.sidecar) and self._catalogue.source.is_local and self._pool.is_local
                     is_here = is_here and self._pool.watches(self._name(missing.identity))
-                    found = not is_here and self._corpus.check_video(missing)
+                    found = not is_here and self._check_video(missing)
                     todo.extend(dispatcher.video_checked(missing, found, now()))
                 case ReportRefusal(refusal, request):
                     self._say(f"passed over {refusal}", "warning", request, video=refusal.video)
                 case SendStatus() as request:
                     self._publisher.ask(request)
+
+    def _record(self, record: AddToQuarantine, until: float | None = None) -> list[Action]:
+        """Write a quarantine entry. If that fails, the server continues and logs the consequence.
+
+        Args:
+            record: the entry.
+            until: time until which :meth:`_retry` repeats it while another process writes; None: for a short time.
+
+        Returns:
+            what the dispatcher does about it; nothing while it is retried.
+        """
+        entry, now = record.entry, self._clock()
+        until = now + _RECORD_SECONDS if until is None else until
+        latest = self._dispatcher.quarantine.latest
+        if (
+            self._dispatcher.quarantine.refusal(latest, entry.path, entry.fingerprint, entry.frame, entry.spec)
+            is not None
+        ):
+            # Another worker ended over it while the file was locked. A second entry would refuse the whole video.
+            return self._dispatcher.quarantine_recorded(record, [], now)
+        written: list[QuarantineEntry] = []
+        try:
+            written = write_entry(self._quarantine_file, entry, self._dispatcher.quarantine, wait_seconds=0.0)
+        except (OSError, CorpusError) as error:
+            if isinstance(error, BlockingIOError) and now < until:
+                self._unrecorded.append((record, until))
+                return []
+            self._say(
+                f"{entry.path} from frame {entry.frame}: {entry.reason}; the sequence is skipped once and will "
+                f"be tried again, because the quarantine cannot be written: {error}",
+                "error",
+                record.request,
+                video=entry.path,
+            )
+        for line in written:
+            self._say(f"quarantine: {line}", "warning", record.request, video=line.path)
+        return self._dispatcher.quarantine_recorded(record, written, now)
+
+    def _retry(self) -> list[Action]:
+        """Repeat the writing of entries that another process delayed. Call a few times a second."""
+        unrecorded, self._unrecorded = self._unrecorded, []
+        return [action for record, until in unrecorded for action in self._record(record, until)]
+
+    def _check_video(self, missing: CheckVideo) -> bool:
+        """Check the file against the catalogue. If it matches, warn (rate-limited, since all workers of a host fail
+        alike) that the worker's host does not have it.
+        """
+        try:
+            self._catalogue.check(missing.video, missing.fingerprint, missing.sidecar)
+        except (VideoChanged, VideoGone):
+            if not missing.sidecar:
+                self._catalogue.mark_stale(missing.video)
+            return False
+        except (VideoError, CorpusError):
+            return False
+        now = self._clock()
+        if now >= self._unreadable_said + REST_SECONDS:
+            self._unreadable_said = now
+            name = clean_name(self._dispatcher.registry.name_of(missing.identity))
+            is_local = self._catalogue.source.is_local
+            file = f"the sidecar {missing.sidecar} of {missing.video}" if missing.sidecar else missing.video
+            self._say(
+                f"worker {name} failed on {file}, which "
+                f"{'is on this host as catalogued' if is_local else 'is not known to be gone or changed'}: "
+                f"{missing.reason}; other workers make the sample, and this one gets no work for {REST_SECONDS:g} s. "
+                "Check --videos on its host",
+                "warning",
+                missing.request,
+                video=missing.video,
+            )
+        return True
 
     def _give_up(self, hopeless: GiveUp) -> Loss:
         """End the process of a hung worker, if it is one of ours."""

@@ -22,7 +22,7 @@ from v2v_server.motion.prediction import SUBSTEP_PX, Prediction, predict
 from v2v_server.schedule.sequences import VideoSequence
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.view import apply_view, without_margin
-from v2v_server.system.opencv import cv2
+from v2v_server.system.compile_cache import cv2
 from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import SDR

@@ -23,17 +23,15 @@ from v2v_protocol.sample import DEFAULT_ARRAYS, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.broker import grants
-from v2v_server.broker.candidates import next_candidate
+from v2v_server.broker.grants import next_candidate
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
-from v2v_server.quarantine.file import quarantine_path, read_quarantine
-from v2v_server.quarantine.snapshots import Quarantine
+from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample
-from v2v_server.worker.sidecars import open_sidecars
+from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample, open_sidecars
 from v2v_tools.event_files import check_event_file, write_events
 
 _MOMENTS = 4

@@ -42,7 +42,7 @@ from v2v_server.corpus.scenes.findings import BARS, COMBED, CUTS, DUPLICATES, FA
 from v2v_server.corpus.scenes.scene import MOTION, Scene
 from v2v_server.video.decode import stream_luma
 from v2v_server.video.probe import probe
-from v2v_server.worker.cleaning import CleanFrames
+from v2v_server.worker.scene_choice import CleanFrames
 
 LEAST_FOUND = 0.95
 FRAMES = 120

@@ -38,8 +38,8 @@ from tests.oracles.stream_log import BatchLine, Kill, read_log, recovery_seconds
 from v2v_client.loadtest import percentile
 from v2v_protocol.command import Parser
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.sources.names import VIDEO_SUFFIXES
-from v2v_server.quarantine.file import quarantine_path, read_quarantine
+from v2v_server.corpus.sources.listfile import VIDEO_SUFFIXES
+from v2v_server.quarantine import quarantine_path, read_quarantine
 
 _POLL_SECONDS = 0.05
 _LAST_BATCH_SECONDS = 120.0

@@ -23,7 +23,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, SampleId, SampleParams, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import decode, encode, encode_sample
-from v2v_server.worker.output_buffer import slot_arrays
+from v2v_server.worker.process import slot_arrays
 
 SPEC = StreamSpec(recipe=Recipe(voxels_per_clip=2, bins=2, crop_height_px=4, crop_width_px=6))
 _IDLE_MS = 5

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from v2v_client.memory import Arena, open_arena
 from v2v_protocol.arena import MOST_SLOTS, NO_SLOT, ArenaName, Slot, array_offsets
 from v2v_protocol.errors import ProtocolError
-from v2v_server.worker.output_buffer import slot_arrays
+from v2v_server.worker.process import slot_arrays
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this system has no memfd_create")
 

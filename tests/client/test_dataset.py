@@ -33,7 +33,7 @@ from v2v_protocol.messages import Denied
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import array_layout
 from v2v_protocol.wire import decode, decode_map, encode, encode_map
-from v2v_server.worker.output_buffer import slot_arrays
+from v2v_server.worker.process import slot_arrays
 
 SEED = 5
 QUICK = Patience(ping_seconds=0.05, rewant_seconds=0.2)

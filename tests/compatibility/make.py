@@ -35,8 +35,7 @@ from trainer.run.checkpoint import load_checkpoint
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol import NUMERICS_VERSION, __version__
-from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.refresh import index_path
+from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION
 from v2v_server.prepare.prepare import prepare
 from v2v_server.store.cache import Cache, make_cache

@@ -38,9 +38,9 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import StateMismatch
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus import refresh
+from v2v_server.corpus import catalogue as refresh
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.index.file import SCHEMA_VERSION
+from v2v_server.corpus.index import SCHEMA_VERSION
 from v2v_server.corpus.scenes.analysis import SceneAnalysis
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION
 from v2v_server.store.cache import Cache

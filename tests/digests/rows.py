@@ -28,8 +28,7 @@ from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import decode_for, make_sample
-from v2v_server.worker.sidecars import open_sidecars
+from v2v_server.worker.produce import decode_for, make_sample, open_sidecars
 from v2v_tools.remake import lease_for
 
 ROWS = Rows.parse("0.05:0.95")

@@ -24,7 +24,7 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import NoWorkers, ServerLost
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.quarantine.file import read_quarantine
+from v2v_server.quarantine import read_quarantine
 from v2v_tools.remake import remake
 
 INJECT = Path(__file__).parent / "inject"

@@ -11,7 +11,6 @@ from typing import Any
 from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import NO_SLOT
-from v2v_protocol.errors import IndexUnreadable, V2VError
 from v2v_protocol.messages import (
     Begun,
     Denied,
@@ -30,20 +29,11 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.sample import array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Buffer, decode, encode, encode_map
-from v2v_server.broker.actions import (
-    Action,
-    AddToQuarantine,
-    CheckVideo,
-    GiveUp,
-    ReportRefusal,
-    SendLease,
-    ToConsumer,
-    ToWorker,
-)
+from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, GiveUp, ReportRefusal, ToConsumer, ToWorker
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.corpus.catalogue import Catalogue, complete_lease
-from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
+from v2v_server.quarantine import Quarantine, QuarantineEntry
 
 DEADLINE = 60.0
 IDLE = 600.0
@@ -156,8 +146,6 @@ class Peers:
                         self.owners[message.lease] = b"" if asked is None else asked.session
                     else:
                         self.told.setdefault(identity, []).append(message)
-                case SendLease() as grant:
-                    self._complete(grant, todo)
                 case GiveUp(identity, reason):
                     self.given_up.append(identity)
                     cause = Cause.UNEXPLAINED if identity in self.remote else Cause.HUNG
@@ -172,18 +160,6 @@ class Peers:
                 case CheckVideo() as missing:
                     found = missing.video not in self.gone
                     todo.extend(self.dispatcher.video_checked(missing, found, self.now))
-
-    def _complete(self, grant: SendLease, todo: deque[Action]) -> None:
-        try:
-            frames = encode(complete_lease(grant.lease, self.catalogue, grant.spec))
-            todo.appendleft(ToWorker(grant.worker, frames))
-        except IndexUnreadable as error:
-            unsent = [grant, *(each for each in todo if isinstance(each, SendLease))]
-            for each in unsent[1:]:
-                todo.remove(each)
-            self.dispatcher.index_unreadable(unsent, str(error), self.now)
-        except V2VError as error:
-            todo.extendleft(reversed(self.dispatcher.lease_refused(grant, str(error), self.now)))
 
     def _write(self, verdict: QuarantineEntry) -> list[QuarantineEntry]:
         if not self.writable:
@@ -308,6 +284,7 @@ def peers(
     dispatcher = Dispatcher(
         videos.facts,
         spec,
+        complete=lambda lease, spec: complete_lease(lease, videos, spec),
         lease_deadline_seconds=DEADLINE,
         session_idle_seconds=IDLE,
         max_credit_bytes=max_credit_bytes,

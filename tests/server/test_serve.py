@@ -21,16 +21,15 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.wire import encode
 from v2v_server import serve as serve_module
 from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, GiveUp, ReportRefusal, ToConsumer, ToWorker
-from v2v_server.broker.counters import Counters
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause, Loss, Request
+from v2v_server.broker.state import Counters
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, CorpusPart
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.quarantine.file import read_quarantine
-from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
+from v2v_server.quarantine import QuarantineEntry, read_quarantine
 from v2v_server.serve import Server
-from v2v_server.supervise.scaling import question_workers
+from v2v_server.supervise.pool import question_workers
 
 VERDICT = QuarantineEntry(0, "v.mp4", "f", 0, "crash", "t")
 RECORD = AddToQuarantine(VERDICT, Request(b"c", 0, 0))
@@ -103,7 +102,6 @@ def served(
         cast(Dispatcher, dispatcher),
         transport or Queues(),
         supervisor or ToyPool(lambda name, address: None),
-        Quarantine(),
         folder / "quarantine.jsonl",
         clock,
     )
@@ -318,3 +316,28 @@ def test_the_end_is_summed_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_a_server_that_was_never_ready_sums_up_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     served(Scripted(), tmp_path, workers=1).close()
     assert "in all" not in capsys.readouterr().err
+
+
+class Recording(Scripted):
+    """Adds what was written to the quarantine, as the dispatcher does."""
+
+    def quarantine_recorded(self, record: AddToQuarantine, written: list[QuarantineEntry], now: float) -> list[Action]:
+        self.quarantine.extend(written)
+        return super().quarantine_recorded(record, written, now)
+
+
+def test_a_sequence_that_ends_two_workers_while_the_file_is_locked_is_written_once(tmp_path: Path) -> None:
+    """A second entry would refuse the whole video."""
+    file, times = tmp_path / "quarantine.jsonl", [0.0]
+    both = [AddToQuarantine(VERDICT, Request(session, 0, 1)) for session in (b"one", b"other")]
+    dispatcher = Recording(both)
+    with file.open("a+b") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        server = served(dispatcher, tmp_path, clock=lambda: times[0])
+        times[0] = 1.0
+        server.turn(0.0)
+        assert dispatcher.told == []
+    times[0] = 1.5
+    server.turn(0.0)
+    assert [record for _, record, _ in dispatcher.told] == both
+    assert [each.frame for each in read_quarantine(file).lines] == [VERDICT.frame]

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from v2v_protocol.errors import ProtocolError, VersionMismatch
-from v2v_protocol.messages import Denied, ErrorCode, Lease
+from v2v_protocol.messages import Denied, ErrorCode
 from v2v_protocol.refusal import Refusal
-from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import Frames, encode
 from v2v_server.broker.leases import Request
-from v2v_server.quarantine.snapshots import QuarantineEntry
+from v2v_server.quarantine import QuarantineEntry
 
 _LONGEST_TEXT = 2000
 """Characters of a denial. It quotes what the peer sent, which may be long, and must fit a header."""
@@ -30,25 +29,17 @@ class ToConsumer:
 
 @dataclass(frozen=True, slots=True)
 class ToWorker:
-    """Send these frames to a worker."""
+    """Send these frames to a worker.
+
+    Attributes:
+        identity: routing id.
+        frames: the message.
+        arena: arena of the lease that it is, which is passed to the worker before.
+    """
 
     identity: bytes
     frames: Frames
-
-
-@dataclass(frozen=True, slots=True)
-class SendLease:
-    """Complete a lease with what the index on disk holds of its video, send it, and report a failure.
-
-    Attributes:
-        worker: routing id.
-        lease: without ``frame_index`` and ``scene``.
-        spec: the spec that the lease names.
-    """
-
-    worker: bytes
-    lease: Lease
-    spec: StreamSpec
+    arena: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +118,7 @@ class SendStatus:
 
 
 Action: TypeAlias = (
-    ToConsumer | ToWorker | SendLease | Disconnect | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | SendStatus
+    ToConsumer | ToWorker | Disconnect | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | SendStatus
 )
 
 

@@ -7,17 +7,13 @@ message from a peer leads to an action or a counted fault, never to an exception
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
-from v2v_protocol.errors import (
-    CorpusError,
-    LimitExceeded,
-    ProtocolError,
-    UsageError,
-)
+from v2v_protocol.errors import CorpusError, LimitExceeded, ProtocolError, UsageError
+from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import (
     Begun,
     Denied,
@@ -30,144 +26,61 @@ from v2v_protocol.messages import (
     Ping,
     Pong,
     Result,
-    SampleHeader,
     Stop,
     Want,
+    Welcome,
     WorkerHello,
 )
-from v2v_protocol.sample import SampleId
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import SampleId, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import LARGEST_REQUEST_BYTES, Buffer, Frames, decode, encode
+from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_REQUEST_BYTES, Buffer, Frames, decode, encode
 from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,
     CheckVideo,
     Disconnect,
     GiveUp,
-    SendLease,
     SendStatus,
     ToConsumer,
     ToWorker,
     denial,
     malformed,
 )
-from v2v_server.broker.candidates import Candidates
-from v2v_server.broker.counters import Counters, bounded_seconds
-from v2v_server.broker.grants import Grants, check_result
-from v2v_server.broker.leases import Cause, LeaseBook, Loss, Request, Stall, judge
-from v2v_server.broker.session import Admission, Session, Sessions
-from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, Workers, clean_name
-from v2v_server.corpus.videos import CorpusFacts
-from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
-from v2v_server.sharing.ring import SampleRing
+from v2v_server.broker.grants import (
+    answer_shared,
+    as_leased,
+    assign,
+    assign_slow,
+    blame,
+    check_result,
+    deliver,
+    forget_session,
+    quarantine_candidate,
+    refuse_quarantined,
+)
+from v2v_server.broker.leases import Cause, Loss, Request, Stall, judge
+from v2v_server.broker.session import Session
+from v2v_server.broker.state import Broker
+from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, clean_name
+from v2v_server.quarantine import QuarantineEntry
+from v2v_server.schedule.epoch import Schedule
+from v2v_server.schedule.sequences import MOST_CLIP_BYTES, SequenceTable
 
 MOST_SESSIONS = 4096
 MOST_FAULTS = 16
 """Malformed messages and refused specs after which a consumer is disconnected: an answer costs as much as a sample."""
+MOST_BATCH_SIZE = 65_536
+MOST_CREDIT = 400
+"""Less than ``router.MOST_QUEUED``, the number of queued messages at which a consumer is disconnected."""
+MOST_TABLES = 16
+"""Sequence tables cached for later consumers. A session keeps its own, which is small."""
 _LONGEST_SECRET_BYTES = 64
 _LONGEST_NAME_BYTES = 255
 
 
-class Dispatcher:
-    """Assign requests of consumers to workers.
-
-    Args:
-        facts: what is known of the videos, in memory.
-        default_spec: the spec of a consumer that sends none.
-        lease_deadline_seconds: a worker that is silent over one sample for longer than this, in addition to the time
-            that the sample may take, is treated as hung.
-        session_idle_seconds: a consumer that is silent for longer is forgotten; it can come back.
-        max_credit_bytes: bound on the bytes in flight to one consumer.
-        quarantine: the snapshots; new entries are added to it once they are on disk.
-        wall_clock: returns the time for a quarantine entry, ISO 8601.
-        expected_workers: total number of workers expected, including other hosts. It sets a consumer's credit when the
-            consumer connects, which may be before the first worker says hello.
-        share_bytes: size limit of the finished samples kept for other consumers; 0: keep none.
-
-    Attributes:
-        counters: totals since the start.
-        sessions: the consumers.
-        registry: the workers.
-        leases: which worker makes what.
-        candidates: which sequences were refused.
-    """
-
-    def __init__(
-        self,
-        facts: CorpusFacts,
-        default_spec: StreamSpec,
-        *,
-        lease_deadline_seconds: float,
-        session_idle_seconds: float,
-        max_credit_bytes: int,
-        quarantine: Quarantine,
-        wall_clock: Callable[[], str],
-        expected_workers: int = 0,
-        share_bytes: int = 0,
-    ) -> None:
-        self.counters = Counters()
-        self.leases = LeaseBook(lease_deadline_seconds)
-        self.sessions = Sessions(self.leases)
-        self._expected_workers = expected_workers
-        self._facts = facts
-        self._quarantine = quarantine
-        self.candidates = Candidates(self.sessions, quarantine, self.counters, wall_clock)
-        self._admission = Admission(facts, default_spec, max_credit_bytes, session_idle_seconds, quarantine)
-        self.registry = Workers(self.leases)
-        ring = SampleRing(share_bytes) if share_bytes else None
-        self._grants = Grants(facts, self.sessions, self.leases, self.registry, self.candidates, self.counters, ring)
-        self._faults: dict[bytes, int] = {}  # malformed messages and refused specs of connected consumers
-
-    @property
-    def blocked_reason(self) -> str:
-        """Why no lease can be granted at the moment; empty if leases can be granted."""
-        return self._grants.blocked_reason
-
-    @property
-    def workers(self) -> int:
-        """Return the number of workers that said hello and are alive as far as is known."""
-        return len(self.registry)
-
-    @property
-    def waiting(self) -> int:
-        """Return the number of requested samples that are not leased to a worker yet."""
-        return len(self._grants.lone) + sum(len(session.waiting) for session in self.sessions)
-
-    @property
-    def waiting_share(self) -> float:
-        """Share of the connected consumers that have requests without a worker: 0 to 1."""
-        connected = [session for session in self.sessions if session.left_at is None]
-        return sum(bool(session.waiting) for session in connected) / max(len(connected), 1)
-
-    @property
-    def consumers(self) -> int:
-        """Return the number of consumers that are connected, as far as is known."""
-        return sum(session.left_at is None for session in self.sessions)
-
-    def has_session(self, identity: bytes) -> bool:
-        """Return whether a peer is a consumer with a session, or a worker that said hello."""
-        return self.sessions.get(identity) is not None or identity in self.registry
-
-    def identity_of(self, request: Request) -> SampleId | None:
-        """Return the identity of the sample that a request asks for; None if its consumer is gone."""
-        session = self.sessions.get(request.session)
-        if session is None:
-            return None
-        catalogue = self._facts.digest_under(session.spec.scene)
-        return SampleId(session.spec.digest, catalogue, NUMERICS_VERSION, session.seed, request.epoch, request.index)
-
-    def clip_of(self, request: Request) -> tuple[str, int] | None:
-        """Return the video and first frame of the request's current candidate; None if its consumer is gone."""
-        session = self.sessions.get(request.session)
-        if session is None:
-            return None
-        sequence = self.candidates.sequence(session, request)
-        return sequence.video.id, sequence.start_frame
-
-    @property
-    def idle_share(self) -> float:
-        """Share of the workers that hold no lease: 0 to 1."""
-        return max(0.0, 1.0 - self.leases.holders / max(len(self.registry), 1)) if self.registry else 0.0
+class Dispatcher(Broker):
+    """Assign requests of consumers to workers: the broker's value, with what changes it from outside."""
 
     # --- consumers ---------------------------------------------------------------------------------------------------
 
@@ -195,7 +108,7 @@ class Dispatcher:
             case Ping():
                 return [
                     ToConsumer(
-                        identity, encode(Pong(self.blocked_reason or self.registry.trouble(self._expected_workers)))
+                        identity, encode(Pong(self.blocked_reason or self.registry.trouble(self.expected_workers)))
                     )
                 ]
             case GetStatus():
@@ -210,7 +123,7 @@ class Dispatcher:
                     return [_deny(identity, ErrorCode.UNKNOWN_SESSION, "no session: say Hello (again)")]
                 self.counters.waited_seconds += session.add_wait(message.waited_seconds, now)
                 denials = self._want(session, message)
-                return denials or [*self._grants.answer_shared(session), *self._grants.assign(now)]
+                return denials or [*answer_shared(self, session), *assign(self, now)]
             case WorkerHello():
                 stray = ProtocolError("this is the consumers' port: connect to the address of --worker-bind")
                 return [self._fault(identity, self._malformed(stray))]
@@ -221,11 +134,11 @@ class Dispatcher:
     def in_flight(self, identity: bytes, nbytes: int, now: float) -> list[Action]:
         """Note how many bytes are on their way to a consumer, and serve the requests that waited for it to read."""
         session = self.sessions.set_in_flight(identity, nbytes)
-        return [] if session is None else [*self._grants.answer_shared(session), *self._grants.assign(now)]
+        return [] if session is None else [*answer_shared(self, session), *assign(self, now)]
 
     def consumer_gone(self, identity: bytes, now: float) -> None:
         """Note that a consumer's connection has ended. The consumer may reconnect at once and find its session."""
-        self._faults.pop(identity, None)
+        self.faults.pop(identity, None)
         session = self.sessions.get(identity)
         if session is not None:
             session.left_at = now
@@ -233,7 +146,7 @@ class Dispatcher:
     def consumer_lost(self, identity: bytes) -> None:
         """Forget a consumer that left or cannot be reached any more."""
         self.sessions.forget(identity)
-        self._grants.forget_session(identity)
+        forget_session(self, identity)
 
     def _hello(self, identity: bytes, hello: Hello, now: float, user: str) -> Action:
         try:
@@ -244,19 +157,19 @@ class Dispatcher:
         if present is not None and (present.owner, present.user) != (owner, user):
             text = "this routing id belongs to the session of another consumer: connect with a random one"
             return _deny(identity, ErrorCode.MALFORMED, text)
-        if self.sessions.get(identity) is None and len(self.sessions) >= MOST_SESSIONS:
+        if present is None and len(self.sessions) >= MOST_SESSIONS:
             for silent in self.sessions.dispensable(now):
                 self.consumer_lost(silent)
-        if self.sessions.get(identity) is None and len(self.sessions) >= MOST_SESSIONS:
+        if present is None and len(self.sessions) >= MOST_SESSIONS:
             return _deny(identity, ErrorCode.BUSY, f"this server has {MOST_SESSIONS} consumers, its limit")
         try:
-            workers = max(len(self.registry), self._expected_workers)
-            session, welcome = self._admission.admit(identity, hello, workers, now)
+            workers = max(len(self.registry), self.expected_workers)
+            session, welcome = admit(self, identity, hello, workers, now)
             session.user, session.owner = user, owner
         except (UsageError, CorpusError) as error:
             return self._fault(identity, denial(ErrorCode.SPEC, str(error)))
         for before in {identity, *self.sessions.owned_by(owner)}:
-            self._grants.forget_session(before)
+            forget_session(self, before)
         self.sessions.open(session)
         return ToConsumer(identity, encode(welcome))
 
@@ -267,7 +180,7 @@ class Dispatcher:
             return [self._fault(session.identity, self._malformed(error))]
         try:
             for index in want.indices[:1]:
-                SampleId(session.spec.digest, self._facts.digest, NUMERICS_VERSION, session.seed, want.epoch, index)
+                SampleId(session.spec.digest, self.facts.digest, NUMERICS_VERSION, session.seed, want.epoch, index)
             self.sessions.want(session, want.epoch, want.indices, slots)
         except LimitExceeded as error:
             return [_deny(session.identity, ErrorCode.CREDIT, str(error))]
@@ -277,9 +190,9 @@ class Dispatcher:
 
     def _fault(self, identity: bytes, answer: Frames) -> Action:
         """Answer a malformed message or a refused spec of a consumer; disconnect it after too many."""
-        faults = self._faults[identity] = self._faults.pop(identity, 0) + 1
-        if len(self._faults) > MOST_SESSIONS:
-            del self._faults[next(iter(self._faults))]
+        faults = self.faults[identity] = self.faults.pop(identity, 0) + 1
+        if len(self.faults) > MOST_SESSIONS:
+            del self.faults[next(iter(self.faults))]
         return ToConsumer(identity, answer) if faults <= MOST_FAULTS else Disconnect(identity)
 
     def _malformed(self, error: ProtocolError) -> Frames:
@@ -344,7 +257,7 @@ class Dispatcher:
 
     def stop_workers(self) -> list[ToWorker]:
         """Tell every worker to finish and leave."""
-        return [ToWorker(identity, encode(Stop())) for identity in self.registry.members()]
+        return [ToWorker(identity, encode(Stop())) for identity in self.registry.members]
 
     def _worker_hello(self, identity: bytes, hello: WorkerHello, now: float, user: str) -> list[Action]:
         try:
@@ -361,7 +274,7 @@ class Dispatcher:
             text = f"this server has {MOST_WORKERS} workers, its limit"
             return [ToWorker(identity, denial(ErrorCode.BUSY, text)), *actions]
         self.registry.add(identity, hello, now, user, owner)
-        return actions + self._grants.assign(now)
+        return actions + assign(self, now)
 
     def _replaced_by(self, identity: bytes, name: str, owner: bytes, user: str) -> list[bytes]:
         """Return the connections that a worker's hello replaces: its own ones.
@@ -371,7 +284,7 @@ class Dispatcher:
         """
         if len(name.encode()) > _LONGEST_NAME_BYTES:
             raise LimitExceeded(f"the name has {len(name.encode())} bytes; the limit is {_LONGEST_NAME_BYTES}")
-        members = self.registry.members()
+        members = self.registry.members
         before = [each for each in {identity, self.registry.named(name)} if each is not None and each in members]
         for each in before:
             is_own = members[each].owner == owner and (bool(owner) or each == identity)
@@ -393,35 +306,35 @@ class Dispatcher:
             self._charge(result.lease, identity, now)
         else:
             try:
-                header = check_result(payload, self._grants.as_leased(request, result.lease), session.form)
+                header = check_result(payload, as_leased(self, request, result.lease), session.form)
             except ProtocolError as error:
                 # Our workers never send such a result; a worker that sends one would send more.
                 refused = ToWorker(identity, self._malformed(ProtocolError(f"malformed result: {error}")))
                 return [refused, *self.worker_lost(identity, Loss(Cause.KILLED, "sent a malformed result"), now)]
             decoded = header.decoded
-            if self._count(session, request, header, in_slot=len(payload) == 1):
+            actions += deliver(self, session, request, result.lease, header, payload)
+            if actions:
                 self.counters.add(result, header.cpu_seconds)
                 self.registry.worked(identity, result, header.cpu_seconds)
-                actions += self._grants.deliver(session, request, result.lease, header, payload)
         self.registry.can_work(identity)
         self.leases.finished(result.lease, identity, now, decoded=decoded)
         self.leases.mark_begun(result.begins, identity, now)
-        return actions + self._grants.assign(now)
+        return actions + assign(self, now)
 
     def _lease_failed(self, identity: bytes, failed: LeaseFailed, now: float) -> list[Action]:
         self._charge(failed.lease, identity, now)
         request = self.leases.finished(failed.lease, identity, now)
         session = None if request is None else self.sessions.get(request.session)
         if request is None or session is None:
-            return self._grants.assign(now)
-        video, sidecar = self.candidates.sequence(session, request).video, failed.sidecar
-        fingerprint = self._facts.sidecars_of(video.id, session.arrays).get(sidecar) if sidecar else video.fingerprint
+            return assign(self, now)
+        video, sidecar = session.sequence(request).video, failed.sidecar
+        fingerprint = self.facts.sidecars_of(video.id, session.arrays).get(sidecar) if sidecar else video.fingerprint
         failure = CheckVideo(
             video.id, fingerprint or "", identity, failed.frame, failed.reason, request, sidecar if fingerprint else ""
         )
         if not failed.here:
             self.registry.can_work(identity)
-            return [*self.candidates.blame(failure), *self._grants.assign(now)]
+            return [*blame(self, failure), *assign(self, now)]
         # The catalogue lists this host's files: if the file is here, other workers can probably read it.
         return [failure]
 
@@ -429,17 +342,7 @@ class Dispatcher:
         """Charge a consumer for a sample that it asked for and then abandoned."""
         debt = self.leases.debt(lease, worker, now)
         if debt is not None:
-            self.sessions.charge(*debt)
-
-    def _count(self, session: Session, request: Request, header: SampleHeader, *, in_slot: bool) -> bool:
-        """Count what was sent of a sample; return False if no session waits for it."""
-        if not self.sessions.mark_answered(request, bounded_seconds(header.cpu_seconds)):
-            self.counters.late_results += 1
-            return False
-        self.counters.decodes += header.decoded
-        self.counters.count_cache(header.cache)
-        self.counters.count_sent(session.batch_size, session.form.sizes, in_slot=in_slot)
-        return True
+            self.sessions.queue.charge(*debt)
 
     def _take_back(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
         self.registry.remove(identity)
@@ -451,10 +354,10 @@ class Dispatcher:
             if isinstance(verdict, Request):
                 self.sessions.put_back(verdict)
             else:
-                actions += self.candidates.quarantine_candidate(
-                    request, verdict, for_all=loss.for_all and loss.cause is not Cause.UNEXPLAINED
+                actions += quarantine_candidate(
+                    self, request, verdict, for_all=loss.for_all and loss.cause is not Cause.UNEXPLAINED
                 )
-        return actions + self._grants.assign(now)
+        return actions + assign(self, now)
 
     # --- what comes of actions, and of time ---------------------------------------------------------------------------
 
@@ -469,33 +372,14 @@ class Dispatcher:
                 written.
             now: monotonic time, seconds.
         """
-        before = self._quarantine.latest
-        self._quarantine.extend(written)
+        before = self.quarantine.latest
+        self.quarantine.extend(written)
         # Consumers under the newest snapshot move on to the new one. A consumer that resumed an older snapshot keeps
         # it: entries cleared since must not return, and sequences that it refused must stay refused.
         for each in self.sessions:
             if each.quarantine == before:
-                each.quarantine = self._quarantine.latest
-        return [*self.candidates.refuse_quarantined(record.request, record.entry.reason), *self._grants.assign(now)]
-
-    def index_unreadable(self, unsent: Sequence[SendLease], reason: str, now: float) -> None:
-        """Continue after leases that cannot be completed, because the index cannot be read at the moment.
-
-        No lease is granted until the next :meth:`tick`.
-
-        Args:
-            unsent: the actions, oldest first.
-            reason: why it cannot be read.
-            now: monotonic time, seconds.
-        """
-        self._grants.blocked_reason = f"{reason}; retried ten times a second"
-        self._grants.take_back(unsent, now)
-
-    def lease_refused(self, unsent: SendLease, reason: str, now: float) -> list[Action]:
-        """Continue after a lease that can never be sent: the index of its video is damaged, belongs to another file, or
-        is too large.
-        """
-        return [*self._grants.refuse(unsent, reason, now), *self._grants.assign(now)]
+                each.quarantine = self.quarantine.latest
+        return [*refuse_quarantined(self, record.request, record.entry.reason), *assign(self, now)]
 
     def video_checked(self, missing: CheckVideo, found: bool, now: float) -> list[Action]:
         """Continue after a :class:`CheckVideo`: blame the video, or the worker's host.
@@ -506,11 +390,11 @@ class Dispatcher:
             now: monotonic time, seconds.
         """
         if not found:
-            return [*self.candidates.blame(missing), *self._grants.assign(now)]
+            return [*blame(self, missing), *assign(self, now)]
         self.counters.missing_videos += 1
         self.registry.rest(missing.identity, now, f"{missing.video}: {missing.reason}")
         self.sessions.put_back(missing.request)
-        return self._grants.assign(now)
+        return assign(self, now)
 
     def tick(self, now: float) -> list[Action]:
         """Apply deadlines, lease slow samples to a second worker, and forget silent peers. Call a few times a
@@ -519,17 +403,17 @@ class Dispatcher:
         for identity in self.sessions.idle(now):
             self.consumer_lost(identity)
         actions: list[Action] = []
-        self._grants.blocked_reason = ""  # cleared so that the next lease is tried
+        self.blocked_reason = ""  # cleared so that the next lease is tried
         self.registry.wake(now)
         for identity in self.registry.hanging(now):
             actions.append(GiveUp(identity, f"gave no answer for {self.leases.limit_seconds(identity):g} s"))
         for identity in self.registry.vanished(now):
             actions.append(GiveUp(identity, f"was silent for {SILENCE_SECONDS:g} s"))
-        second = self._grants.assign_slow(now)
+        second = assign_slow(self, now)
         self.counters.second_leases += len(second)
         actions += second
         # A consumer that left may have freed a worker that was reserved for its requests.
-        return actions + self._grants.assign(now)
+        return actions + assign(self, now)
 
 
 def _only(frames: Sequence[Buffer]) -> Message:
@@ -568,3 +452,139 @@ def owner_digest(user: str, secret: bytes) -> bytes:
     if len(secret) > _LONGEST_SECRET_BYTES:
         raise LimitExceeded(f"the secret has {len(secret)} bytes; the limit is {_LONGEST_SECRET_BYTES}")
     return hashlib.blake2b(secret, key=hashlib.sha256(user.encode()).digest()).digest() if secret else b""
+
+
+def suggested_credit(batch_size: int, workers: int, samples_per_decode: int) -> int:
+    """Return how many samples a consumer should have outstanding: one batch ahead, and two for each worker.
+
+    With K samples per decode the count is in blocks of ``batch_size`` clips with K samples each. A worker gets the
+    siblings of a clip together only if all of them have been requested. So the credit covers the blocks in work (two
+    clips for each worker) and one more. It is then raised by a seventh, because our client asks only when an eighth of
+    its credit is free.
+    """
+    ahead = 2 * max(1, workers)
+    if samples_per_decode == 1:
+        return max(2 * batch_size, ahead)
+    under_way = batch_size * samples_per_decode * (1 + -(-ahead // batch_size))
+    return under_way + -(-under_way // 7)
+
+
+def admit(broker: Broker, identity: bytes, hello: Hello, workers: int, now: float) -> tuple[Session, Welcome]:
+    """Open the session that a consumer asks for, and return it with the reply.
+
+    Args:
+        identity: the consumer's routing id.
+        hello: its message.
+        workers: number of workers, present or expected; the credit keeps all of them busy, within its bounds.
+        now: monotonic time, seconds.
+
+    Raises:
+        UsageError, CorpusError: the request cannot be served.
+    """
+    if not 1 <= hello.batch_size <= MOST_BATCH_SIZE:
+        raise UsageError(f"batch_size = {hello.batch_size}: give 1 to {MOST_BATCH_SIZE}")
+    spec = StreamSpec.from_dict(hello.spec, broker.default_spec)
+    spec = spec.spaced(hello.stride or hello.batch_size)
+    layout = array_layout(spec.recipe, spec.voxel_dtype, hello.arrays)
+    _check_sizes(broker, spec.recipe, layout)
+    broker.facts.require_arrays(hello.arrays)
+    newest = broker.quarantine.latest
+    quarantine = newest if hello.quarantine is None else hello.quarantine
+    if quarantine > newest:
+        raise CorpusError(
+            f"quarantine snapshot {quarantine} was asked for, this server has 0 .. {newest}: the stream follows "
+            "entries that this server has not read. Replace this server's quarantine file with that of the "
+            "stream's earlier server (v2v-quarantine --videos DIR prints its path), and restart this server; if "
+            'they are the same file, just restart. To continue without these entries, set "quarantine" of the '
+            "saved state to None: the sequences that they refused then return"
+        )
+    table = _table(broker, spec)
+    schedule = Schedule.of(table, spec)
+    if not schedule.count:
+        raise UsageError(
+            f"{table.count} sequences do not fill a block of sibling_spacing = {spec.sibling_spacing}: use a "
+            "smaller batch size, fewer ranks or loader workers, samples_per_decode = 1, or more videos"
+        )
+    suggested = suggested_credit(hello.batch_size, workers, spec.samples_per_decode)
+    session = Session(
+        identity=identity,
+        spec=spec,
+        seed=hello.seed,
+        arrays=hello.arrays,
+        batch_size=hello.batch_size,
+        schedule=schedule,
+        credit=min(suggested, MOST_CREDIT, broker.max_credit_bytes // layout_bytes(layout)),
+        liveness=Liveness(now, gone_seconds=broker.session_idle_seconds),
+        quarantine=quarantine,
+        since=now,
+        packed=hello.packed,
+        name=clean_name(hello.name),
+        host=clean_name(hello.host),
+    )
+    return session, Welcome(
+        spec=spec.to_dict(),
+        spec_digest=spec.digest,
+        catalogue_digest=broker.facts.digest_under(spec.scene),
+        numerics_version=NUMERICS_VERSION,
+        sequences=schedule.count,
+        credit=session.credit,
+        quarantine=quarantine,
+        sidecars=broker.facts.sidecars_digest(hello.arrays),
+    )
+
+
+def _check_sizes(broker: Broker, recipe: Recipe, layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:
+    remedy = "ask for fewer voxels_per_clip or a smaller crop"
+    for name, (dtype, shape) in layout.items():
+        size = layout_bytes({name: (dtype, shape)})
+        if size > LARGEST_ARRAY_BYTES:
+            raise UsageError(
+                f"array {name} {dtype}{list(shape)} of one sample is {size} bytes; the limit is "
+                f"{LARGEST_ARRAY_BYTES}: {remedy}"
+            )
+    # The view of an enlarged picture may be larger than the picture, which the sequences are bounded by. How many
+    # frames a duration has depends on the video.
+    view = (recipe.steps + 1) * recipe.crop_height_px * recipe.crop_width_px
+    if view > MOST_CLIP_BYTES and not recipe.is_timed:
+        raise UsageError(
+            f"the {recipe.steps + 1} frames of {recipe.crop_width_px}x{recipe.crop_height_px} px of one sample "
+            f"are {view >> 20} MiB; the limit is {MOST_CLIP_BYTES >> 20} MiB: {remedy}"
+        )
+    if layout_bytes(layout) > broker.max_credit_bytes:
+        raise UsageError(
+            f"one sample is {layout_bytes(layout)} bytes; the server's --max-credit-bytes is "
+            f"{broker.max_credit_bytes}: raise it, or {remedy}"
+        )
+
+
+def _table(broker: Broker, spec: StreamSpec) -> SequenceTable:
+    recipe = spec.recipe
+    # The sequences depend only on these fields, so many specs share a table.
+    geometry = (
+        recipe.frames_needed,
+        spec.samples_per_decode,
+        recipe.frames_per_sequence,
+        recipe.frame_stride,
+        recipe.voxel_seconds[1],
+        recipe.crop_height_px,
+        recipe.crop_width_px,
+        recipe.resize_scale,
+        recipe.light,
+        spec.flow_margin_px,
+        spec.substep_px > 0.0,
+        spec.voxel_dtype,
+        spec.max_sequences_per_video,
+        spec.scene,
+        spec.kept_defects,
+        spec.still_share,
+        spec.quiet_share,
+    )
+    table = broker.tables.get(geometry)
+    if table is None:
+        table = SequenceTable(broker.facts.videos, broker.facts.rows, spec, broker.columns)
+        if not table.count:
+            raise UsageError(f"none of the {len(table.refusals)} videos gives a sequence; {table.refusals[0]}")
+        while len(broker.tables) >= MOST_TABLES:
+            del broker.tables[next(iter(broker.tables))]
+        broker.tables[geometry] = table
+    return table

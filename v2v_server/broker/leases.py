@@ -154,14 +154,19 @@ class LeaseBook:
     Args:
         deadline_seconds: longest time from the grant, or from the beginning of the work, to the answer, in addition to
             the time that the work itself may take.
+
+    Attributes:
+        held: numbers of the leases that each worker holds, in the order of the work.
+        out: numbers of the leases of each sample (:attr:`Request.sample`) that is still wanted.
+        durations: times that the last decoded clips of each session took, seconds.
     """
 
     def __init__(self, deadline_seconds: float) -> None:
         self.deadline_seconds = deadline_seconds
         self._leases: dict[int, _Grant] = {}
-        self._held: dict[bytes, list[int]] = {}
-        self._out: dict[tuple[bytes, int, int], list[int]] = {}
-        self._durations: dict[bytes, deque[float]] = {}
+        self.held: dict[bytes, list[int]] = {}
+        self.out: dict[tuple[bytes, int, int], list[int]] = {}
+        self.durations: dict[bytes, deque[float]] = {}
         self._abandoned: dict[bytes, int] = {}
         self._released: set[bytes] = set()
         self._next = 1
@@ -173,27 +178,14 @@ class LeaseBook:
     def __contains__(self, number: object) -> bool:
         return number in self._leases
 
-    def is_out(self, sample: tuple[bytes, int, int]) -> bool:
-        """Return whether a worker has a lease for a requested sample (:attr:`Request.sample`) that is still wanted."""
-        return sample in self._out
-
     def held_by(self, worker: bytes) -> int:
         """Return the number of clips that this worker has to decode for its leases.
 
         Abandoned leases count individually; otherwise a repeated request could hide behind an old lease for the same
         clip.
         """
-        requests = [self._leases[number].request for number in self._held.get(worker, ())]
+        requests = [self._leases[number].request for number in self.held.get(worker, ())]
         return len({request.clip for request in requests if request is not None}) + requests.count(None)
-
-    def holds(self, worker: bytes) -> bool:
-        """Return whether this worker holds any lease."""
-        return worker in self._held
-
-    @property
-    def holders(self) -> int:
-        """Return the number of workers that hold any lease."""
-        return len(self._held)
 
     def take_changed(self) -> set[bytes]:
         """Return and clear the workers whose leases have changed since the last call, including leases that were
@@ -204,7 +196,7 @@ class LeaseBook:
 
     def requests_of(self, worker: bytes) -> Iterator[Request]:
         """Yield the requests that this worker holds and that are still wanted."""
-        for number in self._held.get(worker, ()):
+        for number in self.held.get(worker, ()):
             request = self._leases[number].request
             if request is not None:
                 yield request
@@ -213,7 +205,7 @@ class LeaseBook:
         """Return what this worker works on, as far as it said, and since when. The request is None if it was abandoned.
         The result is None if the worker has begun nothing.
         """
-        for number in self._held.get(worker, ()):
+        for number in self.held.get(worker, ()):
             lease = self._leases[number]
             if lease.begun_at is not None:
                 return lease.request, lease.begun_at
@@ -240,11 +232,11 @@ class LeaseBook:
         self._next += 1
         # It waits behind the others.
         limit = max(
-            [self.deadline_seconds + work_seconds, *(self._leases[n].limit_seconds for n in self._held.get(worker, ()))]
+            [self.deadline_seconds + work_seconds, *(self._leases[n].limit_seconds for n in self.held.get(worker, ()))]
         )
         self._leases[number] = _Grant(request, worker, now, limit)
-        self._held.setdefault(worker, []).append(number)
-        self._out.setdefault(request.sample, []).append(number)
+        self.held.setdefault(worker, []).append(number)
+        self.out.setdefault(request.sample, []).append(number)
         self._changed.add(worker)
         return number
 
@@ -257,7 +249,7 @@ class LeaseBook:
         if lease is None or lease.worker != worker or lease.begun_at is not None:
             return
         lease.begun_at = now
-        for other in map(self._leases.__getitem__, self._held[worker]):
+        for other in map(self._leases.__getitem__, self.held[worker]):
             other.since, other.stopped_seconds, other.queued_seconds = now, 0.0, 0.0
             other.limit_seconds = max(other.limit_seconds, lease.limit_seconds)
 
@@ -268,7 +260,7 @@ class LeaseBook:
         that waits for a core is not: it gets one eventually, and replacing it would use more cores. Meanwhile its
         samples may be given to a second worker (:meth:`slow`).
         """
-        for number in self._held.get(worker, ()):
+        for number in self.held.get(worker, ()):
             lease = self._leases[number]
             lease.stopped_seconds = min(lease.stopped_seconds + stalled.stopped_seconds, lease.limit_seconds)
             lease.queued_seconds += stalled.queued_seconds
@@ -277,7 +269,7 @@ class LeaseBook:
 
     def limit_seconds(self, worker: bytes) -> float:
         """Return how long the worker may be silent over its current leases, seconds."""
-        return max((self._leases[n].limit_seconds for n in self._held.get(worker, ())), default=self.deadline_seconds)
+        return max((self._leases[n].limit_seconds for n in self.held.get(worker, ())), default=self.deadline_seconds)
 
     def abandoned(self, session: bytes) -> int:
         """Return the number of leases out for samples that this consumer asked for and then abandoned."""
@@ -316,7 +308,7 @@ class LeaseBook:
         request = lease.request
         if request is not None:
             if lease.begun_at is not None and decoded:
-                remembered = self._durations.setdefault(request.session, deque(maxlen=_REMEMBERED))
+                remembered = self.durations.setdefault(request.session, deque(maxlen=_REMEMBERED))
                 remembered.append(now - lease.begun_at)
             self._retire(request.sample)
         self._drop(number)
@@ -334,10 +326,10 @@ class LeaseBook:
             slots, because this worker may still write to them.
         """
         returned = []
-        for number in list(self._held.get(worker, ())):
+        for number in list(self.held.get(worker, ())):
             lease = self._leases[number]
             self._drop(number)
-            if lease.request is not None and lease.request.sample not in self._out:
+            if lease.request is not None and lease.request.sample not in self.out:
                 begun = lease.begun_at is not None if at is None else number == at
                 returned.append((replace(lease.request, slot=None), begun))
         return returned
@@ -363,11 +355,11 @@ class LeaseBook:
                 oldest.setdefault(lease.request.session, lease)
         found = []
         for session, lease in oldest.items():
-            durations = self._durations.get(session, ())
+            durations = self.durations.get(session, ())
             if lease.request is None or len(durations) < _LEAST_REMEMBERED:
                 continue
             limit = max(_LEAST_SLOW_SECONDS, SLOW_FACTOR * statistics.median(durations))
-            if now - lease.since > limit and len(self._out[lease.request.sample]) == 1:
+            if now - lease.since > limit and len(self.out[lease.request.sample]) == 1:
                 found.append((lease.request, lease.worker))
         return found
 
@@ -377,15 +369,15 @@ class LeaseBook:
         Their leases stay with the workers, which do not know and finish them. Until then they occupy the workers, and
         the leases queued behind them must not become overdue.
         """
-        self._durations.pop(session, None)
-        for sample in [sample for sample in self._out if sample[0] == session]:
-            for number in self._out[sample]:
+        self.durations.pop(session, None)
+        for sample in [sample for sample in self.out if sample[0] == session]:
+            for number in self.out[sample]:
                 self._leases[number].debtor = session
                 self._abandoned[session] = self._abandoned.get(session, 0) + 1
             self._retire(sample)
 
     def _retire(self, sample: tuple[bytes, int, int]) -> None:
-        for number in self._out.pop(sample, ()):
+        for number in self.out.pop(sample, ()):
             self._leases[number].request = None
             self._changed.add(self._leases[number].worker)
 
@@ -397,12 +389,12 @@ class LeaseBook:
             if not self._abandoned[lease.debtor]:
                 del self._abandoned[lease.debtor]
         self._changed.add(lease.worker)
-        held = self._held[lease.worker]
+        held = self.held[lease.worker]
         held.remove(number)
         if not held:
-            del self._held[lease.worker]
+            del self.held[lease.worker]
         if lease.request is not None:
-            out = self._out[lease.request.sample]
+            out = self.out[lease.request.sample]
             out.remove(number)
             if not out:
-                del self._out[lease.request.sample]
+                del self.out[lease.request.sample]

@@ -3,7 +3,7 @@
 The server keeps no position: a consumer asks for indices, each of which is one unit of its credit until it is answered,
 and an index that was answered is forgotten. So a session can be dropped and opened again at any time.
 
-Worker time is shared by deficit round robin (:mod:`v2v_server.broker.fair_queue`). A repeated Hello changes none of
+Worker time is shared by deficit round robin (:class:`FairQueue`). A repeated Hello changes none of
 this: the new session takes over the debt of the old one, and its abandoned requests count against its credit until the
 workers have finished them.
 
@@ -14,34 +14,22 @@ most its credit, all of them together hold about MOST_IN_FLIGHT_BYTES, and none 
 
 from __future__ import annotations
 
+import heapq
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import count
+from typing import TypeAlias
 
-from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import Slot
-from v2v_protocol.errors import CorpusError, LimitExceeded, UsageError
+from v2v_protocol.errors import LimitExceeded
 from v2v_protocol.liveness import Liveness
-from v2v_protocol.messages import Hello, Welcome
-from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import Form, array_layout, layout_bytes
+from v2v_protocol.sample import Form, array_layout
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import LARGEST_ARRAY_BYTES, MOST_IN_FLIGHT_BYTES
-from v2v_server.broker.fair_queue import FairQueue
+from v2v_protocol.wire import MOST_IN_FLIGHT_BYTES
 from v2v_server.broker.leases import LeaseBook, Request, runs_alone
-from v2v_server.broker.worker_registry import clean_name
-from v2v_server.corpus.videos import CorpusFacts
-from v2v_server.quarantine.snapshots import Quarantine
 from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.sequences import MOST_CLIP_BYTES, Columns, SequenceTable
-
-MOST_BATCH_SIZE = 65_536
-MOST_CREDIT = 400
-"""Less than ``router.MOST_QUEUED``, the number of queued messages at which a consumer is disconnected."""
-MOST_TABLES = 16
-"""Sequence tables cached for later consumers. A session keeps its own, which is small."""
-
+from v2v_server.schedule.sequences import VideoSequence
 
 GONE_SECONDS = 10.0
 """Time that a consumer has to return to its session after its connection ended."""
@@ -52,168 +40,150 @@ RETURN_SECONDS = 60.0
 """A consumer that says Hello within this time of the last message of one with the same name continues its totals."""
 _MOST_DEPARTED = 1024
 """Number of departed consumers whose totals are remembered; the oldest is dropped first."""
+_SECOND_NS = 1_000_000_000
+_QUANTUM_NS = _SECOND_NS // 20
+_MOST_DEBTS = 4096
+"""Number of debts remembered for absent consumers; the oldest is dropped first."""
+_MOST_STALE = 64
+"""Entries that a heap may hold, besides two for each consumer, before it is rebuilt."""
+
+_Place: TypeAlias = tuple[bool, int]  # (whether in debt, key in the heap of such consumers)
 
 
-def suggested_credit(batch_size: int, workers: int, samples_per_decode: int) -> int:
-    """Return how many samples a consumer should have outstanding: one batch ahead, and two for each worker.
+@dataclass(slots=True)
+class _Balance:
+    turn: int
+    balance_ns: int = 0  # without what a waiting debtor has earned
+    place: _Place | None = None  # None: does not wait
 
-    With K samples per decode the count is in blocks of ``batch_size`` clips with K samples each. A worker gets the
-    siblings of a clip together only if all of them have been requested. So the credit covers the blocks in work (two
-    clips for each worker) and one more. It is then raised by a seventh, because our client asks only when an eighth of
-    its credit is free.
+
+class FairQueue:
+    """Order in which waiting consumers are served: deficit round robin, at logarithmic cost for each request.
+
+    Shreedhar and Varghese, "Efficient fair queuing using deficit round robin", SIGCOMM 1995. The cost of a sample is
+    known only once it is made, so a consumer pays afterwards. Consumers that wait are served in turn while their
+    balance is not negative. If all of them are in debt, each earns the same number of quanta, so that the smallest debt
+    is paid. A consumer whose samples take ten times the work therefore gets a tenth of the samples, not ten times the
+    time.
+
+        waiting, balance >= 0     heap by turn: the consumer that was served longest ago comes first
+        waiting, balance < 0      heap by the earnings that pay the debt: ``earned`` of the queue minus the balance
+        not waiting               in no heap; earns nothing
+
+    Quanta are not added to every balance: the queue counts what each waiting debtor has earned. Balances are whole
+    nanoseconds, so that this sum is exact. Heap entries that no longer hold are skipped when they reach the top, and
+    removed when they outnumber the consumers.
+
+    Attributes:
+        debts_ns: of absent consumers.
+        heaps: (key, consumer) of the solvent ones, and of those in debt.
     """
-    ahead = 2 * max(1, workers)
-    if samples_per_decode == 1:
-        return max(2 * batch_size, ahead)
-    under_way = batch_size * samples_per_decode * (1 + -(-ahead // batch_size))
-    return under_way + -(-under_way // 7)
 
+    def __init__(self) -> None:
+        self._accounts: dict[bytes, _Balance] = {}
+        self.debts_ns: dict[bytes, int] = {}
+        self._turns = count()
+        self._earned_ns = 0
+        self.heaps: tuple[list[tuple[int, bytes]], list[tuple[int, bytes]]] = [], []
 
-class Admission:
-    """Turn what consumers ask for into sessions.
-
-    Args:
-        facts: what is known of the videos, in memory.
-        default_spec: the spec of a consumer that sends none.
-        max_credit_bytes: bound on the bytes in flight to one consumer.
-        session_idle_seconds: a session that is silent for this long is dropped, even if it waits for samples. Its
-            consumer opens it again with its next request, so the limit only bounds the cost of abandoned consumers.
-        quarantine: the snapshots that a consumer may ask for.
-    """
-
-    def __init__(
-        self,
-        facts: CorpusFacts,
-        default_spec: StreamSpec,
-        max_credit_bytes: int,
-        session_idle_seconds: float,
-        quarantine: Quarantine,
-    ) -> None:
-        self._facts = facts
-        self._default_spec = default_spec
-        self._max_credit_bytes = max_credit_bytes
-        self._session_idle_seconds = session_idle_seconds
-        self._quarantine = quarantine
-        self._columns = Columns(facts.videos)
-        self._tables: dict[tuple[object, ...], SequenceTable] = {}
-
-    def admit(self, identity: bytes, hello: Hello, workers: int, now: float) -> tuple[Session, Welcome]:
-        """Open the session that a consumer asks for, and return it with the reply.
+    def add(self, identity: bytes, debtors: Iterable[bytes] = ()) -> None:
+        """Add a consumer, which does not wait yet.
 
         Args:
-            identity: the consumer's routing id.
-            hello: its message.
-            workers: number of workers, present or expected; the credit keeps all of them busy, within its bounds.
-            now: monotonic time, seconds.
-
-        Raises:
-            UsageError, CorpusError: the request cannot be served.
+            identity: the consumer.
+            debtors: absent consumers whose debts it takes over.
         """
-        if not 1 <= hello.batch_size <= MOST_BATCH_SIZE:
-            raise UsageError(f"batch_size = {hello.batch_size}: give 1 to {MOST_BATCH_SIZE}")
-        spec = StreamSpec.from_dict(hello.spec, self._default_spec)
-        spec = spec.spaced(hello.stride or hello.batch_size)
-        layout = array_layout(spec.recipe, spec.voxel_dtype, hello.arrays)
-        self._check_sizes(spec.recipe, layout)
-        self._facts.require_arrays(hello.arrays)
-        newest = self._quarantine.latest
-        quarantine = newest if hello.quarantine is None else hello.quarantine
-        if quarantine > newest:
-            raise CorpusError(
-                f"quarantine snapshot {quarantine} was asked for, this server has 0 .. {newest}: the stream follows "
-                "entries that this server has not read. Replace this server's quarantine file with that of the "
-                "stream's earlier server (v2v-quarantine --videos DIR prints its path), and restart this server; if "
-                'they are the same file, just restart. To continue without these entries, set "quarantine" of the '
-                "saved state to None: the sequences that they refused then return"
-            )
-        table = self._table(spec)
-        schedule = Schedule.of(table, spec)
-        if not schedule.count:
-            raise UsageError(
-                f"{table.count} sequences do not fill a block of sibling_spacing = {spec.sibling_spacing}: use a "
-                "smaller batch size, fewer ranks or loader workers, samples_per_decode = 1, or more videos"
-            )
-        suggested = suggested_credit(hello.batch_size, workers, spec.samples_per_decode)
-        session = Session(
-            identity=identity,
-            spec=spec,
-            seed=hello.seed,
-            arrays=hello.arrays,
-            batch_size=hello.batch_size,
-            schedule=schedule,
-            credit=min(suggested, MOST_CREDIT, self._max_credit_bytes // layout_bytes(layout)),
-            liveness=Liveness(now, gone_seconds=self._session_idle_seconds),
-            quarantine=quarantine,
-            since=now,
-            packed=hello.packed,
-            name=clean_name(hello.name),
-            host=clean_name(hello.host),
-        )
-        return session, Welcome(
-            spec=spec.to_dict(),
-            spec_digest=spec.digest,
-            catalogue_digest=self._facts.digest_under(spec.scene),
-            numerics_version=NUMERICS_VERSION,
-            sequences=schedule.count,
-            credit=session.credit,
-            quarantine=quarantine,
-            sidecars=self._facts.sidecars_digest(hello.arrays),
-        )
+        debt_ns = sum(self.debts_ns.pop(each, 0) for each in debtors)
+        self._accounts[identity] = _Balance(next(self._turns), -debt_ns)
 
-    def _check_sizes(self, recipe: Recipe, layout: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:
-        remedy = "ask for fewer voxels_per_clip or a smaller crop"
-        for name, (dtype, shape) in layout.items():
-            size = layout_bytes({name: (dtype, shape)})
-            if size > LARGEST_ARRAY_BYTES:
-                raise UsageError(
-                    f"array {name} {dtype}{list(shape)} of one sample is {size} bytes; the limit is "
-                    f"{LARGEST_ARRAY_BYTES}: {remedy}"
-                )
-        # The view of an enlarged picture may be larger than the picture, which the sequences are bounded by. How many
-        # frames a duration has depends on the video.
-        view = (recipe.steps + 1) * recipe.crop_height_px * recipe.crop_width_px
-        if view > MOST_CLIP_BYTES and not recipe.is_timed:
-            raise UsageError(
-                f"the {recipe.steps + 1} frames of {recipe.crop_width_px}x{recipe.crop_height_px} px of one sample "
-                f"are {view >> 20} MiB; the limit is {MOST_CLIP_BYTES >> 20} MiB: {remedy}"
-            )
-        if layout_bytes(layout) > self._max_credit_bytes:
-            raise UsageError(
-                f"one sample is {layout_bytes(layout)} bytes; the server's --max-credit-bytes is "
-                f"{self._max_credit_bytes}: raise it, or {remedy}"
-            )
+    def remove(self, identity: bytes) -> None:
+        """Remove a consumer; its debt is remembered."""
+        balance_ns = self._balance_ns(self._accounts.pop(identity))
+        if balance_ns < 0:
+            self._remember(identity, -balance_ns)
 
-    def _table(self, spec: StreamSpec) -> SequenceTable:
-        recipe = spec.recipe
-        # The sequences depend only on these fields, so many specs share a table.
-        geometry = (
-            recipe.frames_needed,
-            spec.samples_per_decode,
-            recipe.frames_per_sequence,
-            recipe.frame_stride,
-            recipe.voxel_seconds[1],
-            recipe.crop_height_px,
-            recipe.crop_width_px,
-            recipe.resize_scale,
-            recipe.light,
-            spec.flow_margin_px,
-            spec.substep_px > 0.0,
-            spec.voxel_dtype,
-            spec.max_sequences_per_video,
-            spec.scene,
-            spec.kept_defects,
-            spec.still_share,
-            spec.quiet_share,
-        )
-        table = self._tables.get(geometry)
-        if table is None:
-            table = SequenceTable(self._facts.videos, self._facts.rows, spec, self._columns)
-            if not table.count:
-                raise UsageError(f"none of the {len(table.refusals)} videos gives a sequence; {table.refusals[0]}")
-            while len(self._tables) >= MOST_TABLES:
-                del self._tables[next(iter(self._tables))]
-            self._tables[geometry] = table
-        return table
+    def charge(self, identity: bytes, seconds: float) -> None:
+        """Charge worker time to a consumer, whether it is present or not."""
+        cost_ns = round(seconds * _SECOND_NS)
+        account = self._accounts.get(identity)
+        if account is None:
+            self._remember(identity, cost_ns)
+        else:
+            self._settle(identity, account, self._balance_ns(account) - cost_ns, waits=account.place is not None)
+
+    def balance_seconds(self, identity: bytes) -> float:
+        """Return what a consumer has earned and not used; negative: its debt."""
+        return self._balance_ns(self._accounts[identity]) / _SECOND_NS
+
+    def drop_savings(self, identity: bytes) -> None:
+        """Drop what an idle consumer has earned and not used.
+
+        A debt stays; otherwise asking for one sample at a time would be free. The debt is at most the cost of the
+        samples that were in work at the same time.
+        """
+        account = self._accounts[identity]
+        account.balance_ns = min(account.balance_ns, 0)
+
+    def set_waiting(self, identity: bytes, *, waits: bool) -> None:
+        """Note whether a consumer waits for a worker."""
+        account = self._accounts[identity]
+        if waits != (account.place is not None):
+            self._settle(identity, account, self._balance_ns(account), waits=waits)
+
+    def next(self) -> bytes | None:
+        """Return the consumer to serve, and put its next turn behind those of all others; None if none waits."""
+        if (identity := self._first(in_debt=False)) is None:
+            if self._first(in_debt=True) is None:
+                return None
+            self._pay_smallest_debt()
+            return self.next()
+        account = self._accounts[identity]
+        account.turn = next(self._turns)
+        self._settle(identity, account, account.balance_ns, waits=True)
+        return identity
+
+    def _pay_smallest_debt(self) -> None:
+        debt_ns = self.heaps[True][0][0] - self._earned_ns
+        self._earned_ns += (debt_ns // _QUANTUM_NS + 1) * _QUANTUM_NS
+        while (debtor := self._first(in_debt=True)) is not None and self.heaps[True][0][0] <= self._earned_ns:
+            account = self._accounts[debtor]
+            self._settle(debtor, account, self._balance_ns(account), waits=True)
+
+    def _balance_ns(self, account: _Balance) -> int:
+        in_debt, key = account.place or (False, 0)
+        return self._earned_ns - key if in_debt else account.balance_ns
+
+    def _settle(self, identity: bytes, account: _Balance, balance_ns: int, *, waits: bool) -> None:
+        """Set a balance, and move the consumer to the heap where it belongs."""
+        account.balance_ns = balance_ns
+        in_debt = balance_ns < 0
+        place = (in_debt, self._earned_ns - balance_ns if in_debt else account.turn) if waits else None
+        if place == account.place:
+            return
+        account.place = place
+        if place is None:
+            return
+        heap = self.heaps[in_debt]
+        heapq.heappush(heap, (place[1], identity))
+        if len(heap) > 2 * len(self._accounts) + _MOST_STALE:
+            heap[:] = {entry for entry in heap if self._holds(entry, in_debt=in_debt)}
+            heapq.heapify(heap)
+
+    def _first(self, *, in_debt: bool) -> bytes | None:
+        """Return the consumer at the top of a heap; None if the heap is empty."""
+        heap = self.heaps[in_debt]
+        while heap and not self._holds(heap[0], in_debt=in_debt):
+            heapq.heappop(heap)
+        return heap[0][1] if heap else None
+
+    def _holds(self, entry: tuple[int, bytes], *, in_debt: bool) -> bool:
+        account = self._accounts.get(entry[1])
+        return account is not None and account.place == (in_debt, entry[0])
+
+    def _remember(self, identity: bytes, debt_ns: int) -> None:
+        self.debts_ns[identity] = self.debts_ns.pop(identity, 0) + debt_ns
+        if len(self.debts_ns) > _MOST_DEBTS:
+            del self.debts_ns[next(iter(self.debts_ns))]
 
 
 @dataclass(slots=True)
@@ -324,6 +294,21 @@ class Session:
         self.totals.waited_seconds += more
         return more
 
+    def current(self, request: Request) -> Request:
+        """Return the request under the session's quarantine snapshot.
+
+        Another snapshot may refuse other candidates. So the request starts again at the first candidate, as a later
+        remake of the sample does.
+        """
+        if request.snapshot == self.quarantine:
+            return request
+        deaths = 0 if request.candidate else request.deaths
+        return replace(request, snapshot=self.quarantine, candidate=0, refusals=(), deaths=deaths)
+
+    def sequence(self, request: Request) -> VideoSequence:
+        """Return the sequence of the request's candidate."""
+        return self.schedule.candidate(self.seed, request.epoch, request.index, request.candidate)
+
     @property
     def display(self) -> tuple[object, ...]:
         """Return what identifies the consumer in the status. Its secret does not: it changes with each epoch."""
@@ -336,6 +321,9 @@ class Sessions:
     Args:
         leases: the leases that are out. They say how many samples workers still make that a consumer abandoned in an
             earlier session.
+
+    Attributes:
+        queue: the order; it keeps the consumers' accounts of worker time.
     """
 
     def __init__(self, leases: LeaseBook) -> None:
@@ -344,7 +332,7 @@ class Sessions:
         self._in_flight: dict[bytes, int] = {}
         self._departed: deque[tuple[tuple[object, ...], ConsumerTotals]] = deque(maxlen=_MOST_DEPARTED)
         self._numbers = count()
-        self._queue = FairQueue()
+        self.queue = FairQueue()
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -365,7 +353,7 @@ class Sessions:
             self.forget(before)
         session.totals = self._totals_of(session)
         self._sessions[session.identity] = session
-        self._queue.add(session.identity, replaced)
+        self.queue.add(session.identity, replaced)
 
     def totals(self) -> Iterator[ConsumerTotals]:
         """Yield the totals of all consumers, and of those that left and may return."""
@@ -393,15 +381,7 @@ class Sessions:
         if session is not None:
             session.totals.left_at = session.liveness.heard_at
             self._departed.append((session.display, session.totals))
-            self._queue.remove(identity)
-
-    def charge(self, identity: bytes, seconds: float) -> None:
-        """Charge worker time to a consumer, whether it is connected or not."""
-        self._queue.charge(identity, seconds)
-
-    def balance_seconds(self, identity: bytes) -> float:
-        """Return the worker time that a consumer has earned and not used; negative: its debt."""
-        return self._queue.balance_seconds(identity)
+            self.queue.remove(identity)
 
     def want(self, session: Session, epoch: int, indices: Sequence[int], slots: Sequence[Slot | None] = ()) -> None:
         """Queue requests of a consumer. Samples that it already waits for are not made twice, and keep their slots.
@@ -444,7 +424,7 @@ class Sessions:
         for identity in self._leases.take_released():
             if (session := self._sessions.get(identity)) is not None:
                 self._requeue(session)
-        if (first := self._queue.next()) is None:
+        if (first := self.queue.next()) is None:
             return None
         session = self._sessions[first]
         request = session.waiting.popleft()
@@ -473,7 +453,7 @@ class Sessions:
 
     def _requeue(self, session: Session) -> None:
         """Queue a session if it has waiting requests and room for them; else dequeue it."""
-        self._queue.set_waiting(session.identity, waits=bool(session.waiting) and self.room(session) > 0)
+        self.queue.set_waiting(session.identity, waits=bool(session.waiting) and self.room(session) > 0)
 
     def take_siblings(self, request: Request) -> list[Request]:
         """Take the waiting requests that are made from the same clip as ``request``."""
@@ -506,10 +486,10 @@ class Sessions:
         if request.epoch == session.epoch:
             before, session.position = session.position, max(session.position, request.index + 1)
             session.totals.passed += session.position - before
-        self._queue.charge(request.session, worker_seconds)
+        self.queue.charge(request.session, worker_seconds)
         self._requeue(session)
         if not session.unanswered:
-            self._queue.drop_savings(request.session)
+            self.queue.drop_savings(request.session)
         session.totals.served += 1
         return True
 

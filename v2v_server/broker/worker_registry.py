@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import Result, WorkerHello
-from v2v_server.broker.counters import WorkDone
 from v2v_server.broker.leases import LeaseBook, runs_alone
 
 MOST_WORKERS = 4096
@@ -21,6 +20,45 @@ LONGEST_NAME = 100
 """Characters kept of the name that a peer gives itself or its host."""
 _MOST_STALE = 64
 """Stale entries that the heap may hold, besides one for each worker with free credit, before it is rebuilt."""
+
+
+_MOST_SECONDS = 86_400.0
+
+
+@dataclass(slots=True)
+class WorkDone:
+    """Totals of the time that samples took, as reported by the workers.
+
+    Attributes:
+        samples: number of samples.
+        cpu_seconds: processor time.
+        decode_seconds, simulate_seconds, handover_seconds: wall-clock time for decoding clips, for building the arrays,
+            and for delivering them to their consumers.
+    """
+
+    samples: int = 0
+    cpu_seconds: float = 0.0
+    decode_seconds: float = 0.0
+    simulate_seconds: float = 0.0
+    handover_seconds: float = 0.0
+
+    def add(self, result: Result, cpu_seconds: float) -> None:
+        """Add one sample."""
+        self.samples += 1
+        self.cpu_seconds += bounded_seconds(cpu_seconds)
+        self.decode_seconds += bounded_seconds(result.decode_seconds)
+        self.simulate_seconds += bounded_seconds(result.simulate_seconds)
+        self.handover_seconds += bounded_seconds(result.handover_seconds)
+
+    @property
+    def busy_seconds(self) -> float:
+        """Wall-clock time of all three parts."""
+        return self.decode_seconds + self.simulate_seconds + self.handover_seconds
+
+
+def bounded_seconds(said: float) -> float:
+    """Clip a duration that a worker reported to a plausible range: 0 to one day, seconds."""
+    return min(max(said, 0.0), _MOST_SECONDS)
 
 
 @dataclass(slots=True)
@@ -62,11 +100,14 @@ class Workers:
 
     Args:
         leases: the leases that they hold.
+
+    Attributes:
+        members: all of them by routing id.
     """
 
     def __init__(self, leases: LeaseBook) -> None:
         self._leases = leases
-        self._workers: dict[bytes, Member] = {}
+        self.members: dict[bytes, Member] = {}
         self._names: dict[str, bytes] = {}
         self._resting: dict[bytes, float] = {}  # time at which their rest ends
         # With a thousand workers, only those whose load has changed are examined; the heap gives the least loaded one.
@@ -76,18 +117,14 @@ class Workers:
         self._in_heap: set[tuple[int, bytes]] = set()
 
     def __len__(self) -> int:
-        return len(self._workers)
+        return len(self.members)
 
     def __contains__(self, identity: bytes) -> bool:
-        return identity in self._workers
-
-    def members(self) -> Mapping[bytes, Member]:
-        """Return all workers by routing id."""
-        return self._workers
+        return identity in self.members
 
     def name_of(self, identity: bytes) -> str:
         """Return the name of a worker; empty if it has not said hello."""
-        worker = self._workers.get(identity)
+        worker = self.members.get(identity)
         return "" if worker is None else worker.name
 
     def named(self, name: str) -> bytes | None:
@@ -102,13 +139,13 @@ class Workers:
         """Add a worker that said hello; none of that routing id or name is there."""
         room = max(1, min(hello.credit, MOST_WORKER_CREDIT))
         liveness = Liveness(now, gone_seconds=SILENCE_SECONDS)
-        self._workers[identity] = Member(hello.name, room, liveness, clean_name(hello.host), user, owner)
+        self.members[identity] = Member(hello.name, room, liveness, clean_name(hello.host), user, owner)
         self._names[hello.name] = identity
         self._changed.add(identity)
 
     def remove(self, identity: bytes) -> None:
         """Remove a worker that is gone."""
-        worker = self._workers.pop(identity, None)
+        worker = self.members.pop(identity, None)
         if worker is not None:
             del self._names[worker.name]
         self._resting.pop(identity, None)
@@ -116,7 +153,7 @@ class Workers:
 
     def mark_heard(self, identity: bytes, now: float) -> bool:
         """Note a message from a worker; return False if it has not said hello."""
-        worker = self._workers.get(identity)
+        worker = self.members.get(identity)
         if worker is None:
             return False
         worker.liveness.mark_heard(now)
@@ -124,15 +161,15 @@ class Workers:
 
     def worked(self, identity: bytes, result: Result, cpu_seconds: float) -> None:
         """Add a wanted sample to the worker's totals."""
-        worker = self._workers.get(identity)
+        worker = self.members.get(identity)
         if worker is not None:
             worker.work.add(result, cpu_seconds)
             worker.memory_bytes = result.memory_bytes
 
     def can_work(self, identity: bytes) -> None:
         """Note that a worker has made a sample, so its host can read videos."""
-        if identity in self._workers:
-            self._workers[identity].unreadable = ""
+        if identity in self.members:
+            self.members[identity].unreadable = ""
 
     def trouble(self, expected: int) -> str:
         """Return why no worker can make a sample, and what to do about it; empty if one can, as far as is known.
@@ -140,10 +177,10 @@ class Workers:
         Args:
             expected: number of workers expected.
         """
-        if not self._workers:
+        if not self.members:
             start = f"{expected} should come; see what v2v-serve says of them" if expected else "start v2v-worker"
             return f"no worker is connected to the server: {start}, or v2v-serve with --workers N"
-        reasons = [worker.unreadable for worker in self._workers.values()]
+        reasons = [worker.unreadable for worker in self.members.values()]
         if not all(reasons):
             return ""
         return (
@@ -153,8 +190,8 @@ class Workers:
 
     def rest(self, identity: bytes, now: float, unreadable: str) -> None:
         """Give a worker no work for a while, because its host could not read a video."""
-        if identity in self._workers:
-            self._workers[identity].unreadable = unreadable
+        if identity in self.members:
+            self.members[identity].unreadable = unreadable
             self._resting[identity] = now + REST_SECONDS
             self._changed.add(identity)
 
@@ -167,7 +204,7 @@ class Workers:
 
     def hanging(self, now: float) -> list[bytes]:
         """Return workers with an overdue lease. Each is returned once, and gets no more work."""
-        return self._give_up(identity for identity in self._leases.overdue(now) if identity in self._workers)
+        return self._give_up(identity for identity in self._leases.overdue(now) if identity in self.members)
 
     def vanished(self, now: float) -> list[bytes]:
         """Return workers without leases that have been silent for too long. Each is returned once, and gets no more
@@ -175,7 +212,7 @@ class Workers:
         """
         return self._give_up(
             identity
-            for identity, worker in self._workers.items()
+            for identity, worker in self.members.items()
             if not self._leases.held_by(identity) and worker.liveness.is_gone(now)
         )
 
@@ -194,9 +231,9 @@ class Workers:
         return next((identity for held, identity in self._lightest(1) if not held), None)
 
     def _give_up(self, found: Iterable[bytes]) -> list[bytes]:
-        given_up = [identity for identity in found if not self._workers[identity].given_up]
+        given_up = [identity for identity in found if not self.members[identity].given_up]
         for identity in given_up:
-            self._workers[identity].given_up = True
+            self.members[identity].given_up = True
         self._changed.update(given_up)
         return given_up
 
@@ -217,7 +254,7 @@ class Workers:
     def _look_at_changed(self) -> None:
         changed, self._changed = self._changed | self._leases.take_changed(), set()
         for identity in changed:
-            worker, held = self._workers.get(identity), self._leases.held_by(identity)
+            worker, held = self.members.get(identity), self._leases.held_by(identity)
             if worker is None or worker.given_up or identity in self._resting:
                 self._room.pop(identity, None)
                 continue

@@ -18,8 +18,7 @@ from v2v_protocol.errors import V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.write_aside import write_json
 from v2v_server.corpus.sources.source import SourceOptions, open_source
-from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
-from v2v_server.quarantine.snapshots import Quarantine, clearing
+from v2v_server.quarantine import Quarantine, clearing, quarantine_path, read_quarantine, write_entry
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -12,9 +12,8 @@ from v2v_protocol.errors import V2VError
 from v2v_protocol.spec_flags import add_spec, recipe_setting
 from v2v_protocol.write_aside import check_output
 from v2v_server.config import SERVE_KEYS, ServeConfig
-from v2v_server.supervise.child import start_ahead
-from v2v_server.system.log import report_errors
-from v2v_server.system.start_times import StartTimes
+from v2v_server.supervise.local_host import start_ahead
+from v2v_server.system.log import StartTimes, report_errors
 
 
 def main(argv: Sequence[str] | None = None) -> int:

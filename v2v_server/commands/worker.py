@@ -14,9 +14,8 @@ from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_sou
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.packing import QUICK, RAW
 from v2v_server.store.quota import MOST_GIB
-from v2v_server.system.log import LOG_FORMATS, Log, report_errors
+from v2v_server.system.log import LOG_FORMATS, Log, StartTimes, report_errors
 from v2v_server.system.process import die_with_parent
-from v2v_server.system.start_times import StartTimes
 from v2v_server.system.status_fields import GIB
 from v2v_server.worker.process import run_worker, unshared_name
 from v2v_server.worker.warm_up import warm_up_in_turn

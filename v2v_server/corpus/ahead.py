@@ -7,14 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.corpus import list_corpus
-from v2v_server.corpus.index.parts import Shard, make_folder, merge_parts, parts_in, write_part
+from v2v_server.corpus.catalogue import Catalogue, index_path, list_corpus, open_catalogue, refresh_index
+from v2v_server.corpus.index import Shard, make_folder, merge_parts, parts_in, write_part
 from v2v_server.corpus.probe import Progress
-from v2v_server.corpus.refresh import index_path, refresh_index
 from v2v_server.corpus.scenes.collect import SceneCollection
-from v2v_server.corpus.sources.asking import Notice
-from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
+from v2v_server.corpus.sources.source import COPIES_GIB, Notice, SourceOptions, VideoSource, open_source
 from v2v_server.video.rows import Rows
 
 

@@ -21,9 +21,9 @@ from typing import Any, TypeVar
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_protocol.programs import printable
 from v2v_protocol.safe_json import parse_json
-from v2v_server.corpus.index.file import IndexRow
+from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sources.names import UNPRINTABLE
+from v2v_server.corpus.sources.listfile import UNPRINTABLE
 from v2v_server.store.packing import SIZES
 from v2v_server.store.reader import STORE_FORMAT
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from v2v_protocol.errors import VideoError, VideoUnreadable
-from v2v_server.corpus.index.file import IndexRow
+from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.pixels import open_pixels
 from v2v_server.system.isolate import Died, run_twice

@@ -15,11 +15,10 @@ from functools import partial
 
 from v2v_protocol.errors import VideoError
 from v2v_protocol.programs import printable
-from v2v_server.corpus.index.file import FigureKind, Figures, Store
+from v2v_server.corpus.index import FigureKind, Figures, Store
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
-from v2v_server.corpus.sources.asking import Notice, by_parts
 from v2v_server.corpus.sources.sidecar import files_between, open_sidecar, read_files, sidecar_id
-from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.corpus.sources.source import Notice, VideoSource, by_parts
 from v2v_server.labels.formats import check_labels
 from v2v_server.system.isolate import Died, run_isolated
 

@@ -20,7 +20,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.flow.methods import AUTO, STILL_METHOD, Estimator, Field, GreyPicture, choose, estimator, one_thread
 from v2v_server.simulation.draw import resized_size
 from v2v_server.simulation.view import Frames, Window, crop_place, crop_region, resized
-from v2v_server.system.opencv import cv2
+from v2v_server.system.compile_cache import cv2
 
 SKIPPED = "skipped"
 PAUSED = "paused"

@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_server.system.opencv import cv2
+from v2v_server.system.compile_cache import cv2
 
 GreyPicture = npt.NDArray[np.uint8]
 """[h, w] uint8, C-contiguous."""

@@ -1,15 +1,19 @@
 """List the sequences of videos that a spec may draw samples from.
 
 A sequence is a run of consecutive frames of one video. The sequences of a video start at frame 0, L, 2L ... while
-start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L = frames per sequence). With scene
-"auto" the same holds for each run of the video (:mod:`v2v_server.schedule.runs`). With ``voxel_seconds``, L is the
-frames of the longest duration that the recipe can draw, at the video's average rate.
+start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L = frames per sequence). With
+``voxel_seconds``, L is the frames of the longest duration that the recipe can draw, at the video's average rate.
+
+With scene "auto", repeats, shots, fades and stretches with nothing to see divide a video into runs. A run is what a
+spec may read in one go: frames of one shot with one set of bars, without the pieces that are skipped. Repeated frames
+do not count. Sequences begin at 0, L, 2L ... of each run. Of those that are still for three quarters, and of the others
+that are quiet for half, shares are kept: which, depends on a hash of the video's number and the first frame.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import repeat
 from typing import overload
@@ -21,23 +25,186 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, MOST_STEPS_PER_GRID, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
-from v2v_server.corpus.scenes.pieces import SplitVideos
-from v2v_server.corpus.scenes.scene import NO_BARS, Sides
-from v2v_server.corpus.videos import VideoEntry
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.scenes.scene import MOST_FRAMES, NO_BARS, Flag, Pieces, Sides, sides_of
+from v2v_server.corpus.videos import SplitVideos, VideoEntry
 from v2v_server.corpus.videos import Videos as CatalogueVideos
-from v2v_server.schedule.runs import Cleaning, Runs, SplitSequences
 from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.rows import Rows
 
+_SKIPPED = {
+    "fades": Flag.FADE,
+    "black": Flag.BLACK,
+    "white": Flag.WHITE,
+    "combed": Flag.COMBED,
+    "cuts": Flag.UNSEEN,  # there are most likely more of them
+}
+_Int64 = npt.NDArray[np.int64]
 MOST_CLIP_BYTES = 2 << 30
 """Largest size of the decoded frames of one lease without margins, in 8 bits."""
 MOST_LEASE_BYTES = 7 << 30
 """Largest memory that one lease may take, with all that its spec may ask for; a worker has a GiB more."""
 _BLOCK = 256
 """Videos whose sequences are counted again for a look-up. Larger blocks take more time, smaller ones more memory."""
-
-
 Videos = Sequence[VideoEntry]
+_SHOWN = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Cleaning:
+    """What a spec does about the defects of videos.
+
+    Attributes:
+        skipped: bits of :class:`Flag`: no sequence has such a frame.
+        cuts, duplicates, bars: whether sequences end at cuts, leave repeats out, and do without bars.
+    """
+
+    skipped: int
+    cuts: bool
+    duplicates: bool
+    bars: bool
+
+    @classmethod
+    def of(cls, spec: StreamSpec) -> Cleaning:
+        """Return that of a spec with scene "auto"."""
+        kept = spec.kept_defects
+        skipped = sum(flag for kind, flag in _SKIPPED.items() if kind not in kept)
+        return cls(skipped, "cuts" not in kept, "duplicates" not in kept, "bars" not in kept)
+
+
+class Runs:
+    """The usable pieces of videos, and the runs that they form.
+
+    Attributes:
+        piece_first, piece_run: [U] first frame and run of each usable piece.
+        piece_flags: [U], its flags.
+        ends: [U], usable frames up to the end of each piece, of all videos together.
+        first: [R], the usable frames before each run.
+        frames: [R], usable frames of each run.
+        owners: [R], place of its video.
+        sides: [R, 4], bars.
+    """
+
+    def __init__(self, split: SplitVideos, cleaning: Cleaning) -> None:
+        pieces: Pieces = split.pieces
+        flags, owners, firsts = pieces["flags"], split.owners(), split.firsts()
+        sides = sides_of(pieces) if cleaning.bars else np.zeros((len(pieces), 4), np.uint16)
+        skipped = (flags & cleaning.skipped) != 0
+        repeated = (flags & (Flag.REPEAT if cleaning.duplicates else 0)) != 0
+        begins = skipped | (np.diff(owners, prepend=-1) != 0)
+        begins[1:] |= skipped[:-1] | (sides[1:] != sides[:-1]).any(axis=1)
+        if cleaning.cuts:
+            begins |= (flags & Flag.CUT) != 0
+        usable = ~skipped & ~repeated
+        runs, self.piece_run = np.unique(np.cumsum(begins)[usable], return_inverse=True)
+        lengths = (pieces["end"] - firsts)[usable]
+        self.piece_first, self.piece_flags = firsts[usable], flags[usable]
+        self.ends: _Int64 = np.cumsum(lengths)
+        at = np.searchsorted(self.piece_run, np.arange(len(runs)))  # the first piece of each run
+        self.first: _Int64 = (self.ends - lengths)[at]
+        self.frames: _Int64 = np.diff(np.concatenate((self.first, self.ends[-1:])))
+        self.owners, self.sides = owners[usable][at], sides[usable][at]
+        self._piece_begin = self.ends - lengths
+
+    def frame(self, place: _Int64) -> _Int64:
+        """Return which frames of their videos usable frames are, by their places among all."""
+        piece = self.ends.searchsorted(place, side="right")
+        frames: _Int64 = self.piece_first[piece] + place - self._piece_begin[piece]
+        return frames
+
+    def flagged(self, flag: int, first: _Int64, count: _Int64) -> _Int64:
+        """Return how many of ``count`` usable frames from each place on have a flag."""
+        has = (self.piece_flags & flag) != 0
+        lengths = np.where(has, self.ends - self._piece_begin, 0)
+        before = np.cumsum(lengths) - lengths
+
+        def upto(place: _Int64) -> _Int64:
+            piece = np.minimum(self.ends.searchsorted(place, side="right"), len(self.ends) - 1)
+            found: _Int64 = before[piece] + np.where(has[piece], place + 1 - self._piece_begin[piece], 0)
+            return found
+
+        return upto(first + count - 1) - upto(first - 1)
+
+
+class SplitSequences:
+    """Sequences of divided videos.
+
+    Args:
+        split: these videos.
+        whole: [C], how many sequences each would have if all its frames were one run.
+        strides: [C], frames from the first of a sequence to the first of the next.
+        spec: determines the frames of a sequence and what is done about defects.
+        sizes: [C], a number of each video's picture size.
+        suits: return whether a picture of the size of that number, less these bars, is large enough.
+
+    Attributes:
+        counts: [C], sequences of each video.
+    """
+
+    def __init__(
+        self,
+        split: SplitVideos,
+        whole: _Int64,
+        strides: _Int64,
+        spec: StreamSpec,
+        sizes: npt.NDArray[np.integer],
+        suits: Callable[[int, Sides], bool],
+    ) -> None:
+        self._split, self._whole = split, whole
+        self._strides = strides
+        self._runs = runs = Runs(split, Cleaning.of(spec))
+        each = np.maximum((runs.frames - 1) // strides[runs.owners], 0)
+        each[whole[runs.owners] == 0] = 0
+        barred = np.flatnonzero(runs.sides.any(axis=1))
+        pictures = np.column_stack((sizes[runs.owners[barred]], runs.sides[barred]))
+        kinds, kind = np.unique(pictures, axis=0, return_inverse=True)
+        fits = np.array([suits(size, Sides(*sides)) for size, *sides in kinds.tolist()], bool)
+        each[barred] *= fits[kind.ravel()]
+        number = np.repeat(np.arange(len(each)), each)
+        within = np.arange(len(number)) - np.repeat(np.cumsum(each) - each, each)
+        owners = runs.owners[number]
+        places = runs.first[number] + strides[owners] * within
+        starts = runs.frame(places) if len(places) else places
+        if min(spec.still_share, spec.quiet_share) < 1 and len(places):
+            needed = strides[owners] + 1
+            shares = np.where(2 * runs.flagged(Flag.QUIET, places, needed) >= needed, spec.quiet_share, 1.0)
+            shares[4 * runs.flagged(Flag.STILL, places, needed) >= 3 * needed] = spec.still_share
+            kept = (shares >= 1) | (_hash(split.numbers[owners], starts) < shares)
+            owners, starts = owners[kept], starts[kept]
+        found = np.bincount(owners, minlength=len(split)) if len(owners) else np.zeros(len(split), np.int64)
+        self._begin = np.cumsum(found) - found
+        self._starts = starts
+        self.counts: _Int64 = np.minimum(found, spec.max_sequences_per_video)
+
+    def start(self, video: int, place: int) -> int | None:
+        """Return the first frame of a sequence of a video; None if the video is not divided."""
+        at = self._split.find(video)
+        return None if at is None else int(self._starts[self._begin[at] + place])
+
+    def spoilt(self) -> int:
+        """Return the number of sequences that are not where they would be if all frames were one run."""
+        owners = np.repeat(np.arange(len(self.counts)), self.counts)
+        within = np.arange(len(owners)) - np.repeat(np.cumsum(self.counts) - self.counts, self.counts)
+        starts = self._starts[self._begin[owners] + within] if len(owners) else within
+        strides = self._strides[owners]
+        in_place = (starts % strides == 0) & (starts // strides < self._whole[owners])
+        return int(self._whole.sum() - in_place.sum())
+
+    def too_short(self) -> tuple[npt.NDArray[np.integer], _Int64]:
+        """Return the videos that have no sequence because they are divided, and the frames of their longest runs."""
+        longest = np.zeros(len(self._split), np.int64)
+        np.maximum.at(longest, self._runs.owners, self._runs.frames)
+        short = (self._whole > 0) & (self.counts == 0)
+        return self._split.numbers[short], longest[short]
+
+
+def _hash(numbers: npt.NDArray[np.integer], starts: _Int64) -> npt.NDArray[np.float64]:
+    """Return a number from 0 up to 1 for each pair: the mixing function of SplitMix64 (Steele et al. 2014)."""
+    mixed = numbers.astype(np.uint64) << np.uint64(32) ^ starts.astype(np.uint64)
+    mixed += np.uint64(0x9E3779B97F4A7C15)
+    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return (mixed ^ (mixed >> np.uint64(31))) * 2.0**-64
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,3 +523,76 @@ def _too_small(video: VideoEntry, rows: Rows, recipe: Recipe, sides: Sides = NO_
     )
     larger = f"resize_scale up to {scale:g}, or a smaller crop" if scale <= LARGEST_SCALE else "a smaller crop"
     return _unsuited(video, reason, larger)
+
+
+def corpus_summary(
+    catalogue: Catalogue, spec: StreamSpec, table: SequenceTable, *, list_refused: bool = False
+) -> list[str]:
+    """Return lines that say how many sequences there are, which videos give none, and which setting would admit them.
+
+    Args:
+        catalogue, spec, table: of the server.
+        list_refused: whether to name all of those videos, not only the first few.
+    """
+    span, lines = sequence_span(catalogue, spec.recipe)
+    lines = [
+        f"{len(catalogue.videos)} videos in {catalogue.source}: {table.videos} give {table.count} sequences of "
+        f"{span} (at most {spec.max_sequences_per_video} a video), rows {catalogue.rows}",
+        *lines,
+    ]
+    if spec.scene != "off":
+        split = 0 if catalogue.videos.split is None else len(catalogue.videos.split)
+        lines.append(
+            f"scene {spec.scene}: {split} videos have shot boundaries or empty parts; {table.spoilt} sequences are "
+            "left out or moved"
+        )
+        if long := int(np.count_nonzero(catalogue.videos.frames > MOST_FRAMES)):
+            lines.append(
+                f"{long} videos are longer than the {MOST_FRAMES} frames that are analysed: later frames are served "
+                "only of videos without defects; split long videos to use all of them"
+            )
+    if refusals := table.refusals:
+        lines.append(f"{len(refusals)} videos give none under the server's own recipe:")
+        lines += _listed(refusals, list_refused)
+        lines += _shorter_clips(table)
+    if catalogue.refusals:
+        lines.append(f"{len(catalogue.refusals)} files cannot be used at all:")
+        lines += _listed(catalogue.refusals, list_refused)
+    return lines
+
+
+def sequence_span(catalogue: Catalogue, recipe: Recipe) -> tuple[str, list[str]]:
+    """Return what a sequence consists of, and a warning if frames are too far apart for the recipe's grids."""
+    if not recipe.is_timed:
+        return f"{recipe.frames_needed} frames", []
+    rates = catalogue.videos.frames_per_second
+    steps = recipe.frame_stride / rates[rates > 0.0]  # of videos without a rate there are no sequences
+    if not len(steps):
+        return f"{recipe.spans} grids", []
+    # A grid has the number of steps that comes nearest to its duration, and at least one.
+    made = [np.maximum(np.rint(wanted / steps), 1.0) * steps for wanted in recipe.voxel_seconds]
+    shortest, longest = f"{made[0].min():.3g}", f"{made[1].max():.3g}"
+    span = f"{recipe.spans} grids of {shortest if shortest == longest else f'{shortest} to {longest}'} s"
+    coarse = np.count_nonzero(steps > recipe.voxel_seconds[1])
+    warning = (
+        f"warning: voxel_seconds = {recipe.voxel_seconds[1]:g} is shorter than the time between frames of {coarse} "
+        f"videos (at most {steps.max():.3g} s), so each of their grids lasts from frame to frame: raise voxel_seconds, "
+        "or serve videos with more frames a second"
+    )
+    return span, [warning] if coarse else []
+
+
+def _listed(refused: Sequence[Refusal], all_of_them: bool) -> list[str]:
+    shown = refused if all_of_them else refused[:_SHOWN]
+    rest = len(refused) - len(shown)
+    return [f"  {line}" for line in shown] + ([f"  ... and {rest} more: --list-refused names all"] if rest else [])
+
+
+def _shorter_clips(table: SequenceTable) -> list[str]:
+    """Say how many of the videos that are too short a shorter clip would admit: half of them, and all."""
+    longest = sorted(table.longest_clips, reverse=True)
+    if not longest:
+        return []
+    choices = dict.fromkeys((longest[(len(longest) - 1) // 2], longest[-1]))
+    each = (f"--set voxels_per_clip={n} admits {sum(voxels >= n for voxels in longest)} of them" for n in choices)
+    return [f"  The longest clip that fits has {longest[0]} voxel grids. Shorter clips: {', '.join(each)}"]

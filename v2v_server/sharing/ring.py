@@ -118,12 +118,15 @@ class SampleRing:
 
     Args:
         most_bytes: size limit.
+
+    Attributes:
+        being_made: memory lent for each lease.
     """
 
     def __init__(self, most_bytes: int) -> None:
         self._most_bytes = most_bytes
         self._samples: dict[Hashable, SharedSample] = {}
-        self._lent: dict[int, SampleMemory] = {}
+        self.being_made: dict[int, SampleMemory] = {}
         self._bytes = 0
 
     def get(self, key: Hashable) -> SharedSample | None:
@@ -138,24 +141,24 @@ class SampleRing:
             sizes: bytes of each array.
         """
         files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-        used = 2 * (len(self._samples) + len(self._lent)) + len(mappings)
+        used = 2 * (len(self._samples) + len(self.being_made)) + len(mappings)
         if files != resource.RLIM_INFINITY and used >= files // _FILES_SHARE:
             return None
         try:
-            self._lent[lease] = SampleMemory(sizes)
+            self.being_made[lease] = SampleMemory(sizes)
         except OSError:
             return None
-        return self._lent[lease].slot
+        return self.being_made[lease].slot
 
     def lent(self, lease: int) -> Slot | None:
         """Return what was lent for a lease; None if nothing was."""
-        memory = self._lent.get(lease)
+        memory = self.being_made.get(lease)
         return None if memory is None else memory.slot
 
     def release(self, leases: Container[int]) -> None:
         """Free memory whose lease is not among these."""
-        for lease in [lease for lease in self._lent if lease not in leases]:
-            del self._lent[lease]
+        for lease in [lease for lease in self.being_made if lease not in leases]:
+            del self.being_made[lease]
 
     def add(self, key: Hashable, lease: int, header: SampleHeader, frames: Sequence[Buffer]) -> SharedSample:
         """Add a finished sample; the oldest ones make place for it.
@@ -165,7 +168,7 @@ class SampleRing:
             lease: its number.
             header, frames: the message of its worker.
         """
-        memory = self._lent.pop(lease, None)
+        memory = self.being_made.pop(lease, None)
         if frames:
             memory = None
         elif memory is not None and not memory.seal():

@@ -16,7 +16,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation.draw import resized_size
-from v2v_server.system.opencv import cv2
+from v2v_server.system.compile_cache import cv2
 from v2v_server.video.luma import SDR, Signal
 
 Frames = npt.NDArray[Any]

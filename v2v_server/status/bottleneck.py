@@ -152,7 +152,7 @@ class History:
     def _moment(self, now: float) -> Moment:
         peers: dict[bytes | int, tuple[float, ...]] = {
             identity: (now, member.work.busy_seconds, member.work.cpu_seconds)
-            for identity, member in self._dispatcher.registry.members().items()
+            for identity, member in self._dispatcher.registry.members.items()
         }
         for each in self._dispatcher.sessions.totals():
             peers[each.number] = each.present(now), each.served, each.waited_seconds, each.passed

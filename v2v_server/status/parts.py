@@ -9,10 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from v2v_server.broker.candidates import RefusalPart
-from v2v_server.broker.counters import Counters, FaultTotal
+from v2v_server.broker.state import Counters, FaultTotal, RefusalPart
 from v2v_server.corpus.catalogue import CorpusPart
-from v2v_server.quarantine.snapshots import QuarantinePart, VerdictPart
+from v2v_server.quarantine import QuarantinePart, VerdictPart
 from v2v_server.status.bottleneck import Bottleneck, Shares
 from v2v_server.store.quota import CachePart
 from v2v_server.system.status_fields import Meaning, counter, gauge, meanings, states, text

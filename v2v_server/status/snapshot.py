@@ -19,23 +19,15 @@ from v2v_protocol import PROTOCOL_VERSION, __version__
 from v2v_protocol.messages import Status as StatusMessage
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, encode
 from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
-from v2v_server.broker.counters import FaultTotal
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.session import Session
+from v2v_server.broker.state import FaultTotal
 from v2v_server.broker.transport import ServerTransport
 from v2v_server.broker.worker_registry import Member, clean_name
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.quarantine.snapshots import Quarantine
 from v2v_server.status.bottleneck import Bottleneck, History, Shares, TimeWindow, find_bottleneck
-from v2v_server.status.parts import (
-    STATUS_VERSION,
-    ConsumerPart,
-    LoadPart,
-    ServerPart,
-    StatusFields,
-    WorkerPart,
-)
+from v2v_server.status.parts import STATUS_VERSION, ConsumerPart, LoadPart, ServerPart, StatusFields, WorkerPart
 from v2v_server.store.quota import cache_part
 from v2v_server.supervise.pool import Pool
 from v2v_server.system.status_fields import GIB, short, values
@@ -58,7 +50,6 @@ class Service:
     catalogue: Catalogue
     dispatcher: Dispatcher
     pool: Pool
-    quarantine: Quarantine
     transport: ServerTransport
 
     def status(
@@ -81,14 +72,14 @@ class Service:
             **values(self._server(time, uptime_seconds, is_ready=is_ready)),
             **values(self.catalogue.part()),
             **values(self._load(window)),
-            **values(self.quarantine.part()),
+            **values(self.dispatcher.quarantine.part()),
             "waiting": values(self._bottleneck(shares, is_attended=is_attended)) | {"shares": values(shares)},
             "totals": values(counters) | values(FaultTotal(counters.faults)),
             "cache": None if cache is None else values(cache),
             "workers": self._workers(window),
             "consumers": [values(_consumer(each, window)) for each in list(self.dispatcher.sessions)[:MOST_SHOWN]],
-            "refusals": [values(each) for each in self.dispatcher.candidates.parts()],
-            "verdicts": [values(each) for each in self.quarantine.verdict_parts()],
+            "refusals": [values(each) for each in reversed(self.dispatcher.refusals)],
+            "verdicts": [values(each) for each in self.dispatcher.quarantine.verdict_parts()],
         }
 
     def _server(self, time: str, uptime_seconds: float, *, is_ready: bool) -> ServerPart:
@@ -135,7 +126,7 @@ class Service:
         )
 
     def _workers(self, window: TimeWindow) -> list[dict[str, Any]]:
-        members, restarts = self.dispatcher.registry.members(), self.pool.restarts
+        members, restarts = self.dispatcher.registry.members, self.pool.restarts
         return [
             values(_worker(self.dispatcher, identity, member, restarts.get(member.name.encode()), window))
             for identity, member in list(members.items())[:MOST_SHOWN]
@@ -163,7 +154,7 @@ def _worker(
     elif dispatcher.registry.is_resting(identity):
         state = "resting"
     else:
-        state = "working" if leases.holds(identity) else "idle"
+        state = "working" if identity in leases.held else "idle"
     return WorkerPart(
         name=clean_name(member.name),
         host=member.host,

@@ -32,7 +32,7 @@ from v2v_server.store.planes import OPTIONAL, PLANES, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
 from v2v_server.store.reader import StoreFile, has_planes, read_clips
 from v2v_server.store.writer import StoreWriter, head_of, planes_of, write_pictures
-from v2v_server.system.private import make_private
+from v2v_server.system.process import make_private
 from v2v_server.system.status_fields import GIB
 from v2v_server.video.collect import ClipRequest, DecodedPicture
 from v2v_server.video.decode import DecodedClip

@@ -1,37 +1,217 @@
 """Workers as processes of this host. The process that starts them also reaps them.
 
 Workers are started as programs of their own (never forked), in their own process group so that Ctrl-C in a terminal
-reaches only the server, and die with the server even when it is killed.
+reaches only the server, and die with the server even when it is killed. An actor on another host
+(:mod:`v2v_server.supervise.ray_host`) starts them, and interprets their ends, in the same way.
+
+Processes may be started before there is work: they import their modules while the server imports its own and opens its
+catalogue. The pool then tells them their arguments, in place of starting other processes.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import math
 import os
+import signal
 import subprocess
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
 
-from v2v_protocol.keys import PeerKey
+import psutil
+
+from v2v_protocol.keys import PeerKey, nameless_key
+from v2v_protocol.programs import environment
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
-from v2v_server.supervise.child import (
-    Standby,
-    arguments,
-    out_of_memory_kills,
-    post_mortem,
-    queued_seconds,
-    start_child,
-    status_of,
-)
 from v2v_server.supervise.host import Exit, ProcessStatus
 from v2v_server.worker.logbook import Logbook
 
+STOPPED = (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
+_CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
+PROGRAM = (sys.executable, "-m", "v2v_server.commands.worker")
+Program = subprocess.Popen[bytes]
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 _MEMORY_SECONDS = 5.0
 """Time after the kernel has killed a process for lack of memory in which a worker's SIGKILL is attributed to that."""
 _SHORTAGES = (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
 _AFTER_SHORTAGE_SECONDS = 5.0
+
+
+class Standby:
+    """One process. It ends if it is not told its arguments before this process ends.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+
+    def __init__(self) -> None:
+        self.logbook = Logbook()
+        flags = ["--standby", str(os.getpid())]
+        self.process = start_program(
+            flags, [self.logbook.descriptor, self.logbook.arenas.fileno()], stdin=subprocess.PIPE
+        )
+
+    def begin(self, arguments: Sequence[str]) -> None:
+        """Tell it the arguments of ``v2v-worker``.
+
+        Raises:
+            OSError: it has ended.
+        """
+        assert self.process.stdin is not None
+        try:
+            with self.process.stdin as file:
+                file.write("\0".join(arguments).encode())
+        except OSError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """End it."""
+        self.process.kill()
+        self.process.communicate()
+        self.logbook.close()
+
+
+@contextmanager
+def start_ahead(config: ServeConfig) -> Iterator[list[Standby]]:
+    """Start the workers of this host that a server begins with; at the end, end those that are left in the list."""
+    standbys: list[Standby] = []
+    try:
+        with suppress(OSError):  # the pool starts the others, and reports why if it cannot
+            while config.engine == "local" and len(standbys) < config.least_workers:
+                standbys.append(Standby())
+        yield standbys
+    finally:
+        for standby in standbys:
+            standby.close()
+
+
+def start_child(
+    address: str, root: str, name: str, flags: Sequence[str], logbook: Logbook, key: PeerKey | None = None
+) -> Program:
+    """Start a worker in a process of its own, which dies with this one.
+
+    Args:
+        address: where the server listens for workers.
+        root: the corpus, a folder or an address.
+        name: unique name of the worker.
+        flags: further flags.
+        logbook: records the lease in work.
+        key: its key, passed in an unnamed file: neither command line, environment nor disk shows it.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+    with contextlib.ExitStack() as open_here:
+        handed = [logbook.descriptor, logbook.arenas.fileno()]
+        if key is not None:
+            handed.append(open_here.enter_context(nameless_key(key)).fileno())
+            flags = [*flags, "--keys", f"/dev/fd/{handed[-1]}"]
+        return start_program(arguments(address, root, name, flags, logbook), handed)
+
+
+def start_program(arguments: Sequence[str], handed: Sequence[int], stdin: int = subprocess.DEVNULL) -> Program:
+    """Start the program of a worker with these arguments, which has the descriptors ``handed``.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+    return subprocess.Popen(
+        [*PROGRAM, *arguments],
+        stdin=stdin,
+        pass_fds=handed,
+        env=environment() | _ONE_THREAD,
+        process_group=0,
+    )
+
+
+def arguments(address: str, root: str, name: str, flags: Sequence[str], logbook: Logbook) -> list[str]:
+    """Return the arguments of one worker, see :func:`start_child`."""
+    return [
+        *("--arenas-fd", str(logbook.arenas.fileno())),
+        *("--connect", address, "--videos", root, "--name", name),
+        *("--parent-pid", str(os.getpid())),
+        *flags,
+        *("--logbook-fd", str(logbook.descriptor)),
+    ]
+
+
+def post_mortem(returncode: int, logbook: Logbook | None, *, short_of_memory: bool) -> Loss:
+    """Return the cause of a worker's unexpected end, and what it worked on.
+
+    Only the death of a worker that decoded speaks against the video; otherwise the spec may be to blame.
+    """
+    loss = _cause(returncode, short_of_memory=short_of_memory)
+    if logbook is None or (at := logbook.lease()) is None:
+        return loss
+    return replace(loss, lease=at, for_all=logbook.decodes())
+
+
+def _cause(returncode: int, *, short_of_memory: bool) -> Loss:
+    if returncode >= 0:
+        # An unhandled exception or a broken installation. The trace is on stderr; the cause is not known.
+        return Loss(Cause.UNEXPLAINED, f"exited with status {returncode}")
+    number = -returncode
+    name = signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
+    if number in _CRASH_SIGNALS:
+        return Loss(Cause.CRASHED, f"was ended by {name}")
+    if number == signal.SIGKILL and short_of_memory:
+        return Loss(Cause.UNEXPLAINED, f"was ended by {name} while the host ran out of memory")
+    if number in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        return Loss(Cause.KILLED, f"was ended by {name} from outside")
+    return Loss(Cause.UNEXPLAINED, f"was ended by {name}")
+
+
+def hung(status: str, reason: str, at: int | None, *, decodes: bool) -> Loss:
+    """Return what it means that a worker is given up.
+
+    Args:
+        status: status of its process, in psutil's words.
+        reason: what it did, in words.
+        at: the lease in work by its logbook.
+        decodes: whether it decodes a video, by its logbook.
+    """
+    if status in STOPPED:
+        return Loss(Cause.KILLED, "was stopped from outside and killed")
+    if status == psutil.STATUS_DISK_SLEEP:
+        # If the server of a network file system is away, every worker waits, each at a sound clip.
+        return Loss(Cause.UNEXPLAINED, f"waited for its storage and {reason}", at, decodes)
+    return Loss(Cause.HUNG, reason, at, decodes)
+
+
+def queued_seconds(pid: int) -> float:
+    """Return how long the first thread of a process, which does the work, has waited for a core since it started; 0 if
+    the system does not say.
+    """
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_bytes().split()[1]) / 1e9
+    except (OSError, IndexError, ValueError):
+        return 0.0
+
+
+def status_of(pid: int) -> str:
+    """Return the status of a process in psutil's words: stopped, stopped by a debugger, waiting for a disk ..."""
+    try:
+        return str(psutil.Process(pid).status())
+    except psutil.NoSuchProcess:
+        return psutil.STATUS_DEAD
+
+
+def out_of_memory_kills() -> int:
+    """Return how many processes the kernel of this host has killed for lack of memory; 0 if it does not say."""
+    try:
+        for line in Path("/proc/vmstat").read_text(encoding="ascii").splitlines():
+            if line.startswith("oom_kill "):
+                return int(line.split()[1])
+    except OSError:
+        pass
+    return 0
 
 
 def make_host(

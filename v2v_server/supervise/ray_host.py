@@ -29,8 +29,8 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.keys import PeerKey
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
-from v2v_server.supervise.child import out_of_memory_kills, post_mortem, queued_seconds, start_child, status_of
 from v2v_server.supervise.host import Exit, ProcessStatus
+from v2v_server.supervise.local_host import out_of_memory_kills, post_mortem, queued_seconds, start_child, status_of
 from v2v_server.worker.logbook import Logbook
 
 WORKER_BYTES = 1 << 30

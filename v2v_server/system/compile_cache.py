@@ -1,4 +1,5 @@
-"""Choose where numba stores compiled kernels: a separate folder for every state of their sources and every processor.
+"""Choose where numba stores compiled kernels (a separate folder for every state of their sources and every processor),
+and import OpenCV on first use.
 
 Numba treats compiled code as current while the one file that defines the function is unchanged. Our kernels include
 functions and constants of several files. After a change of one of them numba would silently use the old kernel, with
@@ -22,6 +23,7 @@ from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from itertools import takewhile
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 SOURCES = Path(__file__).parents[1] / "simulation"
 """The folder of the pixel kernels; with the one beside it named "motion" it has all files that a kernel may use."""
@@ -129,3 +131,25 @@ def _can_be_written(folder: Path) -> bool:
     except OSError:
         return False
     return os.access(folder, os.W_OK | os.X_OK)
+
+
+if TYPE_CHECKING:
+    import cv2 as cv2
+else:
+
+    class _OpenCV:
+        """OpenCV, imported on first use.
+
+        A worker whose samples have no flow and are not resized does not need OpenCV, and starts without its 30 MB. A
+        module that uses a part of OpenCV at import time, as a default value or a constant, would load it for all: use
+        ``cv2.NAME`` inside functions only.
+        """
+
+        def __getattr__(self, name: str) -> Any:
+            import cv2
+
+            value = getattr(cv2, name)
+            setattr(self, name, value)  # the next access does not call this function
+            return value
+
+    cv2 = _OpenCV()

@@ -1,13 +1,18 @@
-"""Log lines of a service: plain text for people, or one JSON object per line for log collectors."""
+"""Log lines of a service: plain text for people, or one JSON object per line for log collectors; and how long the steps
+of its start took.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from typing import Any, Literal, TextIO
+
+import psutil
 
 from v2v_protocol.errors import V2VError
 from v2v_protocol.programs import printable
@@ -71,3 +76,29 @@ def report_errors(log_format: Callable[[], str | None]) -> Iterator[None]:
 
 def _utc_now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+class StartTimes:
+    """How long each step of a program's start takes, for ``--debug``, from the creation of the process on.
+
+    Args:
+        is_logged: whether the program logs them.
+
+    Attributes:
+        steps: name and seconds of each step, in order.
+    """
+
+    def __init__(self, *, is_logged: bool = False) -> None:
+        self.is_logged = is_logged
+        self.steps: list[tuple[str, float]] = []
+        self._since = psutil.Process().create_time()
+
+    def mark(self, step: str) -> None:
+        """Note the end of a step, which began at the end of the one before."""
+        now = time.time()
+        self.steps.append((step, now - self._since))
+        self._since = now
+
+    def __str__(self) -> str:
+        whole = sum(seconds for _, seconds in self.steps)
+        return f"start: {', '.join(f'{step} {seconds:.2f} s' for step, seconds in self.steps)}; {whole:.2f} s in all"

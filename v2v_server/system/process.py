@@ -1,14 +1,19 @@
-"""Services of the operating system: memory that stays, cores, long time slices, children that die with their parent."""
+"""Services of the operating system: memory that stays, cores, long time slices, children that die with their parent,
+locks, private files.
+"""
 
 from __future__ import annotations
 
 import ctypes
+import errno
+import fcntl
 import gc
 import math
 import os
 import platform
 import resource
 import signal
+import stat
 import sys
 import time
 from collections.abc import Iterator
@@ -23,6 +28,7 @@ _TURN_SECONDS = 0.1  # the longest time slice that Linux grants
 MOST_CONNECTIONS = 4096 + 256
 _MOST_FILES = 1 << 16  # one connection per consumer and worker, and one logbook per worker
 _SCHED_ATTR_CALLS = {"x86_64": (315, 314), "aarch64": (275, 274)}  # numbers of sched_getattr and sched_setattr
+_LONGEST_PAUSE_SECONDS = 0.05
 
 
 def keep_freed_memory() -> bool:
@@ -214,3 +220,58 @@ def cache_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
             f"user {os.getuid()} has no home folder for the catalogue's index: give a folder with --cache-dir or "
             "V2V_CACHE_DIR"
         ) from error
+
+
+def lock(descriptor: int, wait_seconds: float, file: str | os.PathLike[str]) -> None:
+    """Lock an open file until it is closed.
+
+    Args:
+        descriptor: of the file.
+        wait_seconds: longest wait for another process; 0 tries once.
+        file: its name, for the error.
+
+    Raises:
+        BlockingIOError: another process keeps it locked.
+    """
+    pause, end = 0.001, time.monotonic() + wait_seconds
+    while True:
+        try:
+            return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() >= end:
+                raise BlockingIOError(errno.EAGAIN, "another process keeps it locked; end that process", file) from None
+        time.sleep(pause)
+        pause = min(2 * pause, _LONGEST_PAUSE_SECONDS)
+
+
+def open_private(path: Path, flags: int) -> int:
+    """Open a regular file of ours with mode 0600, and return its descriptor. Never blocks.
+
+    Args:
+        path: the file. Other users lose access to an existing file, unless it lies behind a symbolic link.
+        flags: of ``os.open``; with ``O_CREAT`` a missing file is made.
+
+    Raises:
+        OSError: the file cannot be opened, or is not a regular one.
+    """
+    descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NONBLOCK, 0o600)
+    try:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "not a regular file", str(path))
+        is_open = stat.S_IMODE(status.st_mode) & 0o077
+        if status.st_uid == os.geteuid() and is_open and not path.is_symlink():
+            os.fchmod(descriptor, 0o600)
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def make_private(path: Path) -> None:
+    """Make an empty file with mode 0600; an existing file keeps its content.
+
+    Raises:
+        OSError: the file cannot be made, or is not a regular one.
+    """
+    os.close(open_private(path, os.O_RDWR | os.O_CREAT))

@@ -1,13 +1,10 @@
 """The server worker takes a lease, makes its sample, sends it, and takes the next.
 
 conversation   what the worker says: a state machine without I/O
-process        the process that does what the conversation says, with one decode for siblings
-produce        from a lease to its sample: decode, view, simulate
+process        the process that does what the conversation says, with one decode for siblings, into its output buffer
+produce        from a lease to its sample: decode, open the files beside the video, view, simulate
 arrays         functions that fill each array; additional arrays are files beside it
-sidecars       files beside the video, and the boxes and masks made from them
-output_buffer  memory for a sample, shared with its consumer or private
-cleaning       which frames and which part of the picture are used
-scene_choice   which flow method a clip needs
+scene_choice   which frames and which part of the picture are used, and which flow method a clip needs
 warm_up        compiled kernels, compiled once on a host
 logbook        a record of the lease in work that outlives the worker
 """

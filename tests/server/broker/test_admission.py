@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from tests.pieces import pieces
-from tests.server.named_corpus import SMALL_SPEC, corpus, video
+from tests.server.named_corpus import SMALL_SPEC, video
+from tests.server.peers import peers
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import CorpusError, UsageError, V2VError
 from v2v_protocol.messages import Hello
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.session import MOST_BATCH_SIZE, Admission
-from v2v_server.corpus.scenes.pieces import encoded_pieces
+from v2v_server.broker.dispatcher import MOST_BATCH_SIZE, Dispatcher, admit
+from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.scene import Flag
-from v2v_server.corpus.videos import CorpusFacts
-from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
+from v2v_server.corpus.videos import CorpusFacts, encoded_pieces
+from v2v_server.quarantine import Quarantine, QuarantineEntry
 from v2v_server.schedule import sequences
 from v2v_server.video.rows import Rows
 
@@ -25,9 +27,8 @@ SAMPLE_BYTES = 2 * 2 * 8 * 8
 VERDICTS = [QuarantineEntry(number, "v0.mp4", "f", 0, "crash", "t") for number in (1, 2, 3)]
 
 
-def admission(max_credit_bytes: int = 2**30, quarantine: Quarantine | None = None) -> Admission:
-    videos = corpus(*(video(f"v{number}.mp4") for number in range(5)))
-    return Admission(videos.facts, SMALL_SPEC, max_credit_bytes, 600.0, quarantine or Quarantine())
+def admission(max_credit_bytes: int = 2**30, quarantine: Quarantine | None = None) -> Dispatcher:
+    return peers(None, SMALL_SPEC, max_credit_bytes, quarantine).dispatcher
 
 
 def hello(batch_size: int = 4, seed: int = 0, quarantine: int | None = None, **spec: Any) -> Hello:
@@ -35,7 +36,7 @@ def hello(batch_size: int = 4, seed: int = 0, quarantine: int | None = None, **s
 
 
 def test_the_session_is_what_the_answer_says() -> None:
-    session, welcome = admission(quarantine=Quarantine(VERDICTS)).admit(b"c", hello(12, 7, 2, shuffle=False), 3, 5.0)
+    session, welcome = admit(admission(quarantine=Quarantine(VERDICTS)), b"c", hello(12, 7, 2, shuffle=False), 3, 5.0)
     spec = StreamSpec.from_dict(welcome.spec)
     assert (session.spec, spec.shuffle, spec.digest) == (spec, False, welcome.spec_digest)
     assert (session.identity, session.seed, session.arrays, session.batch_size) == (b"c", 7, ("voxels",), 12)
@@ -51,17 +52,17 @@ def test_the_session_is_what_the_answer_says() -> None:
 
 @pytest.mark.parametrize(("batch_size", "workers", "credit"), [(12, 0, 24), (12, 12, 24), (12, 20, 40), (1, 0, 2)])
 def test_credit_keeps_batches_and_workers_busy(batch_size: int, workers: int, credit: int) -> None:
-    assert admission().admit(b"c", hello(batch_size), workers, 0.0)[0].credit == credit
+    assert admit(admission(), b"c", hello(batch_size), workers, 0.0)[0].credit == credit
 
 
 @pytest.mark.parametrize(("limit", "credit"), [(SAMPLE_BYTES, 1), (10 * SAMPLE_BYTES - 1, 9), (24 * SAMPLE_BYTES, 24)])
 def test_credit_is_bounded_in_bytes(limit: int, credit: int) -> None:
-    assert admission(limit).admit(b"c", hello(12), 1, 0.0)[0].credit == credit
+    assert admit(admission(limit), b"c", hello(12), 1, 0.0)[0].credit == credit
 
 
 def test_a_sample_that_the_credit_cannot_hold_is_refused() -> None:
     with pytest.raises(UsageError, match=f"one sample is {SAMPLE_BYTES} bytes; .* is {SAMPLE_BYTES - 1}: raise it"):
-        admission(SAMPLE_BYTES - 1).admit(b"c", hello(), 1, 0.0)
+        admit(admission(SAMPLE_BYTES - 1), b"c", hello(), 1, 0.0)
 
 
 @pytest.mark.parametrize(("stride", "height"), [(1, 1100), (4, 1100), (4, 1000)])
@@ -71,51 +72,51 @@ def test_the_frames_that_a_camera_sees_are_limited(stride: int, height: int) -> 
               "crop_height_px": height, "crop_width_px": 1000}  # fmt: skip
     said = "the 2001 frames of 1000x1100 px .* are 2099 MiB; the limit is 2048" if height > 1000 else "none of the 5"
     with pytest.raises(UsageError, match=said):
-        admission(2**40).admit(b"c", Hello({"recipe": recipe}, ("frames",), 1, 0), 1, 0.0)
+        admit(admission(2**40), b"c", Hello({"recipe": recipe}, ("frames",), 1, 0), 1, 0.0)
 
 
 def test_the_quarantine_is_the_newest_unless_an_older_one_is_asked_for() -> None:
     at = admission(quarantine=Quarantine(VERDICTS))
-    received = [at.admit(b"c", hello(quarantine=asked), 1, 0.0) for asked in (None, 0, 1, 3)]
+    received = [admit(at, b"c", hello(quarantine=asked), 1, 0.0) for asked in (None, 0, 1, 3)]
     assert [session.quarantine for session, _ in received] == [3, 0, 1, 3]
     assert [welcome.quarantine for _, welcome in received] == [3, 0, 1, 3]
     with pytest.raises(CorpusError, match=r"snapshot 4 was asked for, this server has 0 \.\. 3"):
-        at.admit(b"c", hello(quarantine=4), 1, 0.0)
+        admit(at, b"c", hello(quarantine=4), 1, 0.0)
 
 
 def test_a_stream_from_a_server_that_knows_more_verdicts_is_told_what_to_do() -> None:
     """Perhaps the file is another one; perhaps another server has added to it since this one read it."""
     at = admission(quarantine=Quarantine(VERDICTS[:1]))
     with pytest.raises(CorpusError) as refused:
-        at.admit(b"c", hello(quarantine=3), 1, 0.0)
+        admit(at, b"c", hello(quarantine=3), 1, 0.0)
     for remedy in (
         "v2v-quarantine --videos DIR",
         "restart this server",
         'set "quarantine" of the saved state to None',
     ):
         assert remedy in str(refused.value)
-    assert at.admit(b"c", hello(quarantine=None), 1, 0.0)[1].quarantine == 1
+    assert admit(at, b"c", hello(quarantine=None), 1, 0.0)[1].quarantine == 1
 
 
 @pytest.mark.parametrize("batch_size", [0, MOST_BATCH_SIZE + 1, 2**64 - 1])
 def test_batch_sizes_are_limited(batch_size: int) -> None:
     with pytest.raises(UsageError, match=f"batch_size = {batch_size}: give 1 to {MOST_BATCH_SIZE}"):
-        admission().admit(b"c", hello(batch_size), 1, 0.0)
+        admit(admission(), b"c", hello(batch_size), 1, 0.0)
 
 
 def test_how_many_share_a_decode_decides_what_a_worker_can_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two such specs shared a table: how many sequences there were depended on who had come first."""
     at = admission()
     monkeypatch.setattr(sequences, "MOST_CLIP_BYTES", 400)  # one sample takes 320
-    at.admit(b"c", hello(), 1, 0.0)
+    admit(at, b"c", hello(), 1, 0.0)
     with pytest.raises(UsageError, match="MiB of decoded frames"):
-        at.admit(b"d", hello(samples_per_decode=2), 1, 0.0)
+        admit(at, b"d", hello(samples_per_decode=2), 1, 0.0)
 
 
 def test_one_table_serves_all_specs_of_a_geometry() -> None:
     at = admission()
-    of = [at.admit(b"c", each, 1, 0.0)[0].schedule._table for each in (hello(), hello(shuffle=False, seed=3))]
-    other = at.admit(b"c", hello(max_sequences_per_video=3), 1, 0.0)[0].schedule._table
+    of = [admit(at, b"c", each, 1, 0.0)[0].schedule.table for each in (hello(), hello(shuffle=False, seed=3))]
+    other = admit(at, b"c", hello(max_sequences_per_video=3), 1, 0.0)[0].schedule.table
     assert of[0] is of[1]
     assert (other.count, of[0].count) == (15, 50)
 
@@ -128,8 +129,8 @@ def test_the_sequences_of_a_spec_do_not_depend_on_who_came_before(asked: dict[st
     default, other = ({"scene": "auto", "max_sequences_per_video": 1000} | changed for changed in ({}, asked))
 
     def count(*specs: dict[str, Any]) -> int:
-        at = Admission(facts, SMALL_SPEC, 2**30, 600.0, Quarantine())
-        return [at.admit(b"c", hello(**spec), 1, 0.0)[1].sequences for spec in specs][-1]
+        at = peers(cast(Catalogue, SimpleNamespace(facts=facts))).dispatcher
+        return [admit(at, b"c", hello(**spec), 1, 0.0)[1].sequences for spec in specs][-1]
 
     assert count(default, other) == count(other) != count(default)
 
@@ -138,5 +139,5 @@ def test_a_refused_hello_may_be_followed_by_a_good_one() -> None:
     at = admission()
     for bad in (hello(colour=1), hello(0), hello(quarantine=1), hello(recipe={"bins": 1000})):
         with pytest.raises(V2VError):
-            at.admit(b"c", bad, 1, 0.0)
-    assert at.admit(b"c", hello(), 1, 0.0)[1].sequences == 50
+            admit(at, b"c", bad, 1, 0.0)
+    assert admit(at, b"c", hello(), 1, 0.0)[1].sequences == 50

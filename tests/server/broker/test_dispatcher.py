@@ -42,12 +42,12 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.wire import LARGEST_HEADER_BYTES, LARGEST_REQUEST_BYTES, decode, decode_map, encode
 from v2v_server.broker import dispatcher as dispatcher_module
 from v2v_server.broker.actions import AddToQuarantine, Disconnect, GiveUp, ToConsumer
-from v2v_server.broker.dispatcher import MOST_FAULTS
+from v2v_server.broker.dispatcher import MOST_BATCH_SIZE, MOST_FAULTS, MOST_TABLES
 from v2v_server.broker.grants import work_seconds
 from v2v_server.broker.leases import Cause, Loss
-from v2v_server.broker.session import GONE_SECONDS, MOST_BATCH_SIZE, MOST_TABLES, SILENT_SECONDS
+from v2v_server.broker.session import GONE_SECONDS, SILENT_SECONDS
 from v2v_server.broker.worker_registry import REST_SECONDS, SILENCE_SECONDS
-from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
+from v2v_server.quarantine import Quarantine, QuarantineEntry
 from v2v_server.schedule.epoch import MOST_CANDIDATES
 from v2v_server.video.frame_index import FrameIndex
 
@@ -762,7 +762,7 @@ def test_geometries_requested_once_are_evicted() -> None:
         at.hello(max_sequences_per_video=number + 1)
         session = at.dispatcher.sessions.get(b"c")
         assert session is not None
-        alive.append(weakref.ref(session.schedule._table))
+        alive.append(weakref.ref(session.schedule.table))
     del session
     gc.collect()
     assert sum(each() is not None for each in alive) == MOST_TABLES

@@ -6,7 +6,7 @@ import hypothesis.strategies as st
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from v2v_server.broker.fair_queue import FairQueue
+from v2v_server.broker.session import FairQueue
 
 QUANTUM_NS = 50_000_000
 
@@ -107,5 +107,5 @@ def test_consumers_that_come_and_go_while_no_worker_is_there_leave_nothing() -> 
         queue.charge(identity, 1.0)
         queue.charge(identity, -1.0)
         queue.remove(identity)
-    assert sum(map(len, queue._heaps)) <= 200
+    assert sum(map(len, queue.heaps)) <= 200
     assert queue.next() is None

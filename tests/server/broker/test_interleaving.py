@@ -294,7 +294,7 @@ class Interleaving(RuleBasedStateMachine):
         if at is None:
             return
         book = at.dispatcher.leases
-        for identity in list(at.dispatcher.registry.members()):
+        for identity in list(at.dispatcher.registry.members):
             lonely = any(runs_alone(request) for request in book.requests_of(identity))
             assert not lonely or book.held_by(identity) == 1
 
@@ -319,11 +319,11 @@ class Interleaving(RuleBasedStateMachine):
                     self._listen()
         assert not any(self.owed.values())
         assert self.at.dispatcher.waiting == 0
-        assert not self.at.dispatcher._grants.lone
+        assert not self.at.dispatcher.lone
         assert len(self.at.dispatcher.leases) == 0
-        assert not self.at.dispatcher.leases._held
-        assert not self.at.dispatcher.leases._out
-        assert set(self.at.dispatcher.leases._durations) <= set(self.owed)
+        assert not self.at.dispatcher.leases.held
+        assert not self.at.dispatcher.leases.out
+        assert set(self.at.dispatcher.leases.durations) <= set(self.owed)
 
 
 TestInterleaving = Interleaving.TestCase
@@ -483,7 +483,7 @@ def walk(seed: int, steps: int, kind: type[Interleaving] = Interleaving) -> Coun
         model.a_lone_request_is_alone()
         book = model.at.dispatcher.leases
         seen["lone at work"] += any(map(runs_alone, (request for name in names for request in book.requests_of(name))))
-        seen["lone waiting"] += bool(model.at.dispatcher._grants.lone)
+        seen["lone waiting"] += bool(model.at.dispatcher.lone)
     seen["twins"] = model.at.dispatcher.counters.second_leases
     seen["verdicts"] = len(model.at.recorded)
     seen["samples"] = model.at.dispatcher.counters.samples

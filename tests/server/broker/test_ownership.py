@@ -45,11 +45,11 @@ def test_a_hello_with_another_secret_changes_nothing() -> None:
 def test_the_secret_moves_a_session_to_a_new_connection_with_its_debt() -> None:
     at = peers()
     at.consumer_says(b"before", hello(OURS))
-    at.dispatcher.sessions.charge(b"before", 3.0)
+    at.dispatcher.sessions.queue.charge(b"before", 3.0)
     (welcome,) = at.consumer_says(b"after", hello(OURS))
     assert isinstance(welcome, Welcome)
     (session,) = at.dispatcher.sessions
-    assert (session.identity, at.dispatcher.sessions.balance_seconds(b"after")) == (b"after", -3.0)
+    assert (session.identity, at.dispatcher.sessions.queue.balance_seconds(b"after")) == (b"after", -3.0)
 
 
 def test_consumers_without_a_secret_stay_apart() -> None:
@@ -114,7 +114,7 @@ def test_the_secret_of_a_worker_moves_its_name_and_returns_its_leases() -> None:
     at.consumer_says(b"c", hello(OURS))
     at.want(0, 1)
     assert enter(at, b"2", "worker", OURS) == ""
-    assert list(at.dispatcher.registry.members()) == [b"2"]
+    assert list(at.dispatcher.registry.members) == [b"2"]
     assert at.dispatcher.registry.named("worker") == b"2"
     assert len(at.leases[b"2"]) == 2
     at.work_off(b"2")
@@ -125,7 +125,7 @@ def test_no_key_holds_the_name_of_a_worker_of_this_host() -> None:
     at = peers()
     assert enter(at, b"1", "w1-0.1", THEIRS, "gpu-1") == ""
     assert enter(at, b"2", "w1-0.1", OURS) == ""
-    assert list(at.dispatcher.registry.members()) == [b"2"]
+    assert list(at.dispatcher.registry.members) == [b"2"]
     assert enter(at, b"1", "w1-0.1", THEIRS, "gpu-1") != ""
 
 

@@ -309,26 +309,26 @@ def test_asking_for_one_sample_at_a_time_is_not_free_of_charge(credit: int) -> N
 
 def test_a_debt_outlives_the_session() -> None:
     sessions = opened(session(b"a"))
-    sessions.charge(b"a", 3.0)
+    sessions.queue.charge(b"a", 3.0)
     sessions.open(session(b"a"))
     sessions.forget(b"a")
-    sessions.charge(b"a", 1.0)  # for what was under way
+    sessions.queue.charge(b"a", 1.0)  # for what was under way
     again = session(b"a")
     sessions.open(again)
-    assert sessions.balance_seconds(b"a") == -4.0
+    assert sessions.queue.balance_seconds(b"a") == -4.0
     sessions.forget(b"a")
     for number in range(5000):
-        sessions.charge(str(number).encode(), 1.0)
-    assert len(sessions._queue._debts_ns) < 5000
+        sessions.queue.charge(str(number).encode(), 1.0)
+    assert len(sessions.queue.debts_ns) < 5000
 
 
 def test_nothing_is_saved_up_while_idle() -> None:
     a, b = session(b"a"), session(b"b")
     sessions = opened(a, b)
-    sessions.charge(b"a", -1000.0)
+    sessions.queue.charge(b"a", -1000.0)
     sessions.want(a, 0, [0])
     assert sessions.mark_answered(take(sessions), 0.1)
-    assert sessions.balance_seconds(b"a") == 0.0
+    assert sessions.queue.balance_seconds(b"a") == 0.0
 
 
 # --- any order --------------------------------------------------------------------------------------------------------

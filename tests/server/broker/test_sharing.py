@@ -17,7 +17,7 @@ from v2v_protocol.messages import Hello, Lease, SampleHeader, Want
 from v2v_protocol.sample import Form, array_layout
 from v2v_protocol.wire import encode
 from v2v_server.sharing.ring import SampleRing
-from v2v_server.worker.output_buffer import slot_arrays
+from v2v_server.worker.process import slot_arrays
 
 ARENA = f"17:9:12:{'0123456789abcdef' * 2}"
 LAYOUT = array_layout(SMALL_SPEC.recipe, "int8", ("voxels",))
@@ -194,9 +194,9 @@ class Sharing(WithSlots):
     def teardown(self) -> None:
         super().teardown()
         if hasattr(self, "at"):
-            grants = self.at.dispatcher._grants
-            assert grants._ring is not None
-            assert (grants._makers, grants._followers, grants._ring._lent) == ({}, {}, {})
+            broker = self.at.dispatcher
+            assert broker.ring is not None
+            assert (broker.makers, broker.followers, broker.ring.being_made) == ({}, {}, {})
 
 
 TestInterleavingOfSharing = Sharing.TestCase

@@ -56,7 +56,7 @@ def test_the_registry_starts_empty_and_forgets_removed_workers() -> None:
     table = Table()
     assert (len(table.workers), table.next(), table.workers.for_lone_request()) == (0, None, None)
     table.add(b"a", 1, 0.0)
-    assert (len(table.workers), b"a" in table.workers, list(table.workers.members())) == (1, True, [b"a"])
+    assert (len(table.workers), b"a" in table.workers, list(table.workers.members)) == (1, True, [b"a"])
     table.workers.remove(b"a")
     table.workers.remove(b"a")
     assert (len(table.workers), b"a" in table.workers, table.next()) == (0, False, None)
@@ -102,12 +102,11 @@ def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int
             table.workers.rest(identity, float(how), "a.mp4: not there")
         elif what == "wake":
             table.workers.wake(how + REST_SECONDS)
-        resting = table.workers._resting
         expected = sorted(
             (table.book.held_by(identity), identity)
-            for identity, worker in table.workers._workers.items()
+            for identity, worker in table.workers.members.items()
             if not worker.given_up
-            and identity not in resting
+            and not table.workers.is_resting(identity)
             and table.book.held_by(identity) < worker.credit
             and not lonely(table, identity)
         )

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from v2v_server.commands.quarantine import main
-from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
-from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
+from v2v_server.quarantine import Quarantine, QuarantineEntry, quarantine_path, read_quarantine, write_entry
 
 TIME = "2024-02-29T12:00:00+00:00"
 

@@ -22,9 +22,8 @@ from v2v_protocol.errors import UsageError
 from v2v_server.commands import catalogue
 from v2v_server.commands.catalogue import main
 from v2v_server.corpus.ahead import Ahead
-from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Store
-from v2v_server.corpus.index.parts import Shard
-from v2v_server.corpus.refresh import index_path
+from v2v_server.corpus.catalogue import index_path
+from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Shard, Store
 
 _SLOWLY = """
 import sys, time

@@ -20,13 +20,12 @@ from tests.server.corpus.failing_storage import failing_opens
 from tests.server.video.lethal_reads import always_exits, always_killed, killed_once, lethal, waiting
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged, VideoError
 from v2v_server.corpus import catalogue as catalogue_module
+from v2v_server.corpus import index as index_file
 from v2v_server.corpus import probe as probe_module
-from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.index import file as index_file
-from v2v_server.corpus.index.file import SCHEMA_VERSION
+from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
+from v2v_server.corpus.index import SCHEMA_VERSION
 from v2v_server.corpus.manifest import MANIFEST_NAME
 from v2v_server.corpus.probe import ProbeFile, probe_files
-from v2v_server.corpus.refresh import index_path
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint, is_same_file
 from v2v_server.video.frame_index import FrameIndex

@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 
 from v2v_server.corpus import probe
-from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.index import columns
-from v2v_server.corpus.index.file import IndexRow, Store
-from v2v_server.corpus.refresh import index_path
+from v2v_server.corpus import videos as columns
+from v2v_server.corpus.catalogue import index_path, open_catalogue
+from v2v_server.corpus.index import IndexRow, Store
 
 VIDEOS = 2000
 MOST_BYTES = 820

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from v2v_server.corpus import refresh
-from v2v_server.corpus.index.file import IndexRow, Store
+from v2v_server.corpus import catalogue as refresh
+from v2v_server.corpus.index import IndexRow, Store
 from v2v_server.corpus.sources.folder import Folder
 
 COUNT = 700

@@ -18,7 +18,8 @@ from v2v_protocol.errors import VideoChanged, VideoError, VideoGone
 from v2v_protocol.sample import FromSidecar
 from v2v_server.corpus import sidecars as collecting
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.sources import asking, sidecar
+from v2v_server.corpus.sources import sidecar
+from v2v_server.corpus.sources import source as asking
 from v2v_server.corpus.sources.sidecar import open_sidecar, read_files, sidecar_id
 from v2v_server.corpus.sources.source import SourceOptions, open_source
 

@@ -27,7 +27,7 @@ from v2v_server.broker.actions import ToConsumer
 from v2v_server.broker.transport import Arrival, FromConsumer, FromWorker, Sockets
 from v2v_server.commands.keys import main
 from v2v_server.keys.folder import KeyFolder
-from v2v_server.worker.output_buffer import pack
+from v2v_server.worker.process import pack
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a connection guard")
 

@@ -19,8 +19,15 @@ import pytest
 from hypothesis import given, settings
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
-from v2v_server.quarantine.snapshots import VERDICTS_PER_VIDEO, Quarantine, QuarantineEntry, clearing
+from v2v_server.quarantine import (
+    VERDICTS_PER_VIDEO,
+    Quarantine,
+    QuarantineEntry,
+    clearing,
+    quarantine_path,
+    read_quarantine,
+    write_entry,
+)
 
 TIME = "2024-02-29T12:00:00+00:00"
 
@@ -221,8 +228,8 @@ def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
     program = f"""
 import resource, signal
 from pathlib import Path
-from v2v_server.quarantine.file import read_quarantine, write_entry
-from v2v_server.quarantine.snapshots import QuarantineEntry
+from v2v_server.quarantine import read_quarantine, write_entry
+from v2v_server.quarantine import QuarantineEntry
 file = Path({str(file)!r})
 known = read_quarantine(file)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -291,7 +298,7 @@ def test_writers_exclude_each_other(tmp_path: Path) -> None:
 def test_many_processes_at_once_lose_nothing(tmp_path: Path) -> None:
     file = tmp_path / "q.jsonl"
     program = (
-        "import sys\nfrom pathlib import Path\nfrom v2v_server.quarantine.file import *\n"
+        "import sys\nfrom pathlib import Path\nfrom v2v_server.quarantine import *\n"
         "file, name = Path(sys.argv[1]), sys.argv[2]\nknown = read_quarantine(file)\n"
         "for frame in range(20):\n"
         "    known.extend(write_entry(file, QuarantineEntry(0, name, 'f', frame, 'crash', 't'), known))\n"

@@ -14,9 +14,7 @@ from v2v_protocol.refusal import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.videos import VideoEntry
-from v2v_server.schedule import summary
-from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.schedule.summary import corpus_summary
+from v2v_server.schedule.sequences import SequenceTable, corpus_summary, sequence_span
 from v2v_server.video.rows import Rows
 
 
@@ -41,7 +39,7 @@ def test_a_corpus_without_trouble_is_one_line() -> None:
 def test_the_duration_of_grids_is_the_one_that_is_made(seconds: tuple[float, float], made: str) -> None:
     recipe = replace(SMALL, frames_per_bin=1, voxel_seconds=seconds)
     catalogue = SimpleNamespace(videos=SimpleNamespace(frames_per_second=np.array([30.0, np.nan])))
-    span, more = summary._span(catalogue, recipe)  # type: ignore[arg-type]
+    span, more = sequence_span(catalogue, recipe)  # type: ignore[arg-type]
     assert span == made
     if seconds[1] < 1 / 30:
         (warning,) = more

@@ -18,7 +18,7 @@ from v2v_protocol.arena import ArenaName, Slot, open_memory
 from v2v_protocol.messages import SampleHeader
 from v2v_protocol.wire import Frames, decode
 from v2v_server.sharing.ring import SampleRing, mappings
-from v2v_server.worker.output_buffer import slot_arrays
+from v2v_server.worker.process import slot_arrays
 
 LAYOUT = {"voxels": ("int8", (3, 5)), "frames": ("uint8", (7,))}
 SIZES = (15, 7)

@@ -18,7 +18,8 @@ from v2v_protocol.wire import encode
 from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
 from v2v_server.broker.leases import Cause
 from v2v_server.broker.session import RETURN_SECONDS
-from v2v_server.quarantine.snapshots import QuarantineEntry
+from v2v_server.broker.state import RefusalPart
+from v2v_server.quarantine import QuarantineEntry
 from v2v_server.status.parts import STATUS_VERSION
 from v2v_server.status.snapshot import ANSWER_SECONDS, MOST_SHOWN, to_json
 
@@ -296,7 +297,7 @@ def test_refusals_and_verdicts_are_listed_newest_first() -> None:
 def test_of_many_refusals_the_last_few_are_listed() -> None:
     at = peers()
     for number in range(100):
-        at.dispatcher.candidates.latest.append((str(number), Refusal("v.mp4", None, "x" * 500)))
+        at.dispatcher.refusals.append(RefusalPart.of(Refusal("v.mp4", None, "x" * 500), str(number)))
     state = published(at).view()
     assert len(state.refusals) == 20
     assert state.refusals[0].time == "99"
@@ -360,7 +361,7 @@ def test_thousands_of_peers_fit_into_one_message_after_a_few_encodings(monkeypat
 def test_names_that_are_no_text_and_very_long_ones_do_no_harm() -> None:
     at = peers()
     for _ in range(20):
-        at.dispatcher.candidates.latest.append((WALL, Refusal("\x01" * 4000, None, "\x02" * 4000)))
+        at.dispatcher.refusals.append(RefusalPart.of(Refusal("\x01" * 4000, None, "\x02" * 4000), WALL))
     at.quarantine.extend(
         [QuarantineEntry(number + 1, "\x03" * 4000, "f", 0, "\x04" * 4000, WALL) for number in range(100)]
     )

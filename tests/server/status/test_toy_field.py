@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[3]
-DECLARED = ("broker/counters.py", "    cache_hits: int = 0\n", '    pings: int = counter("Pings of consumers.")\n')
+DECLARED = ("broker/state.py", "    cache_hits: int = 0\n", '    pings: int = counter("Pings of consumers.")\n')
 COUNTED = (
     "broker/dispatcher.py",
     "        match message:\n            case Hello():\n",

@@ -18,7 +18,7 @@ import pytest
 from tests.waiting import until
 from v2v_protocol.errors import WorkerCrashLoop
 from v2v_server.broker.leases import Cause, Loss
-from v2v_server.supervise import child as child_module
+from v2v_server.supervise import local_host as child_module
 from v2v_server.supervise import local_host as host_module
 from v2v_server.supervise.local_host import LocalHost
 from v2v_server.supervise.pool import Death, Pool, crash_budget

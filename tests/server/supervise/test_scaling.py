@@ -7,7 +7,7 @@ import random
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from v2v_server.supervise.scaling import Decision, Scaling
+from v2v_server.supervise.pool import Decision, Scaling
 
 SECONDS = 60.0
 

@@ -9,9 +9,8 @@ import pytest
 
 from v2v_protocol.errors import CorpusError
 from v2v_server.config import ServeConfig
-from v2v_server.supervise import child
-from v2v_server.supervise.child import Standby, start_ahead
-from v2v_server.supervise.local_host import LocalHost
+from v2v_server.supervise import local_host as child
+from v2v_server.supervise.local_host import LocalHost, Standby, start_ahead
 from v2v_server.supervise.pool import Pool
 
 WRITES = "import os, sys; open(sys.argv[1], 'wb').write(sys.stdin.buffer.read())"

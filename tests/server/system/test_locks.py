@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from v2v_server.system.locks import lock
+from v2v_server.system.process import lock
 
 
 def test_one_holder_at_a_time(tmp_path: Path) -> None:

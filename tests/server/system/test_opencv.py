@@ -10,7 +10,7 @@ import cv2 as real
 import pytest
 
 from v2v_server.flow import methods
-from v2v_server.system.opencv import cv2
+from v2v_server.system.compile_cache import cv2
 
 
 def test_it_is_opencv() -> None:
@@ -45,7 +45,7 @@ def test_a_worker_loads_it_with_its_first_use(code: str, is_loaded: bool) -> Non
 
 
 def test_it_begins_with_the_number_of_threads_that_a_worker_states() -> None:
-    code = "from v2v_server.system.opencv import cv2; print(cv2.getNumThreads())"
+    code = "from v2v_server.system.compile_cache import cv2; print(cv2.getNumThreads())"
     environment = os.environ | {"OPENCV_FOR_THREADS_NUM": "1"}
     seen = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True, env=environment)
     assert seen.stdout.strip() == "1"

@@ -18,7 +18,7 @@ from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.serve import load_catalogue, serve
 from v2v_server.system import process
-from v2v_server.system.start_times import StartTimes
+from v2v_server.system.log import StartTimes
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux only")
 

@@ -2,7 +2,7 @@
 
 import time
 
-from v2v_server.system.start_times import StartTimes
+from v2v_server.system.log import StartTimes
 
 
 def test_steps_follow_each_other_from_the_creation_of_the_process() -> None:

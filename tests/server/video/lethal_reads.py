@@ -6,7 +6,7 @@ import os
 import signal
 import stat
 
-from v2v_server.corpus.index.file import IndexRow
+from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.probe import probe_file
 from v2v_server.corpus.sources.source import VideoSource
 

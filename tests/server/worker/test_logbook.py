@@ -15,7 +15,7 @@ from v2v_client.memory import Arena
 from v2v_protocol.arena import ArenaName, Slot
 from v2v_protocol.errors import ProtocolError
 from v2v_server.worker.logbook import IDLE, Logbook, note, take_arena
-from v2v_server.worker.output_buffer import slot_arrays
+from v2v_server.worker.process import slot_arrays
 
 WRITES_AND_DIES = """
 import os, signal, sys

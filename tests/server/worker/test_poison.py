@@ -16,7 +16,7 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import ALONE_AFTER, Cause
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry, clearing
+from v2v_server.quarantine import Quarantine, QuarantineEntry, clearing
 from v2v_tools import remake as remake_module
 from v2v_tools.remake import remake
 

@@ -19,8 +19,7 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.sample import Provenance
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
-from v2v_server.quarantine.snapshots import QuarantineEntry
+from v2v_server.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.worker import process as clips

@@ -14,8 +14,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.scenes.scene import CHANGE, COLUMNS, CONTRAST, DARK, MOTION, NOISE, TILES, Scene
 from v2v_server.simulation.draw import choose_crop
 from v2v_server.simulation.view import Window
-from v2v_server.worker.cleaning import CleanFrames
-from v2v_server.worker.scene_choice import LEAN_METHOD, FlowPlan, crop_weight, plan_flow
+from v2v_server.worker.scene_choice import LEAN_METHOD, CleanFrames, FlowPlan, crop_weight, plan_flow
 
 RECIPE = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=32)
 AUTO = StreamSpec(recipe=RECIPE, scene="auto")

@@ -15,9 +15,9 @@ from v2v_protocol.sample import FromSidecar
 from v2v_protocol.wire import decode, encode
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.sidecar import fingerprint_of
-from v2v_server.worker import sidecars as reading
+from v2v_server.worker import produce as reading
 from v2v_server.worker.conversation import Make, Readiness, Send, WorkerConversation
-from v2v_server.worker.sidecars import errors_of_sidecar, open_sidecars, refused_sidecars, sidecar_files
+from v2v_server.worker.produce import errors_of_sidecar, open_sidecars, refused_sidecars, sidecar_files
 
 ENDING = ".label.json"
 

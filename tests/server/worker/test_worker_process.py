@@ -26,8 +26,7 @@ from v2v_server.corpus.sources.folder import Folder
 from v2v_server.simulation.variants import Variant
 from v2v_server.worker import process as worker_module
 from v2v_server.worker.conversation import Reconnect, Send
-from v2v_server.worker.output_buffer import OutputBuffer
-from v2v_server.worker.process import Clips, Worker, run_worker
+from v2v_server.worker.process import Clips, OutputBuffer, Worker, run_worker
 
 WAIT_MS = 20_000
 LEASE: Lease = replace(example(Lease), indices=(3,), arena="", slot=0)

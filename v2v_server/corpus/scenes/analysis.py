@@ -32,7 +32,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.corpus.scenes.bars import bars_of
 from v2v_server.corpus.scenes.scene import (
     CHANGE,
     CLIPPED,
@@ -49,8 +48,7 @@ from v2v_server.corpus.scenes.scene import (
     Scene,
     Sides,
 )
-from v2v_server.corpus.scenes.steps import change_of, duplicated, is_cut
-from v2v_server.corpus.scenes.stretches import is_flat, is_still, pieces_of
+from v2v_server.corpus.scenes.stretches import bars_of, change_of, duplicated, is_cut, is_flat, is_still, pieces_of
 from v2v_server.flow.methods import DIS_ULTRAFAST, GreyPicture, dis, one_thread
 
 DARK_BELOW_LEVEL = 16

@@ -29,15 +29,12 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoGone
 from v2v_protocol.programs import printable
 from v2v_server.corpus.manifest import MANIFEST_NAME
 from v2v_server.corpus.sources.bucket import Bucket, is_url
-from v2v_server.corpus.sources.listfile import ListEntry
-from v2v_server.corpus.sources.names import UNPRINTABLE, count_left_out, is_video_name
+from v2v_server.corpus.sources.listfile import UNPRINTABLE, ListEntry, count_left_out, is_video_name
 from v2v_server.corpus.sources.sidecar import fingerprint_of as sidecar_fingerprint
 from v2v_server.corpus.sources.sidecar import is_sidecar, state_text
 from v2v_server.corpus.sources.source import GONE, SourceOptions, State, VideoSource
 from v2v_server.store.quota import MOST_GIB, PARTIAL, QuotaFolder
-from v2v_server.system.locks import lock
-from v2v_server.system.private import make_private, open_private
-from v2v_server.system.process import cache_folder
+from v2v_server.system.process import cache_folder, lock, make_private, open_private
 from v2v_server.video.fingerprint import fingerprint as video_fingerprint
 from v2v_server.video.fingerprint import is_same_file
 

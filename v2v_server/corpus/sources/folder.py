@@ -16,11 +16,16 @@ from pathlib import Path, PurePosixPath
 from v2v_protocol.errors import CorpusError
 from v2v_protocol.programs import printable
 from v2v_server.corpus.manifest import MANIFEST_NAME
-from v2v_server.corpus.sources.asking import answers
-from v2v_server.corpus.sources.listfile import LIST_SUFFIXES, ListEntry, read_list
-from v2v_server.corpus.sources.names import UNPRINTABLE, count_left_out, is_video_name
+from v2v_server.corpus.sources.listfile import (
+    LIST_SUFFIXES,
+    UNPRINTABLE,
+    ListEntry,
+    count_left_out,
+    is_video_name,
+    read_list,
+)
 from v2v_server.corpus.sources.sidecar import check_local, is_sidecar, local_state, sidecar_id
-from v2v_server.corpus.sources.source import GONE, NO_STATE, SourceOptions, State, VideoSource
+from v2v_server.corpus.sources.source import GONE, NO_STATE, SourceOptions, State, VideoSource, answers
 from v2v_server.store.pixels import open_pixels
 from v2v_server.video.fingerprint import unreadable
 

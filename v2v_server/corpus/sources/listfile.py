@@ -1,4 +1,4 @@
-"""List files like the paper's: one video a line, ``path frames c+ c-``.
+"""List files like the paper's: one video a line, ``path frames c+ c-``; and which names are videos'.
 
 The columns after the path may be left out from the right. A single threshold holds for both polarities. Paths may hold
 spaces, since no path ends in a number of its own; ``#`` at the beginning of a line makes it a comment. In a ``.csv``
@@ -12,6 +12,7 @@ import csv
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -19,11 +20,52 @@ from pathlib import Path, PurePosixPath
 from v2v_protocol.errors import CorpusError
 from v2v_protocol.programs import printable
 
-LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
+VIDEO_SUFFIXES = frozenset({
+    ".3gp", ".avi", ".flv", ".h264", ".h265", ".hevc", ".ivf", ".m2ts", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov",
+    ".mp4", ".mpeg", ".mpg", ".mts", ".mxf", ".obu", ".ogv", ".ts", ".vob", ".webm", ".wmv", ".y4m",
+})  # fmt: skip
 
+_NO_VIDEO_SUFFIXES = frozenset({
+    ".7z", ".aac", ".ac3", ".aedat", ".aedat4", ".ass", ".bag", ".bib", ".bin", ".bmp", ".bz2", ".c", ".cfg", ".conf",
+    ".cpp", ".csv", ".dat", ".db", ".doc", ".docx", ".exr", ".flac", ".gz", ".h", ".h5", ".hdf5", ".htm", ".html",
+    ".info", ".ini", ".ipynb", ".jpeg", ".jpg", ".json", ".jsonl", ".log", ".lst", ".m4a", ".mat", ".md", ".md5",
+    ".mp3", ".nfo", ".npy", ".npz", ".ogg", ".opus", ".parquet", ".pdf", ".pickle", ".pkl", ".png", ".pt", ".pth",
+    ".py", ".raw", ".rst", ".sh", ".sha256", ".sqlite3", ".srt", ".sub", ".tar", ".tgz", ".thm", ".tif", ".tiff",
+    ".tmp", ".toml", ".tsv", ".txt", ".vtt", ".wav", ".webp", ".xlsx", ".xml", ".xz", ".yaml", ".yml", ".zip", ".zst",
+})  # fmt: skip
+_MOST_SUFFIXES_SHOWN = 10
+
+UNPRINTABLE = "its name is not UTF-8 text, or holds control characters; rename it"
+LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
 _SUFFIX = re.compile(r"\.(?=.*[a-z]|26[45]$)[a-z0-9]+", re.IGNORECASE)
 _MOST_COLUMNS = 4
+
+
+def is_video_name(name: str) -> bool:
+    """Return whether a file of this name is listed as a video."""
+    _, dot, ending = name.rpartition(".")
+    return bool(dot) and f".{ending.lower()}" in VIDEO_SUFFIXES
+
+
+def count_left_out(name: str, left_out: Counter[str]) -> None:
+    """Count a file that may be a video of another ending."""
+    stem, _, ending = name.rpartition(".")
+    suffix = printable(f".{ending.lower()}")
+    if stem and len(suffix) <= 12 and suffix not in _NO_VIDEO_SUFFIXES:
+        left_out[suffix] += 1
+
+
+def left_out_note(left_out: Counter[str]) -> str:
+    """Return the line that reports files with other endings; "" where there is no such file."""
+    if not left_out:
+        return ""
+    shown = ", ".join(f"{suffix} ({count})" for suffix, count in sorted(left_out.items())[:_MOST_SUFFIXES_SHOWN])
+    more = len(left_out) - _MOST_SUFFIXES_SHOWN
+    return (
+        f"{left_out.total()} files have endings that are not looked at and were left out: {shown}"
+        f"{f' and {more} other endings' if more > 0 else ''}. Name those that are videos in a list file to serve them"
+    )
 
 
 @dataclass(frozen=True, slots=True)

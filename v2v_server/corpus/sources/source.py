@@ -5,6 +5,9 @@ A kind of source is a file beside this one, named in :data:`KINDS`: a subclass o
 
 Errors are the same for every source: :class:`VideoGone` (not there), :class:`VideoDenied` (not permitted),
 :class:`VideoChanged` (another file by now), and :class:`VideoUnreadable` for every other fault, which may pass.
+
+On remote storage each question about a file is a round trip, most of it waiting, so several are under way at once
+(:func:`by_parts`).
 """
 
 from __future__ import annotations
@@ -12,29 +15,37 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from array import array
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.sources.listfile import ListEntry, read_list
 from v2v_server.store.pixels import Pixels, open_pixels
 from v2v_server.video.rows import Rows
 
-if TYPE_CHECKING:
-    from v2v_server.corpus.manifest import Manifest
+Q = TypeVar("Q")
+A = TypeVar("A")
 
+Notice = Callable[..., None]
+"""Progress callback: a line of text; with ``is_urgent=True`` it is shown at once."""
+
+_AT_ONCE = 16
+_TOGETHER, _MOST_TOGETHER = 64, 1024
+"""Files per task of a thread: passing them one by one takes longer than a local disk's answer."""
+_SOON_SECONDS = 0.05
+_IN_TURN = 256
+"""Parts that are asked many at a time before one alone is tried again."""
 KINDS = ("copies", "prepared", "folder")
 """Files of the kinds of sources, in the order in which they are asked. The last one takes any name."""
-
 COPIES_GIB = 100.0
 """Default limit of the folder of copies."""
-
 State = tuple[int, int, int]
 """Size in bytes, and two numbers that change with the content: the times of the last modification and change of status,
 or a mark of an object's ETag and 0."""
@@ -42,6 +53,69 @@ NO_STATE: State = (-1, 0, 0)
 """The state cannot be told now."""
 GONE: State = (-2, 0, 0)
 """There is no such file."""
+
+
+def is_said(done: int) -> bool:
+    """Return whether progress is reported after this number of files: a million reports take seconds."""
+    return done <= _TOGETHER or done % _TOGETHER == 0
+
+
+def answers(question: Callable[[Q], A], files: Sequence[Q]) -> Generator[tuple[Q, A], None, None]:
+    """Yield (file, answer) for each file, in their order.
+
+    Args:
+        question: asked in threads; must not raise.
+        files: what to ask it of.
+    """
+    with closing(by_parts(lambda part: [question(file) for file in part], files)) as answered:
+        for part, found in answered:
+            yield from zip(part, found, strict=True)
+
+
+def by_parts(question: Callable[[Sequence[Q]], A], files: Sequence[Q]) -> Generator[tuple[Sequence[Q], A], None, None]:
+    """Yield (some of the files, answer) until all were asked about, in their order.
+
+    While answers are fast, one part is asked at a time, because switching threads costs more than a local disk's
+    answer. After a slow answer many parts are asked at a time; later a single one is tried again.
+
+    Args:
+        question: asked of a part of the files in threads; must not raise.
+        files: what to ask it of.
+    """
+    asked: deque[tuple[Sequence[Q], Future[A] | None]] = deque()
+    at, together, at_once, in_turn = 0, _TOGETHER, 1, 0
+    with ThreadPoolExecutor(_AT_ONCE) as threads:
+        try:
+            while asked or at < len(files):
+                while at < len(files) and len(asked) < at_once:
+                    part = files[at : at + together]
+                    at += len(part)
+                    try:
+                        asked.append((part, threads.submit(question, part)))
+                    except RuntimeError:  # no further thread can be started: continue without threads
+                        threads.shutdown(cancel_futures=True)
+                        asked.append((part, None))
+                part, answer = asked[0]
+                if answer is None or answer.cancelled():
+                    found = question(part)
+                else:
+                    try:
+                        found = answer.result(_SOON_SECONDS if at_once == 1 else None)
+                    except TimeoutError:
+                        together, at_once, in_turn = _TOGETHER, 2 * _AT_ONCE, _IN_TURN
+                        continue
+                asked.popleft()
+                yield part, found
+                if at_once == 1:
+                    together = min(2 * together, _MOST_TOGETHER)
+                elif (in_turn := in_turn - 1) <= 0:
+                    at_once = 1
+        finally:
+            threads.shutdown(cancel_futures=True)
+
+
+if TYPE_CHECKING:
+    from v2v_server.corpus.manifest import Manifest
 
 
 @dataclass(frozen=True, slots=True)

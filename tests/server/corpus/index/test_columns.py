@@ -14,13 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.pieces import pieces, shots
+from v2v_server.corpus import videos as columns
 from v2v_server.corpus import videos as videos_module
-from v2v_server.corpus.index import columns
-from v2v_server.corpus.index.columns import StringColumn, VideoTable, joined
-from v2v_server.corpus.index.file import IndexRow
-from v2v_server.corpus.scenes.pieces import SplitVideos
+from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import Flag
-from v2v_server.corpus.videos import NO_THRESHOLDS, Thresholds, Videos
+from v2v_server.corpus.videos import NO_THRESHOLDS, SplitVideos, StringColumn, Thresholds, Videos, VideoTable, joined
 from v2v_server.video.rows import Rows
 
 NAMES = sorted(f"{name}-{number}.mp4" for name in ("plain", "Größe", "日本", "𝄞", "a b") for number in range(40))

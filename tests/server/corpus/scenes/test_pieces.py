@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.pieces import pieces
-from v2v_server.corpus.scenes.pieces import SplitVideos, encoded_pieces
 from v2v_server.corpus.scenes.scene import NO_BARS, Flag, Pieces, Sides, clip_pieces, firsts_of
+from v2v_server.corpus.videos import SplitVideos, encoded_pieces
 
 TELLING = Flag.CUT | Flag.REPEAT | Flag.FADE | Flag.COMBED
 SIDES = st.sampled_from([NO_BARS, Sides(2, 4, 0, 0)])
