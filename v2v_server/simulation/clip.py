@@ -15,15 +15,14 @@ import numpy.typing as npt
 from v2v_protocol.bounds import most_events, pixel_thresholds
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import STARTS, TIME_UNITS, Recipe, effect_settings
-from v2v_protocol.sample import SampleParams
+from v2v_protocol.sample import SampleParams, needs_seconds
 from v2v_protocol.settings import nearest, require_known
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.effects.tolerance import changed_shares, left_out
 from v2v_server.simulation.grey import grey_levels
 from v2v_server.simulation.intensity import Intensity, log_table_float64
-from v2v_server.simulation.kernels import KernelInput
+from v2v_server.simulation.kernels import KernelInput, Voxels
 from v2v_server.simulation.precision import AUTO, EFFECTS_MARGIN, check_thresholds, choose, noise_sum
-from v2v_server.simulation.result import Voxels
 from v2v_server.simulation.voxel import Levels, bin_edges, timed_edges
 from v2v_server.video.luma import SDR, Signal
 
@@ -164,8 +163,9 @@ def simulate_clip(
             different frames the clip shows.
         params, recipe: the draw and its recipe.
         voxel_dtype: "int8", "int16" or "float32".
-        step_seconds: [steps] duration of each step (``voxel.py``); given exactly when ``recipe.needs_seconds``.
-        out: C-contiguous arrays to fill, by name (``kernels.ARRAYS``); None makes the voxels.
+        step_seconds: [steps] duration of each step (``voxel.py``); given exactly when the recipe or an array of ``out``
+            needs seconds.
+        out: C-contiguous arrays to fill, by name (``representations.NAMES``); None makes the voxels.
         levels: grey levels between frames, only with 8 bits; None: log intensity is linear in time there.
         signal: what the levels mean.
         tolerance: share of the events that effects may change which are left out (``effects/tolerance.py``).
@@ -186,7 +186,7 @@ def simulate_clip(
             f"frames {frames.dtype}{list(frames.shape)}: this draw shows {source_index[-1] + 1} frames, "
             f"{signal.dtype} [n, H, W]"
         )
-    if (step_seconds is None) == recipe.needs_seconds:
+    if (step_seconds is None) == (recipe.needs_seconds or needs_seconds(out or ())):
         raise UsageError(
             f"step_seconds is {'missing' if step_seconds is None else 'unwanted'}: noise_unit is "
             f"{recipe.noise_unit!r}, voxel_seconds is {recipe.voxel_seconds[1]:g}, and there "

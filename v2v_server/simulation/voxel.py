@@ -43,6 +43,7 @@ Doubles = npt.NDArray[np.float64]
 Longs = npt.NDArray[np.int64]
 LARGEST_COUNT = {"int8": 127.0, "int16": 32767.0, "float32": np.inf}
 """Largest magnitude of a bin that the dtype stores."""
+LARGEST_FLOAT16 = 65504.0
 
 
 class Moments(NamedTuple):
@@ -124,6 +125,12 @@ def timed_edges(ends: Longs, bins: int, durations: Doubles) -> Moments:
     steps = np.column_stack([step, ends[1:]]).ravel()
     shares = np.column_stack([share, np.zeros(len(ends) - 1)]).ravel()
     return Moments(np.concatenate(([0], steps)), np.concatenate(([0.0], shares)))
+
+
+def time_of(moments: Moments, durations: Doubles) -> Doubles:
+    """Return the time of each moment since the clip's start, [n], in the unit of the durations, [steps]."""
+    since = np.concatenate(([0.0], np.cumsum(durations)))
+    return np.asarray(since[moments.step] + moments.share * np.append(durations, 0.0)[moments.step])
 
 
 def timeline(edges: Moments, bins: int, durations: Doubles, levels: Moments | None = None) -> Timeline:

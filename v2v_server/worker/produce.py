@@ -31,6 +31,7 @@ from v2v_protocol.sample import (
     SampleParams,
     array_layout,
     empty_value,
+    needs_seconds,
     new_arrays,
 )
 from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
@@ -40,7 +41,8 @@ from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.motion import cells_of, levels_of
 from v2v_server.simulation.draw import choose_crop, draw
 from v2v_server.simulation.intensity import eight_bits
-from v2v_server.simulation.kernels import ARRAYS, list_events
+from v2v_server.simulation.kernels import list_events
+from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.variants import Variant, variants
 from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
@@ -266,6 +268,10 @@ def make_sample(
     context, irregular = sample_context(lease, decoded, arrays, sidecars)
     unlabelled = dict[str, str]()
     for name, array in context.into.items():
+        if not context.can_time(name):
+            array[...] = empty_value(name)
+            unlabelled[name] = f"{lease.video}: its frame rate is unknown, and {name} needs it"
+            continue
         try:
             if name in decoded.clip.arrays:
                 array[...] = decoded.clip.arrays[name]
@@ -337,11 +343,13 @@ def sample_context(
             eight_bits(part, signal), params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods
         )
     motion = decoded.clip.motion
-    if motion is not None and motion.any() and not (into and into.keys().isdisjoint(ARRAYS)):
+    if motion is not None and motion.any() and not (into and into.keys().isdisjoint(NAMES)):
         part = without_margin(frames, params, recipe, plan.margin_px, MARGIN_PX)
         picture = within_rows(lease, plan.frames.sides)
         levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px, motion, picture)
-    seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
+    # An array must not make a video unusable for the others: without a rate, it is left empty.
+    is_timed = recipe.needs_seconds or (bool(lease.frames_per_second) and needs_seconds(into))
+    seconds, irregular = _step_seconds(lease, decoded) if is_timed else (None, 0)
     view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe, signal)
     clip = SourceClip(
         lease.start_frame,
@@ -390,7 +398,7 @@ def _decoder(clip: DecodedClip) -> str:
 
 def kernels_of(lease: Lease) -> frozenset[Variant]:
     """Return the compiled kernels that a lease's sample may need."""
-    made = tuple(name for name in ARRAYS if name in lease.arrays)
+    made = tuple(name for name in NAMES if name in lease.arrays)
     return _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds, made) if made else frozenset()
 
 

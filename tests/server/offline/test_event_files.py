@@ -16,7 +16,7 @@ from v2v_protocol.events import EventList
 from v2v_server.commands import simulate as command
 from v2v_server.offline.event_files import FORMS, write_events
 from v2v_server.simulation import simulate
-from v2v_server.simulation.result import Voxels
+from v2v_server.simulation.kernels import Voxels
 
 BIN_US = 7000.0
 

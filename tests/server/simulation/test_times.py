@@ -20,8 +20,8 @@ from tests.server.video.test_real_videos import FOLDER as REAL_VIDEOS
 from v2v_protocol.errors import UsageError
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.intensity import log_table
-from v2v_server.simulation.kernels import ARRAYS, fill, list_events
-from v2v_server.simulation.result import Voxels
+from v2v_server.simulation.kernels import Voxels, fill, list_events
+from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, bin_edges, rounding_tolerance, timeline
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
@@ -62,7 +62,7 @@ def test_it_counts_the_events_of_the_papers_kernel(
         seed=seed, dtype=dtype, precision=precision,
     )  # fmt: skip
     assert not made.given.needs_general
-    found = again(made, *ARRAYS)
+    found = again(made, *NAMES)
     np.testing.assert_array_equal(found["voxels"], made.voxels)
     counts = found["event_counts"].astype(np.int64)
     assert counts.min() >= 0
@@ -91,7 +91,7 @@ def test_kernel_equals_the_oracle(data: Any, precision: str, grids: int) -> None
     )  # fmt: skip
     at = Moments(np.array([0, 0, 2, 3, 3, 3]), np.array([0.25, 0.7, 1 / 3, 0.1, 0.5, 0.9]))
     levels = Levels(at, random.integers(0, 255 * FINE_STEPS + 1, (6, 4, 6), np.uint16))
-    found = again(made, *ARRAYS, levels=levels)
+    found = again(made, *NAMES, levels=levels)
     events = list_events(dataclasses.replace(made.given, levels=levels), made.real, np.full(steps, 1e6 / FPS))
 
     table = np.log(1e-3 + (np.arange(256) / 255) ** 2.2)
@@ -285,7 +285,7 @@ CONTRAST = float(np.ptp(log_table(2.2, 1e-3)))
 
 def test_every_array_saturates_and_counts_it() -> None:
     made = simulate(BLACK_WHITE_BLACK, threshold_pos=CONTRAST / 300.5, bins=1, frames_per_bin=2, start_residual=0.0)
-    arrays, saturated = fill(made.given, made.real, dict.fromkeys(ARRAYS))
+    arrays, saturated = fill(made.given, made.real, dict.fromkeys(NAMES))
     assert made.voxels.ravel().tolist() == [0]
     assert arrays["event_counts"].ravel().tolist() == [127, 127]
     assert saturated == {"voxels": 0, "event_counts": 2, "voxels_bilinear": 0}
@@ -345,7 +345,8 @@ from tests.server.simulation.test_pixel import moving_frames
 from tests.server.simulation.test_times import ALL, FPS
 from v2v_server.simulation import simulate
 from v2v_server.simulation.intensity import log_table
-from v2v_server.simulation.kernels import ARRAYS, fill
+from v2v_server.simulation.kernels import fill
+from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
 
 grey = np.linspace(0, 255 * FINE_STEPS, 80).astype(np.uint16).reshape(2, 5, 8)
@@ -357,7 +358,7 @@ for effects in ({}, ALL):
             moving_frames(9, 5, 8, 3), threshold_pos=0.2, noise_sigma=0.1, bins=3, grids_per_frame=2, dtype="float32",
             seed=5, frames_per_second=FPS, precision=precision, **effects,
         )
-        for array in fill(dataclasses.replace(made.given, levels=levels), made.real, dict.fromkeys(ARRAYS))[0].values():
+        for array in fill(dataclasses.replace(made.given, levels=levels), made.real, dict.fromkeys(NAMES))[0].values():
             digest.update(array.tobytes())
         digest.update(made.to_events(1000.0).t.tobytes())
 print(digest.hexdigest()[:32])

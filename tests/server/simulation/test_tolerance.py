@@ -15,7 +15,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.effects.tolerance import _COSTS, changed_shares, left_out
-from v2v_server.simulation.result import Voxels
+from v2v_server.simulation.kernels import Voxels
 
 CAMERA = Recipe(
     crop_height_px=64, crop_width_px=64, pause_probability=0.0102, noise_sigma=0.0,
