@@ -244,6 +244,7 @@ class Provenance:
         substeps: parts that the clip's steps were divided into along the motion, undivided steps included; 0: the spec
             states no ``substep_px``, so no motion was used.
         remark: what of the video is not served, or served with wrong grey levels; empty for most.
+        dropped: as ``boxes_dropped``, for other labels by name; only those that have any.
     """
 
     id: SampleId
@@ -266,10 +267,11 @@ class Provenance:
     left_out: tuple[str, ...] = ()
     substeps: int = 0
     remark: str = ""
+    dropped: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     @property
     def labelled(self) -> bool:
-        """Return whether all requested labels could be made."""
+        """Return whether all requested arrays could be made."""
         return not self.unlabelled
 
     def __repr__(self) -> str:
@@ -291,7 +293,7 @@ class Provenance:
         }
         optional = (
             "scene", "saturated", "sidecars", "unlabelled", "boxes_dropped", "grid_seconds", "left_out", "substeps",
-            "remark",
+            "remark", "dropped",
         )  # fmt: skip
         return {name: value for name, value in values.items() if value or name not in optional}
 

@@ -23,7 +23,7 @@ from v2v_server.offline.motion import quiet_voxels
 from v2v_server.offline.remake import Remaker
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.simulation import simulate, simulate_log
-from v2v_server.simulation.variants import warm_up
+from v2v_server.simulation.precision import warm_up
 from v2v_server.video.rows import Rows
 from v2v_server.worker.cleaning import CleanFrames
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tests.oracles.noise import error_bound
 from v2v_protocol.bounds import most_events
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import MOST_SUBSTEPS
@@ -19,7 +20,7 @@ from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import FrameTimes, draw
 from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.kernels import KernelInput, fill
-from v2v_server.simulation.precision import AUTO, choose, error_bound
+from v2v_server.simulation.precision import AUTO, choose
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, step_seconds
 
 Doubles = npt.NDArray[np.float64]

@@ -3,20 +3,18 @@
 :func:`simulate` takes any array of frames; :func:`simulate_log` takes log intensities (high dynamic range, analytic
 scenes); the server worker calls :func:`simulate_clip`. The pixel model is in ``v2v_protocol.recipe``.
 
-    draw.py       from a recipe to one camera and its view
-    view.py       the camera's view of the picture: resize, crop, flip, contrast
-    grey.py       frames of any usual kind to grey levels
-    intensity.py  from grey level to log intensity and to light
-    clip.py       simulate a clip: check arguments, choose the arithmetic
-    kernels.py    call the kernel that a clip needs; its result
-    pixel.py      the paper's kernel: all pixels, all steps, one pass
-    noise.py      its random numbers: the definition
-    voxel.py      steps, segments, bins and dtypes: the definition
-    effects/      effects beyond the paper's pixel, one file per effect, and the general kernel
+    draw.py           from a recipe to one camera and its view
+    view.py           the camera's view of the picture: resize, crop, flip, contrast
+    intensity.py      from grey level to log intensity and to light
+    clip.py           simulate a clip: check arguments, frames of any kind to grey levels
+    kernels.py        call the kernel that a clip needs; its result
+    pixel.py          the paper's kernel: all pixels, all steps, one pass
+    noise.py          its random numbers: the definition
+    voxel.py          steps, segments, bins and dtypes: the definition
+    effects/          effects beyond the paper's pixel, one file per effect, and the general kernel
     representations/  arrays made of events, one file per array
-    precision.py  float32, float64 or a refusal
-    variants.py   the compiled forms of the kernels, and when they are loaded
-    vectors.py    functions that the compiler's language lacks
+    precision.py      float32, float64 or a refusal; the compiled forms of the kernels, and when they are loaded
+    vectors.py        functions that the compiler's language lacks
 """
 
 from __future__ import annotations

@@ -17,12 +17,12 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList, check_duration, whole_edges
 from v2v_protocol.sample import ARRAYS, OfEvents, SampleParams, html_table
 from v2v_protocol.spec import VOXEL_DTYPES
-from v2v_server.simulation import effects, noise, representations
+from v2v_server.simulation import effects
 from v2v_server.simulation.effects.kernel import FIXED, TRIANGULAR, UNIFORM, Segments, simulate_general
 from v2v_server.simulation.intensity import Intensity, fine_table, log_table, log_table_float64
-from v2v_server.simulation.pixel import simulate_pixels, words
+from v2v_server.simulation.pixel import hot_pixels, simulate_pixels
 from v2v_server.simulation.precision import Real
-from v2v_server.simulation.representations import NAMES, REPRESENTATIONS
+from v2v_server.simulation.representations import NAMES, REPRESENTATIONS, fill_array, new_memory
 from v2v_server.simulation.voxel import (
     LARGEST_COUNT,
     Doubles,
@@ -35,6 +35,8 @@ from v2v_server.simulation.voxel import (
     time_of,
     timeline,
 )
+
+_NO_LIST = np.empty((0, 4))
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +128,10 @@ def fill(
     arrays = {name: new_array(*given.form(name), array) for name, array in out.items()}
     if out.keys() == {"voxels"} and not given.needs_general:
         return arrays, {"voxels": _paper(given, real, arrays["voxels"])}
-    return arrays, _General(given, real).run(arrays) if arrays else {}
+    if not out:
+        return {}, {}
+    clipped = _General(given, real).run(arrays)
+    return arrays, {name: clipped[name] for name in arrays}
 
 
 def list_events(given: KernelInput, real: Real, step_us: Doubles) -> EventList:
@@ -144,9 +149,8 @@ def list_events(given: KernelInput, real: Real, step_us: Doubles) -> EventList:
     """
     check_duration(float(step_us.sum()))
     general = _General(given, real)
-    count = general.run({"listing": np.empty((0, 4))})["listing"]
-    rows = np.empty((count, 4))
-    general.run({"listing": rows})
+    rows = np.empty((general.run({}, np.empty((1, 4)))["listing"], 4))
+    general.run({}, rows)
     pixel, segment, is_positive = rows[:, :3].T.astype(np.int64)
     part = general.timeline
     starts = time_of(Moments(part.step, part.start), step_us)
@@ -290,16 +294,21 @@ class _General:
         )  # fmt: skip
         self._tables = effects.prepare(
             params.effects, params.noise_key, given.intensity or Intensity(1.0, 1.0),
-            given.step_seconds[part.step] * part.share, self._pixels, real, _compiled_words,
+            given.step_seconds[part.step] * part.share, self._pixels, real,
         )  # fmt: skip
 
-    def run(self, arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, int]:
-        """Fill arrays of representations, by name; return how many values of each did not fit its dtype."""
+    def run(self, arrays: Mapping[str, npt.NDArray[Any]], listing: Doubles = _NO_LIST) -> dict[str, int]:
+        """Fill arrays, by name, and the listing if it has rows; return how many values of each did not fit its dtype,
+        and the number of events that were to be listed.
+        """
         given, real, pixels, params = self._given, self._real, self._pixels, self._given.params
-        clip = representations.Clip(
-            self.timeline, given.edges, given.step_seconds, given.bins, pixels, given.dtype, real
+        none = {name: np.empty((0, *shape[1:]), dtype) for name in NAMES for dtype, shape in (given.form(name),)}
+        memory = {name: new_memory(array, pixels) for name, array in (none | dict(arrays)).items()}
+        made = tuple(
+            each.prepare(own, given, self.timeline, real) if hasattr(each, "prepare") else own
+            for each, own in zip(REPRESENTATIONS.values(), (*memory.values(), listing), strict=True)
         )
-        made = representations.prepare(arrays, clip)
+        clipped = np.zeros(len(made), np.int64)
         sigma = params.effects.get("threshold_mismatch_sigma", 0.0)
         smallest, _ = pixel_thresholds(min(params.threshold_pos, params.threshold_neg), 1.0, sigma)
         between = np.empty((0, pixels), np.uint16) if given.levels is None else given.levels.grey
@@ -310,10 +319,12 @@ class _General:
             table, fine_table(table), np.array(params.noise_key, np.uint32), self._segments,
             *_hot(params, pixels, real), real(params.threshold_pos), real(params.threshold_neg),
             real(rounding_tolerance(smallest, smallest)), law, real(fixed), not params.effects,
-            any(hasattr(REPRESENTATIONS[name], "events") for name in arrays),
-            not params.effects and arrays.keys() == {"voxels"}, made, self._tables,
+            len(listing) > 0 or any(hasattr(REPRESENTATIONS[name], "events") for name in arrays),
+            not params.effects and arrays.keys() == {"voxels"}, given.bins, real(LARGEST_COUNT[given.dtype]), made,
+            clipped, self._tables,
         )  # fmt: skip
-        return representations.finish(arrays, made)
+        counts: dict[str, int] = dict(zip(REPRESENTATIONS, clipped.tolist(), strict=True))
+        return counts | {name: counts[name] + fill_array(array, memory[name]) for name, array in arrays.items()}
 
 
 def _noise_scale(params: SampleParams, durations: Doubles) -> Doubles:
@@ -323,7 +334,7 @@ def _noise_scale(params: SampleParams, durations: Doubles) -> Doubles:
 
 def _hot(params: SampleParams, pixels: int, real: Real) -> tuple[Longs, npt.NDArray[Any]]:
     count = params.hot_pixel_count if params.hot_pixel_sigma > 0.0 else 0
-    position, normal = noise.hot_pixels(params.noise_key, count, pixels, _compiled_words)
+    position, normal = hot_pixels(params.noise_key, count, pixels)
     return position, normal.astype(real) * real(params.hot_pixel_sigma)
 
 
@@ -331,7 +342,3 @@ def _table(intensity: Intensity | None, real: Real) -> npt.NDArray[Any]:
     if intensity is None:
         return np.empty(0, real)
     return log_table(*intensity) if real is np.float32 else log_table_float64(*intensity)
-
-
-def _compiled_words(key: noise.NoiseKey, purpose: int, counters: npt.NDArray[np.int64]) -> npt.NDArray[np.uint32]:
-    return words(np.array(key, np.uint32), np.uint32(purpose), counters.astype(np.uint32))  # type: ignore[no-any-return]

@@ -43,7 +43,6 @@ Doubles = npt.NDArray[np.float64]
 Longs = npt.NDArray[np.int64]
 LARGEST_COUNT = {"int8": 127.0, "int16": 32767.0, "float32": np.inf}
 """Largest magnitude of a bin that the dtype stores."""
-LARGEST_FLOAT16 = 65504.0
 
 
 class Moments(NamedTuple):

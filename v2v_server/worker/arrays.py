@@ -11,8 +11,8 @@ that fills it:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from importlib.resources.abc import Traversable
 from typing import Any
 
@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import SampleParams, needs_seconds
+from v2v_protocol.sample import SampleParams, empty_value, needs_seconds
 from v2v_protocol.spec import StreamSpec
 from v2v_server.flow import FlowClip
 from v2v_server.simulation.clip import simulate_clip
@@ -77,7 +77,7 @@ class SampleContext:
         levels: grey levels between frames (``substep_px``); None if there are none.
         into: the arrays to fill, by name.
         saturated: number of bins that were clipped, by array; None until the clip is simulated.
-        boxes_dropped: boxes left out because of ``max_boxes``.
+        dropped: number of rows that did not fit, by label (:func:`fill_rows`).
         left_out: effects of the draw that were not simulated.
     """
 
@@ -93,7 +93,7 @@ class SampleContext:
     levels: Levels | None
     into: Mapping[str, npt.NDArray[Any]]
     saturated: Mapping[str, int] | None = None
-    boxes_dropped: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
 
     def can_time(self, name: str) -> bool:
@@ -139,6 +139,22 @@ def makes(name: str) -> Callable[[ArrayBuilder], ArrayBuilder]:
         return builder
 
     return register
+
+
+def fill_rows(context: SampleContext, name: str, out: npt.NDArray[Any], frames: Iterable[npt.NDArray[Any]]) -> None:
+    """Fill in a label with a number of rows in each frame, and count those that do not fit.
+
+    Args:
+        context: of the sample.
+        name: of the label; ``empty`` of its form fills the other rows.
+        out: [frames, most rows, columns].
+        frames: [n, columns] of each frame, what matters most first.
+    """
+    found = list(frames)
+    out[...] = empty_value(name)
+    for target, rows in zip(out, found, strict=True):
+        target[: len(rows)] = rows[: len(target)]
+    context.dropped[name] = sum(max(0, len(rows) - out.shape[1]) for rows in found)
 
 
 def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Voxels:

@@ -42,8 +42,8 @@ from v2v_server.motion import cells_of, levels_of
 from v2v_server.simulation.draw import choose_crop, draw
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.kernels import list_events
+from v2v_server.simulation.precision import Variant, variants
 from v2v_server.simulation.representations import NAMES
-from v2v_server.simulation.variants import Variant, variants
 from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache, Cached
@@ -302,7 +302,8 @@ def make_sample(
             scene="" if plan.flow_plan is None else plan.flow_plan.reason,
             sidecars=dict(context.clip.fingerprints),
             unlabelled=unlabelled,
-            boxes_dropped=context.boxes_dropped,
+            boxes_dropped=context.dropped.pop("boxes", 0),
+            dropped={name: count for name, count in context.dropped.items() if count},
             saturated={name: count for name, count in saturated.items() if count},
             grid_seconds=_grid_seconds(context),
             left_out=context.left_out,

@@ -17,11 +17,9 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.sample import sidecar_endings
 from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.labels.boxes import BoxTable
-from v2v_server.labels.formats import READERS, numbered_files
-from v2v_server.labels.masks import read_mask
+from v2v_server.labels.formats import READERS, BoxTable, numbered_files, read_mask
 from v2v_server.labels.views import kept_boxes, view_boxes, view_mask
-from v2v_server.worker.arrays import SampleContext, makes
+from v2v_server.worker.arrays import SampleContext, fill_rows, makes
 
 _KEPT = 4
 """Sidecars that stay in memory once they are read: siblings use them one after the other."""
@@ -64,16 +62,14 @@ def boxes(context: SampleContext, out: npt.NDArray[Any]) -> None:
     clip = context.clip
     ending, opened = _only_sidecar("boxes", context.video, clip.sidecars)
     table = _boxes_of(ending, clip.fingerprints[ending], clip.picture_px, opened)
-    found = [table.at(frame) for frame in context.target_frames]
-    out[...] = -1
-    dropped = 0
-    for rows, (corners, numbers) in zip(out, found, strict=True):
-        seen, share = view_boxes(corners, context.clip.usable, context.params, context.recipe)
-        kept = kept_boxes(seen, share)
-        dropped += max(0, len(kept) - len(rows))
-        kept = kept[: len(rows)]
-        rows[: len(kept)] = np.concatenate([seen[kept], numbers[kept], share[kept, None]], axis=1)
-    context.boxes_dropped = dropped
+
+    def seen(frame: int) -> npt.NDArray[np.float64]:
+        corners, numbers = table.at(frame)
+        inside, share = view_boxes(corners, clip.usable, context.params, context.recipe)
+        kept = kept_boxes(inside, share)
+        return np.concatenate([inside[kept], numbers[kept], share[kept, None]], axis=1)
+
+    fill_rows(context, "boxes", out, map(seen, context.target_frames))
 
 
 @makes("masks")

@@ -12,15 +12,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.oracles.in_time import bilinear_of, counts_of, stacked_histogram, watch
+from tests.oracles.in_time import ages_of, bilinear_of, counts_of, stacked_histogram, watch
 from tests.oracles.noise import standard_normals, start_uniforms
 from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from tests.server.simulation.test_pixel import moving_frames
 from tests.server.video.test_real_videos import FOLDER as REAL_VIDEOS
 from v2v_protocol.errors import UsageError
-from v2v_server.simulation import noise, simulate, simulate_log
+from v2v_server.simulation import simulate, simulate_log
 from v2v_server.simulation.intensity import log_table
 from v2v_server.simulation.kernels import Voxels, fill, list_events
+from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, bin_edges, rounding_tolerance, timeline
 from v2v_server.video.decode import decode_luma
@@ -104,7 +105,7 @@ def test_kernel_equals_the_oracle(data: Any, precision: str, grids: int) -> None
     added = np.zeros((steps, pixels))
     if sigma:
         added += standard_normals(key, steps, pixels) * sigma
-    position, normal = noise.hot_pixels(key, 2, pixels)
+    position, normal = hot_pixels(key, 2, pixels)
     added[:, position] += 0.5 * normal
     sums = np.concatenate([np.zeros((1, pixels)), np.cumsum(added, axis=0)])
     known += np.stack([np.interp(times, np.arange(steps + 1.0), sums[:, p]) for p in range(pixels)], axis=1)
@@ -119,6 +120,8 @@ def test_kernel_equals_the_oracle(data: Any, precision: str, grids: int) -> None
         y, x = divmod(p, 6)
         got = found["event_counts"][:, :, :, y, x].astype(np.int64).transpose(1, 0, 2).reshape(2, -1)
         wrong += int(np.abs(got - counts_of(seen, edges)).sum())
+        ages = found["time_surface"][:, :, :, y, x].transpose(1, 0, 2).reshape(2, -1) * FPS
+        wrong += int(np.count_nonzero(~np.isclose(ages, ages_of(seen, edges), rtol=0.0, atol=3e-3)))
         here = (events.x == x) & (events.y == y)
         # An event within a rounding of the end of a bin may come a rounding later, and then shifts none of the others.
         if here.sum() == len(seen.times):
@@ -288,7 +291,7 @@ def test_every_array_saturates_and_counts_it() -> None:
     arrays, saturated = fill(made.given, made.real, dict.fromkeys(NAMES))
     assert made.voxels.ravel().tolist() == [0]
     assert arrays["event_counts"].ravel().tolist() == [127, 127]
-    assert saturated == {"voxels": 0, "event_counts": 2, "voxels_bilinear": 0}
+    assert saturated == {"voxels": 0, "event_counts": 2, "voxels_bilinear": 0, "time_surface": 0}
 
 
 @pytest.mark.parametrize("height", [2047.5, 2049.5, 65503.5, 65504.5, 65521.5, 1e5 + 0.5])

@@ -9,6 +9,8 @@ segment.
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numba
@@ -28,7 +30,7 @@ from v2v_server.simulation.pixel import (
     two_normals,
     word,
 )
-from v2v_server.simulation.representations import REPRESENTATIONS, Counts, Pixels, Train
+from v2v_server.simulation.representations import REPRESENTATIONS, Counts, Train
 from v2v_server.simulation.vectors import aligned_rows, use_widest_vectors
 
 _PIXEL_RADIUS, _PIXEL_ANGLE = np.uint32(noise.PIXEL_RADIUS), np.uint32(noise.PIXEL_ANGLE)
@@ -36,6 +38,7 @@ _PAIR_RADIUS, _PAIR_ANGLE = np.uint32(noise.PAIR_RADIUS), np.uint32(noise.PAIR_A
 _START = np.uint32(noise.START)
 _TIME = np.uint32(noise.TIME)
 _UNIT = np.float32(2.0**-24)
+_FIRST_ROW = (0, *accumulate(effect.ROWS for effect in EFFECTS))
 FIXED, UNIFORM, TRIANGULAR = range(3)
 """How residuals start."""
 
@@ -63,23 +66,22 @@ class Segments(NamedTuple):
     hot_scale: Any
 
 
-def _linked(name: str, link: Any) -> Any:
-    """Build one compiled function of (tables, rows, block, at) from the hooks of all effects that have it, in their
-    order.
-    """
+def _linked(entries: Sequence[Any], name: str, link: Any) -> Any:
+    """Build one compiled function from the functions of all entries that have it, in their order."""
 
     @hook
-    def chain(tables, rows, block, at):
+    def chain(*_):
         return False
 
-    for number in reversed(range(len(EFFECTS))):
-        if hasattr(EFFECTS[number], name):
-            first = sum(effect.ROWS for effect in EFFECTS[:number])
-            chain = link(number, first, first + EFFECTS[number].ROWS, getattr(EFFECTS[number], name), chain)
+    for number in reversed(range(len(entries))):
+        if hasattr(entries[number], name):
+            chain = link(number, getattr(entries[number], name), chain)
     return chain
 
 
-def _each(number: int, first: int, last: int, function: Any, rest: Any) -> Any:
+def _each(number: int, function: Any, rest: Any) -> Any:
+    first, last = _FIRST_ROW[number : number + 2]
+
     @hook
     def chain(tables, rows, block, at):
         function(tables[number], rows[first:last], block, at)
@@ -88,7 +90,9 @@ def _each(number: int, first: int, last: int, function: Any, rest: Any) -> Any:
     return chain
 
 
-def _until_true(number: int, first: int, last: int, function: Any, rest: Any) -> Any:
+def _until_true(number: int, function: Any, rest: Any) -> Any:
+    first, last = _FIRST_ROW[number : number + 2]
+
     @hook
     def chain(tables, rows, block, at):
         return function(tables[number], rows[first:last], block, at) or rest(tables, rows, block, at)
@@ -96,38 +100,27 @@ def _until_true(number: int, first: int, last: int, function: Any, rest: Any) ->
     return chain
 
 
-def _made(name: str) -> Any:
-    """Build one compiled function of (tables, argument) from the functions of all representations that have it."""
-
+def _counted(number: int, function: Any, rest: Any) -> Any:
     @hook
-    def chain(tables, argument):
-        return False
-
-    for number, each in reversed(list(enumerate(REPRESENTATIONS.values()))):
-        if hasattr(each, name):
-            chain = _then(number, getattr(each, name), chain)
-    return chain
-
-
-def _then(number: int, function: Any, rest: Any) -> Any:
-    @hook
-    def chain(tables, argument):
-        function(tables[number], argument)
-        return rest(tables, argument)
+    def chain(made, clipped, argument):
+        clipped[number] += function(made[number], argument)
+        return rest(made, clipped, argument)
 
     return chain
 
 
-_begin, _events, _end = map(_made, ("begin", "events", "end"))
-_start, _see, _change, _after = (_linked(name, _each) for name in ("start", "see", "change", "after"))
-_cross = _linked("cross", _until_true)
-_OWN_ROWS = sum(effect.ROWS for effect in EFFECTS)
+_start, _see, _change, _after = (_linked(EFFECTS, name, _each) for name in ("start", "see", "change", "after"))
+_cross = _linked(EFFECTS, "cross", _until_true)
+_begin, _events, _end = (
+    _linked(tuple(REPRESENTATIONS.values()), name, _counted) for name in ("begin", "events", "end")
+)
 
 
 @compiled
 def _simulate(
     frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
-    tolerance, start, start_residual, drifts_first, timed, is_plain, made, tables, state, words, floats,
+    tolerance, start, start_residual, drifts_first, timed, is_plain, bins, limit, made, clipped, tables,
+    state, words, floats,
 ):  # fmt: skip
     """Run the kernel in memory of the caller, so that views of arrays need no reference counting."""
     use_widest_vectors()  # type: ignore[call-arg]
@@ -157,7 +150,7 @@ def _simulate(
         now, known, known_before, row, pair_done = 0, 0, 0, 0, -1
         shown = frames[0, first:last]
         look_up(table, shown, shown, levels[now])
-        _begin(made, Pixels(first, last))
+        _begin(made, clipped, first)
         for i in range(BLOCK_PX):
             positive[i], negative[i] = threshold_pos, threshold_neg
         _start(tables, own, block, At(first, 0, False, now, now, shown))
@@ -249,17 +242,17 @@ def _simulate(
                     if drifts_first:
                         for spot in range(hot, next_hot):
                             change[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
-                    _time(each, block, old, first, last, time_folds, made)
+                    _time(each, block, old, first, last, time_folds, made, clipped)
             if each == count - 1 or segments.bin[each + 1] != of_bin:
                 net = on if is_plain else signed
                 if not is_plain:
                     for i in range(BLOCK_PX):
                         net[i] = on[i] - off[i]
-                _end(made, Counts(first, last, of_bin, net, on, off))
+                _end(made, clipped, Counts(first, last, of_bin // bins, of_bin % bins, limit, net, on, off))
 
 
 @compiled
-def _time(each, block, old, first, last, folds, made):
+def _time(each, block, old, first, last, folds, made, clipped):
     """Give every event of a segment its time, and pass it to the representations.
 
     Crossings of one pixel come at equal distances. Events that no change of intensity caused (shot noise) come at
@@ -285,17 +278,17 @@ def _time(each, block, old, first, last, folds, made):
                 passed = min(max(block.waited[i] + (threshold - sign * np.float64(old[i])) / speed, 0.0), 1.0)
                 apart = min(apart, (1.0 - passed) / max(crossings - 1, 1))
             if crossings > 0:
-                _events(made, Train(first + i, i, each, is_rising, passed, apart, crossings))
+                _events(made, clipped, Train(first + i, i, each, is_rising, passed, apart, crossings))
             for k in range(crossings, events):
                 drawn = word((word(folds, first + i), np.uint32(each)), np.uint32(2 * k + is_rising))
                 passed = np.float64(np.int64(drawn)) * 2.0**-32
-                _events(made, Train(first + i, i, each, is_rising, passed, 0.0, 1))
+                _events(made, clipped, Train(first + i, i, each, is_rising, passed, 0.0, 1))
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def simulate_general(
     frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
-    tolerance, start, start_residual, drifts_first, timed, is_plain, made, tables,
+    tolerance, start, start_residual, drifts_first, timed, is_plain, bins, limit, made, clipped, tables,
 ):  # fmt: skip
     """Simulate every pixel of a clip.
 
@@ -312,13 +305,17 @@ def simulate_general(
         drifts_first: True adds a hot pixel's drift in the order of ``pixel.simulate_pixels``, for the same roundings.
         timed: whether events need times: a representation has ``events``.
         is_plain: whether there are no effects, and nothing but voxels is made.
-        made: tables of all representations, ``representations.prepare``; written.
+        bins: of a voxel grid.
+        limit: real, largest count that the dtype of the voxels stores.
+        made: tables of all representations; written.
+        clipped: [representations] int64, to which the number of values that did not fit is added.
         tables: of all effects, ``effects.prepare``.
     """
-    state = aligned_rows(16 + _OWN_ROWS, PITCH, table.dtype)
+    state = aligned_rows(16 + _FIRST_ROW[-1], PITCH, table.dtype)
     words = aligned_rows(6, PITCH, np.uint32)
     floats = aligned_rows(6, PITCH, np.float32)
     _simulate(
         frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
-        tolerance, start, start_residual, drifts_first, timed, is_plain, made, tables, state, words, floats,
+        tolerance, start, start_residual, drifts_first, timed, is_plain, bins, limit, made, clipped, tables,
+        state, words, floats,
     )  # fmt: skip

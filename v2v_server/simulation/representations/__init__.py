@@ -6,25 +6,26 @@
     time_surface.py     age of the last event of each polarity at the end of each bin
     listing.py          the events one by one, which are no array of a sample
 
-A representation is one line of ``v2v_protocol.sample.ARRAYS`` (its form, as ``OfEvents``) and one file here. The file
-states
+A representation is one line of ``v2v_protocol.sample.ARRAYS`` (its form, as ``OfEvents``) and one file here, with
+compiled functions. It has some of these, and each does nothing if the array has no rows:
 
-    prepare(array, clip)    its tables, among them the memory that the kernel writes; for None, which switches it off,
-                            they have the same types
-    finish(tables, array)   complete the array from that memory; return how many values did not fit its dtype
+    begin(tables, first)     before the first step of a block of pixels; the first of them
+    events(tables, train)    what events of a pixel do (:class:`Train`); the kernel then gives every event its time
+    end(tables, counts)      at the end of a bin (:class:`Counts`)
 
-and, compiled, any of these functions. Each does nothing if the tables say off:
+They return how many values did not fit, allocate no memory and use no maths library. The tables are the memory of the
+array with height and width as one axis, of no rows if it is not wanted; or what this function of the file returns, of
+the same types in both cases:
 
-    begin(tables, block)    before the first step of a block of pixels (:class:`Pixels`)
-    events(tables, train)   what events of a pixel do (:class:`Train`); it makes the kernel give every event its time
-    end(tables, counts)     at the end of a bin (:class:`Counts`)
+    prepare(memory, given, segments, real)
 
-They allocate no memory and use no maths library. ``docs/extending.md`` shows how to add a representation.
+It gets the clip (``kernels.KernelInput``), its segments (``voxel.Timeline``) and the arithmetic, float32 or float64. In
+the place of float16 the memory is float32, and is clipped to float16 at the end. ``docs/extending.md`` shows how to add
+a representation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -32,46 +33,8 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.sample import ARRAYS, OfEvents
-from v2v_server.simulation.precision import Real
-from v2v_server.simulation.voxel import LARGEST_COUNT, Doubles, Moments, Timeline
 
-
-class Clip(NamedTuple):
-    """Inputs of a representation's tables.
-
-    Attributes:
-        segments: of the clip.
-        edges: ends of the bins, the clip's start included.
-        step_seconds: [steps] duration of each step.
-        bins: bins of a voxel grid.
-        pixels: number of pixels of the picture.
-        dtype: of the voxels, "int8", "int16" or "float32".
-        real: arithmetic of the pixels, float32 or float64.
-    """
-
-    segments: Timeline
-    edges: Moments
-    step_seconds: Doubles
-    bins: int
-    pixels: int
-    dtype: str
-    real: Real
-
-    @property
-    def limit(self) -> np.floating[Any]:
-        """Return the largest count that the dtype stores."""
-        return self.real(LARGEST_COUNT[self.dtype])
-
-    def memory(self, array: npt.NDArray[Any] | None, dtype: str, *axes: int) -> npt.NDArray[Any]:
-        """Return an array as the kernel writes it, [n, *axes, pixels]; of no rows if it is None."""
-        return np.empty((0, *axes, self.pixels), dtype) if array is None else array.reshape(-1, *axes, self.pixels)
-
-
-class Pixels(NamedTuple):
-    """A block of pixels: the first one, and the one after the last."""
-
-    first: Any
-    last: Any
+_LARGEST_FLOAT16 = 65504.0
 
 
 class Train(NamedTuple):
@@ -100,14 +63,17 @@ class Counts(NamedTuple):
 
     Attributes:
         first, last: the first pixel of the block, and the one after the last.
-        bin: number of the bin in the clip.
+        grid, bin: number of the voxel grid, and of the bin in it.
+        limit: real, largest count that the dtype of the voxels stores.
         net, on, off: [block] real, signed, positive and negative events. Only ``net`` is set if nothing but voxels is
             made.
     """
 
     first: Any
     last: Any
+    grid: Any
     bin: Any
+    limit: Any
     net: Any
     on: Any
     off: Any
@@ -118,17 +84,17 @@ NAMES = tuple(name for name, form in ARRAYS.items() if isinstance(form, OfEvents
 REPRESENTATIONS = {name: import_module(f"{__name__}.{name}") for name in (*NAMES, "listing")}
 
 
-def prepare(arrays: Mapping[str, npt.NDArray[Any]], clip: Clip) -> tuple[Any, ...]:
-    """Return the tables of every representation for one clip, in the order of :data:`REPRESENTATIONS`.
-
-    Args:
-        arrays: those to make, by name, C-contiguous; the others are off.
-        clip: the clip.
-    """
-    return tuple(each.prepare(arrays.get(name), clip) for name, each in REPRESENTATIONS.items())
+def new_memory(array: npt.NDArray[Any], pixels: int) -> npt.NDArray[Any]:
+    """Return what the kernel writes in the place of an array [..., H, W]: [..., pixels]."""
+    shape = (*array.shape[:-2], pixels)
+    return np.empty(shape, np.float32) if array.dtype == np.float16 else array.reshape(shape)
 
 
-def finish(arrays: Mapping[str, npt.NDArray[Any]], tables: tuple[Any, ...]) -> dict[str, int]:
-    """Complete the arrays that the kernel has made; return how many values of each did not fit its dtype."""
-    made = zip(REPRESENTATIONS.items(), tables, strict=True)
-    return {name: each.finish(own, arrays[name]) for (name, each), own in made if name in arrays}
+def fill_array(array: npt.NDArray[Any], memory: npt.NDArray[Any]) -> int:
+    """Fill an array from the memory that the kernel wrote; return how many values were clipped."""
+    if array.dtype != np.float16:
+        return 0
+    within = np.clip(memory, -_LARGEST_FLOAT16, _LARGEST_FLOAT16)
+    np.copyto(within, memory, where=np.isinf(memory))
+    array[...] = within.reshape(array.shape)
+    return int(np.count_nonzero(within != memory))
