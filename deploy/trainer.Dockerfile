@@ -9,6 +9,7 @@ WORKDIR /opt/v2v
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY v2v_protocol v2v_protocol
 COPY v2v_server v2v_server
+COPY v2v_tools v2v_tools
 COPY v2v_client v2v_client
 COPY v2v_pictures v2v_pictures
 COPY v2v_recordings v2v_recordings

@@ -29,7 +29,7 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def _probe_in_this_process() -> Iterator[None]:
     """Probe videos of commands called in this process here; programs that tests start use other processes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("v2v_server.offline.remake.usable_cores", lambda: 0)
+        patch.setattr("v2v_tools.remake.usable_cores", lambda: 0)
         yield
 
 

@@ -4,7 +4,16 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("v2v_protocol", "v2v_server", "v2v_client", "v2v_pictures", "v2v_recordings", "trainer", "examples")
+PACKAGES = (
+    "v2v_protocol",
+    "v2v_server",
+    "v2v_tools",
+    "v2v_client",
+    "v2v_pictures",
+    "v2v_recordings",
+    "trainer",
+    "examples",
+)
 FORBIDDEN = re.compile(
     r"\b(nobody|whoever|anew|shall|lest|thereby|hence|for ever|of late|as it was|so many|so long|so much)\b", re.I
 )

@@ -38,7 +38,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
 from v2v_protocol.write_aside import write_json
 from v2v_server.config import ServeConfig
-from v2v_server.offline.event_files import FORMS, write_events
+from v2v_tools.event_files import FORMS, write_events
 
 OUTPUTS = [
     ("v2v-preview a.mp4 --out a.mp4", ["--out a.mp4", "also reads"]),

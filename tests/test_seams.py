@@ -90,7 +90,7 @@ import numpy as np
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.offline.remake import remake
+from v2v_tools.remake import remake
 from v2v_server.simulation.effects import event_loss
 from v2v_server.simulation.effects.kernel import simulate_general
 

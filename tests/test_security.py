@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("v2v_protocol", "v2v_pictures", "v2v_recordings", "v2v_server", "v2v_client", "trainer")
+PACKAGES = ("v2v_protocol", "v2v_pictures", "v2v_recordings", "v2v_server", "v2v_tools", "v2v_client", "trainer")
 MAY_UNPICKLE = {
     "v2v_client/position/shared.py",  # a descriptor that only this process and its loader workers have
     "trainer/unpickle.py",  # weights, by an unpickler that knows a closed list of names

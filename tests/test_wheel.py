@@ -57,7 +57,7 @@ def test_every_command_is_there(installed: Path, tmp_path: Path, command: str) -
 
 
 def test_packages_come_from_the_wheel_with_their_types(installed: Path, tmp_path: Path) -> None:
-    packages = ("v2v_protocol", "v2v_pictures", "v2v_recordings", "v2v_server", "v2v_client", "trainer")
+    packages = ("v2v_protocol", "v2v_pictures", "v2v_recordings", "v2v_server", "v2v_tools", "v2v_client", "trainer")
     script = f"import importlib; print(*(importlib.import_module(n).__path__[0] for n in {packages}), sep='\\n')"
     for path in ran(installed / "python", "-c", script, cwd=tmp_path).splitlines():
         assert Path(path).is_relative_to(installed.parent)

@@ -181,7 +181,7 @@ def _open_remaker(
     videos: str, rows: str, list_file: str | None, cache_dir: str | None, spec: StreamSpec, arrays: tuple[str, ...]
 ) -> Any:
     try:
-        remake = importlib.import_module("v2v_server.offline.remake")
+        remake = importlib.import_module("v2v_tools.remake")
     except ModuleNotFoundError as error:
         raise UsageError(
             f"V2VDataset makes samples in this process, which needs the package {error.name}: pip install '.[server]' "

@@ -17,7 +17,7 @@ from typing import TextIO
 
 from v2v_protocol.settings import nearest
 
-_OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_client", "trainer"})
+_OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_tools", "v2v_client", "trainer"})
 
 Program = Callable[[], int | None]
 """A function that returns the exit status; None is success."""
@@ -133,10 +133,10 @@ def v2v() -> int | None:
 
 _GROUPS: dict[str, dict[str, tuple[str, str, str]]] = {
     "Look at videos": {
-        "preview": ("v2v_server.commands.preview", "server", "draw what a recipe makes of videos"),
-        "simulate": ("v2v_server.commands.simulate", "server", "write one sample to a file, its events too"),
-        "doctor": ("v2v_server.commands.doctor", "server", "check installation, machine and videos"),
-        "fit": ("v2v_server.commands.fit", "server", "fit a virtual camera to a recording, or measure one"),
+        "preview": ("v2v_tools.preview.command", "server", "draw what a recipe makes of videos"),
+        "simulate": ("v2v_tools.simulate", "server", "write one sample to a file, its events too"),
+        "doctor": ("v2v_tools.doctor.command", "server", "check installation, machine and videos"),
+        "fit": ("v2v_tools.fit.command", "server", "fit a virtual camera to a recording, or measure one"),
     },
     "Stream": {
         "serve": ("v2v_server.commands.serve", "server", "stream samples to trainers"),
@@ -146,7 +146,7 @@ _GROUPS: dict[str, dict[str, tuple[str, str, str]]] = {
     },
     "Manage a corpus": {
         "prepare": ("v2v_server.commands.prepare", "server", "decode videos once, into a store that reads fast"),
-        "tradeoff": ("v2v_server.commands.tradeoff", "server", "compare speed, disk space and accuracy"),
+        "tradeoff": ("v2v_tools.tradeoff.command", "server", "compare speed, disk space and accuracy"),
         "catalogue": ("v2v_server.commands.catalogue", "server", "catalogue videos ahead of time"),
         "quarantine": ("v2v_server.commands.quarantine", "server", "list what crashed workers, or clear the list"),
         "keys": ("v2v_server.commands.keys", "server", "create and revoke the keys of a server"),

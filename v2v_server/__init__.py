@@ -3,7 +3,6 @@
     serve.py      one server: runs the loop; config.py: its settings
     commands/     the command lines
     prepare/      `v2v-prepare`
-    offline/      samples without a server
     status/       what the operator sees
     supervise/    start and restart workers
     broker/       which worker makes which sample for which consumer

@@ -41,9 +41,9 @@ from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, 
 from v2v_server.broker.worker_registry import clean_name
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.scenes.picture_check import check_in_background
 from v2v_server.corpus_actions import CorpusActions
 from v2v_server.keys.folder import KeyFolder
-from v2v_server.offline.doctor_pictures import check_in_background
 from v2v_server.page.child import PageProcess
 from v2v_server.quarantine.file import quarantine_path, read_quarantine
 from v2v_server.quarantine.snapshots import Quarantine

@@ -19,13 +19,13 @@ from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.scenes.pieces import encoded_pieces
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.videos import VideoEntry
-from v2v_server.offline.motion import quiet_voxels
-from v2v_server.offline.remake import Remaker
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.simulation import simulate, simulate_log
 from v2v_server.simulation.precision import warm_up
 from v2v_server.video.rows import Rows
 from v2v_server.worker.cleaning import CleanFrames
+from v2v_tools.motion import quiet_voxels
+from v2v_tools.remake import Remaker
 
 Film = npt.NDArray[np.uint8]
 THRESHOLD = 0.2

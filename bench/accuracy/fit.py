@@ -11,7 +11,7 @@ width of at most 15 %; every other parameter in one of three.
 With ``--outside``, cameras with the noise models of v2e and IEBCS (``tests/oracles/other_cameras.py``) record instead.
 Each is fitted on one half of the sensor; on the other half, the fitted camera and eight draws of every preset (median)
 simulate the frames. Shown are their distances from the recording: logarithms of the ratios of rates, and of brighter to
-darker events; the statistics of ``v2v_server/fit/statistics.py`` for pixels and intervals. Bar: none is nearer than the
+darker events; the statistics of ``v2v_tools/fit/statistics.py`` for pixels and intervals. Bar: none is nearer than the
 fitted camera.
 """
 
@@ -38,12 +38,12 @@ from tests.oracles.cameras import (
 from tests.oracles.other_cameras import OTHERS, record_other
 from v2v_protocol.command import Parser
 from v2v_protocol.recipe import PRESETS, Recipe
-from v2v_server.fit.fit import fit
-from v2v_server.fit.interval import Doubles
-from v2v_server.fit.recording import Recorded, recorded
-from v2v_server.fit.regression import light_of
-from v2v_server.fit.statistics import panels_of, simulate_recording
 from v2v_server.simulation.draw import draw
+from v2v_tools.fit.fit import fit
+from v2v_tools.fit.interval import Doubles
+from v2v_tools.fit.recording import Recorded, recorded
+from v2v_tools.fit.regression import light_of
+from v2v_tools.fit.statistics import panels_of, simulate_recording
 
 HEIGHT_PX, WIDTH_PX = 96, 128
 FIRST_SEED = 100

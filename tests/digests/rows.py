@@ -23,7 +23,6 @@ from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.offline.leases import lease_for
 from v2v_server.prepare.prepare import prepare
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
@@ -31,6 +30,7 @@ from v2v_server.store.cache import Cache, make_cache
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import decode_for, make_sample
 from v2v_server.worker.sidecars import open_sidecars
+from v2v_tools.remake import lease_for
 
 ROWS = Rows.parse("0.05:0.95")
 SIZE: Mapping[str, Any] = {"voxels_per_clip": 2, "bins": 3, "crop_height_px": 16, "crop_width_px": 20}

@@ -24,8 +24,8 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import NoWorkers, ServerLost
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.offline.remake import remake
 from v2v_server.quarantine.file import read_quarantine
+from v2v_tools.remake import remake
 
 INJECT = Path(__file__).parent / "inject"
 pytestmark = pytest.mark.slow

@@ -14,12 +14,12 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.cache import Cache
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import decode_for, make_sample
+from v2v_tools.remake import lease_for
 
 
 @contextmanager

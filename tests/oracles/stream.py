@@ -23,12 +23,11 @@ from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.offline.leases import lease_for
-from v2v_server.offline.remake import remake
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.worker.produce import decode_for, make_sample
 from v2v_server.worker.sidecars import open_sidecars
+from v2v_tools.remake import lease_for, remake
 
 
 @dataclass(frozen=True, slots=True)

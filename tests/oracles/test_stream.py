@@ -15,7 +15,7 @@ from tests.oracles.stream import Profile, StreamOracle, Verdict, check
 from tests.oracles.stream_log import BatchLine, LifeLine, Line, Sighting, sighting
 from v2v_protocol.refusal import Refusal
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.offline.remake import remake
+from v2v_tools.remake import remake
 
 ASKED = PROFILES[0]
 BATCHES = 4

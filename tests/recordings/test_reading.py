@@ -27,9 +27,9 @@ from v2v_protocol.events import EventList
 from v2v_recordings.forms import recognise
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, SensorSize
 from v2v_recordings.reading import LATE_NS, _Clock, read_items
-from v2v_server.fit.recording import read_recording
-from v2v_server.offline.event_files import FORMS as EXPORTS
-from v2v_server.offline.event_files import write_events
+from v2v_tools.event_files import FORMS as EXPORTS
+from v2v_tools.event_files import write_events
+from v2v_tools.fit.recording import read_recording
 
 
 def read(path: Path, options: ConvertOptions | None = None) -> list[Item]:

@@ -96,7 +96,7 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import SampleUnavailable, StateMismatch
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.offline.remake import remake
+from v2v_tools.remake import remake
 
 folder, cache = Path(sys.argv[1]), sys.argv[2]
 small = dict(voxels_per_clip=4, bins=2, crop_height_px=16, crop_width_px=24, pause_probability=0.0)

@@ -147,6 +147,6 @@ def test_what_is_wrong_is_said(clips: Path, tmp_path: Path, monkeypatch: pytest.
         V2VDataset(clips, seed=-1)
     with pytest.raises(CorpusError, match="no video gives a sequence"):
         V2VDataset(clips, recipe={"voxels_per_clip": 1000}, cache_dir=str(tmp_path))
-    monkeypatch.setitem(sys.modules, "v2v_server.offline.remake", None)
+    monkeypatch.setitem(sys.modules, "v2v_tools.remake", None)
     with pytest.raises(UsageError, match=r"pip install '\.\[server\]'"):
         V2VDataset(clips, recipe=SMALL)

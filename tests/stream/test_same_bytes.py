@@ -19,8 +19,8 @@ from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.offline.remake import remake
 from v2v_server.status.client import StatusClient
+from v2v_tools.remake import remake
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +151,7 @@ def test_one_process_makes_the_same_samples(clips: Path, server: LocalServer) ->
 def test_v2v_simulate_makes_the_same_sample(clips: Path, server: LocalServer, tmp_path: Path) -> None:
     recipe = tmp_path / "small.yaml"
     recipe.write_text("preset: paper\nvoxels_per_clip: 4\ncrop_height_px: 32\n", encoding="utf-8")
-    command = [sys.executable, "-m", "v2v_server.commands.simulate", str(clips), "--recipe", str(recipe)]
+    command = [sys.executable, "-m", "v2v_tools.simulate", str(clips), "--recipe", str(recipe)]
     command += ["--set", "crop_width_px=40", "--seed", "3", "--index", "7", "--out", str(tmp_path / "sample.npz")]
     subprocess.run([*command, "--picture", str(tmp_path / "sample.png")], check=True, capture_output=True)
     batch = epoch_of(server.address)[2]

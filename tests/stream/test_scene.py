@@ -19,10 +19,10 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import Provenance, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.offline.remake import remake
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.schedule.summary import corpus_summary
 from v2v_server.worker.scene_choice import MOVING
+from v2v_tools.remake import remake
 
 Luma = npt.NDArray[np.uint8]
 ARRAYS = ("voxels", "frames", "flow", "flow_valid")

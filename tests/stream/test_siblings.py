@@ -16,7 +16,7 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.offline.remake import remake
+from v2v_tools.remake import remake
 
 BATCH, VIEWS = 3, 3
 

@@ -27,7 +27,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from shutil import copytree, ignore_patterns
 
-PACKAGES = ("v2v_protocol", "v2v_server", "v2v_client", "v2v_pictures", "v2v_recordings", "trainer")
+PACKAGES = ("v2v_protocol", "v2v_server", "v2v_tools", "v2v_client", "v2v_pictures", "v2v_recordings", "trainer")
 MOST_TESTS = 40
 TIMEOUT_SECONDS = 300
 KERNELS = ("v2v_server/simulation/", "v2v_server/motion/")

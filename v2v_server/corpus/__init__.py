@@ -8,6 +8,7 @@ sidecars         the fingerprints of files beside the videos
 probe            probing many files in processes of their own
 index            what probing found, on disk and in memory
 refresh          bring the index up to date
+ahead            a corpus catalogued before a server needs it, on one host or many
 scenes           what the videos show, and what is wrong with it
 manifest         what a prepared folder states about itself
 manifest_writer  writing a manifest

@@ -14,9 +14,9 @@ from v2v_protocol.sample import DEFAULT_ARRAYS, Form, Provenance, SampleId, arra
 from v2v_protocol.wire import decode_map, decode_sample
 from v2v_server.broker.grants import check_result
 from v2v_server.broker.leases import Request
-from v2v_server.offline.leases import lease_for
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_tools.remake import lease_for
 
 
 @pytest.mark.parametrize("arrays", [DEFAULT_ARRAYS, ("frames",), ("voxels", "flow", "flow_valid")])

@@ -21,9 +21,9 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.offline.remake import remake
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import plan_sample
+from v2v_tools.remake import remake
 
 ROWS = "top:0.9"
 SMALL = Recipe(voxels_per_clip=2, bins=3, crop_height_px=24, crop_width_px=32)

@@ -19,10 +19,10 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.manifest import MANIFEST_NAME
-from v2v_server.offline.remake import remake
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.rows import Rows
+from v2v_tools.remake import remake
 
 ROWS = "top:0.54"
 SPEC = StreamSpec(recipe=Recipe(voxels_per_clip=2, bins=3, crop_height_px=24, crop_width_px=32))

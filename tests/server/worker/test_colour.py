@@ -23,8 +23,6 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.offline.leases import lease_for
-from v2v_server.offline.remake import Remaker
 from v2v_server.prepare.prepare import prepare
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
@@ -32,6 +30,7 @@ from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.reader import has_planes
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import decode_for, make_sample
+from v2v_tools.remake import Remaker, lease_for
 
 RECIPE = Recipe(
     voxels_per_clip=4, bins=2, crop_height_px=24, crop_width_px=32, lead_frames=1, pause_probability=0.3,

@@ -19,8 +19,8 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.offline.remake import Remaker
 from v2v_server.video.rows import Rows
+from v2v_tools.remake import Remaker
 
 FRAMES, HEIGHT_PX, WIDTH_PX, SIDE_PX = 40, 48, 64, 14
 RECIPE = Recipe(

@@ -24,18 +24,18 @@ from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.scenes.picture_check import look_at_pictures
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.offline.doctor_pictures import look_at_pictures
-from v2v_server.offline.motion import WholePictures, predicted_loss
-from v2v_server.offline.preview import _signal_note
-from v2v_server.offline.remake import Remaker
 from v2v_server.simulation.intensity import light_table
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.planes.detail import detail_of, levels_of
-from v2v_server.tradeoff.accuracy import Places, seen, simulated
 from v2v_server.video.luma import Signal, range_table
 from v2v_server.worker.process import Clips
 from v2v_server.worker.produce import make_sample
+from v2v_tools.motion import WholePictures, predicted_loss
+from v2v_tools.preview.preview import _signal_note
+from v2v_tools.remake import Remaker
+from v2v_tools.tradeoff.accuracy import Places, seen, simulated
 
 SDR = preset("noise-free").replace(
     voxels_per_clip=2,

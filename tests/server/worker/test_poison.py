@@ -16,9 +16,9 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import ALONE_AFTER, Cause
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.offline import remake as remake_module
-from v2v_server.offline.remake import remake
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry, clearing
+from v2v_tools import remake as remake_module
+from v2v_tools.remake import remake
 
 TIME = "2024-02-29T12:00:00+00:00"
 BLAMING = (Cause.CRASHED, Cause.HUNG)

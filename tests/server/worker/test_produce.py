@@ -18,10 +18,7 @@ from v2v_protocol.errors import ProtocolError, VideoChanged, VideoError, VideoUn
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import Provenance
 from v2v_server.broker.leases import Request
-from v2v_server.commands.simulate import main as simulate
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.offline.leases import lease_for
-from v2v_server.offline.remake import remake
 from v2v_server.quarantine.file import quarantine_path, read_quarantine, write_entry
 from v2v_server.quarantine.snapshots import QuarantineEntry
 from v2v_server.schedule.epoch import Schedule
@@ -29,6 +26,8 @@ from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.worker import process as clips
 from v2v_server.worker import produce
 from v2v_server.worker.produce import Decoded, decode_for, make_sample
+from v2v_tools.remake import lease_for, remake
+from v2v_tools.simulate import main as simulate
 
 CHANGED = ("voxels_per_clip", "bins", "crop_height_px", "crop_width_px")
 """Fields of the small recipe that are not the paper's."""

@@ -8,4 +8,5 @@ bars        bars at the sides of the picture
 findings    all of it, said for people
 pieces      the pieces of all videos
 collect     the statistics of all videos of a corpus
+picture_check  a look at the pictures of a sample of the videos
 """

@@ -28,7 +28,7 @@ DARKEST = 20 / 255
 
 
 def prepare(value: float, clip: Clip) -> tuple[Any, Any]:
-    """Return a and b by grey level, real [tables, 2, levels], no table without low-pass; which of them each step has."""
+    """Return a and b by grey level, real [tables, 2, levels], no table without low-pass; and which a step has."""
     durations = clip.durations if value > 0.0 else clip.durations[:0]
     return low_pass_tables(value, clip.light, durations).astype(clip.real), clip.table_of_step
 

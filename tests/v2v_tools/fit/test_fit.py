@@ -1,0 +1,234 @@
+"""A camera with known parameters is recorded and fitted again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.oracles.cameras import Film, TrueCamera, record, rendered_film
+from v2v_protocol.errors import UsageError
+from v2v_recordings.items import ConvertOptions, SensorSize
+from v2v_server.config import recipe_setting
+from v2v_tools.fit import estimators
+from v2v_tools.fit import recording as recording_module
+from v2v_tools.fit.fit import FittedCamera, fit
+from v2v_tools.fit.increments import increments_of
+from v2v_tools.fit.interval import Estimate
+from v2v_tools.fit.recording import Recorded, chosen_pixels, read_recording, recorded
+from v2v_tools.fit.regression import Regression
+from v2v_tools.fit.report import draw_fit, recipe_fields, report_lines, write_recipe
+
+FAST = TrueCamera(0.2, 0.26, shot_noise_hz=3.0, leak_hz=0.0, refractory_seconds=5e-4, log_eps=0.01)
+SLOW = TrueCamera(0.25, 0.21, 0.12, 0.4, 0.6, 0.0, 60.0, log_eps=0.01)
+
+
+@lru_cache(maxsize=1)
+def film() -> Film:
+    return rendered_film("coffee", 48, 64, 70.0, moving=1.0)
+
+
+def recording_of(camera: TrueCamera, film_seen: Film | None = None) -> Recorded:
+    made = record(film_seen or film(), camera, 1)
+    height, width = made["frames"].shape[1:]
+    place = made["y"].astype(np.int64) * width + made["x"]
+    return recorded(height, width, made["t"], place, made["p"], made["frames"], made["frame_us"])
+
+
+@lru_cache(maxsize=2)
+def fitted(camera: TrueCamera) -> FittedCamera:
+    return fit(recording_of(camera))
+
+
+@pytest.mark.parametrize("camera", [FAST, SLOW], ids=["refractory", "low-pass"])
+def test_thresholds_come_back_from_events_and_frames(camera: TrueCamera) -> None:
+    made = recording_of(camera, rendered_film("camera", 48, 64, 70.0, moving=0.8, still=0.0))
+    found = Regression(increments_of(made, camera.refractory_seconds, 33_333.0), made.blocks())
+    names = ("threshold_pos", "threshold_neg", "log_eps")
+    check(dict(zip(names, (found.positive, found.negative, found.log_eps), strict=True)), camera, names)
+
+
+@pytest.mark.slow
+def test_a_camera_with_refractory_period_and_noise_is_found_again() -> None:
+    check(fitted(FAST).estimates, FAST, ("threshold_pos", "threshold_neg", "refractory_seconds", "shot_noise_hz"))
+
+
+@pytest.mark.slow
+def test_a_camera_with_low_pass_mismatch_and_leak_is_found_again() -> None:
+    names = ("threshold_pos", "threshold_neg", "threshold_mismatch_sigma", "leak_hz")
+    check(fitted(SLOW).estimates, SLOW, names)
+    corner = fitted(SLOW).estimates["photoreceptor_hz"]
+    assert corner.told
+    assert corner.low <= 1 / SLOW.photoreceptor_hz <= corner.high
+
+
+def check(estimates: Mapping[str, Estimate], camera: TrueCamera, names: tuple[str, ...]) -> None:
+    for name in names:
+        made, true = estimates[name], getattr(camera, name)
+        assert made.told, (name, made)
+        assert made.low * 0.97 <= true <= made.high * 1.03, (name, true, made)
+
+
+@pytest.mark.slow
+def test_an_absent_effect_is_left_out_and_the_report_says_why() -> None:
+    left_out = fitted(FAST).left_out
+    for name in ("threshold_mismatch_sigma", "photoreceptor_hz", "hot_pixel_share"):
+        assert "too little to matter" in left_out[name]
+    assert "refractory_seconds" not in left_out
+    assert any(line.startswith("  photoreceptor_hz: at most") for line in report_lines(fitted(FAST), "x"))
+
+
+@pytest.mark.slow
+def test_the_recipe_is_one_that_a_server_accepts(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    write_recipe(path, fitted(SLOW), "recording.h5")
+    recipe = recipe_setting(str(path), ())
+    assert recipe.threshold[0] < 0.21 * 1.03
+    assert recipe.threshold[1] > 0.21 * 0.97
+    assert recipe.leak_hz[0] > 0.3
+    assert 40 < recipe.photoreceptor_hz[0] < 60 * 1.1
+    assert recipe.refractory_seconds == (0.0, 0.0)
+    assert path.read_text().startswith("# Camera of recording.h5, fitted by v2v-fit")
+
+
+@pytest.mark.slow
+def test_the_picture_shows_measured_and_simulated() -> None:
+    page = draw_fit(fitted(SLOW), "recording.h5")
+    assert page.dtype == np.uint8
+    assert page.shape[1] == 1400
+    assert fitted(SLOW).simulated is not None
+
+
+@pytest.mark.slow
+def test_events_without_frames_tell_no_threshold() -> None:
+    given_recording = recording_of(FAST)
+    alone = recorded(
+        48, 64, given_recording.t_us, np.repeat(given_recording.pixels, np.diff(given_recording.first)),
+        given_recording.p, np.empty((0, 48, 64), np.uint8), np.empty(0, np.int64),
+    )  # fmt: skip
+    made = fit(alone)
+    assert not made.estimates["threshold_pos"].told
+    assert "frames" in made.left_out["threshold_pos"]
+    assert made.estimates["refractory_seconds"].told
+    assert recipe_fields(made)["preset"] == "paper"
+    assert "threshold" not in recipe_fields(made)
+
+
+@pytest.mark.slow
+def test_a_static_scene_tells_the_noise() -> None:
+    grey = np.full((1441, 40, 40), 0.53, np.float32)  # a quarter of white's light
+    camera = TrueCamera(0.2, 0.2, shot_noise_hz=4.0, leak_hz=1.5, refractory_seconds=1e-3)
+    seen = recording_of(camera, Film(grey, 480))
+    alone = recorded(
+        40, 40, seen.t_us, np.repeat(seen.pixels, np.diff(seen.first)), seen.p, np.empty((0, 40, 40), np.uint8),
+        np.empty(0, np.int64),
+    )  # fmt: skip
+    check(fit(alone, static=True).estimates, camera, ("shot_noise_hz",))
+
+
+@given(st.floats(0.05, 0.5), st.booleans())
+def test_events_of_a_steady_ramp_count_its_change(threshold: float, rises: bool) -> None:
+    """The level between two events is linear, so there is no residual: the count is the change over the threshold."""
+    frames_us = np.arange(11) * 20_000
+    level = 2.0 * frames_us / frames_us[-1]
+    crossings = np.arange(1, int(2.0 / threshold) + 1) * threshold
+    t = np.round(crossings / 2.0 * frames_us[-1]).astype(np.int64)
+    grey = np.full((11, 1, 1), 100, np.uint8)
+    made = recorded(1, 1, t, np.zeros(len(t), np.int64), np.full(len(t), rises), grey, frames_us)
+    increments = increments_of(made, 0.0, 1e6)
+    count = increments.on if rises else increments.off
+    change = np.round(increments.seconds * 1e6) / frames_us[-1] * level[-1]
+    np.testing.assert_allclose(count, change / threshold, atol=2e-4 / threshold)
+    assert len(count) or len(t) < 3 or 2 * threshold > 0.5
+
+
+@settings(max_examples=20)
+@given(st.floats(1e-4, 3e-3), st.integers(0, 99))
+def test_the_end_of_the_intervals_is_the_refractory_period(period: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    gaps = 1e6 * period + rng.exponential(3e4, 20_000)
+    made = estimators.refractory(np.stack([np.floor(gaps), rng.random(20_000) < 0.5]))
+    assert made.told
+    assert made.low - 5e-6 <= period <= made.high + 5e-6
+
+
+def test_intervals_that_the_scene_ends_do_not_pass_for_a_refractory_period() -> None:
+    rng = np.random.default_rng(3)
+    same = rng.random(20_000) < 0.7
+    gaps = np.where(same, 2000.0, 9000.0) + rng.exponential(2e3, 20_000)
+    made = estimators.refractory(np.stack([gaps, same]))
+    assert not made.told
+    assert "speed" in made.note
+
+
+def test_a_recording_in_files_is_the_recording_in_memory(tmp_path: Path) -> None:
+    made = record(rendered_film("coins", 20, 24, 60.0, moving=0.2), FAST, 1)
+    write_ijrr(tmp_path, made)
+    read, direct = read_recording(tmp_path), recorded(
+        20, 24, made["t"], made["y"].astype(np.int64) * 24 + made["x"], made["p"], made["frames"], made["frame_us"]
+    )  # fmt: skip
+    np.testing.assert_array_equal(read.t_us + int(made["t"].min()), direct.t_us)
+    np.testing.assert_array_equal(read.first, direct.first)
+    np.testing.assert_array_equal(read.counts, direct.counts)
+    assert len(read.frames) in (len(direct.frames) - 1, len(direct.frames))
+
+
+@pytest.mark.parametrize("line", ["0.1 -1 5 1", "0.1 5 -1 0", "0.1 24 5 1"])
+def test_events_outside_the_sensor_are_refused(tmp_path: Path, line: str) -> None:
+    (tmp_path / "a.txt").write_text(f"24 20\n0.0 1 1 1\n{line}\n")
+    with pytest.raises(UsageError, match="an event lies outside 24x20 px"):
+        read_recording(tmp_path / "a.txt", ConvertOptions(size=SensorSize(24, 20)))
+
+
+def write_ijrr(folder: Path, made: Mapping[str, npt.NDArray[Any]]) -> None:
+    columns = zip(made["t"], made["x"], made["y"], made["p"], strict=True)
+    lines = [f"{t * 1e-6:.6f} {x} {y} {int(p)}\n" for t, x, y, p in columns]
+    height, width = made["frames"].shape[1:]
+    (folder / "events.txt").write_text(f"{width} {height}\n" + "".join(lines))
+    listing = []
+    for number, (t, frame) in enumerate(zip(made["frame_us"], made["frames"], strict=True)):
+        cv2.imwrite(str(folder / f"{number}.png"), frame)
+        listing.append(f"{t * 1e-6:.6f} {number}.png\n")
+    (folder / "images.txt").write_text("".join(listing))
+
+
+def test_a_long_recording_is_read_within_its_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tiles are dropped, not time: the still end of a recording stays."""
+    made = record(rendered_film("coins", 40, 56, 60.0, moving=0.2, still=0.2), FAST, 1)
+    write_ijrr(tmp_path, made)
+    whole = read_recording(tmp_path)
+    monkeypatch.setattr(recording_module, "MOST_EVENTS", len(made["t"]) // 3)
+    monkeypatch.setattr(recording_module, "MOST_FRAME_PIXELS", made["frames"].size // 5)
+    part = read_recording(tmp_path)
+    assert 0 < len(part.t_us) <= len(made["t"]) // 3
+    assert 0 < part.frames.size <= made["frames"].size // 5
+    assert part.seconds == pytest.approx(whole.seconds, rel=0.05)
+    np.testing.assert_array_equal(part.counts, whole.counts)
+    mine = whole.part(np.isin(whole.pixels, part.pixels))
+    np.testing.assert_array_equal(part.frames, mine.frames)
+    np.testing.assert_array_equal(np.diff(part.first), np.diff(mine.first))
+
+
+@settings(max_examples=20)
+@given(st.integers(64, 900), st.integers(64, 900))
+def test_tiles_of_a_large_sensor_stay_within_the_limit(height: int, width: int) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording_module, "MOST_PIXELS", 4096)
+        pixels = chosen_pixels(height, width)
+    assert len(pixels) == min(height * width, 4096)
+    assert (np.diff(pixels) > 0).all()
+    assert np.isin(chosen_pixels(height, width, len(pixels) // 2), pixels).all()
+
+
+def test_a_recording_without_events_is_refused() -> None:
+    none = np.empty(0, np.int64)
+    with pytest.raises(UsageError, match="no events"):
+        recorded(4, 4, none, none, none.astype(bool), np.empty((0, 4, 4), np.uint8), none)

@@ -1,0 +1,226 @@
+"""`v2v-preview`: every kind of file, recipes side by side, videos too short or too small, and what is refused."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image as Pictures
+
+from tests.clips import panned_luma, write_clip
+from tests.oracles.rendered import rendered_scene
+from v2v_pictures.camera import Camera
+from v2v_pictures.labels import class_colour
+from v2v_protocol.errors import CorpusError, UsageError
+from v2v_tools.preview import command
+from v2v_tools.preview.preview import Shot, preview
+
+TINY = {"voxels_per_clip": 3, "crop_height_px": 48, "crop_width_px": 64}
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_clip(tmp_path_factory.mktemp("clips") / "gliding.mp4", panned_luma(40, 96, 128))
+
+
+def test_each_kind_of_file_is_what_its_name_says(clip: Path, tmp_path: Path) -> None:
+    two = [Shot("a", TINY, 0), Shot("b", TINY, 1)]
+    for kind, shots in (("png", two), ("mp4", two[:1]), ("gif", two[:1]), ("html", two[:1])):
+        preview(
+            str(clip), tmp_path / f"preview.{kind}", shots, {}, title="t", cache_dir=str(tmp_path),
+            with_flow=kind == "png", say=lambda line: None,
+        )  # fmt: skip
+    with Pictures.open(tmp_path / "preview.png") as picture:
+        assert picture.format == "PNG"
+    with Pictures.open(tmp_path / "preview.gif") as picture:
+        assert picture.n_frames == -(-3 * 5 // 2)
+    with av.open(io.BytesIO((tmp_path / "preview.mp4").read_bytes())) as film:
+        assert len(list(film.decode(video=0))) == 3 * 5
+    assert "data:image/png;base64," in (tmp_path / "preview.html").read_text()
+
+
+def test_a_single_video_is_shown_with_the_boxes_beside_it(clip: Path, tmp_path: Path) -> None:
+    (tmp_path / clip.name).symlink_to(clip)
+    boxes = tmp_path / f"{clip.stem}.boxes.txt"
+    pages = []
+    for text in ("", "".join(f"{frame},1,33,25,61,50,1,-1,-1,-1\n" for frame in range(1, 41))):
+        if text:
+            boxes.write_text(text)
+        out = tmp_path / "p.png"
+        preview(
+            str(tmp_path / clip.name), out, [Shot("", TINY, 0)], {}, title="t", cache_dir=str(tmp_path),
+            with_flow=False, say=lambda line: None,
+        )  # fmt: skip
+        with Pictures.open(out) as picture:
+            pages.append(np.asarray(picture.convert("RGB")))
+    plain, labelled = ((page == class_colour(0)).all(axis=-1).sum() for page in pages)
+    assert plain == 0
+    assert labelled > 2 * (61 + 50)
+
+
+def test_a_video_too_short_or_too_small_is_shown_all_the_same_and_said(clip: Path, tmp_path: Path) -> None:
+    said: list[str] = []
+    looks = [Shot("paper", "paper", 0)]
+    preview(str(clip), tmp_path / "p.png", looks, {}, title="t", cache_dir=str(tmp_path), say=said.append)
+    # 40 frames: 7 grids of 5 bins; 96 rows: a crop of 128 shrinks by quarters.
+    assert "all cameras: shown with 7 voxel grids of 96 x 96 instead of 40 of 128 x 128" in said[0]
+    assert said[-1] == f"{tmp_path / 'p.png'}: 1 camera"
+
+
+def test_a_video_of_one_frame_is_refused(tmp_path: Path) -> None:
+    still = write_clip(tmp_path / "still.mp4", panned_luma(1, 64, 64))
+    with pytest.raises(CorpusError, match=r"still\.mp4"):
+        preview(str(still), tmp_path / "p.png", [Shot("", "paper", 0)], {}, title="t", cache_dir=str(tmp_path))
+    assert not (tmp_path / "p.png").exists()
+
+
+def test_the_command_compares_recipes_on_one_clip(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen: list[tuple[str, int]] = []
+    drawn = command.preview
+
+    def spy(source: str, out: Path, looks: list[Shot], *rest: object, **named: object) -> None:
+        seen.extend((look.title, look.seed) for look in looks)
+        drawn(source, out, looks, *rest, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(command, "preview", spy)
+    sets = [f"--set={name}={value}" for name, value in TINY.items()]
+    own = tmp_path / "own.yaml"
+    own.write_text("preset: paper\nthreshold: [0.3, 0.3]\n")
+    out = tmp_path / "c.png"
+    command.main(
+        [
+            str(clip),
+            "--out",
+            str(out),
+            "--compare",
+            "paper",
+            "noise-free",
+            str(own),
+            *sets,
+            "--cache-dir",
+            str(tmp_path),
+        ]
+    )
+    assert seen == [("paper", 0), ("noise-free", 0), ("own", 0)]
+    assert np.asarray(Pictures.open(out)).ndim == 3
+    chosen, _, said = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"seed \d+: chosen because their crops show motion; --seed 0 takes what chance gives", chosen)
+    assert said == f"{out}: 3 cameras"
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--out", "p.bmp"], "--out p.bmp: unknown ending; give a name that ends in .png, .mp4, .gif, .html"),
+        (["--out", "p.png", "--seeds", "0"], "--seeds 0: give 1 to 32"),
+        (["--out", "p.png", "--moments", "99"], "--moments 99: give 1 to 32"),
+        (["--out", "nowhere/p.png"], "--out nowhere/p.png: there is no folder nowhere"),
+        (["--out", "p.png", "--recipe", "paper", "--compare", "paper"], "leave --recipe out"),
+        (["--out", "p.png", "--seeds", "2", "--compare", "paper"], "leave --seeds out"),
+        (["--out", "p.png", "--recipe", "papr"], "paper"),
+    ],
+)
+def test_what_is_wrong_is_one_line_and_leaves_no_file(
+    flags: list[str],
+    said: str,
+    clip: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert command.main([str(clip), *flags]) == 2
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_recipes_of_other_sizes_are_not_compared(clip: Path, tmp_path: Path) -> None:
+    """A sheet needs equal bins, a film also equal clips."""
+    more: dict[str, Any] = {"title": "t", "with_flow": False, "cache_dir": str(tmp_path / "cache")}
+    bins = [Shot(f"b{number}", {**TINY, "bins": number}, 0) for number in (2, 3)]
+    clips = [Shot(f"c{number}", {**TINY, "voxels_per_clip": number}, 0) for number in (2, 3)]
+    with pytest.raises(UsageError, match=r"b2 has 3 frames of 2 bins here, b3 has 3 .*: give recipes of equal bins"):
+        preview(str(clip), tmp_path / "p.png", bins, {}, **more)
+    with pytest.raises(UsageError, match=r"c2 has 2 frames of 5 bins here, c3 has 3 "):
+        preview(str(clip), tmp_path / "p.gif", clips, {}, **more)
+    assert not list(tmp_path.glob("p.*"))
+    preview(str(clip), tmp_path / "p.png", clips, {}, **more)
+    assert (tmp_path / "p.png").exists()
+
+
+def test_the_error_of_the_library_is_typed(clip: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="ends in"):
+        preview(str(clip), tmp_path / "p.tiff", [Shot("", "paper", 0)], {}, title="t")
+
+
+def test_many_cameras_and_a_film_show_their_progress(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("v2v_protocol.progress.LOG_SECONDS", 0.0)
+    shots = [Shot(str(seed), TINY, seed) for seed in range(4)]
+    preview(str(clip), tmp_path / "p.gif", shots, {}, title="t", cache_dir=str(tmp_path), with_flow=False)
+    said = capsys.readouterr().err.splitlines()
+    cameras = [line for line in said if line.startswith("simulating: ")]
+    assert [line.split(" cameras")[0] for line in cameras] == [f"simulating: {number} of 4" for number in range(1, 5)]
+    assert all("a second" in line and "left" in line for line in cameras[1:3])
+    assert sum(line.startswith("drawing the film: ") for line in said) == 15
+
+
+def _shares(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: dict[str, object]
+) -> list[float | None]:
+    cameras: list[Camera] = []
+
+    def keep(shown: list[Camera], title: str, *, moments: int, whole: Camera) -> npt.NDArray[np.uint8]:
+        cameras.extend(shown)
+        return np.zeros((8, 8, 3), np.uint8)
+
+    monkeypatch.setattr("v2v_tools.preview.preview.draw_sheet", keep)
+    shots = [Shot("a", TINY | recipe, 0)]
+    preview(str(source), tmp_path / "a.png", shots, {}, title="t", cache_dir=str(tmp_path), with_flow=False)
+    return [camera.noise_share([0, 1, 2]) for camera in cameras]
+
+
+def test_the_share_of_noise_is_measured(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    still = write_clip(tmp_path / "still.mp4", np.full((40, 96, 128), 90, np.uint8))
+    loud = {"noise_sigma": [0.3, 0.3], "pause_probability": 0.0}
+    assert _shares(still, tmp_path, monkeypatch, loud) == [1.0]
+    quiet = {"preset": "noise-free"}
+    assert _shares(clip, tmp_path, monkeypatch, quiet) == [0.0]
+
+
+def _said(source: Path, tmp_path: Path) -> str:
+    said: list[str] = []
+    shots = [Shot("a", {"preset": "noise-free", "voxels_per_clip": 3, "crop_height_px": 64, "crop_width_px": 64}, 0)]
+    preview(str(source), tmp_path / "a.png", shots, {}, title="t", cache_dir=str(tmp_path), say=said.append)
+    return said[-2]
+
+
+def test_a_preview_says_what_fast_motion_costs(tmp_path: Path) -> None:
+    fast = rendered_scene("coffee", 96, 96, 180.0).frames(30.0, 20)
+    line = _said(write_clip(tmp_path / "fast.mp4", fast), tmp_path)
+    found = re.match(
+        r"fast motion: ([\d.]+) px a frame .*; about (\d+) % .* lost .*, (\d+) % with --substep-px 1", line
+    )
+    assert found is not None, line
+    assert 4.0 < float(found[1]) < 8.0
+    assert int(found[2]) > int(found[3])
+
+
+def test_a_preview_promises_nothing_where_sub_steps_do_not_help(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    light = rendered_scene("coffee", 96, 96, 300.0).light
+    shaken = np.stack([np.rint(255 * light(0.05 * rng.random())) for _ in range(20)]).astype(np.uint8)
+    line = _said(write_clip(tmp_path / "shaken.mp4", shaken), tmp_path)
+    assert line.startswith("fast changes that motion does not explain")
+    assert "%" not in line
+    still = np.repeat(shaken[:1], 20, axis=0)
+    assert _said(write_clip(tmp_path / "still.mp4", still), tmp_path).endswith("substep_px would change little")

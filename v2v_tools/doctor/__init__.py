@@ -1,0 +1,7 @@
+"""`v2v-doctor`: what is in the way, and what to change.
+
+command         the command line
+machine         the installation and the machine
+corpus          the videos and their labels
+motion          what a corpus loses between its frames
+"""

@@ -1,0 +1,288 @@
+"""The checks of `v2v-doctor`: installation, machine, port and corpus, each with what to change.
+
+Missing packages are one of its findings, so it imports modules that need them only after it has checked.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+import resource
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from v2v_protocol.command import version_of
+from v2v_server.system.process import usable_cores
+from v2v_server.system.sandbox import can_confine
+
+OK, NOTE, BAD = "ok", "note", "bad"
+PARTS = ("server", "client", "trainer")
+"""Extras of the distribution: where the videos are, where the GPU is, and there with the paper's networks."""
+DECODERS = ("h264", "hevc", "vp8", "vp9", "libdav1d", "mpeg4", "mjpeg")
+ENCODERS = ("libx264",)
+_GIB = 1 << 30
+_LITTLE_MEMORY_BYTES = 1 << 30
+_SMALL_SHM_BYTES = 256 << 20
+_FEW_FILES = 4096
+_TORCH = """
+import json, torch
+cuda = torch.cuda.is_available()
+names = [torch.cuda.get_device_name(n) for n in range(torch.cuda.device_count())] if cuda else []
+print(json.dumps([torch.__version__, names]))
+"""
+_TORCH_SECONDS = 120.0
+_NAME = re.compile(r"([A-Za-z0-9_.-]+)(?:\[([a-z]+)\])?")
+_FLOOR = re.compile(r">=([0-9.]+)")
+_EXTRA = re.compile(r"extra == ['\"]([a-z]+)['\"]")
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the report.
+
+    Attributes:
+        level: OK, NOTE (worth knowing) or BAD (in the way).
+        about: what was checked.
+        text: what was found.
+        change: what to do; empty if nothing.
+    """
+
+    level: str
+    about: str
+    text: str
+    change: str = ""
+
+
+def look_around(port: int, videos: str | None, recipe: str, rows: str, cache_dir: str | None) -> Iterator[Finding]:
+    """Run all checks and yield each finding at once; arguments as of the command.
+
+    Raises:
+        UsageError: wrong recipe or rows.
+    """
+    yield Finding(OK, "version", f"{version_of('v2v-stream')}, Python {sys.version.split()[0]}, {sys.platform}")
+    missing: dict[str, list[str]] = {}
+    for part in PARTS:
+        missing[part] = _missing(part)
+    yield from _installation(missing)
+    if not missing["server"]:
+        yield from _libraries()
+    if _is_here("torch", None):
+        yield _torch()
+    yield from _machine()
+    yield _port(port)
+    if videos is None:
+        yield Finding(OK, "corpus", "not checked; --videos DIR checks one")
+    elif missing["server"]:
+        yield Finding(BAD, "corpus", "cannot be checked without the extra 'server'", "pip install '.[server]'")
+    else:
+        # Needs packages of that extra.
+        corpus = importlib.import_module("v2v_tools.doctor.corpus")
+        yield from (Finding(*line) for line in corpus.look_at_corpus(videos, recipe, rows, cache_dir))
+
+
+def _missing(part: str) -> list[str]:
+    """List the requirements of an extra that are not installed, or too old, with their lowest versions."""
+    try:
+        requirements = metadata.requires("v2v-stream") or []
+    except metadata.PackageNotFoundError:
+        return []
+    wanting = []
+    for requirement in requirements:
+        extra, named, stated = _EXTRA.search(requirement), _NAME.match(requirement), _FLOOR.search(requirement)
+        if extra is None or extra[1] != part or named is None:
+            continue
+        (name, of_ours), floor = named.groups(), stated and stated[1]
+        if of_ours:
+            wanting += _missing(of_ours)
+        elif not _is_here(name, floor):
+            wanting.append(f"{name}>={floor}" if floor else name)
+    return wanting
+
+
+def _is_here(name: str, floor: str | None) -> bool:
+    try:
+        found = metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return False
+    return floor is None or _numbers(found) >= _numbers(floor)
+
+
+def _numbers(version: str) -> list[int]:
+    return [int(number) for number in re.findall(r"\d+", version.split("+")[0])]
+
+
+def _installation(missing: dict[str, list[str]]) -> Iterator[Finding]:
+    for part, names in missing.items():
+        if not names:
+            yield Finding(OK, part, "all required packages are installed")
+        else:
+            level = BAD if missing["server"] and missing["client"] and part != "trainer" else NOTE
+            change = f"pip install '.[{part}]' in a checkout, if you need that part on this machine"
+            # Name the packages only if no part works: this machine may not need the others.
+            text = f"not installed or too old: {', '.join(names)}" if level == BAD else "not complete"
+            yield Finding(level, part, text, change)
+
+
+def _libraries() -> Iterator[Finding]:
+    try:
+        av, zmq, numba = (importlib.import_module(name) for name in ("av", "zmq", "numba"))
+        importlib.import_module("cv2")
+    except (ImportError, OSError) as error:
+        change = "install the library it names with the system's package manager, or reinstall that Python package"
+        yield Finding(BAD, "libraries", f"a package is installed and cannot be loaded: {error}", change)
+        return
+    ffmpeg = ".".join(map(str, av.library_versions["libavcodec"]))
+    yield Finding(
+        OK, "libraries",
+        f"PyAV {av.__version__} (libavcodec {ffmpeg}), libzmq {zmq.zmq_version()}, numba {numba.__version__}",
+    )  # fmt: skip
+    absent = [name for name in DECODERS if not _has_codec(av, name, "r")]
+    absent += [f"{name} (encoder)" for name in ENCODERS if not _has_codec(av, name, "w")]
+    if absent:
+        change = "pip install --force-reinstall av, whose wheels bring FFmpeg with all of them"
+        yield Finding(NOTE, "codecs", f"this FFmpeg lacks {', '.join(absent)}", change)
+    else:
+        yield Finding(OK, "codecs", f"decodes {', '.join(DECODERS)}; encodes {', '.join(ENCODERS)}")
+    if not zmq.has("curve"):
+        yield Finding(NOTE, "keys", "this libzmq has no CURVE: no connections with keys", "pip install pyzmq again")
+
+
+def _has_codec(av: Any, name: str, mode: str) -> bool:
+    try:
+        av.Codec(name, mode)
+    except ValueError:  # PyAV's UnknownCodecError is one
+        return False
+    return True
+
+
+def _torch() -> Finding:
+    """Load torch in another process: loading takes seconds, and a wrong driver may end the process."""
+    cards = _cards()
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _TORCH], capture_output=True, text=True, timeout=_TORCH_SECONDS, check=False
+        )
+        version, names = json.loads(done.stdout.strip().splitlines()[-1])
+    except (subprocess.TimeoutExpired, IndexError, ValueError):
+        return Finding(BAD, "torch", "is installed and cannot be loaded", 'run python -c "import torch" to see why')
+    if names:
+        return Finding(OK, "torch", f"{version}; {', '.join(names)}")
+    if cards:
+        change = "install the build of torch for its driver's CUDA version (nvidia-smi shows it)"
+        return Finding(BAD, "torch", f"{version} sees no GPU, though nvidia-smi lists {cards}", change)
+    return Finding(NOTE, "torch", f"{version}, no GPU: networks train on the processor")
+
+
+def _cards() -> str:
+    program = shutil.which("nvidia-smi")
+    if program is None:
+        return ""
+    with suppress(OSError, subprocess.TimeoutExpired):
+        done = subprocess.run([program, "-L"], capture_output=True, text=True, timeout=30, check=False)
+        if done.returncode == 0:
+            return ", ".join(re.findall(r"^GPU \d+: ([^(\n]+?) *\(", done.stdout, re.M))
+    return ""
+
+
+def _machine() -> Iterator[Finding]:
+    cores, all_cores = usable_cores(), os.cpu_count() or 1
+    why = "" if cores == all_cores else f" of {all_cores}: affinity or a control group holds the rest back"
+    yield Finding(OK, "cores", f"{cores}{why}; v2v-serve --workers {cores} keeps them busy")
+    yield _memory()
+    yield _sandbox()
+    yield from _shared_memory()
+    kernels = os.environ.get("NUMBA_CACHE_DIR", "")  # chosen when v2v_server was imported
+    if kernels:
+        yield Finding(OK, "kernels", f"compiled kernels are kept in {kernels}")
+    else:
+        change = "set V2V_CACHE_DIR to a writable folder"
+        yield Finding(NOTE, "kernels", "no folder for compiled kernels: every start takes longer", change)
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < _FEW_FILES:
+        change = "ulimit -Hn 65536, LimitNOFILE= of systemd, or docker run --ulimit nofile=65536"
+        yield Finding(NOTE, "open files", f"at most {hard}: too few for many consumers and workers", change)
+    else:
+        yield Finding(OK, "open files", "no limit" if hard == resource.RLIM_INFINITY else f"up to {hard}")
+
+
+def _memory() -> Finding:
+    available = _kilobytes("MemAvailable") * 1024
+    limit, used = control_group_memory()
+    if not available and limit is None:
+        return Finding(NOTE, "memory", "this system does not report free memory")
+    free = min(value for value in (available or None, None if limit is None else limit - used) if value is not None)
+    text = f"{free / _GIB:.1f} GiB free"
+    if limit is not None:
+        text += f"; the control group's limit is {limit / _GIB:.1f} GiB"
+    if free < _LITTLE_MEMORY_BYTES:
+        return Finding(BAD, "memory", text, "free memory or raise the limit: a server and one worker need about 1 GiB")
+    return Finding(OK, "memory", text)
+
+
+def _sandbox() -> Finding:
+    can = can_confine()
+    lacking = [name for name, has in (("seccomp", can.calls), ("Landlock", can.files)) if not has]
+    if not lacking:
+        return Finding(OK, "sandbox", "processes that decode videos cannot start programs or open other files")
+    text = f"no {' and no '.join(lacking)} here: a video that exploits a decoder gets more of its user's rights"
+    return Finding(NOTE, "sandbox", text, "serve untrusted videos from a container, or with deploy/systemd")
+
+
+def _kilobytes(name: str, table: Path = Path("/proc/meminfo")) -> int:
+    with suppress(OSError):
+        for line in table.read_text(encoding="ascii").splitlines():
+            if line.startswith(f"{name}:"):
+                return int(line.split()[1])
+    return 0
+
+
+def control_group_memory(
+    groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")
+) -> tuple[int | None, int]:
+    """Return (limit, used), bytes, of the tightest control group among this process's own and those above it.
+
+    Linux, version 2. The limit is None if no group has one.
+    """
+    with suppress(OSError, ValueError):
+        (path,) = (line[3:] for line in own.read_text(encoding="utf-8").splitlines() if line.startswith("0::"))
+        found, folder = [], groups
+        for part in ("", *path.strip("/").split("/")):
+            folder = folder / part
+            with suppress(OSError, ValueError):  # "max", or the topmost group, which has none
+                limit = int((folder / "memory.max").read_text(encoding="ascii"))
+                found.append((limit, int((folder / "memory.current").read_text(encoding="ascii"))))
+        if found:
+            return min(found, key=lambda each: each[0] - each[1])
+    return None, 0
+
+
+def _shared_memory(folder: str = "/dev/shm") -> Iterator[Finding]:
+    with suppress(OSError):
+        free = shutil.disk_usage(folder).free
+        if free >= _SMALL_SHM_BYTES:
+            yield Finding(OK, "/dev/shm", f"{free / _GIB:.1f} GiB free")
+        else:
+            change = "docker run --shm-size 1g; v2v-stream itself does not use it"
+            text = f"{free >> 20} MiB free: too little for a DataLoader with num_workers above 0"
+            yield Finding(NOTE, "/dev/shm", text, change)
+
+
+def _port(port: int) -> Finding:
+    try:
+        with socket.socket() as taker:
+            taker.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            taker.bind(("127.0.0.1", port))
+    except (OSError, OverflowError) as error:
+        change = f"a server may be running already; otherwise give v2v-serve --bind tcp://127.0.0.1:{port % 60000 + 1}"
+        return Finding(NOTE, "port", f"{port} cannot be taken: {getattr(error, 'strerror', None) or error}", change)
+    return Finding(OK, "port", f"{port} is free")

@@ -1,0 +1,271 @@
+"""Where something moves in a video: its whole picture simulated without noise, and the cameras that look there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_pictures.camera import Camera
+from v2v_protocol.errors import VideoError
+from v2v_protocol.recipe import Recipe, effect_settings
+from v2v_protocol.sample import SampleParams
+from v2v_protocol.spec import StreamSpec
+from v2v_server.broker.leases import Request
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.corpus.scenes.findings import Defect
+from v2v_server.corpus.scenes.picture_check import CHANGES, hides_motion
+from v2v_server.motion.prediction import SUBSTEP_PX, Prediction, predict
+from v2v_server.schedule.sequences import VideoSequence
+from v2v_server.simulation.effects import NOISE
+from v2v_server.simulation.intensity import eight_bits
+from v2v_server.simulation.view import apply_view, without_margin
+from v2v_server.system.opencv import cv2
+from v2v_server.video.collect import ClipRequest, Cut
+from v2v_server.video.decode import DecodedClip
+from v2v_server.video.luma import SDR
+from v2v_server.worker.produce import Decoded, make_sample, plan_sample
+from v2v_tools.remake import RemadeSample, Remaker, lease_for
+
+LONGEST_SIDE_PX = 384
+"""The whole picture is simulated at this size: a clip of 201 frames of 1920 x 1080 would take 400 MiB."""
+THRESHOLD = 0.2
+CANDIDATES = 64
+"""Seeds that are looked at, at least."""
+_MOST_CLIPS = 4
+"""Clips that are decoded for it."""
+_ENOUGH = 0.25
+"""A camera is worth showing that has this share of the events of the best one."""
+_STORED_FRAMES = 16
+_NOISE = ("noise_sigma", "hot_pixel_share", *NOISE)
+
+
+def noise_free(recipe: Recipe) -> Recipe:
+    """Return the recipe without what fires where nothing moves."""
+    return recipe.replace(**dict.fromkeys(_NOISE, (0.0, 0.0)))
+
+
+def quiet_voxels(made: RemadeSample) -> npt.NDArray[Any]:
+    """Simulate a sample's frames again, with the same draw but without noise.
+
+    Returns:
+        [lead voxels + T, bins, H, W], signed event counts.
+    """
+    plan, lease = made.decoded.plan, made.lease
+    spec = StreamSpec.from_dict({**plan.spec.to_dict(), "recipe": noise_free(plan.spec.recipe)})
+    lease = replace(lease, spec=spec.canonical(), spec_digest=spec.digest, arrays=("voxels",))
+    params = replace(
+        plan.params,
+        noise_sigma=0.0,
+        hot_pixel_count=0,
+        effects={name: value for name, value in plan.params.effects.items() if name not in _NOISE},
+    )
+    quiet = Decoded(replace(plan, spec=spec, params=params, flow=None), made.decoded.clip)
+    return make_sample(lease, quiet).arrays["voxels"]
+
+
+def predicted_loss(made: RemadeSample) -> Prediction:
+    """Predict what a sample loses between its frames."""
+    plan, recipe = made.decoded.plan, made.decoded.plan.spec.recipe
+    frames = eight_bits(made.decoded.clip.frames, made.decoded.clip.signal)
+    return predict(apply_view(without_margin(frames, plan.params, recipe, plan.margin_px), plan.params, recipe))
+
+
+def describe_loss(found: Prediction, defects: Sequence[Defect] = ()) -> str:
+    """Return one line for the user about what the motion between frames costs and whether sub-steps help.
+
+    Args:
+        defects: of the videos. Where they are what changes, motion is not.
+    """
+    if hides_motion(defects, found.can_be_followed):
+        causes = dict.fromkeys(f"{each.text}: {CHANGES[each.kind]}" for each in defects if each.kind in CHANGES)
+        return f"changes that motion does not explain: {'; '.join(causes)}"
+    if found.is_slow:
+        return (
+            f"motion: {found.px_per_frame:.2g} px a frame at the median of what moves; substep_px would change little"
+        )
+    if not found.can_be_followed:
+        return (
+            "fast changes that motion does not explain, such as flicker or vibration: events between frames are lost, "
+            "and substep_px restores few of them; take videos with more frames a second"
+        )
+    off, on = (max(5, 5 * round(20 * found.errors(setting).lost)) for setting in ("linear", "divided"))
+    return (
+        f"fast motion: {found.px_per_frame:.2g} px a frame at the median of what moves; about {off} % of the events "
+        f"are lost between frames, {on} % with --substep-px {SUBSTEP_PX:g} "
+        "(prediction; motion blur hides further losses)"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class CropEstimate:
+    """What the camera of a seed is estimated to see.
+
+    Attributes:
+        clip: video and first frame.
+        box: left, top, width and height of its crop, px of the whole picture.
+        motion, noise: events a pixel and frame that each makes.
+    """
+
+    clip: tuple[str, int]
+    box: tuple[float, float, float, float]
+    motion: float
+    noise: float
+
+    @property
+    def moves(self) -> bool:
+        """Return whether motion makes more events than noise."""
+        return self.motion > self.noise
+
+    def overlaps(self, other: CropEstimate) -> bool:
+        """Return whether a camera of the same clip sees the same place."""
+        (left, top, width, height), (x, y, *_) = self.box, other.box
+        return self.clip == other.clip and abs(left - x) < width and abs(top - y) < height
+
+
+class WholePictures:
+    """Simulates whole pictures, each once: one threshold, no noise, no pauses.
+
+    Args:
+        catalogue: the corpus.
+        stream: whose clips they show; their crops and draws are not used.
+    """
+
+    def __init__(self, catalogue: Catalogue, stream: StreamSpec) -> None:
+        self._catalogue, self._stream = catalogue, stream
+        self._made: dict[tuple[str, int], Camera] = {}
+
+    def camera(self, sequence: VideoSequence) -> Camera:
+        """Return the whole picture of a sequence as a camera sees it that has no noise.
+
+        Raises:
+            VideoError: the video cannot be read, or not simulated.
+        """
+        key = sequence.video.id, sequence.start_frame
+        if key not in self._made:
+            self._made[key] = self._simulated(sequence)
+        return self._made[key]
+
+    def _simulated(self, sequence: VideoSequence) -> Camera:
+        catalogue, video = self._catalogue, sequence.video
+        top, bottom = catalogue.rows.bounds(video.height_px)
+        scale = min(1.0, LONGEST_SIDE_PX / max(bottom - top, video.width_px))
+        height, width = (max(1, round(side * scale)) for side in (bottom - top, video.width_px))
+        recipe = self._stream.recipe
+        recipe = noise_free(recipe).replace(
+            crop_height_px=height, crop_width_px=width, resize_scale=(1.0, 1.0), flip_probability=0.0,
+            pause_probability=0.0, contrast_probability=0.0, threshold=(THRESHOLD, THRESHOLD),
+            threshold_ratio=(1.0, 1.0), threshold_source="sample", lead_frames=0, lead_voxels=0,
+            voxel_seconds=recipe.voxel_seconds[1], **dict.fromkeys(effect_settings(), (0.0, 0.0)),
+        )  # fmt: skip
+        spec = StreamSpec.from_dict({"recipe": recipe})
+        lease = lease_for(
+            Request(b"", 0, 0), sequence=sequence, catalogue=catalogue, spec=spec, seed=0, arrays=("voxels", "frames")
+        )
+        lease = replace(lease, rows="full", height_px=height, width_px=width, thresholds=())
+        plan = plan_sample(lease, 0)
+        frames = np.empty((len(plan.source), height, width), np.uint8)
+        index, stride = catalogue.frame_index(video.id), recipe.frame_stride
+        count = (len(frames) - 1) * stride + 1
+        cut = Cut(len(frames), (top, 0, bottom - top, video.width_px))
+        with catalogue.source.open_pixels(video.id, video.fingerprint) as pixels:
+            signal = SDR if recipe.light == "sdr" else pixels.signal(index)._replace(bits=8)
+            taken = pixels.pictures(ClipRequest(index, sequence.start_frame, (cut,), stride))
+            for frame, picture in zip(frames, taken, strict=True):
+                cv2.resize(picture.grey, (width, height), frame, interpolation=cv2.INTER_AREA)
+        seconds = index.seconds(sequence.start_frame, count)[::stride]
+        clip = DecodedClip(frames, seconds, codec="", bit_exact=False, signal=signal)
+        sample = make_sample(lease, Decoded(plan, clip))
+        camera = Camera.of(sample.arrays, sample.provenance, f"threshold {THRESHOLD:g}, no noise", recipe)
+        return replace(camera, step_seconds=stride / video.frames_per_second)
+
+    def estimate(self, sequence: VideoSequence, seed: int) -> CropEstimate:
+        """Estimate what the camera of a seed sees of a sequence.
+
+        Raises:
+            VideoError: see :meth:`camera`.
+        """
+        recipe, video = self._stream.recipe, sequence.video
+        lease = lease_for(
+            Request(b"", 0, 0), sequence=sequence, catalogue=self._catalogue, spec=self._stream, seed=seed,
+            arrays=("voxels",),
+        )  # fmt: skip
+        plan = plan_sample(replace(lease, thresholds=()), 0)
+        params = plan.params
+        left, top = params.crop_left_px / params.scale, params.crop_top_px / params.scale
+        width, height = recipe.crop_width_px / params.scale, recipe.crop_height_px / params.scale
+        whole = self.camera(sequence)
+        bins = whole.voxels.reshape(-1, *whole.voxels.shape[2:])
+        steps = sum(params.grid_steps[recipe.lead_voxels :]) or recipe.voxels_per_clip * recipe.steps_per_frame
+        shown = whole.provenance.params.ends(recipe)[-1] if recipe.is_timed else steps
+        seen = int(plan.source[-1]) * len(bins) // int(shown)  # pauses leave the rest out
+        scale = bins.shape[-1] / video.width_px
+        rows, columns = (
+            slice(int(at * scale), int((at + size) * scale)) for at, size in ((top, height), (left, width))
+        )
+        crop = bins[:, rows, columns]
+        events = float(np.abs(crop[:seen], dtype=np.float32).sum()) / (crop[0].size * steps)
+        seconds = recipe.frame_stride / video.frames_per_second if video.frames_per_second > 0 else 0.0
+        return CropEstimate(
+            (video.id, sequence.start_frame),
+            (left, top, width, height),
+            events * THRESHOLD / max(params.threshold_pos, params.threshold_neg),
+            noise_rate(params, seconds),
+        )
+
+
+def moving_seeds(remaker: Remaker, wholes: WholePictures, count: int) -> tuple[list[int], int]:
+    """Choose seeds whose cameras look where something moves, among the first ones, and apart from each other.
+
+    Motion and noise are estimated from the draw, so that no candidate is simulated.
+
+    Args:
+        remaker: of the stream that the cameras are drawn from.
+        wholes: of the same stream.
+        count: seeds wanted.
+
+    Returns:
+        ``count`` different seeds, ascending, the first ones of all where no video can be read; and how many of them
+        are estimated to see more motion than noise.
+    """
+    views: dict[int, CropEstimate] = {}
+    clips: dict[tuple[str, int], bool] = {}
+    for seed in range(max(CANDIDATES, 2 * count)):
+        sequence = remaker.sequence(seed, 0, 0)
+        clip = sequence.video.id, sequence.start_frame
+        if not clips.get(clip, len(clips) < _MOST_CLIPS):
+            continue
+        try:
+            views[seed] = wholes.estimate(sequence, seed)
+        except VideoError:
+            clips[clip] = False
+        else:
+            clips[clip] = True
+    best = max((view.motion for view in views.values() if view.moves), default=0.0)
+    lively = [seed for seed, view in views.items() if view.moves and view.motion >= _ENOUGH * best]
+    apart: list[int] = []
+    for seed in lively:
+        if not any(views[seed].overlaps(views[other]) for other in apart):
+            apart.append(seed)
+    rest = sorted(views, key=lambda seed: (not views[seed].moves, -views[seed].motion))
+    chosen = list(dict.fromkeys([*apart, *rest, *range(count)]))[:count]
+    return sorted(chosen), sum(seed in views and views[seed].moves for seed in chosen)
+
+
+def noise_rate(params: SampleParams, step_seconds: float) -> float:
+    """Estimate how often a pixel fires where nothing moves.
+
+    Args:
+        params: the draw.
+        step_seconds: time between two frames; 0 where it is not known.
+
+    Returns:
+        Events a pixel and frame. Gaussian noise is a random walk of the residual, which leaves a threshold after
+        (threshold / sigma) ** 2 steps on average.
+    """
+    share = params.noise_sigma / min(params.threshold_pos, params.threshold_neg)
+    hertz = sum(float(params.effects.get(name, 0.0)) for name in NOISE)
+    return share**2 / (1.0 + share) + hertz * step_seconds
