@@ -12,9 +12,9 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.bounds import pixel_thresholds
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList, check_duration, whole_edges
+from v2v_protocol.recipe import pixel_thresholds
 from v2v_protocol.sample import ARRAYS, OfEvents, SampleParams, html_table
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import effects
@@ -128,9 +128,7 @@ def fill(
     arrays = {name: new_array(*given.form(name), array) for name, array in out.items()}
     if out.keys() == {"voxels"} and not given.needs_general:
         return arrays, {"voxels": _paper(given, real, arrays["voxels"])}
-    if not out:
-        return {}, {}
-    clipped = _General(given, real).run(arrays)
+    clipped = _General(given, real).run(arrays) if arrays else {}
     return arrays, {name: clipped[name] for name in arrays}
 
 

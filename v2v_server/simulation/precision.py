@@ -42,9 +42,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.bounds import LARGEST_EVENTS
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe
+from v2v_protocol.recipe import LARGEST_EVENTS, Recipe
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.video.luma import MOST_BITS, Signal
 
