@@ -262,15 +262,14 @@ def _paper(given: KernelInput, real: Real, voxels: npt.NDArray[Any]) -> int:
     threshold_pos, threshold_neg = real(params.threshold_pos), real(params.threshold_neg)
     law, fixed = given.law
     start_low, start_span = (real(fixed), real(0)) if law == FIXED else (-threshold_neg, threshold_pos + threshold_neg)
-    pixels = voxels[0, 0].size
-    steps_per_bin = int(given.edges.step[1])
+    tolerance = real(rounding_tolerance(params.threshold_pos, params.threshold_neg))
+    pixels, steps_per_bin = voxels[0, 0].size, int(given.edges.step[1])
     position, drift = _hot(params, pixels, real)
     return int(
         simulate_pixels(
             np.ascontiguousarray(given.frames).reshape(-1, pixels), _table(given.intensity, real), given.source_index,
             np.array(params.noise_key, np.uint32), _noise_scale(params, durations).astype(real), position, drift,
-            durations.astype(real), threshold_pos, threshold_neg,
-            real(rounding_tolerance(params.threshold_pos, params.threshold_neg)), start_low, start_span,
+            durations.astype(real), threshold_pos, threshold_neg, tolerance, start_low, start_span,
             law == TRIANGULAR, steps_per_bin, real(LARGEST_COUNT[given.dtype]), voxels.reshape(-1, pixels),
         )
     )  # fmt: skip

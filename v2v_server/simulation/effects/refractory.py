@@ -32,7 +32,7 @@ def changed(value: float, fired: Fired) -> float:
     lost = np.rint((fired.events * fired.change).astype(np.float64) * (value * fired.pace)[:, None]).astype(np.int64)
     before = np.abs(np.cumsum(lost, axis=0) - lost)
     changed = np.abs(lost) + 2 * np.minimum(before, UNITS) * (fired.events != 0)
-    return int(changed.sum()) / UNITS + fired.grey.shape[1] * fired.noise_events(value)
+    return float(int(changed.sum()) / UNITS + fired.grey.shape[1] * fired.noise_events(value))
 
 
 @numba.njit(nogil=True, error_model="numpy")

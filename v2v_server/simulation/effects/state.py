@@ -73,7 +73,7 @@ class Fired(NamedTuple):
     @property
     def pixel_seconds(self) -> float:
         """Return the duration of the clip, once for each pixel."""
-        return self.grey.shape[1] * self.seconds
+        return float(self.grey.shape[1] * self.seconds)
 
 
 class Block(NamedTuple):

@@ -35,7 +35,9 @@ def prepare(memory, given, segments, real):
 @hook
 def begin(tables, first):
     """Forget the events of other pixels."""
-    tables[1][:] = -np.inf
+    ages, latest, _, _, _ = tables
+    if len(ages) > 0:
+        latest[:] = -np.inf
     return 0
 
 
