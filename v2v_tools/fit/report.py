@@ -105,17 +105,13 @@ def draw_fit(fitted: FittedCamera, source: str) -> Image:
         ("intervals", "share of intervals between events of one polarity", gaps),
         ("intervals", "share of intervals between opposite events", gaps),
     )
+    shown = {name: ", ".join(effect.FIELD for effect in EFFECTS if name == effect.PANEL) for name, *_ in titles}
     panels = [
-        Curves(_title(name, title), ticks, measured[number], None if simulated is None else simulated[number])
+        Curves(f"{title} ({shown[name]})", ticks, measured[number], None if simulated is None else simulated[number])
         for number, (name, title, ticks) in enumerate(titles)
     ]
     lines = report_lines(fitted, source)
     return draw_comparison(lines[0], panels, lines[1:])
-
-
-def _title(panel: str, title: str) -> str:
-    """Return the title of a panel with the effects that it shows."""
-    return f"{title} ({', '.join(effect.FIELD for effect in EFFECTS if panel == effect.PANEL)})"
 
 
 def _curves(panels: Panels) -> list[Doubles]:
