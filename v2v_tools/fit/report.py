@@ -100,7 +100,7 @@ def draw_fit(fitted: FittedCamera, source: str) -> Image:
         ("rates", "brighter events a pixel and second, by grey level", grey),
         ("still", "noise, darker: pixels without a change, by grey level", grey),
         ("still", "noise, brighter: pixels without a change, by grey level", grey),
-        ("pixels", "share of the pixels, by events of a pixel", counts),
+        ("pixels", "share of the pixels, by events", counts),
         ("rates", "brighter events as a share, by grey level", grey),
         ("intervals", "share of intervals between events of one polarity", gaps),
         ("intervals", "share of intervals between opposite events", gaps),
