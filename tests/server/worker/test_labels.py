@@ -135,13 +135,13 @@ def test_a_toy_label_with_a_cap_needs_no_field_of_its_own(
     monkeypatch.setitem(ARRAYS, "points", form)
     monkeypatch.setitem(ARRAY_BUILDERS, "points", points)
     (tmp_path / "a.mp4").symlink_to(corpus / "a.mp4")
-    lines = [f"{frame} {frame} {row}" for frame in range(FRAMES) for row in range(3 if frame % 4 < 2 else 1)]
+    lines = [f"{frame} {frame} {row}" for frame in range(FRAMES) for row in range(3 if frame % 3 < 2 else 1)]
     (tmp_path / "a.points.txt").write_text("\n".join(lines))
     with closing(open_catalogue(tmp_path, processes=0)) as catalogue:
         sample = made(catalogue, RECIPE.replace(max_boxes=2), 3, ("frames", "points"))
         plain = made(catalogue, RECIPE.replace(max_boxes=2), 3, ("frames",))
     frames = sample.arrays["points"][:, 0, 0].astype(int)
-    dropped = int((frames % 4 < 2).sum())
+    dropped = int((frames % 3 < 2).sum())
     assert sample.provenance.dropped == ({"points": dropped} if dropped else {})
     assert 0 < dropped < 5
     assert Provenance.from_dict(sample.provenance.to_dict()) == sample.provenance
@@ -149,7 +149,7 @@ def test_a_toy_label_with_a_cap_needs_no_field_of_its_own(
     arrays = {name: torch.from_numpy(array[None].copy()) for name, array in sample.arrays.items()}
     batch = Batch(arrays, (0,), 0, (sample.provenance,), {}, 0.0, 0.0, 1)
     for frame, rows in zip(frames, batch.rows("points")[0], strict=True):
-        assert rows.tolist() == [[frame, 0], [frame, 1]][: 2 if frame % 4 < 2 else 1]
+        assert rows.tolist() == [[frame, 0], [frame, 1]][: 2 if frame % 3 < 2 else 1]
     assert batch.points is batch["points"]
 
 
