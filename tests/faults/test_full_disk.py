@@ -28,7 +28,7 @@ from v2v_server.corpus.manifest import read_manifest
 from v2v_server.prepare.prepare import prepare
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX
 from v2v_server.quarantine import read_quarantine
-from v2v_server.simulation.variants import warm_up
+from v2v_server.simulation.precision import warm_up
 from v2v_server.video.fingerprint import fingerprint
 
 INJECT = Path(__file__).parent / "inject"
