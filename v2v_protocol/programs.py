@@ -25,6 +25,35 @@ COMPLETION = "V2V_COMPLETION"
 """Variable of the environment that asks for a shell's completion script in place of the command."""
 
 
+_OF_V2V = {
+    "bash": r"""
+_v2v() {
+  if ((COMP_CWORD == 1)); then
+    mapfile -t COMPREPLY < <(compgen -W "NAMES" -- "${COMP_WORDS[1]}")
+  else
+    COMP_WORDS=("v2v-${COMP_WORDS[1]}" "${COMP_WORDS[@]:2}")
+    ((COMP_CWORD--))
+    local function="_shtab_${COMP_WORDS[0]//-/_}"
+    declare -F "$function" > /dev/null && "$function"
+  fi
+}
+complete -o bashdefault -F _v2v v2v""",
+    "zsh": r"""
+_v2v() {
+  if ((CURRENT == 2)); then
+    compadd NAMES
+  else
+    shift words
+    words[1]="v2v-$words[1]"
+    ((CURRENT--))
+    _normal
+  fi
+}
+compdef _v2v v2v""",
+}
+"""How a shell completes `v2v`: the name of a command, then as that command's own script does."""
+
+
 # C0 and C1 controls, separators of lines, what changes the direction of text (Unicode 16, UAX 9), and surrogates that
 # stand for no byte.
 _STEERING = re.compile(
@@ -76,6 +105,8 @@ def _program(name: str, module: str, function: str, extra: str) -> Program:
             package = (error.name or "").partition(".")[0]
             if package in _OURS:
                 raise
+            if os.environ.get(COMPLETION):
+                return None  # a shell completes the commands that are installed
             print(
                 f"{name}: needs the Python package {package}, which is not installed; the extra '{extra}' brings it: "
                 f"pip install '.[{extra}]' in a checkout of v2v-stream",
@@ -123,7 +154,9 @@ def v2v() -> int | None:
         return __getattr__(name)()
     if name == "completion" and rest in (["bash"], ["zsh"]):
         os.environ[COMPLETION] = rest[0]
-        return max(__getattr__(each)() or 0 for each in COMMANDS)
+        failed = any(__getattr__(each)() for each in COMMANDS)
+        print("" if failed else _OF_V2V[rest[0]].replace("NAMES", " ".join(COMMANDS)))
+        return 2 if failed else 0
     if name in ("-h", "--help"):
         print(_USAGE)
         return 0
