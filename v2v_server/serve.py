@@ -140,11 +140,12 @@ def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None
             admits=None if is_open else OwnUser(_OWN_USER_RULE, log.say).admits,
         )
         opened.callback(sockets.close)
-        _serve(config, times, standbys, sockets, page, keys, label)
+        _serve(config, log, times, standbys, sockets, page, keys, label)
 
 
 def _serve(
     config: ServeConfig,
+    log: Log,
     times: StartTimes,
     standbys: list[Standby] | None,
     sockets: Sockets,
@@ -153,7 +154,6 @@ def _serve(
     label: str,
 ) -> None:
     """Open the catalogue and run the loop. Errors: see :func:`serve`."""
-    log = Log(is_json=config.log_format == "json")
     catalogue = load_catalogue(config)
     times.mark("catalogue")
     table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
@@ -189,7 +189,7 @@ def _serve(
     with stop_on_signals(stop):
         pool = make_pool(config, catalogue.source, label, worker_flags, keys, standbys)
         server = Server(
-            config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file, page=page, times=times
+            config, catalogue, dispatcher, sockets, pool, quarantine, quarantine_file, page=page, times=times, log=log
         )
         try:
             if pool.is_local and (question := question_workers(config.most_workers, usable_cores())):
@@ -220,6 +220,7 @@ class Server:
         clock: returns the time, seconds; None: a :class:`v2v_server.serve.Clock`.
         page: the status page; None: no page.
         times: see :func:`serve`.
+        log: where other threads write lines too; None: a new one.
     """
 
     def __init__(
@@ -234,10 +235,11 @@ class Server:
         clock: Callable[[], float] | None = None,
         page: PageProcess | None = None,
         times: StartTimes | None = None,
+        log: Log | None = None,
     ) -> None:
         self._page = page
         self._times = times or StartTimes()
-        self._log = Log(is_json=config.log_format == "json")
+        self._log = log or Log(is_json=config.log_format == "json")
         self._config = config
         self._catalogue = catalogue
         self._dispatcher = dispatcher
@@ -414,7 +416,6 @@ class Server:
             sample: the request that the line is about.
             about: additional fields for programs.
         """
-        self._view.interrupt()
         identity = None if sample is None or not self._log.is_json else self._dispatcher.identity_of(sample)
         if identity is not None:
             about["sample"] = asdict(identity)

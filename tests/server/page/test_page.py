@@ -139,9 +139,7 @@ def test_it_fits_every_screen_and_both_themes(served: LocalServer, port: int, br
     assert browser.complaints == []
 
 
-def test_the_axis_of_time_shows_a_minute_whatever_has_arrived(
-    served: LocalServer, port: int, browser: Browser
-) -> None:
+def test_the_axis_of_time_shows_a_minute_whatever_has_arrived(served: LocalServer, port: int, browser: Browser) -> None:
     browser.open(f"http://127.0.0.1:{port}/")
     browser.until("fields.length")
     browser.value("show = () => {}")  # the server's own states would come between
