@@ -180,6 +180,7 @@ WRONG = [
     ("v2v-train clips", "v2v-train NAME --videos clips"),
     ("v2v-train finetune --videos clips", "did you mean 'finetune-cpu'"),
     ("v2v-train e2vd --videos clips", "did you mean 'e2vid'"),
+    ("v2v-train etnet --videos clips --set loss.lpips_weight=0 --set loss.flow=stream", "or --set stream.list= for"),
     ("v2v-preview a.mp4 --output x.png", "did you mean '--out'"),
     ("v2v-preview --videos clips --out x.png", "without a flag"),
     ("v2v-simulate --video a.mp4 --out x.npz", "without a flag"),

@@ -356,8 +356,8 @@ class Server:
         """End the process of a hung worker, if it is one of ours."""
         name = self._name(hopeless.identity)
         loss = self._pool.give_up(name, hopeless.reason) or Loss(Cause.UNEXPLAINED, hopeless.reason, for_all=False)
-        text = f"worker {clean_name(name.decode())} {hopeless.reason}: {loss.text}; its leases go to other workers"
-        self._say(text, "warning")
+        happened = ": ".join(dict.fromkeys((hopeless.reason, loss.text)))
+        self._say(f"worker {clean_name(name.decode())} {happened}; its leases go to other workers", "warning")
         return loss
 
     def _name(self, identity: bytes) -> bytes:
