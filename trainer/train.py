@@ -89,7 +89,8 @@ def serving(stream: StreamConfig, recipe: Recipe, mine: Ranks) -> Iterator[str]:
         raise UsageError("stream.videos is missing: give --videos DIR, or --connect ADDRESS of a running server")
     if stream.list and not Path(stream.list).is_file():
         raise UsageError(
-            f"stream.list {stream.list}: no such file; give --set stream.list=FILE, or --set stream.list= for all videos"
+            f"stream.list {stream.list}: no such file; --set stream.list=FILE names it, or --set stream.list= for all "
+            "videos"
         )
     if mine.hosts > 1:
         raise UsageError(f"ranks on {mine.hosts} hosts: start v2v-serve yourself and give all ranks --connect ADDRESS")

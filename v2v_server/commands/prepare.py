@@ -24,6 +24,7 @@ from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
 from v2v_server.prepare.report import Report
+from v2v_server.prepare.resume import check_destination
 from v2v_server.store.packing import DEFAULT_SIZE, SIZES
 from v2v_server.store.planes import OPTIONAL, PLANES
 from v2v_server.system.process import usable_cores
@@ -82,7 +83,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.workers < 1:
         raise UsageError(f"--workers {arguments.workers}: give at least 1")
-    started = time.monotonic()
+    started, source = time.monotonic(), Path(arguments.source).absolute()
+    single = source.is_file() and source.suffix.lower() not in LIST_SUFFIXES
+    folder = source.parent if source.is_file() else source
+    check_destination(Path(arguments.destination).resolve(), folder.resolve(), single)  # probing may take hours
     with Progress("probing videos") as probing:
         catalogue = open_catalogue(
             arguments.source,
@@ -101,7 +105,7 @@ def _run(arguments: argparse.Namespace) -> int:
             processes=arguments.workers,
             scene=arguments.scene != "off",
             planes=tuple(dict.fromkeys(arguments.planes)),
-            single=_is_video(Path(arguments.source)),
+            single=single,
             progress=lambda done, total, made, expected: shown(done, total, _size(made, expected)),
         )
     for line in summary(report, arguments.size, time.monotonic() - started):
@@ -117,10 +121,6 @@ def _run(arguments: argparse.Namespace) -> int:
         ]
         write_json(arguments.json, records)
     return 0 if report.complete else FAILED
-
-
-def _is_video(source: Path) -> bool:
-    return source.is_file() and source.suffix.lower() not in LIST_SUFFIXES
 
 
 def summary(report: Report, size: str, seconds: float) -> list[str]:

@@ -1,7 +1,8 @@
 """Puts a fault into real server workers: on the PYTHONPATH of a server, this is run by every Python it starts.
 
 ``V2V_FAULT`` is JSON: {"stage": decode | simulate | send, "action": a signal's name, "exit", "memory", "hang" or
-"disconnect", "video": only at this video (any when missing), "once": a file that is created by the one worker that does it}.
+"disconnect", "video": only at this video (any when missing), "once": a file that is created by the one worker that does
+it}.
 Nothing in the product knows of this.
 """
 
