@@ -19,6 +19,7 @@ from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec import SCENES
+from v2v_protocol.spec_flags import add_corpus
 from v2v_protocol.write_aside import write_json
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
@@ -47,17 +48,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     videos = parser.group("Videos")
     videos.add_argument("source", metavar="SRC", help="folder of videos, a video, or a list file; never written to")
     videos.add_argument("destination", metavar="DST", help="folder to create, or to continue after an interruption")
-    videos.add_argument(
-        "--rows", default="full", metavar="ROWS", help="rows to keep: full (default), top:0.54 (WebVid)"
-    )
-    videos.add_argument("--list", metavar="FILE", help="list file (path frames c+ c-) that restricts SRC")
+    add_corpus(parser, "Videos")
     videos.add_argument(
         "--scene",
         choices=SCENES,
         default="off",
         help="auto: also compute the statistics that v2v-serve --scene auto uses",
     )
-    videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     stored = parser.group("Files")
     stored.add_argument(
         "--size", choices=tuple(SIZES), default=DEFAULT_SIZE,
