@@ -397,7 +397,7 @@ class Server:
             workers = "" if worker_address.startswith("ipc:") else f", workers to {worker_address}"
             self._say(f"ready: consumers connect to {address}{workers}", address=address)
             if self._config.port_file:
-                write_port_file(self._config.port_file, address)
+                write_file(Path(self._config.port_file), address + "\n", "--port-file")
                 self._port_file = Path(self._config.port_file)
             self._publisher.is_ready = True
             self._times.mark("first worker")
@@ -461,15 +461,6 @@ def stop_on_signals(stop: threading.Event) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def write_port_file(file: str, address: str) -> None:
-    """Write the address in one step, so that readers see the whole content or no file.
-
-    Raises:
-        UsageError: the file cannot be written.
-    """
-    write_file(Path(file), address + "\n", "--port-file")
 
 
 def utc_now() -> str:

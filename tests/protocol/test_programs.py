@@ -167,7 +167,7 @@ def test_the_null_device_takes_the_place_of_a_closed_stream() -> None:
 
 def test_ctrl_c_while_modules_are_imported_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text("print('importing', flush=True)\nimport time\ntime.sleep(60)\n")
-    script = "from v2v_protocol import programs; programs._program('v2v-x', 'slow', 'main', 'server')()"
+    script = "from v2v_protocol import programs; programs.COMMANDS['x'] = ('slow', 'server', ''); programs.x()"
     with subprocess.Popen(
         [sys.executable, "-c", script],
         stdout=subprocess.PIPE,

@@ -80,7 +80,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.workers < 1:
         raise UsageError(f"--workers {arguments.workers}: give at least 1")
-    started, source = time.monotonic(), Path(arguments.source).absolute()
+    started = time.monotonic()
+    source = Path(arguments.source).absolute()
     single = source.is_file() and source.suffix.lower() not in LIST_SUFFIXES
     folder = source.parent if source.is_file() else source
     check_destination(Path(arguments.destination).resolve(), folder.resolve(), single)  # probing may take hours
