@@ -39,7 +39,6 @@ _MOST_CLIPS = 4
 """Clips that are decoded for it."""
 _ENOUGH = 0.25
 """A camera is worth showing that has this share of the events of the best one."""
-_STORED_FRAMES = 16
 _NOISE = ("noise_sigma", "hot_pixel_share", *NOISE)
 
 
