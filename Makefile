@@ -20,7 +20,7 @@ help:
 	@echo "make test            the fast tests (six minutes on two cores, the first time)"
 	@echo "make test-slow       the tests that take longer"
 	@echo "make test-old-numpy  the table of digests under an older numpy"
-	@echo "make check           formatting, lint, types"
+	@echo "make check           formatting, lint, types; the snippets and command lines of the pages"
 	@echo "make docs            the documentation as a site, in out/site"
 
 $(READY): pyproject.toml constraints.txt
@@ -79,6 +79,7 @@ check: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/python -m tests.tools.snippets
+	$(BIN)/python -m pytest -q tests/test_commands.py
 
 $(DOCS)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(DOCS)

@@ -12,6 +12,7 @@ import argparse
 import json
 import sys
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from trainer.train import main as train
 
 SIDE_PX = 32
 VOXELS = 6
+FRAMES = 5 * (VOXELS + 1) + 1
 NARROW = {"base_channels": 8}
 RUNS: dict[str, dict[str, Any]] = {
     "firenet": {"network.options": NARROW, "optimizer.learning_rate": 5e-3},
@@ -40,20 +42,29 @@ RUNS: dict[str, dict[str, Any]] = {
 """Settings that differ between the networks; :data:`_TINY` and :func:`overfit` have the common ones."""
 
 
+def squares(path: Path) -> list[np.ndarray[Any, np.dtype[np.uint8]]]:
+    """Return the central squares of the first frames, shrunk; fewer than FRAMES if the file is short or damaged."""
+    found = []
+    with suppress(av.FFmpegError, IndexError), av.open(str(path)) as container:
+        for frame in islice(container.decode(video=0), FRAMES):
+            grey = frame.to_ndarray(format="gray")
+            side = min(grey.shape)
+            top, left = ((length - side) // 2 for length in grey.shape)
+            square = np.ascontiguousarray(grey[top : top + side, left : left + side], np.uint8)
+            found.append(np.asarray(cv2.resize(square, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA), np.uint8))
+    return found
+
+
 def shrink(videos: Iterable[Path], folder: Path, clips: int) -> None:
-    """Write the central squares of the first frames of ``clips`` videos as lossless clips of one sequence each."""
+    """Write the first frames of ``clips`` videos as lossless clips of one sequence each; skip unusable files."""
     folder.mkdir(parents=True, exist_ok=True)
-    for path in islice(videos, clips):
-        with av.open(str(path)) as container, av.open(str(folder / f"{path.stem}.mkv"), "w") as written:
+    usable = ((path, frames) for path in videos if len(frames := squares(path)) == FRAMES)
+    for path, frames in islice(usable, clips):
+        with av.open(str(folder / f"{path.stem}.mkv"), "w") as written:
             stream = written.add_stream("ffv1", rate=25)
             stream.width, stream.height, stream.pix_fmt = SIDE_PX, SIDE_PX, "gray"
-            for frame in islice(container.decode(video=0), 5 * (VOXELS + 1) + 1):
-                grey = frame.to_ndarray(format="gray")
-                side = min(grey.shape)
-                top, left = ((length - side) // 2 for length in grey.shape)
-                square = np.ascontiguousarray(grey[top : top + side, left : left + side])
-                small = cv2.resize(square.astype(np.uint8), (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA)
-                written.mux(stream.encode(av.VideoFrame.from_ndarray(small.astype(np.uint8), format="gray")))
+            for small in frames:
+                written.mux(stream.encode(av.VideoFrame.from_ndarray(small, format="gray")))
             written.mux(stream.encode())
 
 

@@ -10,19 +10,32 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import av
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 HEIGHT_PX, WIDTH_PX, FRAMES = 128, 160, 61
+Pixels: TypeAlias = npt.NDArray[np.uint8]
 
 
-def render(footage: Path, path: Path, generator: np.random.Generator) -> None:
-    """Write a clip of the footage with up to three sprites, and their boxes beside it."""
+def first_frames(video: Path) -> list[Pixels]:
+    """Return the first frames, resized; fewer than FRAMES if the file is short or damaged."""
+    frames = []
+    with suppress(av.FFmpegError, IndexError), av.open(str(video)) as container:
+        for frame in islice(container.decode(video=0), FRAMES):
+            grey = cv2.resize(frame.to_ndarray(format="gray"), (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA)
+            frames.append(np.asarray(grey, np.uint8))
+    return frames
+
+
+def render(footage: Sequence[Pixels], path: Path, generator: np.random.Generator) -> None:
+    """Write a clip of these frames with up to three sprites, and their boxes beside it."""
     sprites: list[list[Any]] = []
     for track in range(int(generator.integers(1, 4))):
         side, kind = int(generator.integers(18, 45)), int(generator.integers(2))
@@ -32,12 +45,10 @@ def render(footage: Path, path: Path, generator: np.random.Generator) -> None:
         place = generator.uniform(0, (WIDTH_PX - side, HEIGHT_PX - side))
         sprites.append([track, kind, side, texture, shape, place, generator.uniform(-2.5, 2.5, 2)])
     images, annotations = [], []
-    with av.open(str(footage)) as container, av.open(str(path), "w") as out:
+    with av.open(str(path), "w") as out:
         stream = out.add_stream("libx264", rate=30, options={"crf": "15"})
         stream.width, stream.height, stream.pix_fmt = WIDTH_PX, HEIGHT_PX, "yuv420p"
-        for number, frame in enumerate(islice(container.decode(video=0), FRAMES)):
-            grey = cv2.resize(frame.to_ndarray(format="gray"), (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA)
-            picture = np.asarray(grey, np.uint8)
+        for number, picture in enumerate(frame.copy() for frame in footage):
             images.append({"id": number, "frame_id": number})
             for sprite in sprites:
                 track, kind, side, texture, shape, place, speed = sprite
@@ -61,7 +72,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", required=True, type=Path, help="folder to write to")
     parser.add_argument("--clips", type=int, default=160, help="number of clips to train on")
     options = parser.parse_args(argv)
-    footage = sorted(path for path in options.footage.iterdir() if path.suffix in (".mp4", ".mkv", ".avi", ".webm"))
+    files = sorted(path for path in options.footage.iterdir() if path.suffix in (".mp4", ".mkv", ".avi", ".webm"))
+    usable = (frames for path in files if len(frames := first_frames(path)) == FRAMES)
+    footage = list(islice(usable, 2 * options.clips))  # each of them in memory, 1.2 MB
+    if len(footage) < 2:
+        raise SystemExit(f"{options.footage}: {len(footage)} of {len(files)} videos have {FRAMES} frames: give two")
     generator, apart = np.random.default_rng(0), -(-len(footage) // 5)
     for name, videos, clips in (
         ("train", footage[:-apart], options.clips),

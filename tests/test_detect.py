@@ -57,6 +57,8 @@ def test_average_precision_of_known_detections(
 def test_it_runs_on_rendered_clips(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("a", "b"):
         write_clip(tmp_path / f"{name}.mp4", panned_luma(61, 48, 64))
+    (tmp_path / "0-damaged.mp4").write_bytes((tmp_path / "a.mp4").read_bytes()[:1000])
+    (tmp_path / "c-empty.mp4").touch()
     out = tmp_path / "sprites"
     render_sprites.main(["--footage", str(tmp_path), "--out", str(out), "--clips", "2"])
     labels = json.loads((out / "train" / "0000.boxes.json").read_text())

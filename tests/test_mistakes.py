@@ -66,6 +66,14 @@ OUTPUTS = [
     ("v2v-tradeoff --videos clips --json clips/b.boxes.json", ["name of a video's labels"]),
     ("v2v-prepare clips store --json clips/b.boxes.json", ["name of a video's labels"]),
     ("v2v-prepare clips store --json a.mp4", ["--json a.mp4", ".json"]),
+    ("v2v-prepare clips a.mp4", ["a.mp4 is a file"]),
+    ("v2v-prepare clips a.mp4/store", ["a.mp4 is a file"]),
+    ("v2v-prepare clips clips/store", ["overlap"]),
+    ("v2v-prepare clips linked", ["overlap"]),
+    ("v2v-prepare clips/list.txt clips", ["overlap"]),
+    ("v2v-prepare clips run", ["holds config.yaml"]),
+    ("v2v-prepare clips locked.png/store", ["locked.png is a file"]),
+    ("v2v-prepare clips locked/store", ["locked is write-protected"]),
     ("v2v-quarantine --videos a.mp4 --json a.mp4", [".json"]),
     ("v2v-loadtest --videos a.mp4 --json a.mp4", [".json"]),
     ("v2v-loadtest --connect tcp://127.0.0.1:9 --json nowhere/x.json", ["there is no folder nowhere"]),
@@ -88,7 +96,7 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_clip(tmp_path / "a.mp4", panned_luma(30, 64, 64))
     (tmp_path / "link.mp4").symlink_to("a.mp4")
     (tmp_path / "hard.mp4").hardlink_to("a.mp4")
-    for folder in ("clips", "b.masks", "run"):
+    for folder in ("clips", "b.masks", "run", "locked"):
         (tmp_path / folder).mkdir()
     (tmp_path / "linked").symlink_to("clips")
     for name in ("b", "c"):
@@ -125,7 +133,8 @@ def test_an_output_never_destroys_an_input(
 ) -> None:
     # Root may write anywhere, so the check itself is asked.
     access = import_module("os").access
-    monkeypatch.setattr("os.access", lambda path, how, **_: Path(path).name != "locked.png" and access(path, how))
+    monkeypatch.setattr("os.access", lambda path, how, **_: Path(path).stem != "locked" and access(path, how))
+    monkeypatch.setattr("v2v_server.commands.prepare.open_catalogue", None)  # the destination is checked before it
     before = contents(desk)
     said = answer(line, capsys)
     assert [word for word in words if word not in said] == [], said
@@ -180,6 +189,7 @@ WRONG = [
     ("v2v-train clips", "v2v-train NAME --videos clips"),
     ("v2v-train finetune --videos clips", "did you mean 'finetune-cpu'"),
     ("v2v-train e2vd --videos clips", "did you mean 'e2vid'"),
+    ("v2v-train etnet --videos clips --set loss.lpips_weight=0 --set loss.flow=stream", "--set stream.list= for"),
     ("v2v-preview a.mp4 --output x.png", "did you mean '--out'"),
     ("v2v-preview --videos clips --out x.png", "without a flag"),
     ("v2v-simulate --video a.mp4 --out x.npz", "without a flag"),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -26,38 +27,31 @@ ROOT = Path(__file__).parents[1]
 EFFECT = '''
 """Event loss: the readout drops each step's events of a pixel with the chance of the field."""
 
-from typing import Any, NamedTuple
-
 import numpy as np
 
-from v2v_server.simulation import noise
 from v2v_server.simulation.effects.state import hook
 from v2v_server.simulation.pixel import BLOCK_PX, folds_of, word
 
 FIELD, ROWS = "event_loss", 0
+NOISE, PANEL = False, "rates"
+COST, MARGIN = 1, 2.0
 PIXEL, STEP = np.uint32(16), np.uint32(17)
 
 
-class Tables(NamedTuple):
-    chance: Any
-
-
 def prepare(value, clip):
-    return Tables(np.uint32(value * 2**32))
+    return np.uint32(value * 2**32)
 
 
-def lost(key, value, steps, pixels):
-    """The oracle: [steps, pixels] bool."""
-    pixel, step = noise.words(key, int(PIXEL), np.arange(pixels)), noise.words(key, int(STEP), np.arange(steps))
-    return noise.scramble(noise.scramble(pixel)[None] + step[:, None]) < np.uint32(value * 2**32)
+def changed(value, fired):
+    return value * np.abs(fired.events).sum()
 
 
 @hook
-def after(tables, own, block, at):
-    if tables.chance > 0:
+def after(chance, own, block, at):
+    if chance > 0:
         pixel, step = folds_of(block.key, PIXEL), word(folds_of(block.key, STEP), at.step)
         for i in range(BLOCK_PX):
-            if word((word(pixel, at.first + i), step), 0) < tables.chance:
+            if word((word(pixel, at.first + i), step), 0) < chance:
                 block.rises[i] = block.falls[i] = block.tolerance - block.tolerance
 '''
 EFFECT_LINES = (
@@ -83,6 +77,27 @@ ARRAY_LINES = (
      "import v2v_server.worker.depth  # noqa: F401\n"),
 )  # fmt: skip
 
+REPRESENTATION = '''
+"""Whether a pixel fired in a bin."""
+
+from v2v_server.simulation.effects.state import hook
+
+
+@hook
+def end(fired, counts):
+    if len(fired) > 0:
+        for i in range(counts.last - counts.first):
+            fired[counts.grid, counts.bin, counts.first + i] = counts.on[i] + counts.off[i] > 0
+    return 0
+'''
+REPRESENTATION_LINES = (
+    (
+        "v2v_protocol/sample.py",
+        '    "time_surface": OfEvents(',
+        '    "fired": OfEvents(lambda dtype, *shape: (dtype, shape)),\n',
+    ),
+)
+
 USE = """
 import json, sys
 from pathlib import Path
@@ -91,8 +106,11 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_tools.remake import remake
-from v2v_server.simulation.effects import event_loss
+from v2v_server.simulation import noise
+from v2v_server.simulation.effects import NOISE, event_loss
 from v2v_server.simulation.effects.kernel import simulate_general
+sys.path.append(sys.argv[2])
+from tests.oracles.noise import scramble, words
 
 folder = Path(sys.argv[1])
 catalogue = open_catalogue(folder, processes=0, cache_dir=folder)
@@ -107,10 +125,20 @@ for name, recipe in (("off", Recipe(**small)), ("on", Recipe(**small, event_loss
     assert kernels == (name == "on"), "an effect that is off runs the code that ran without it"
 off, on = made["off"], made["on"]
 params = on.provenance.params
-lost = event_loss.lost(params.noise_key, params.effects["event_loss"], 20, 16 * 24).reshape(20, 1, 16, 24)
+pixel, step = words(params.noise_key, 16, np.arange(16 * 24)), words(params.noise_key, 17, np.arange(20))
+lost = scramble(scramble(pixel)[None] + step[:, None]) < np.uint32(params.effects["event_loss"] * 2**32)
+lost = lost.reshape(20, 1, 16, 24)
 assert np.array_equal(on.arrays["voxels"], np.where(lost, 0, off.arrays["voxels"])), "the oracle"
 assert off.arrays["voxels"].any() and (off.arrays["voxels"] != on.arrays["voxels"]).any()
 assert np.array_equal(on.arrays["depth"], 255.0 - on.arrays["frames"].astype(np.float32))
+few = StreamSpec(recipe=Recipe(**small, event_loss=0.01), tolerance=0.1)
+tolerated = remake(catalogue, few, seed=1, epoch=0, index=0, arrays=("voxels", "event_counts", "fired"))
+assert tolerated.provenance.left_out == ("event_loss",), tolerated.provenance.left_out
+assert "event_loss" not in NOISE
+assert np.array_equal(tolerated.arrays["voxels"], off.arrays["voxels"])
+counts, fired = tolerated.arrays["event_counts"], tolerated.arrays["fired"]
+assert np.array_equal(fired, counts.any(axis=1))
+assert 0 < fired.mean() < 1
 json.dump({"off": off.provenance.to_dict()["params"], "on": on.provenance.to_dict()["params"]}, sys.stdout)
 """
 
@@ -124,20 +152,22 @@ def add(root: Path, lines: tuple[tuple[str, str, str], ...]) -> None:
 
 
 @pytest.mark.slow
-def test_a_toy_effect_and_a_toy_array_are_a_file_and_two_lines_each(tmp_path: Path) -> None:
-    for package in ("v2v_protocol", "v2v_server", "v2v_pictures"):
+def test_a_toy_effect_array_and_representation_are_a_file_and_a_line_or_two(tmp_path: Path) -> None:
+    for package in ("v2v_protocol", "v2v_server", "v2v_pictures", "v2v_tools"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "v2v_server/simulation/effects/event_loss.py").write_text(EFFECT)
     add(tmp_path, EFFECT_LINES)
     (tmp_path / "v2v_server/worker/depth.py").write_text(ARRAY)
     add(tmp_path, ARRAY_LINES)
+    (tmp_path / "v2v_server/simulation/representations/fired.py").write_text(REPRESENTATION)
+    add(tmp_path, REPRESENTATION_LINES)
     clips = tmp_path / "clips"
     clips.mkdir()
     write_clip(clips / "a.mp4", panned_luma(30, 16, 24), gop=12)
     environment = os.environ | {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "numba")}
     run = subprocess.run(
-        [sys.executable, "-c", USE, str(clips)], env=environment, cwd=tmp_path, capture_output=True, text=True,
-        timeout=500,
+        [sys.executable, "-c", USE, str(clips), str(ROOT)], env=environment, cwd=tmp_path, capture_output=True,
+        text=True, timeout=500,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
     provenance = json.loads(run.stdout)
@@ -163,7 +193,19 @@ def test_every_array_that_can_be_requested_is_made() -> None:
 
 
 def test_the_toys_only_add_the_stated_lines() -> None:
-    """Their own file besides, nothing but added lines: two for each."""
-    for lines in (EFFECT_LINES, ARRAY_LINES):
-        assert len(lines) == 2
+    """Their own file besides, nothing but added lines: two for each, one for a representation."""
+    for lines in (EFFECT_LINES, ARRAY_LINES, REPRESENTATION_LINES):
+        assert len(lines) == 2 - (lines is REPRESENTATION_LINES)
         assert all(line.count("\n") == 1 for *_, line in lines)
+
+
+def test_every_seam_of_the_page_has_a_toy() -> None:
+    """Each section names the test that adds its toy."""
+    _, *sections = re.split(r"^##+ ", (ROOT / "docs/extending.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert len(sections) >= 13
+    for section in sections:
+        named = re.findall(r"`(tests/[\w/]+\.py)` adds", section) or re.findall(
+            r"a toy in `(tests/[\w/]+\.py)`", section
+        )
+        assert named, section[:60]
+        assert all((ROOT / each).is_file() for each in named), named

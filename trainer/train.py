@@ -87,6 +87,11 @@ def serving(stream: StreamConfig, recipe: Recipe, mine: Ranks) -> Iterator[str]:
         return
     if not stream.videos:
         raise UsageError("stream.videos is missing: give --videos DIR, or --connect ADDRESS of a running server")
+    if stream.list and not Path(stream.list).is_file():
+        raise UsageError(
+            f"stream.list {stream.list}: no such file; --set stream.list=FILE names it, or --set stream.list= for all "
+            "videos"
+        )
     if mine.hosts > 1:
         raise UsageError(f"ranks on {mine.hosts} hosts: start v2v-serve yourself and give all ranks --connect ADDRESS")
     if not mine.first:

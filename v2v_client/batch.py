@@ -12,7 +12,7 @@ import os
 from collections.abc import KeysView, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Never
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,7 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import ARRAYS, BOX_COLUMNS, Provenance, html_table
+from v2v_protocol.sample import ARRAYS, Provenance, empty_value, html_table
 from v2v_protocol.settings import nearest
 from v2v_protocol.spec import StreamSpec
 
@@ -69,9 +69,30 @@ class Drawn:
 class Batch(Drawn):
     """Hold the samples of one batch, in the order of the epoch.
 
+    Each array that the dataset requested is an attribute and an item: ``batch.voxels``, ``batch["voxels"]``. The
+    attribute of one that it did not request raises UsageError. With T frames of a clip:
+
+    voxels            [B, T + lead_voxels, bins, H, W] in the spec's ``voxel_dtype``: signed counts, ON events positive.
+                      Voxel t spans frames t - 1 -> t of the target sequence. With ``grids_per_frame`` n there are n
+                      times as many, and :attr:`frame_grids` says which ends at which frame. With ``voxel_seconds``,
+                      ``provenance[b].grid_seconds`` has their durations
+    event_counts      [B, T, 2, bins, H, W], T as for voxels, of the same dtype: OFF (0) and ON (1) events
+    voxels_bilinear   shaped like voxels, float16 (float32 if ``voxel_dtype`` is): each event shared between the two
+                      bins next to its time
+    time_surface      [B, T, 2, bins, H, W], T as for voxels, float16 or float32: age of the last OFF (0) and ON (1)
+                      event at the end of each bin, s; infinity before the first in the clip
+    frames            [B, T + lead_frames, 1, H, W] uint8, the simulated pixels
+    frames_rgb        [B, T + lead_frames, 3, H, W] uint8, red, green and blue
+    frames_u16        [B, T + lead_frames, 1, H, W] uint16, with the levels that the video stores
+    frames_all        [B, steps + 1, 1, H, W] uint8, all frames that were simulated, the first included
+    flow              [B, T, 2, H, W] float16, (x, y) px; flow[:, t] belongs to voxel t of the target sequence, and is
+                      zero before ``flow_from``
+    flow_valid        [B, T, 1, H, W] uint8, 1 where forward and backward flow agree
+    masks             [B, T, 1, H, W] uint8, T as for frames: classes; 255 in a sample without labels
+    boxes             a list, see :attr:`boxes`
+
     Attributes:
-        arrays: the requested tensors by name (``v2v_protocol.sample.ARRAYS``). "voxels", "frames", "flow" and
-            "flow_valid" are also attributes.
+        arrays: the requested tensors by name (``v2v_protocol.sample.ARRAYS``).
         indices: global index of each sample.
         epoch: epoch of the samples.
         provenance: origin of each sample.
@@ -137,75 +158,6 @@ class Batch(Drawn):
         return html_table(f"Batch of {len(self)}, epoch {self.epoch}", rows) + self._html_image()
 
     @property
-    def voxels(self) -> torch.Tensor:
-        """Return the voxel grids: [B, T + lead_voxels, bins, H, W] in the spec's ``voxel_dtype``.
-
-        Positive counts are ON events. Voxel t spans frames t - 1 -> t of the target sequence. With ``grids_per_frame``
-        n, [B, (T + lead_voxels) n, bins, H, W], and :attr:`frame_grids` says which grid ends at which frame. With
-        ``voxel_seconds``, ``provenance[b].grid_seconds`` has the durations of the grids.
-
-        Raises:
-            UsageError: the dataset did not request this array.
-        """
-        return self._array("voxels")
-
-    @property
-    def event_counts(self) -> torch.Tensor:
-        """Return the events of each polarity: [B, T, 2, bins, H, W], T as for :attr:`voxels`; OFF (0) before ON (1).
-
-        Raises:
-            UsageError: the dataset did not request this array.
-        """
-        return self._array("event_counts")
-
-    @property
-    def voxels_bilinear(self) -> torch.Tensor:
-        """Return the voxel grids with each event shared between the two bins next to its time: [B, T, bins, H, W].
-
-        T is as for :attr:`voxels`. float16, or float32 if the spec's ``voxel_dtype`` is float32.
-
-        Raises:
-            UsageError: the dataset did not request this array.
-        """
-        return self._array("voxels_bilinear")
-
-    @property
-    def frames(self) -> torch.Tensor:
-        """Return the simulated pixels: [B, T + lead_frames, 1, H, W] uint8.
-
-        Raises:
-            UsageError: the dataset did not request this array.
-        """
-        return self._array("frames")
-
-    @property
-    def frames_rgb(self) -> torch.Tensor:
-        """Return the frames in colour: [B, T + lead_frames, 3, H, W] uint8, red, green and blue.
-
-        Raises:
-            UsageError: the dataset did not request this array.
-        """
-        return self._array("frames_rgb")
-
-    @property
-    def frames_u16(self) -> torch.Tensor:
-        """Return the frames with the levels that the video stores: [B, T + lead_frames, 1, H, W] uint16.
-
-        Raises:
-            UsageError: the dataset did not request this array.
-        """
-        return self._array("frames_u16")
-
-    @property
-    def frames_all(self) -> torch.Tensor:
-        """Return all frames that were simulated, the first included: [B, steps + 1, 1, H, W] uint8.
-
-        Raises:
-            UsageError: the dataset did not request this array.
-        """
-        return self._array("frames_all")
-
-    @property
     def frame_grids(self) -> torch.Tensor:
         """Return the number of the voxel grid that ends at each frame: int64 [T + lead_frames].
 
@@ -220,60 +172,46 @@ class Batch(Drawn):
         return torch.tensor(StreamSpec.from_dict(self.resume_state["spec"]).recipe.frame_grids)
 
     @property
-    def flow(self) -> torch.Tensor:
-        """Return the optical flow: [B, T, 2, H, W] float16, (x, y) in px.
-
-        flow[:, t] belongs to voxel t of the target sequence and is zero before ``flow_from``.
-
-        Raises:
-            UsageError: the dataset did not request this array.
-        """
-        return self._array("flow")
-
-    @property
-    def flow_valid(self) -> torch.Tensor:
-        """Return the validity of the flow: [B, T, 1, H, W] uint8, 1 where forward and backward flow agree.
-
-        Raises:
-            UsageError: the dataset did not request this array.
-        """
-        return self._array("flow_valid")
-
-    @property
     def boxes(self) -> list[list[torch.Tensor]]:
         """Return the boxes: ``boxes[b][t]`` is float32 [n, 7] with the columns of ``v2v_protocol.sample.BOX_COLUMNS``.
 
-        x0, y0, x1, y1 in px, class, track, and the visible share; the largest box first. Index t as for :attr:`frames`.
+        x0, y0, x1, y1 in px, class, track, and the visible share; the largest box first. Index t as for frames.
         ``self["boxes"]`` is the same as one tensor, [B, T, max_boxes, 7], with -1 where there is no box.
 
         Raises:
             UsageError: the dataset did not request this array.
         """
-        boxes = self._array("boxes")
-        counts = (boxes[..., BOX_COLUMNS.index("class")] >= 0).sum(-1).tolist()
-        return [[frame[:count] for frame, count in zip(*clip, strict=True)] for clip in zip(boxes, counts, strict=True)]
+        return self.rows("boxes")
 
-    @property
-    def masks(self) -> torch.Tensor:
-        """Return the class masks: [B, T, 1, H, W] uint8, T as for :attr:`frames`; 255 in a sample without labels.
+    def rows(self, name: str) -> list[list[torch.Tensor]]:
+        """Return a label that has a number of rows in each frame: item [b][t] is [n, columns], without the empty rows.
 
         Raises:
             UsageError: the dataset did not request this array.
         """
-        return self._array("masks")
+        label = self._array(name)
+        counts = (label != empty_value(name)).any(-1).sum(-1).tolist()
+        return [[frame[:count] for frame, count in zip(*clip, strict=True)] for clip in zip(label, counts, strict=True)]
 
     @property
     def labelled(self) -> tuple[bool, ...]:
-        """Return, for each sample, whether it has all boxes and masks that were requested."""
+        """Return, for each sample, whether all arrays that were requested could be made."""
         return tuple(origin.labelled for origin in self.provenance)
 
-    def __getattr__(self, name: str) -> Never:
-        """Name the nearest attribute.
+    def __getattr__(self, name: str) -> torch.Tensor:
+        """Return the array of this name.
 
         Raises:
-            AttributeError: always.
+            UsageError: the dataset did not request this array.
+            AttributeError: there is no such array; the message names the nearest attribute.
         """
-        raise AttributeError(f"a Batch has no {name!r}{nearest(name, (*ARRAYS, *dir(type(self))))}")
+        if name not in ARRAYS:
+            raise AttributeError(f"a Batch has no {name!r}{nearest(name, (*ARRAYS, *dir(type(self))))}")
+        return self._array(name)
+
+    def __dir__(self) -> list[str]:
+        """List the arrays among the attributes, for the completion of a notebook."""
+        return [*object.__dir__(self), *self.arrays]
 
     def _array(self, name: str) -> torch.Tensor:
         if name not in self.arrays:

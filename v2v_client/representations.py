@@ -2,6 +2,7 @@
 
 stacked_histogram(batch.event_counts)  # [B, T, 2 bins, H, W]
 event_count_image(batch.event_counts)  # [B, T, 2, H, W]
+exponential_surface(batch.time_surface, 0.05)  # [B, T, 2, bins, H, W]
 normalised(batch.voxels)  # [B, T, bins, H, W]
 """
 
@@ -39,6 +40,21 @@ def event_count_image(event_counts: torch.Tensor) -> torch.Tensor:
         [..., 2, H, W], int32, or float32 for counts of that dtype.
     """
     return event_counts.sum(-3, dtype=torch.float32 if event_counts.is_floating_point() else torch.int32)
+
+
+def exponential_surface(time_surface: torch.Tensor, time_constant: float) -> torch.Tensor:
+    """Return exp(-age / time_constant): 1 at an event, 0 where there was none.
+
+    Lagorce et al., "HOTS: A Hierarchy of Event-Based Time-Surfaces for Pattern Recognition", TPAMI 2017.
+
+    Args:
+        time_surface: [..., 2, bins, H, W], the array of that name, ages in seconds.
+        time_constant: seconds, above 0.
+
+    Returns:
+        float32 of the same shape, 0 to 1.
+    """
+    return time_surface.float().div(-time_constant).exp()
 
 
 def normalised(voxels: torch.Tensor) -> torch.Tensor:

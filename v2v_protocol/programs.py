@@ -25,6 +25,35 @@ COMPLETION = "V2V_COMPLETION"
 """Variable of the environment that asks for a shell's completion script in place of the command."""
 
 
+_OF_V2V = {
+    "bash": r"""
+_v2v() {
+  if ((COMP_CWORD == 1)); then
+    mapfile -t COMPREPLY < <(compgen -W "NAMES" -- "${COMP_WORDS[1]}")
+  else
+    COMP_WORDS=("v2v-${COMP_WORDS[1]}" "${COMP_WORDS[@]:2}")
+    ((COMP_CWORD--))
+    local function="_shtab_${COMP_WORDS[0]//-/_}"
+    declare -F "$function" > /dev/null && "$function"
+  fi
+}
+complete -o bashdefault -F _v2v v2v""",
+    "zsh": r"""
+_v2v() {
+  if ((CURRENT == 2)); then
+    compadd NAMES
+  else
+    shift words
+    words[1]="v2v-$words[1]"
+    ((CURRENT--))
+    _normal
+  fi
+}
+compdef _v2v v2v""",
+}
+"""How a shell completes `v2v`: the name of a command, then as that command's own script does."""
+
+
 # C0 and C1 controls, separators of lines, what changes the direction of text (Unicode 16, UAX 9), and surrogates that
 # stand for no byte.
 _STEERING = re.compile(
@@ -55,36 +84,29 @@ def open_standard_streams() -> None:
     sys.stdout, sys.stderr = (each or open(os.devnull, "w") for each in (sys.stdout, sys.stderr))  # noqa: SIM115
 
 
-def _program(name: str, module: str, function: str, extra: str) -> Program:
-    """Return a program whose modules are imported when it runs.
-
-    Args:
-        name: name of the command.
-        module, function: what it runs.
-        extra: the extra of the distribution that installs its imports.
-    """
-
-    def run() -> int | None:
-        before = signal.getsignal(signal.SIGINT)
-        if before is signal.default_int_handler:
-            signal.signal(signal.SIGINT, partial(_end_at_once, name))
-        try:
-            main = getattr(import_module(module), function)
-            signal.signal(signal.SIGINT, before or signal.SIG_DFL)
-            status: int | None = main()
-        except ModuleNotFoundError as error:
-            package = (error.name or "").partition(".")[0]
-            if package in _OURS:
-                raise
-            print(
-                f"{name}: needs the Python package {package}, which is not installed; the extra '{extra}' brings it: "
-                f"pip install '.[{extra}]' in a checkout of v2v-stream",
-                file=sys.stderr,
-            )
-            return 2
-        return status
-
-    return run
+def _run(name: str) -> int | None:
+    """Run a program of :data:`COMMANDS`, whose modules are imported now; return its exit status."""
+    module, extra, _ = COMMANDS[name]
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:
+        signal.signal(signal.SIGINT, partial(_end_at_once, f"v2v-{name}"))
+    try:
+        main = import_module(module).main
+        signal.signal(signal.SIGINT, before or signal.SIG_DFL)
+        status: int | None = main()
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in _OURS:
+            raise
+        if os.environ.get(COMPLETION):
+            return None  # a shell completes the commands that are installed
+        print(
+            f"v2v-{name}: needs the Python package {package}, which is not installed; the extra '{extra}' brings it: "
+            f"pip install '.[{extra}]' in a checkout of v2v-stream",
+            file=sys.stderr,
+        )
+        return 2
+    return status
 
 
 def _end_at_once(name: str, *_: object) -> None:
@@ -111,8 +133,7 @@ def __getattr__(name: str) -> Program:
     name = {"evaluate": "eval"}.get(name, name)
     if name not in COMMANDS:
         raise AttributeError(f"there is no program {name!r}")
-    module, extra, _ = COMMANDS[name]
-    return _program(f"v2v-{name}", module, "main", extra)
+    return partial(_run, name)
 
 
 def v2v() -> int | None:
@@ -120,10 +141,12 @@ def v2v() -> int | None:
     name, *rest = sys.argv[1:] or ["--help"]
     if name in COMMANDS:
         sys.argv = [f"v2v-{name}", *rest]
-        return __getattr__(name)()
+        return _run(name)
     if name == "completion" and rest in (["bash"], ["zsh"]):
         os.environ[COMPLETION] = rest[0]
-        return max(__getattr__(each)() or 0 for each in COMMANDS)
+        failed = any(map(_run, COMMANDS))
+        print("" if failed else _OF_V2V[rest[0]].replace("NAMES", " ".join(COMMANDS)))
+        return 2 if failed else 0
     if name in ("-h", "--help"):
         print(_USAGE)
         return 0

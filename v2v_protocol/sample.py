@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import html
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -26,6 +26,25 @@ BOX_COLUMNS = ("x0", "y0", "x1", "y1", "class", "track", "visible")
 Coordinates are continuous: pixel (row, column) covers column <= x < column + 1 and row <= y < row + 1. Class and track
 are whole numbers; a box without a track has -1. Rows without a box hold -1 in all columns."""
 ArrayForm: TypeAlias = Callable[[Recipe, str], tuple[str, tuple[int, ...]]]
+
+
+@dataclass(frozen=True, slots=True)
+class OfEvents:
+    """The form of an array that is made of the clip's events (``v2v_server/simulation/representations/``).
+
+    Attributes:
+        form: dtype and shape of one sample, by the spec's ``voxel_dtype``, the number of voxel grids, the bins of a
+            grid, and height and width of the picture.
+        in_seconds: whether it needs the time between frames, even if the recipe does not.
+        empty: value of the whole array in a sample whose video has no known frame rate, if it needs one.
+    """
+
+    form: Callable[[str, int, int, int, int], tuple[str, tuple[int, ...]]]
+    in_seconds: bool = False
+    empty: float = 0
+
+    def __call__(self, recipe: Recipe, voxel_dtype: str) -> tuple[str, tuple[int, ...]]:
+        return self.form(voxel_dtype, recipe.voxel_grids, recipe.bins, *recipe.crop_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +73,14 @@ class FromSidecar:
         return self.ending, *self.or_else
 
 
+_REAL = {"float32": "float32"}
+"""dtype of values that are no counts, by ``voxel_dtype``; float16 for the others."""
 ARRAYS: dict[str, ArrayForm] = {
-    "voxels": lambda recipe, voxel_dtype: (voxel_dtype, (recipe.voxel_grids, recipe.bins, *recipe.crop_px)),
-    "event_counts": lambda recipe, voxel_dtype: (
-        voxel_dtype, (recipe.voxel_grids, 2, recipe.bins, *recipe.crop_px)
-    ),
-    "voxels_bilinear": lambda recipe, voxel_dtype: (
-        "float32" if voxel_dtype == "float32" else "float16", (recipe.voxel_grids, recipe.bins, *recipe.crop_px)
+    "voxels": OfEvents(lambda dtype, *shape: (dtype, shape)),
+    "event_counts": OfEvents(lambda dtype, grids, *rest: (dtype, (grids, 2, *rest))),
+    "voxels_bilinear": OfEvents(lambda dtype, *shape: (_REAL.get(dtype, "float16"), shape)),
+    "time_surface": OfEvents(
+        lambda dtype, grids, *rest: (_REAL.get(dtype, "float16"), (grids, 2, *rest)), in_seconds=True, empty=math.inf
     ),
     "frames": lambda recipe, _: ("uint8", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
     "frames_rgb": lambda recipe, _: (
@@ -91,7 +111,8 @@ ARRAYS: dict[str, ArrayForm] = {
 event_counts are the negative (0) and positive (1) events of each bin: one array with an axis of polarity, because
 RVT's stacked histogram and the input of a spiking network are then views of it, with one name and one buffer. Its dtype
 is that of the voxels, so that ``counts[:, 1] - counts[:, 0]`` does not wrap. voxels_bilinear shares each event between
-the two bins next to its time (Zhu et al. 2019).
+the two bins next to its time (Zhu et al. 2019). time_surface is the age of a pixel's last negative (0) and positive (1)
+event at the end of each bin, seconds; infinity before its first one in the clip.
 
 frames_rgb are the frames in colour; frames_all are all frames that are simulated, the first included. boxes and masks
 belong to the frames of the same number. masks hold classes; 255 marks a sample without labels."""
@@ -216,13 +237,14 @@ class Provenance:
         scene: decisions from the statistics of its scene, and the figures behind them; empty with scene "off".
         saturated: as ``saturated_bins``, for other arrays by name; only those that have any.
         sidecars: fingerprints of the sidecars that its arrays were made from, by ending.
-        unlabelled: reason by array, for each requested array that could not be made from the video's sidecars.
+        unlabelled: reason by array, for each requested array that could not be made from the video or its sidecars.
         boxes_dropped: boxes that ``max_boxes`` left out, in all frames of the sample.
         grid_seconds: actual duration of each voxel grid, where the recipe states ``voxel_seconds``.
         left_out: effects of the draw that were not simulated (``tolerance`` of the spec); the others were.
         substeps: parts that the clip's steps were divided into along the motion, undivided steps included; 0: the spec
             states no ``substep_px``, so no motion was used.
         remark: what of the video is not served, or served with wrong grey levels; empty for most.
+        dropped: as ``boxes_dropped``, for other labels by name; only those that have any.
     """
 
     id: SampleId
@@ -245,10 +267,11 @@ class Provenance:
     left_out: tuple[str, ...] = ()
     substeps: int = 0
     remark: str = ""
+    dropped: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     @property
     def labelled(self) -> bool:
-        """Return whether all requested labels could be made."""
+        """Return whether all requested arrays could be made."""
         return not self.unlabelled
 
     def __repr__(self) -> str:
@@ -270,7 +293,7 @@ class Provenance:
         }
         optional = (
             "scene", "saturated", "sidecars", "unlabelled", "boxes_dropped", "grid_seconds", "left_out", "substeps",
-            "remark",
+            "remark", "dropped",
         )  # fmt: skip
         return {name: value for name, value in values.items() if value or name not in optional}
 
@@ -336,10 +359,14 @@ def sidecar_endings(arrays: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(sorted({ending for form in forms if isinstance(form, FromSidecar) for ending in form.endings}))
 
 
-def empty_value(name: str) -> int:
-    """Return the value of an array in a sample without its labels, see :class:`FromSidecar`."""
-    form = ARRAYS[name]
-    return form.empty if isinstance(form, FromSidecar) else 0
+def needs_seconds(arrays: Iterable[str]) -> bool:
+    """Return whether one of these arrays needs the time between frames, see :class:`OfEvents`."""
+    return any(getattr(ARRAYS[name], "in_seconds", False) for name in arrays)
+
+
+def empty_value(name: str) -> float:
+    """Return the value of an array in a sample for which it cannot be made: ``empty`` of its form."""
+    return float(getattr(ARRAYS[name], "empty", 0))
 
 
 def layout_bytes(layout: Layout) -> int:

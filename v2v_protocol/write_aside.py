@@ -101,16 +101,19 @@ def check_output(
             raise UsageError(f"{named}: unknown ending; give a name that ends in {', '.join(endings)}")
         if not path.parent.is_dir():
             raise UsageError(f"{named}: there is no folder {path.parent}; create it first")
-        # By the rights that writing will have, such as the capabilities of a user that is not root.
-        effective = os.access in os.supports_effective_ids
-        checked = (at for at in (path, path.parent) if at.exists())
-        locked = next((at for at in checked if not os.access(at, os.W_OK, effective_ids=effective)), None)
+        locked = next((at for at in (path, path.parent) if at.exists() and not is_writable(at)), None)
         if locked is not None:
             raise UsageError(f"{named}: {locked} is write-protected; give another name, or allow writing")
         if why := _input_reason(path.resolve(), inputs):
             raise UsageError(f"{named}: {why}; give another name")
     except (OSError, ValueError) as error:  # too long a name, a NUL in it, a share that has gone
         raise UsageError(f"{named}: {getattr(error, 'strerror', None) or error}") from error
+
+
+def is_writable(path: Path) -> bool:
+    """Return whether a file or folder can be written to."""
+    # By the rights that writing will have, such as the capabilities of a user that is not root.
+    return os.access(path, os.W_OK, effective_ids=os.access in os.supports_effective_ids)
 
 
 def _input_reason(path: Path, inputs: Iterable[str | os.PathLike[str]]) -> str:

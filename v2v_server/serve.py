@@ -136,11 +136,12 @@ def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None
             admits=None if is_open else OwnUser(_OWN_USER_RULE, log.say).admits,
         )
         opened.callback(sockets.close)
-        _serve(config, times, standbys, sockets, page, keys, label)
+        _serve(config, log, times, standbys, sockets, page, keys, label)
 
 
 def _serve(
     config: ServeConfig,
+    log: Log,
     times: StartTimes,
     standbys: list[Standby] | None,
     sockets: Sockets,
@@ -149,7 +150,6 @@ def _serve(
     label: str,
 ) -> None:
     """Open the catalogue and run the loop. Errors: see :func:`serve`."""
-    log = Log(is_json=config.log_format == "json")
     catalogue = load_catalogue(config)
     times.mark("catalogue")
     table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
@@ -185,7 +185,7 @@ def _serve(
     sockets.has_session = dispatcher.has_session
     with stop_on_signals(stop):
         pool = make_pool(config, catalogue.source, label, worker_flags, keys, standbys)
-        server = Server(config, catalogue, dispatcher, sockets, pool, quarantine_file, page=page, times=times)
+        server = Server(config, catalogue, dispatcher, sockets, pool, quarantine_file, page=page, times=times, log=log)
         try:
             if pool.is_local and (question := question_workers(config.most_workers, usable_cores())):
                 log.say(question, "warning")
@@ -214,6 +214,7 @@ class Server:
         clock: returns the time, seconds; None: a :class:`v2v_server.serve.Clock`.
         page: the status page; None: no page.
         times: see :func:`serve`.
+        log: where other threads write lines too; None: a new one.
     """
 
     def __init__(
@@ -227,10 +228,11 @@ class Server:
         clock: Callable[[], float] | None = None,
         page: PageProcess | None = None,
         times: StartTimes | None = None,
+        log: Log | None = None,
     ) -> None:
         self._page = page
         self._times = times or StartTimes()
-        self._log = Log(is_json=config.log_format == "json")
+        self._log = log or Log(is_json=config.log_format == "json")
         self._config = config
         self._catalogue = catalogue
         self._dispatcher = dispatcher
@@ -418,8 +420,8 @@ class Server:
         """End the process of a hung worker, if it is one of ours."""
         name = self._name(hopeless.identity)
         loss = self._pool.give_up(name, hopeless.reason) or Loss(Cause.UNEXPLAINED, hopeless.reason, for_all=False)
-        text = f"worker {clean_name(name.decode())} {hopeless.reason}: {loss.text}; its leases go to other workers"
-        self._say(text, "warning")
+        happened = ": ".join(dict.fromkeys((hopeless.reason, loss.text)))
+        self._say(f"worker {clean_name(name.decode())} {happened}; its leases go to other workers", "warning")
         return loss
 
     def _name(self, identity: bytes) -> bytes:
@@ -459,7 +461,7 @@ class Server:
             workers = "" if worker_address.startswith("ipc:") else f", workers to {worker_address}"
             self._say(f"ready: consumers connect to {address}{workers}", address=address)
             if self._config.port_file:
-                write_port_file(self._config.port_file, address)
+                write_file(Path(self._config.port_file), address + "\n", "--port-file")
                 self._port_file = Path(self._config.port_file)
             self._publisher.is_ready = True
             self._times.mark("first worker")
@@ -478,7 +480,6 @@ class Server:
             sample: the request that the line is about.
             about: additional fields for programs.
         """
-        self._view.interrupt()
         identity = None if sample is None or not self._log.is_json else self._dispatcher.identity_of(sample)
         if identity is not None:
             about["sample"] = asdict(identity)
@@ -524,15 +525,6 @@ def stop_on_signals(stop: threading.Event) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def write_port_file(file: str, address: str) -> None:
-    """Write the address in one step, so that readers see the whole content or no file.
-
-    Raises:
-        UsageError: the file cannot be written.
-    """
-    write_file(Path(file), address + "\n", "--port-file")
 
 
 def utc_now() -> str:

@@ -20,6 +20,7 @@ from v2v_server.corpus.scenes.findings import Defect
 from v2v_server.corpus.scenes.picture_check import CHANGES, hides_motion
 from v2v_server.motion.prediction import SUBSTEP_PX, Prediction, predict
 from v2v_server.schedule.sequences import VideoSequence
+from v2v_server.simulation.effects import NOISE
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.view import apply_view, without_margin
 from v2v_server.system.compile_cache import cv2
@@ -38,8 +39,7 @@ _MOST_CLIPS = 4
 """Clips that are decoded for it."""
 _ENOUGH = 0.25
 """A camera is worth showing that has this share of the events of the best one."""
-_STORED_FRAMES = 16
-_NOISE = ("noise_sigma", "hot_pixel_share", "shot_noise_hz", "leak_hz")
+_NOISE = ("noise_sigma", "hot_pixel_share", *NOISE)
 
 
 def noise_free(recipe: Recipe) -> Recipe:
@@ -266,5 +266,5 @@ def noise_rate(params: SampleParams, step_seconds: float) -> float:
         (threshold / sigma) ** 2 steps on average.
     """
     share = params.noise_sigma / min(params.threshold_pos, params.threshold_neg)
-    hertz = sum(float(params.effects.get(name, 0.0)) for name in ("shot_noise_hz", "leak_hz"))
+    hertz = sum(float(params.effects.get(name, 0.0)) for name in NOISE)
     return share**2 / (1.0 + share) + hertz * step_seconds

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
-from v2v_protocol.spec_flags import add_spec, recipe_setting, spec_fields
+from v2v_protocol.spec_flags import add_corpus, add_spec, recipe_setting, spec_fields
 from v2v_tools.event_files import EVENT_WRITERS
 from v2v_tools.remake import simulate_to_file
 
@@ -36,9 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         metavar="N",
         help="number of the quarantine snapshot in the sample's provenance",
     )
-    which.add_argument("--cache-dir", metavar="DIR", help="folder of catalogue index and quarantine, as for the server")
-    which.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
-    which.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
+    add_corpus(parser, "Which sample")
     out = parser.group("Output")
     parser.add_output(
         "Output", "--out", (".npz",), "output file for the arrays and the provenance (JSON)", required=True

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from v2v_client.representations import event_count_image, normalised, stacked_histogram
+from v2v_client.representations import event_count_image, exponential_surface, normalised, stacked_histogram
 
 
 @pytest.fixture
@@ -45,3 +45,12 @@ def test_normalised_voxels_have_mean_0_and_deviation_1_where_they_are_not_zero()
 @pytest.mark.parametrize("shape", [(5, 9, 7), (5, 64, 64)])
 def test_equal_voxels_that_are_not_whole_become_0(shape: tuple[int, int, int]) -> None:
     assert not normalised(torch.full(shape, 0.1)).any()
+
+
+def test_an_exponential_surface_by_hand() -> None:
+    """1 at an event, 1/e after a time constant, 0 where there was none."""
+    ages = torch.tensor([0.0, 0.05, 0.1, torch.inf], dtype=torch.float16).reshape(2, 1, 1, 2)
+    found = exponential_surface(ages, 0.05)
+    assert found.dtype == torch.float32
+    assert found.shape == ages.shape
+    torch.testing.assert_close(found.flatten(), torch.tensor([1.0, 0.36788, 0.13534, 0.0]), rtol=1e-3, atol=0.0)

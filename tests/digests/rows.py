@@ -99,6 +99,8 @@ PORTABLE: Mapping[str, Row] = {
     "start at zero": Row(FINE | {"start": "zero"}),
     "event_counts": Row(FINE, ("event_counts",)),
     "voxels_bilinear": Row(FINE, ("voxels_bilinear",)),
+    "time_surface": Row(FINE, ("time_surface", "voxels")),
+    "time_surface of effects": Row("davis346", ("time_surface",), {"voxel_dtype": "float32"}),
     "frames_rgb": Row({}, ("frames_rgb",)),
     "frames_u16": Row({}, ("frames_u16",)),
     "frames_all": Row({"pause_probability": 0.2}, ("frames_all",)),

@@ -130,6 +130,24 @@ def test_a_stopped_worker_changes_nothing(
     assert (tmp_path / "done").exists()
 
 
+@pytest.mark.parametrize("stage", ["simulate", "send"])
+def test_a_worker_that_loses_its_connection_is_replaced(
+    monkeypatch: pytest.MonkeyPatch, clips: Path, tmp_path: Path, cache: Path, reference: list[str], stage: str
+) -> None:
+    """Its confinement lets it open no other one; its server is alive, so it does not end with it."""
+    once = tmp_path / "done"
+    flags = ("--cache-dir", str(cache))
+    with _faulty(monkeypatch, clips, *flags, stage=stage, action="disconnect", once=str(once)) as server:
+        assert server.pid is not None
+        first = {worker.pid for worker in server_workers(server.pid)}
+        assert [digest(batch) for batch in epoch_of(server.address)] == reference
+        assert once.exists()
+        until(lambda: len(first & {worker.pid for worker in server_workers(server.pid)}) == 1)
+        until(lambda: len(server_workers(server.pid)) == 2)
+        assert [digest(batch) for batch in epoch_of(server.address)] == reference
+    assert not list(cache.rglob("quarantine*.jsonl"))
+
+
 @pytest.mark.parametrize(
     ("stage", "action"), [("decode", "SIGSEGV"), ("simulate", "SIGABRT"), ("send", "SIGBUS"), ("decode", "hang")]
 )

@@ -5,7 +5,7 @@
 The kernel does not show its residual, so ``dense.trace`` goes through the clip again, in the arithmetic the kernel
 chose, and has to come to the very same counts. Its residual closes the balance. The right side is summed without error:
 log intensities cancel but for the first and last, thresholds and counts multiply as fractions, normals add by ``fsum``.
-What is left must be below ``error_bound``.
+What is left must be below ``noise.error_bound``.
 """
 
 from __future__ import annotations
@@ -19,19 +19,15 @@ import numpy as np
 import numpy.typing as npt
 
 from tests.oracles.dense import Trace, trace
-from tests.oracles.noise import standard_normals, start_uniforms
-from v2v_protocol.bounds import most_events
-from v2v_server.simulation import noise, simulate, simulate_log
+from tests.oracles.noise import error_bound, standard_normals, start_uniforms
+from v2v_protocol.recipe import most_events
+from v2v_server.simulation import simulate, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.intensity import log_table, log_table_float64
+from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.precision import AUTO, Real, choose, noise_sum
 from v2v_server.simulation.voxel import rounding_tolerance
 from v2v_server.video.luma import SDR, Signal
-
-
-def error_bound(real: Real, events: float, smaller_threshold: float) -> float:
-    """Return the largest error of a pixel's events and residual, log units, given exact change and noise."""
-    return 4.0 * float(np.finfo(real).eps) * events * smaller_threshold
 
 
 @dataclass(frozen=True)
@@ -138,7 +134,7 @@ def trace_of(camera: Camera, frames: npt.NDArray[Any], real: Real) -> Trace:
     if camera.noise_sigma > 0.0:
         noisy = standard_normals(key, steps, pixels).astype(real) * real(camera.noise_sigma)
     hot = np.zeros(pixels, real)
-    position, normal = noise.hot_pixels(key, camera.hot_pixel_count, pixels)
+    position, normal = hot_pixels(key, camera.hot_pixel_count, pixels)
     hot[position] = normal.astype(real) * real(camera.hot_pixel_sigma)
     positive, negative = real(camera.threshold_pos), real(camera.threshold_neg)
     start = start_uniforms(key, pixels).astype(real) * (positive + negative) - negative
@@ -152,7 +148,7 @@ def imbalance(camera: Camera, frames: npt.NDArray[Any], seen: Trace) -> float:
     ends = frames[[0, -1]].reshape(2, pixels)
     level = log_table_float64(camera.gamma, camera.log_eps, camera.signal)[ends] if frames.dtype.kind == "u" else ends
     normals = standard_normals(key, steps, pixels).astype(np.float64) if camera.noise_sigma else None
-    position, hot_normal = noise.hot_pixels(key, camera.hot_pixel_count, pixels)
+    position, hot_normal = hot_pixels(key, camera.hot_pixel_count, pixels)
     hot = np.zeros(pixels)
     hot[position] = hot_normal
     real = seen.counts.dtype.type

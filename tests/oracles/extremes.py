@@ -19,12 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from tests.oracles import extremes_in_time as in_time
-from tests.oracles.balance import Camera, balance, error_bound, imbalance, trace_of
+from tests.oracles.balance import Camera, balance, imbalance, trace_of
 from tests.oracles.dense import trace
-from tests.oracles.noise import standard_normals
-from v2v_protocol.bounds import most_events
+from tests.oracles.noise import error_bound, mix, standard_normals, words
 from v2v_protocol.errors import RecipeError, UsageError
-from v2v_protocol.recipe import Recipe, preset
+from v2v_protocol.recipe import Recipe, most_events, preset
 from v2v_protocol.spec import StreamSpec
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.draw import draw, noise_key_of_seed
@@ -119,11 +118,11 @@ def balanced(camera: Camera, frames: npt.NDArray[Any]) -> Finding:
 def refused(error: type[UsageError], *calls: tuple[Callable[[], object], Sequence[str]]) -> Finding:
     """Count the calls that do not raise exactly that error with all words in its message; other errors pass through."""
     wrong = []
-    for number, (call, words) in enumerate(calls):
+    for number, (call, texts) in enumerate(calls):
         try:
             call()
         except error as refusal:
-            if type(refusal) is error and all(word in str(refusal) for word in words):
+            if type(refusal) is error and all(word in str(refusal) for word in texts):
                 continue
             wrong.append(f"{number}: {refusal}")
         else:
@@ -179,11 +178,9 @@ def large_frames() -> Finding:
         noise_sigma=camera.noise_sigma, bins=1, seed=camera.seed,
     ).voxels.ravel()  # fmt: skip
     place = np.union1d(np.arange(0, pixels, 101), np.arange(pixels - 4096, pixels))
-    radius, angle, begin = (
-        noise.words(key, use, place) for use in (noise.PIXEL_RADIUS, noise.PIXEL_ANGLE, noise.START)
-    )
-    pair = [noise.words(key, use, 0) for use in (noise.PAIR_RADIUS, noise.PAIR_ANGLE)]
-    normal, _ = noise.box_muller(*noise.mix(radius ^ pair[0], angle ^ pair[1]))
+    radius, angle, begin = (words(key, use, place) for use in (noise.PIXEL_RADIUS, noise.PIXEL_ANGLE, noise.START))
+    pair = [words(key, use, 0) for use in (noise.PAIR_RADIUS, noise.PAIR_ANGLE)]
+    normal, _ = noise.box_muller(*mix(radius ^ pair[0], angle ^ pair[1]))
     level = log_table(camera.gamma, camera.log_eps)[frames[:, place]]
     positive, negative = np.float32(camera.threshold_pos), np.float32(camera.threshold_neg)
     start = (begin >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24) * (positive + negative) - negative

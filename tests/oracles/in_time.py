@@ -75,6 +75,18 @@ def bilinear_of(times: Doubles, signs: Doubles, begin: float, end: float, bins: 
     return np.asarray((weight * np.asarray(signs)).sum(axis=1))
 
 
+def ages_of(seen: Seen, edges: Doubles) -> Doubles:
+    """Return the age of the last negative and positive event at the end of each bin: [2, bins], infinity without one.
+
+    An event at an edge belongs to the bin before.
+    """
+    times, signs = np.array(seen.times), np.array(seen.signs)
+    ages = [
+        [end - max(times[(signs == sign) & (times <= end)], default=-math.inf) for end in edges[1:]] for sign in (-1, 1)
+    ]
+    return np.array(ages)
+
+
 def stacked_histogram(
     x: npt.NDArray[np.int64], y: npt.NDArray[np.int64], polarity: npt.NDArray[np.int64], time: npt.NDArray[np.int64],
     bins: int, height: int, width: int, cutoff: int | None = None,

@@ -167,7 +167,7 @@ def test_the_null_device_takes_the_place_of_a_closed_stream() -> None:
 
 def test_ctrl_c_while_modules_are_imported_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text("print('importing', flush=True)\nimport time\ntime.sleep(60)\n")
-    script = "from v2v_protocol import programs; programs._program('v2v-x', 'slow', 'main', 'server')()"
+    script = "from v2v_protocol import programs; programs.COMMANDS['x'] = ('slow', 'server', ''); programs.x()"
     with subprocess.Popen(
         [sys.executable, "-c", script],
         stdout=subprocess.PIPE,
@@ -202,11 +202,53 @@ def test_one_door_lists_all_commands_and_runs_them(
     assert "did you mean 'serve'" in said
 
 
-def test_shells_complete_the_flags(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")
+def completion() -> str:
+    """The script of bash."""
     pytest.importorskip("shtab")
+    command = [
+        sys.executable,
+        "-c",
+        "import v2v_protocol.programs as p; raise SystemExit(p.v2v())",
+        "completion",
+        "bash",
+    ]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def test_shells_complete_the_flags(completion: str) -> None:
+    registered = subprocess.run(
+        ["bash", "-c", f"{completion}\ncomplete -p"], capture_output=True, text=True, check=True
+    ).stdout
+    for name in ("v2v", *(f"v2v-{each}" for each in programs.COMMANDS)):
+        assert re.search(rf" {name}$", registered, re.M), name
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("v2v pre", {"prepare", "preview"}),
+        ("v2v preview --see", {"--seed", "--seeds"}),
+        ("v2v prepare --size fa", {"fast"}),
+        ("v2v nothing --see", set()),
+    ],
+)
+def test_bash_completes_commands_after_v2v(words: str, expected: set[str], completion: str) -> None:
+    given = words.split()
+    asked = (
+        f"{completion}\nCOMP_WORDS=({words}) COMP_CWORD={len(given) - 1}\n_v2v\nprintf '%s\\n' \"${{COMPREPLY[@]}}\""
+    )
+    done = subprocess.run(["bash", "-c", asked], capture_output=True, text=True, check=False)
+    assert (set(done.stdout.split()), done.stderr) == (expected, "")
+
+
+def test_completion_leaves_out_commands_that_are_not_installed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(programs.COMPLETION, "")
-    status, script, _ = run_v2v("completion", "bash", capsys=capsys, monkeypatch=monkeypatch)
-    assert status == 0
-    for name in programs.COMMANDS:
-        assert f"v2v-{name}\n" in script
-    assert subprocess.run(["bash", "-n"], input=script, text=True, check=False).returncode == 0
+    missing = dict.fromkeys(programs.COMMANDS, ("not_installed.here", "server", "")) | {"top": programs.COMMANDS["top"]}
+    monkeypatch.setattr(programs, "COMMANDS", missing)
+    status, script, said = run_v2v("completion", "bash", capsys=capsys, monkeypatch=monkeypatch)
+    assert (status, said) == (0, "")
+    assert "_shtab_v2v_top()" in script
+    assert script.rstrip().endswith("v2v")

@@ -44,10 +44,10 @@ def test_another_number_of_workers_and_the_way_samples_travel_change_nothing(
 
 
 def test_events_in_time_are_the_same_however_they_travel(server: LocalServer, clips: Path) -> None:
-    """Event counts, bilinear voxels and grids within a step, by shared memory, by network, and made again."""
+    """All arrays made of events, and grids within a step, by shared memory, by network, and made again."""
     recipe = {"preset": "davis346", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}
     recipe |= {"grids_per_frame": 2, "bins": 3}
-    arrays = ("voxels", "event_counts", "voxels_bilinear", "frames")
+    arrays = ("voxels", "event_counts", "voxels_bilinear", "time_surface", "frames")
     got = []
     for shared in (True, False):
         with V2VStreamDataset(

@@ -12,7 +12,12 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PAGES = ("README.md", "docs/index.md", "docs/guides/train-your-network.md", "docs/guides/look.md")
+PAGES = (
+    "README.md",
+    "docs/index.md",
+    "docs/flow.md",
+    *(f"docs/guides/{name}.md" for name in ("train-your-network", "look", "detection")),
+)
 THEIR_OWN = """\
 import os
 from collections.abc import Callable
@@ -26,6 +31,7 @@ from v2v_client import V2VStreamDataset
 network: torch.nn.Module
 loss_of: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 frames: npt.NDArray[np.uint8]
+pictures: torch.Tensor
 """
 _BLOCK = re.compile(r"^```python\n(.*?)^```$", re.M | re.S)
 

@@ -14,7 +14,7 @@ from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
 from v2v_server.simulation import simulate
-from v2v_server.simulation.result import Voxels
+from v2v_server.simulation.kernels import Voxels
 from v2v_tools import simulate as command
 from v2v_tools.event_files import EVENT_WRITERS, write_events
 

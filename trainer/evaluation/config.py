@@ -14,7 +14,7 @@ Its keys:
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -164,7 +164,7 @@ def _list(value: Any, where: str) -> list[Any]:
     return value
 
 
-def _known(value: Any, names: tuple[str, ...], where: str) -> tuple[str, ...]:
+def _known(value: Any, names: Collection[str], where: str) -> tuple[str, ...]:
     entries = value if isinstance(value, list) else [value]
     unknown = [entry for entry in entries if entry not in names]
     if unknown:

@@ -42,12 +42,22 @@ FlowImage = npt.NDArray[np.float32]
 
 HOOD_ROW = 190
 LARGE_PX = 3.0
-_TITLES = {"aee_dense": "AEE", "aee_sparse": "AEE sparse", "3pe_dense": "3PE %", "3pe_sparse": "3PE % sparse"}
+FLOW_METRICS: dict[str, tuple[str, Callable[[FlowImage], float]]] = {
+    "aee": ("AEE", lambda error: float(error.mean())),
+    "3pe": ("3PE %", lambda error: 100 * float((error > LARGE_PX).mean())),
+}
+"""Title and definition of each metric, from the error of the pixels that count, [n] px; each has two scores."""
+
+
+def titles() -> dict[str, str]:
+    """Return the titles of all scores by name: each metric of the dense pixels, then of the sparse ones."""
+    kinds = ("dense", ""), ("sparse", " sparse")
+    return {f"{name}_{kind}": title + more for name, (title, _) in FLOW_METRICS.items() for kind, more in kinds}
 
 
 @dataclass
 class FlowScore:
-    """Average the scores over the windows of a sequence, by the names of :data:`_TITLES`. 3PE is in per cent."""
+    """Average the scores over the windows of a sequence, by the names of :func:`titles`. 3PE is in per cent."""
 
     as_published: bool
     windows: int = 0
@@ -67,19 +77,15 @@ class FlowScore:
         known[rows:] = False
         error = np.hypot(*np.where(known, prediction - truth, 0))
         for kind, counted in (("dense", known), ("sparse", known & events)):
-            if counted.any():
-                aee, large = float(error[counted].mean()), float((error[counted] > LARGE_PX).mean())
-            elif self.as_published:
-                aee = large = 0.0
-            else:
-                continue
-            self._values.setdefault(f"aee_{kind}", []).append(aee)
-            self._values.setdefault(f"3pe_{kind}", []).append(100 * large)
+            for name, (_, metric) in FLOW_METRICS.items():
+                if counted.any() or self.as_published:
+                    score = metric(error[counted]) if counted.any() else 0.0
+                    self._values.setdefault(f"{name}_{kind}", []).append(score)
 
     @property
     def means(self) -> dict[str, float]:
         """Return the means by name. Scores without any counted pixel in any window are left out."""
-        return {name: float(np.mean(self._values[name])) for name in _TITLES if name in self._values}
+        return {name: float(np.mean(self._values[name])) for name in titles() if name in self._values}
 
 
 @dataclass(frozen=True)
@@ -163,7 +169,7 @@ def _draw(path: Path, grid: npt.NDArray[np.float32], truth: FlowImage, predictio
 def flow_table(name: str, scores: Mapping[str, Mapping[str, FlowScore]], compared: Sequence[str]) -> Table:
     """Format a block of rows per sequence: network, zeros, and the paper's values."""
     rows = Table(title=escape(name), title_justify="left")
-    for column in ("sequence", "windows", *_TITLES.values()):
+    for column in ("sequence", "windows", *titles().values()):
         rows.add_column(column, justify="left" if column == "sequence" else "right", no_wrap=True)
     for sequence, found in scores.items():
         for predictor, score in found.items():
@@ -177,7 +183,7 @@ def flow_table(name: str, scores: Mapping[str, Mapping[str, FlowScore]], compare
 
 
 def _numbers(values: Mapping[str, float]) -> list[str]:
-    return [f"{values[name]:.3f}" if math.isfinite(values.get(name, math.nan)) else "-" for name in _TITLES]
+    return [f"{values[name]:.3f}" if math.isfinite(values.get(name, math.nan)) else "-" for name in titles()]
 
 
 def flow_records(

@@ -1,4 +1,4 @@
-"""Compute distances between a reconstruction and the picture of the sensor.
+"""Compute distances between a reconstruction and the picture of the sensor. A metric is one entry of METRICS.
 
 | name | definition |
 |---|---|
@@ -22,6 +22,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -35,9 +36,21 @@ from v2v_protocol.errors import UsageError
 GreyImage = npt.NDArray[np.float64]
 Metric = Callable[[GreyImage, GreyImage], float]
 
+LpipsFiles = Mapping[str, tuple[str | Path, str | Path]]
+"""Files of backbone and heads by network."""
 SSIM_WINDOW_PX = 7
-LPIPS_METRICS = {f"lpips_{net}": net for net in BACKBONES}
-METRICS = ("mse", "ssim_range2", "ssim", "correlation", *LPIPS_METRICS)
+
+
+class MetricEntry(NamedTuple):
+    """A metric that can be asked for.
+
+    Attributes:
+        title: of its column in tables.
+        make: build it from the files of LPIPS and the PyTorch device.
+    """
+
+    title: str
+    make: Callable[[LpipsFiles, str], Metric]
 
 
 def mse(prediction: GreyImage, target: GreyImage) -> float:
@@ -66,9 +79,18 @@ def ssim(prediction: GreyImage, target: GreyImage, *, data_range: float) -> floa
     return float(similarity)
 
 
-def lpips_metric(net: str, backbone: str | Path, heads: str | Path, device: str = "cpu") -> Metric:
-    """Create LPIPS with weights from files, see :meth:`trainer.losses.lpips.LPIPS.from_files`."""
-    network = LPIPS.from_files(net, backbone, heads).to(device)
+def lpips_metric(net: str, files: LpipsFiles, device: str = "cpu") -> Metric:
+    """Create LPIPS with weights from files, see :meth:`trainer.losses.lpips.LPIPS.from_files`.
+
+    Raises:
+        UsageError: the network has no files.
+    """
+    if net not in files:
+        raise UsageError(
+            f"lpips_{net} needs weights that this project does not contain: give --lpips {net} BACKBONE HEADS "
+            f"(backbone: {BACKBONES[net].weights_from}, heads: {net}.pth of LPIPS v0.1), or leave it out with --metrics"
+        )
+    network = LPIPS.from_files(net, *files[net]).to(device)
 
     def distance(prediction: GreyImage, target: GreyImage) -> float:
         pair = [torch.from_numpy(picture.astype(np.float32))[None].to(device) for picture in (prediction, target)]
@@ -78,9 +100,17 @@ def lpips_metric(net: str, backbone: str | Path, heads: str | Path, device: str 
     return distance
 
 
-def make_metrics(
-    names: Sequence[str], lpips_files: Mapping[str, tuple[str | Path, str | Path]], device: str = "cpu"
-) -> dict[str, Metric]:
+METRICS: dict[str, MetricEntry] = {
+    "mse": MetricEntry("MSE", lambda *_: mse),
+    "ssim_range2": MetricEntry("SSIM (range 2)", lambda *_: functools.partial(ssim, data_range=2.0)),
+    "ssim": MetricEntry("SSIM", lambda *_: functools.partial(ssim, data_range=1.0)),
+    "correlation": MetricEntry("correlation", lambda *_: correlation),
+    **{f"lpips_{net}": MetricEntry(f"LPIPS {net}", functools.partial(lpips_metric, net)) for net in BACKBONES},
+}
+"""All metrics by name."""
+
+
+def make_metrics(names: Sequence[str], lpips_files: LpipsFiles, device: str = "cpu") -> dict[str, Metric]:
     """Create metrics by name.
 
     Args:
@@ -91,21 +121,7 @@ def make_metrics(
     Raises:
         UsageError: a name is unknown, or LPIPS has no files.
     """
-    metrics: dict[str, Metric] = {}
     for name in names:
         if name not in METRICS:
             raise UsageError(f"metric {name!r}: give some of {', '.join(METRICS)}")
-        if name in ("mse", "correlation"):
-            metrics[name] = mse if name == "mse" else correlation
-        elif name in LPIPS_METRICS:
-            net = LPIPS_METRICS[name]
-            if net not in lpips_files:
-                raise UsageError(
-                    f"{name} needs weights that this project does not contain: give --lpips {net} BACKBONE HEADS "
-                    f"(backbone: {BACKBONES[net].weights_from}, heads: {net}.pth of LPIPS v0.1), or leave it out with "
-                    "--metrics"
-                )
-            metrics[name] = lpips_metric(net, *lpips_files[net], device)
-        else:
-            metrics[name] = functools.partial(ssim, data_range=2.0 if name == "ssim_range2" else 1.0)
-    return metrics
+    return {name: METRICS[name].make(lpips_files, device) for name in names}

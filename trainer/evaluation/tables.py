@@ -12,19 +12,10 @@ from rich.table import Table
 
 from trainer.evaluation import paper
 from trainer.evaluation.data_sets import DataSet
+from trainer.evaluation.metrics import METRICS
 from trainer.evaluation.score import SequenceScore, mean_over_sequences
 from v2v_protocol.errors import UsageError
 from v2v_protocol.write_aside import write_aside_and_rename
-
-_TITLES = {
-    "mse": "MSE",
-    "ssim_range2": "SSIM (range 2)",
-    "ssim": "SSIM",
-    "correlation": "correlation",
-    "lpips_alex": "LPIPS alex",
-    "lpips_squeeze": "LPIPS squeeze",
-    "lpips_vgg": "LPIPS vgg",
-}
 
 
 def table(data_set: DataSet, scores: Sequence[SequenceScore], compared: Sequence[str]) -> Table:
@@ -40,7 +31,7 @@ def table(data_set: DataSet, scores: Sequence[SequenceScore], compared: Sequence
     rows.add_column("sequence", no_wrap=True)
     rows.add_column("frames", justify="right")
     for name in names:
-        rows.add_column(_TITLES[name], justify="right")
+        rows.add_column(METRICS[name].title, justify="right")
     for score in scores:
         rows.add_row(escape(score.sequence), str(score.frames), *(_number(score.means, name) for name in names))
     if not names:

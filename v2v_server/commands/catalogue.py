@@ -14,6 +14,7 @@ from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress, format_duration
 from v2v_protocol.spec import SCENES
+from v2v_protocol.spec_flags import add_corpus
 from v2v_server.corpus.ahead import Ahead, Part, catalogue_ahead, catalogue_shard
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.index import Shard
@@ -40,12 +41,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     videos.add_argument(
         "--videos", required=True, metavar="DIR", help="folder, video, list file, or s3://bucket/prefix"
     )
-    videos.add_argument("--list", metavar="FILE", help="list file (path frames c+ c-) that restricts --videos")
-    videos.add_argument("--rows", default="full", metavar="ROWS", help="rows to analyse with --scene (default full)")
+    add_corpus(parser, "Videos, as for v2v-serve")
     videos.add_argument(
         "--scene", choices=SCENES, default="off", help="auto: also compute the statistics that --scene auto needs"
     )
-    videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     videos.add_argument("--copies", metavar="DIR", help="folder that videos are fetched to from object storage")
     videos.add_argument(
         "--copies-gib",

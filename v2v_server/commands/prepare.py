@@ -19,11 +19,13 @@ from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec import SCENES
+from v2v_protocol.spec_flags import add_corpus
 from v2v_protocol.write_aside import write_json
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
 from v2v_server.prepare.report import Report
+from v2v_server.prepare.resume import check_destination
 from v2v_server.store.packing import DEFAULT_SIZE, SIZES
 from v2v_server.store.planes import OPTIONAL, PLANES
 from v2v_server.system.process import usable_cores
@@ -46,17 +48,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     videos = parser.group("Videos")
     videos.add_argument("source", metavar="SRC", help="folder of videos, a video, or a list file; never written to")
     videos.add_argument("destination", metavar="DST", help="folder to create, or to continue after an interruption")
-    videos.add_argument(
-        "--rows", default="full", metavar="ROWS", help="rows to keep: full (default), top:0.54 (WebVid)"
-    )
-    videos.add_argument("--list", metavar="FILE", help="list file (path frames c+ c-) that restricts SRC")
+    add_corpus(parser, "Videos")
     videos.add_argument(
         "--scene",
         choices=SCENES,
         default="off",
         help="auto: also compute the statistics that v2v-serve --scene auto uses",
     )
-    videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     stored = parser.group("Files")
     stored.add_argument(
         "--size", choices=tuple(SIZES), default=DEFAULT_SIZE,
@@ -83,6 +81,10 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.workers < 1:
         raise UsageError(f"--workers {arguments.workers}: give at least 1")
     started = time.monotonic()
+    source = Path(arguments.source).absolute()
+    single = source.is_file() and source.suffix.lower() not in LIST_SUFFIXES
+    folder = source.parent if source.is_file() else source
+    check_destination(Path(arguments.destination).resolve(), folder.resolve(), single)  # probing may take hours
     with Progress("probing videos") as probing:
         catalogue = open_catalogue(
             arguments.source,
@@ -101,7 +103,7 @@ def _run(arguments: argparse.Namespace) -> int:
             processes=arguments.workers,
             scene=arguments.scene != "off",
             planes=tuple(dict.fromkeys(arguments.planes)),
-            single=_is_video(Path(arguments.source)),
+            single=single,
             progress=lambda done, total, made, expected: shown(done, total, _size(made, expected)),
         )
     for line in summary(report, arguments.size, time.monotonic() - started):
@@ -117,10 +119,6 @@ def _run(arguments: argparse.Namespace) -> int:
         ]
         write_json(arguments.json, records)
     return 0 if report.complete else FAILED
-
-
-def _is_video(source: Path) -> bool:
-    return source.is_file() and source.suffix.lower() not in LIST_SUFFIXES
 
 
 def summary(report: Report, size: str, seconds: float) -> list[str]:

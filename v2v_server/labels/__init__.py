@@ -1,7 +1,5 @@
 """Labels of a video, read from the files beside it, and how a virtual camera sees them.
 
-boxes    the boxes of one video, whatever file they come from
-formats  readers of COCO-VID, MOT and YOLO files
-masks    class masks, a PNG file for each frame
+formats  the boxes of one video, and readers of COCO-VID, MOT and YOLO files; class masks
 views    crop, resize and mirror boxes and masks like the pictures
 """

@@ -1,4 +1,4 @@
-"""Read boxes from the files of three common formats. All errors are ValueErrors that name the line or entry.
+"""Read boxes from the files of three common formats, and masks. All errors are ValueErrors that name the line or entry.
 
     .boxes.json  COCO-VID, of one video: ``frame_id`` counts from 0; each image is an annotated frame. Without it the
                  digits at the end of ``file_name`` are the frame. ``attributes`` may hold the track, as CVAT writes it
@@ -9,6 +9,12 @@
 In MOT and YOLO files a frame without a line has no objects. Entries marked to be ignored (``iscrowd`` or ``ignore`` of
 COCO, seventh column 0 of MOT) are left out.
 
+Coordinates of boxes are px of the upright picture, continuous: pixel (row, column) covers column <= x < column + 1.
+Frames count from 0 in presentation order.
+
+    .masks/      class masks: a PNG file a frame, whose grey levels or palette indices are the classes; the digits at
+                 the end of the name are the frame, from 0
+
 A reader cannot tell everything from the file: :func:`check_labels` compares all labels of a video with the video.
 """
 
@@ -17,16 +23,21 @@ from __future__ import annotations
 import codecs
 import io
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources.abc import Traversable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from v2v_protocol.safe_json import parse_json
-from v2v_server.labels.boxes import NO_TRACK, Box, BoxTable, checked
-from v2v_server.labels.masks import read_mask
 
+NO_TRACK = -1
+LARGEST_NUMBER = 2**24 - 1
+"""Largest class and track: float32 holds all whole numbers up to here."""
+_LARGEST_FRAME = 2**40
+_LARGEST_PX = 1e6
 _LARGEST_BYTES = 64 << 20
 """Limit of a file of boxes. Reading one takes up to 15 s and 1 GiB."""
 _MOT_COLUMNS = "frame, track, left, top, width, height, confidence, class, visibility"
@@ -37,6 +48,84 @@ _ROBOFLOW = re.compile(r"_(jpe?g|png|bmp|webp)\.rf\.\w+(?=\.\w+$)", re.IGNORECAS
 """What Roboflow adds to a name; its hash may end with digits."""
 _NO_FRAME = re.compile(r"(\w*classes|labels|labelmap|\w*names|notes|readme.*|train|val|valid|test)\.txt", re.IGNORECASE)
 """Texts that label tools write beside those of the frames."""
+_GREY, _PALETTE = 0, 3
+"""Colour types of a PNG file, its byte 25; byte 24 is the number of bits."""
+
+
+class Box(NamedTuple):
+    """One box of one frame.
+
+    Attributes:
+        frame: from 0.
+        left, top, width, height: px.
+        category: class, from 0.
+        track: from 0, or NO_TRACK.
+    """
+
+    frame: int
+    left: float
+    top: float
+    width: float
+    height: float
+    category: int
+    track: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoxTable:
+    """All boxes of a video, ordered by frame.
+
+    Attributes:
+        frames: [n] int64, ascending.
+        corners: [n, 4] float64: x0, y0, x1, y1, px.
+        numbers: [n, 2] int64: class and track.
+        annotated: frames that have labels, with boxes or without; None: all frames.
+    """
+
+    frames: npt.NDArray[np.int64]
+    corners: npt.NDArray[np.float64]
+    numbers: npt.NDArray[np.int64]
+    annotated: frozenset[int] | None = None
+
+    @classmethod
+    def of(cls, boxes: Sequence[Box], annotated: frozenset[int] | None = None) -> BoxTable:
+        """Build the table from boxes that :func:`checked` has passed, in any order."""
+        ordered = sorted(boxes, key=lambda box: box.frame)  # stable: boxes of a frame keep the file's order
+        frames = np.array([box.frame for box in ordered], np.int64)
+        places = np.array([box[1:5] for box in ordered], np.float64).reshape(-1, 4)
+        numbers = np.array([box[5:] for box in ordered], np.int64).reshape(-1, 2)
+        corners = np.concatenate([places[:, :2], places[:, :2] + places[:, 2:]], axis=1)
+        return cls(frames, corners, numbers, annotated)
+
+    def at(self, frame: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+        """Return corners and numbers of the boxes of one frame.
+
+        Raises:
+            ValueError: the frame has no labels.
+        """
+        if self.annotated is not None and frame not in self.annotated:
+            raise ValueError(f"has no frame {frame}: add it, also if it shows no object")
+        first, end = np.searchsorted(self.frames, (frame, frame + 1))
+        return self.corners[first:end], self.numbers[first:end]
+
+
+def checked(box: Box) -> Box:
+    """Return the box.
+
+    Raises:
+        ValueError: one of its numbers is outside its limits.
+    """
+    if not 0 <= box.frame <= _LARGEST_FRAME:
+        raise ValueError(f"frame {box.frame} of a box: give a whole number from 0")
+    if not all(-_LARGEST_PX <= number <= _LARGEST_PX for number in box[1:5]):  # also NaN
+        raise ValueError(f"box {list(box[1:5])}: coordinates are at most {_LARGEST_PX:g} px")
+    if box.width < 0 or box.height < 0:
+        raise ValueError(f"box {list(box[1:5])}: width and height are at least 0")
+    if not 0 <= box.category <= LARGEST_NUMBER:
+        raise ValueError(f"class {box.category}: give a whole number from 0 to {LARGEST_NUMBER}")
+    if not NO_TRACK <= box.track <= LARGEST_NUMBER:
+        raise ValueError(f"track {box.track}: give a whole number from 0 to {LARGEST_NUMBER}, or {NO_TRACK} for none")
+    return box
 
 
 def read_coco(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
@@ -130,6 +219,30 @@ def read_yolo(folder: Traversable, picture_px: tuple[int, int]) -> BoxTable:
             category = _whole(where, values[0])
             boxes.append(_checked(where, Box(frame, x - width / 2, y - height / 2, width, height, category, track)))
     return BoxTable.of(boxes)
+
+
+def read_mask(file: Traversable, picture_px: tuple[int, int]) -> npt.NDArray[np.uint8]:
+    """Read the mask of one frame: [height, width] uint8.
+
+    Args:
+        file: a PNG file of 8 bits a pixel or fewer, grey or with a palette.
+        picture_px: height and width of the video's upright picture.
+
+    Raises:
+        ValueError: it is another kind of picture, or has another size.
+    """
+    from PIL import Image  # only samples with masks need it
+
+    data = file.read_bytes()
+    try:
+        with Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
+            if (size := (picture.height, picture.width)) != picture_px:
+                raise ValueError(f"has {size[1]}x{size[0]} px: the video has {picture_px[1]}x{picture_px[0]} px")
+            if data[25] != _PALETTE and (data[25], data[24]) not in ((_GREY, 1), (_GREY, 8)):  # Pillow rescales others
+                raise ValueError("is neither 8-bit grey nor a palette: write the classes as one of these")
+            return np.asarray(picture).astype(np.uint8)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # Pillow raises all of these
+        raise ValueError(f"{file.name} {error}") from error
 
 
 READERS: Mapping[str, Callable[[Traversable, tuple[int, int]], BoxTable]] = {

@@ -30,7 +30,15 @@ from v2v_server.corpus.manifest_writer import ManifestWriter
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.report import Report
-from v2v_server.prepare.resume import has_failed, known_records, locked, refuse_overlap, standing_files
+from v2v_server.prepare.resume import (
+    LEAST_FREE_BYTES,
+    check_destination,
+    check_free_space,
+    has_failed,
+    known_records,
+    locked,
+    standing_files,
+)
 from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode
 from v2v_server.store.packing import DEFAULT_SIZE, SIZES
 from v2v_server.store.planes import OPTIONAL
@@ -39,9 +47,6 @@ from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.orientation import Window
 from v2v_server.video.rows import Rows
-
-LEAST_FREE_BYTES = 1 << 30
-"""Always keep this much disk space free: a full disk stops other programs."""
 
 _STORED_BITS_PER_PIXEL = 2.2
 """Size of a store file, median of the measured clips (docs/prepare.md): 0.7 to 3.4."""
@@ -92,7 +97,7 @@ def prepare(
     total = sum(video.frames for video in catalogue.videos)
     tell(0, total, 0, 0)
     target = Path(destination).resolve()
-    refuse_overlap(catalogue, target, single)
+    check_destination(target, catalogue.folder, single, catalogue)
     header = Header(str(catalogue.rows), size, len(catalogue.videos), catalogue.folder.name, catalogue.digest)
     made: dict[str, PreparedVideo] = {}
     not_looked_at = []
@@ -117,7 +122,7 @@ def prepare(
                     done += video.frames
                     room.done(video, 0 if isinstance(outcome, Refusal) else outcome.bytes)
                     tell(done, total, room.made, room.expected)
-                    room.check()
+                    check_free_space(target)
     except OSError as error:
         raise CorpusError(f"{target}: cannot be written to: {error.strerror or error}") from error
     records = standing | made
@@ -140,7 +145,6 @@ class _Room:
     """
 
     def __init__(self, target: Path, catalogue: Catalogue, left: Sequence[VideoEntry]) -> None:
-        self._target = target
         self._pixels = {video.id: _pixels(video, catalogue.rows) for video in left}
         self._all_pixels, self._done_pixels = sum(self._pixels.values()), 0
         self.made = 0
@@ -163,19 +167,6 @@ class _Room:
         if self.made and self._done_pixels > _TELLING_SHARE * self._all_pixels:
             return int(self.made / self._done_pixels * self._all_pixels)
         return int(_STORED_BITS_PER_PIXEL / 8 * self._all_pixels)
-
-    def check(self) -> None:
-        """Check the free space during the run.
-
-        Raises:
-            CorpusError: the disk is nearly full.
-        """
-        free = shutil.disk_usage(self._target).free
-        if free < LEAST_FREE_BYTES:
-            raise CorpusError(
-                f"{self._target}: the disk has {free / 1e9:.2f} GB free, of which {LEAST_FREE_BYTES / 1e9:.1f} must "
-                "stay free; finished files are kept; free disk space and run the same command to continue"
-            )
 
 
 def _pixels(video: VideoEntry, rows: Rows) -> int:

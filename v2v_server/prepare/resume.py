@@ -6,16 +6,21 @@ import contextlib
 import errno
 import fcntl
 import os
+import shutil
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, VideoError
+from v2v_protocol.write_aside import is_writable
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.manifest import MANIFEST_NAME, Header, PreparedVideo, read_manifest
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX
 from v2v_server.video.fingerprint import fingerprint
+
+LEAST_FREE_BYTES = 1 << 30
+"""Always keep this much disk space free: a full disk stops other programs."""
 
 _LOCK_NAME = ".v2v-prepare.lock"
 _NOT_THERE = frozenset((errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP))
@@ -24,23 +29,74 @@ _AT_A_TIME = 1024
 """Files that are read at a time, so that the memory for the requests does not grow with the corpus."""
 
 
-def refuse_overlap(catalogue: Catalogue, target: Path, single: bool = False) -> None:
-    """Check that source and destination share no file, now or when the source is searched again.
+def check_destination(target: Path, source: Path, single: bool = False, catalogue: Catalogue | None = None) -> None:
+    """Check a destination without reading a video of the source.
+
+    Args:
+        target: the destination, resolved.
+        source: the folder of the source, resolved.
+        single: the source is one video: other files of its folder are never used.
+        catalogue: the source, once it is probed: see :func:`refuse_links`.
+
+    Raises:
+        CorpusError: it is no folder, is write-protected, holds something else, overlaps with the source or lies in a
+            prepared folder, or the disk is nearly full.
+    """
+    try:
+        at = next(each for each in (target, *target.parents) if each.exists())
+        if not at.is_dir():
+            raise CorpusError(f"{target}: {at} is a file; give the name of a folder")
+        if not is_writable(at):
+            raise CorpusError(f"{target}: {at} is write-protected; choose another destination, or allow writing")
+        below = target != source and target.is_relative_to(source)
+        if source.is_relative_to(target) or (below and not single):
+            raise CorpusError(f"{target} and the source {source} overlap; choose a destination outside the source")
+        if catalogue is not None:
+            refuse_links(catalogue, target)
+        check_free_space(at)
+        if (target / MANIFEST_NAME).exists():
+            return
+        for folder in target.parents:
+            if (folder / MANIFEST_NAME).exists():
+                raise CorpusError(f"{target} lies in the prepared folder {folder}; choose another destination")
+        foreign = sorted(entry.name for entry in at.iterdir() if not entry.name.startswith(".")) if at == target else []
+        if foreign:
+            raise CorpusError(
+                f"{target}: holds {foreign[0]} ({len(foreign)} entries) and no manifest of v2v-prepare; choose an "
+                "empty or a new folder"
+            )
+    except OSError as error:
+        raise CorpusError(f"{target}: cannot be written to: {error.strerror or error}") from error
+
+
+def check_free_space(folder: Path) -> None:
+    """Check that the disk is not nearly full.
+
+    Raises:
+        CorpusError: it is.
+        OSError: the free space cannot be read.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < LEAST_FREE_BYTES:
+        raise CorpusError(
+            f"{folder}: the disk has {free / 1e9:.2f} GB free, of which {LEAST_FREE_BYTES / 1e9:.1f} must stay free; "
+            "finished files are kept; free disk space and run the same command to continue"
+        )
+
+
+def refuse_links(catalogue: Catalogue, target: Path) -> None:
+    """Check that no file of the source is a link into the destination.
 
     Args:
         catalogue: the source.
         target: the destination, resolved.
-        single: the source is one video: other files of its folder are never used.
 
     Raises:
-        CorpusError: they do, or the source is a prepared folder itself.
+        CorpusError: one is, or the source is a prepared folder itself.
     """
     root = catalogue.folder
     if catalogue.prepared is not None:
         raise CorpusError(f"{root} is a prepared folder itself; prepare its source instead")
-    below = target != root and target.is_relative_to(root)
-    if root.is_relative_to(target) or (below and not single):
-        raise CorpusError(f"{target} and the source {root} overlap; choose a destination outside the source")
     # Resolving a path queries each of its parts, so do it once for every folder, and for files that are links.
     inside: dict[str, bool] = {}
     for video in catalogue.videos:
@@ -77,20 +133,10 @@ def known_records(target: Path, header: Header, videos: Sequence[VideoEntry]) ->
         videos: videos of its source.
 
     Raises:
-        CorpusError: the folder holds something else, lies in a prepared one, or was prepared with other settings or
-            from another source.
+        CorpusError: the folder was prepared with other settings or from another source.
         OSError: it cannot be read, or unfinished files cannot be removed.
     """
     if not (target / MANIFEST_NAME).exists():
-        for folder in target.parents:
-            if (folder / MANIFEST_NAME).exists():
-                raise CorpusError(f"{target} lies in the prepared folder {folder}; choose another destination")
-        foreign = sorted(entry.name for entry in target.iterdir() if not entry.name.startswith("."))
-        if foreign:
-            raise CorpusError(
-                f"{target}: holds {foreign[0]} ({len(foreign)} entries) and no manifest of v2v-prepare; choose an "
-                "empty or a new folder"
-            )
         return {}
     manifest = read_manifest(target)
     if manifest.header.settings != header.settings:

@@ -1,4 +1,4 @@
-"""Simulate a clip: check arguments, prepare noise, call the kernel."""
+"""Simulate a clip: check arguments, turn frames of any usual kind to grey levels, call the kernel."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.bounds import most_events, pixel_thresholds
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import STARTS, TIME_UNITS, Recipe, effect_settings
-from v2v_protocol.sample import SampleParams
+from v2v_protocol.recipe import STARTS, TIME_UNITS, Recipe, effect_settings, most_events, pixel_thresholds
+from v2v_protocol.sample import SampleParams, needs_seconds
 from v2v_protocol.settings import nearest, require_known
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.effects.tolerance import changed_shares, left_out
-from v2v_server.simulation.grey import grey_levels
 from v2v_server.simulation.intensity import Intensity, log_table_float64
-from v2v_server.simulation.kernels import KernelInput
+from v2v_server.simulation.kernels import KernelInput, Voxels
 from v2v_server.simulation.precision import AUTO, EFFECTS_MARGIN, check_thresholds, choose, noise_sum
-from v2v_server.simulation.result import Voxels
 from v2v_server.simulation.voxel import Levels, bin_edges, timed_edges
-from v2v_server.video.luma import SDR, Signal
+from v2v_server.video.luma import MOST_BITS, SDR, TRANSFERS, Signal
+
+_WEIGHTS = (299, 587, 114)
+"""Weights of red, green and blue in grey (ITU-R BT.601), thousandths."""
 
 
 def simulate(
@@ -54,8 +54,8 @@ def simulate(
     """Simulate an event camera that watches a clip.
 
     Args:
-        frames: a numpy array or a torch tensor; [n, H, W] uint8 grey levels, or a form that ``grey.py`` converts:
-            colour (RGB), floating point in 0 .. 1. n - 1 is a multiple of ``bins * frames_per_bin``, without
+        frames: a numpy array or a torch tensor; [n, H, W] uint8 grey levels, or a form that :func:`grey_levels`
+            converts: colour (RGB), floating point in 0 .. 1. n - 1 is a multiple of ``bins * frames_per_bin``, without
             ``grids_per_frame``.
         threshold_pos: contrast threshold of brighter events, log-intensity units.
         threshold_neg: contrast threshold of darker events; None: the same.
@@ -164,8 +164,9 @@ def simulate_clip(
             different frames the clip shows.
         params, recipe: the draw and its recipe.
         voxel_dtype: "int8", "int16" or "float32".
-        step_seconds: [steps] duration of each step (``voxel.py``); given exactly when ``recipe.needs_seconds``.
-        out: C-contiguous arrays to fill, by name (``kernels.ARRAYS``); None makes the voxels.
+        step_seconds: [steps] duration of each step (``voxel.py``); given exactly when the recipe or an array of ``out``
+            needs seconds.
+        out: C-contiguous arrays to fill, by name (``representations.NAMES``); None makes the voxels.
         levels: grey levels between frames, only with 8 bits; None: log intensity is linear in time there.
         signal: what the levels mean.
         tolerance: share of the events that effects may change which are left out (``effects/tolerance.py``).
@@ -186,7 +187,7 @@ def simulate_clip(
             f"frames {frames.dtype}{list(frames.shape)}: this draw shows {source_index[-1] + 1} frames, "
             f"{signal.dtype} [n, H, W]"
         )
-    if (step_seconds is None) == recipe.needs_seconds:
+    if (step_seconds is None) == (recipe.needs_seconds or needs_seconds(out or ())):
         raise UsageError(
             f"step_seconds is {'missing' if step_seconds is None else 'unwanted'}: noise_unit is "
             f"{recipe.noise_unit!r}, voxel_seconds is {recipe.voxel_seconds[1]:g}, and there "
@@ -268,7 +269,11 @@ def _simulate_array(
             f"{count} frames of {width}x{height} pixels: give {'2 frames or more' if grids_per_frame else needed}, "
             "of at least one pixel"
         )
-    params = _params(threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma, seed, effects)
+    params = SampleParams(
+        threshold_pos, threshold_neg, noise_sigma, hot_pixel_count, hot_pixel_sigma, pauses=(), scale=1.0,
+        crop_top_px=0, crop_left_px=0, flip=False, contrast=0.0, noise_key=noise_key_of_seed(seed),
+        effects=dict(effects),
+    )  # fmt: skip
     ends = (float(frames.min()), float(frames.max())) if intensity is None else _log_ends(intensity)
     edges = bin_edges(steps, frames_per_bin, grids_per_frame * bins or 1)
     durations = np.ones(steps)
@@ -280,6 +285,68 @@ def _simulate_array(
     if intensity is None:
         given = dataclasses.replace(given, frames=frames.astype(real))
     return Voxels.of(given, real)
+
+
+def grey_levels(frames: Any, signal: Signal = SDR) -> npt.NDArray[Any]:
+    """Return the grey levels of a clip: 0 .. 255, apart from a signal of more than 8 bits.
+
+    Grey is 0.299 red + 0.587 green + 0.114 blue. Floating point means 0 for black and 1 for white; the result is
+    rounded to the nearest of 256 levels (use ``simulate_log`` to avoid the rounding).
+
+    Args:
+        frames: a numpy array or a torch tensor in main memory; uint8, or floating point in 0 .. 1; [n, H, W], colour
+            (RGB) as [n, H, W, 3] or [n, 3, H, W], one channel as [n, H, W, 1] or [n, 1, H, W]. If both ends could be
+            channels, the last one is.
+        signal: what the levels mean. With more than 8 bits, frames are uint16 [n, H, W] and returned as they are.
+
+    Returns:
+        uint8 [n, H, W]; grey uint8 is returned without a copy.
+
+    Raises:
+        UsageError: another type, shape or range, or an unknown signal.
+    """
+    if signal.transfer not in ("", *TRANSFERS.values()):
+        raise UsageError(f"transfer {signal.transfer!r}: choose one of {', '.join(TRANSFERS.values())}, or ''")
+    if signal.bits not in range(8, MOST_BITS + 1):
+        raise UsageError(f"bits = {signal.bits!r}: give a whole number from 8 to {MOST_BITS}")
+    try:
+        given = np.asarray(frames)
+    except (TypeError, RuntimeError) as error:  # raised by torch for a tensor on a GPU or one that requires gradients
+        raise UsageError(f"frames: {error}") from error
+    if signal.bits > 8:
+        if given.ndim != 3 or given.dtype != np.uint16 or given.max(initial=0) > signal.white:
+            raise UsageError(
+                f"frames {given.dtype}{list(given.shape)}, levels up to {given.max(initial=0)}: with bits = "
+                f"{signal.bits}, give uint16 [n, H, W] of levels up to {signal.white}"
+            )
+        return given
+    if given.ndim == 4 and given.shape[-1] not in (1, 3):
+        given = np.moveaxis(given, 1, -1)
+    fits = given.ndim == 3 or (given.ndim == 4 and given.shape[-1] in (1, 3))
+    if not fits or (given.dtype != np.uint8 and given.dtype.kind != "f"):
+        shape = list(np.shape(frames))
+        raise UsageError(f"frames {given.dtype}{shape}: give uint8 or floating point [n, H, W], or colour [n, H, W, 3]")
+    if given.ndim == 4 and given.shape[-1] == 1:
+        given = given[..., 0]
+    if given.ndim == 3 and given.dtype == np.uint8:
+        return given
+    grey = np.empty(given.shape[:3], np.uint8)
+    for frame, out in zip(given, grey, strict=True):  # one at a time: the intermediate arrays are eight times as large
+        out[:] = _grey(frame)
+    return grey
+
+
+def _grey(frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    red, green, blue = _WEIGHTS
+    if frame.dtype == np.uint8:
+        wide = frame.astype(np.int32)
+        return (red * wide[..., 0] + green * wide[..., 1] + blue * wide[..., 2] + 500) // 1000
+    if not ((frame >= 0) & (frame <= 1)).all():
+        raise UsageError("frames: a value is NaN or outside 0 .. 1; floating point means 0 for black and 1 for white")
+    value = frame.astype(np.float64)
+    if value.ndim == 3:
+        value = (red * value[..., 0] + green * value[..., 1] + blue * value[..., 2]) / 1000
+    return np.rint(value * 255)
 
 
 def _most_events(given: KernelInput, log_ends: tuple[float, float]) -> float:
@@ -298,33 +365,6 @@ def _log_ends(intensity: Intensity) -> tuple[float, float]:
     # From the table, not from a maths library: the choice of arithmetic must not depend on the host.
     table = log_table_float64(*intensity)
     return float(table[0]), float(table[-1])
-
-
-def _params(
-    threshold_pos: float,
-    threshold_neg: float,
-    noise_sigma: float,
-    hot_count: int,
-    hot_sigma: float,
-    seed: int,
-    effects: Mapping[str, float] = MappingProxyType({}),
-) -> SampleParams:
-    """Return the parameters of a camera without a view."""
-    return SampleParams(
-        threshold_pos=threshold_pos,
-        threshold_neg=threshold_neg,
-        noise_sigma=noise_sigma,
-        hot_pixel_count=hot_count,
-        hot_pixel_sigma=hot_sigma,
-        pauses=(),
-        scale=1.0,
-        crop_top_px=0,
-        crop_left_px=0,
-        flip=False,
-        contrast=0.0,
-        noise_key=noise_key_of_seed(seed),
-        effects=dict(effects),
-    )
 
 
 def _check_number(name: str, value: float, *, positive: bool = False) -> None:

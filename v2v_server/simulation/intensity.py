@@ -28,7 +28,7 @@ from __future__ import annotations
 import decimal
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,7 @@ from v2v_server.simulation.voxel import FINE_STEPS
 from v2v_server.video.luma import SDR, Signal
 
 Doubles = npt.NDArray[np.float64]
+_Table = TypeVar("_Table", bound=npt.NDArray[Any])
 
 _LOG2_E, _LN2_HIGH, _LN2_LOW = 1.4426950408889634, 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _EXP_DEGREE, _LOG_TERMS = 14, 12
@@ -64,9 +65,7 @@ def log_table(gamma: float, log_eps: float, signal: Signal = SDR) -> npt.NDArray
     Returns:
         [2**bits] float32, read-only, log-intensity units, never falling.
     """
-    table = log_table_float64(gamma, log_eps, signal).astype(np.float32)
-    table.setflags(write=False)
-    return table
+    return _read_only(log_table_float64(gamma, log_eps, signal).astype(np.float32))
 
 
 @functools.lru_cache(maxsize=64)
@@ -77,15 +76,11 @@ def log_table_float64(gamma: float, log_eps: float, signal: Signal = SDR) -> Dou
     maths library may differ in its last bit from host to host.
     """
     if signal != SDR:
-        deep = logarithm(log_eps + light_table(gamma, signal))
-        deep.setflags(write=False)
-        return deep
+        return _read_only(logarithm(log_eps + light_table(gamma, signal)))
     with decimal.localcontext(decimal.Context(prec=50)):
         exponent, floor = decimal.Decimal(gamma), decimal.Decimal(log_eps)
         levels = [(floor + (decimal.Decimal(level) / 255) ** exponent if level else floor).ln() for level in range(256)]
-    table = np.array([float(level) for level in levels])
-    table.setflags(write=False)
-    return table
+    return _read_only(np.array([float(level) for level in levels]))
 
 
 def fine_table(table: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -114,9 +109,7 @@ def linear_light(gamma: float, log_eps: float, signal: Signal = SDR) -> Doubles:
 def light_table(gamma: float, signal: Signal) -> Doubles:
     """Return i of every grey level, [2**bits] float64, read-only, never falling."""
     value = np.arange(signal.white + 1) / signal.white
-    light = _LIGHT[signal.transfer](value) if signal.transfer else _power(value, gamma)
-    light.setflags(write=False)
-    return light
+    return _read_only(_LIGHT[signal.transfer](value) if signal.transfer else _power(value, gamma))
 
 
 @functools.lru_cache(maxsize=16)
@@ -125,14 +118,17 @@ def tone_table(gamma: float, signal: Signal) -> npt.NDArray[np.uint8]:
     value = np.arange(signal.white + 1) / signal.white
     if signal.transfer:
         value = _power(np.minimum(light_table(gamma, signal), 1.0), 1.0 / gamma)
-    table = np.floor(255.0 * value + 0.5).astype(np.uint8)
-    table.setflags(write=False)
-    return table
+    return _read_only(np.floor(255.0 * value + 0.5).astype(np.uint8))
 
 
 def eight_bits(frames: npt.NDArray[Any], signal: Signal) -> npt.NDArray[np.uint8]:
     """Return levels in 8 bits: rounded, with the same transfer. Levels of 8 bits are returned as they are."""
     return frames if signal.bits == 8 else tone_table(1.0, Signal(signal.bits))[frames]
+
+
+def _read_only(table: _Table) -> _Table:
+    table.setflags(write=False)
+    return table
 
 
 def _pq(value: Doubles) -> Doubles:

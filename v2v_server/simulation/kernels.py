@@ -1,25 +1,28 @@
-"""Call the kernel that a clip needs: the paper's, or the general one."""
+"""Call the kernel that a clip needs, the paper's or the general one; its result, and its display in a notebook."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import base64
+import os
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.bounds import pixel_thresholds
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList, check_duration, whole_edges
-from v2v_protocol.sample import SampleParams
+from v2v_protocol.recipe import pixel_thresholds
+from v2v_protocol.sample import ARRAYS, OfEvents, SampleParams, html_table
 from v2v_protocol.spec import VOXEL_DTYPES
-from v2v_server.simulation import noise
-from v2v_server.simulation.effects import prepare
-from v2v_server.simulation.effects.kernel import FIXED, TRIANGULAR, UNIFORM, Outputs, Segments, simulate_general
+from v2v_server.simulation import effects
+from v2v_server.simulation.effects.kernel import FIXED, TRIANGULAR, UNIFORM, Segments, simulate_general
 from v2v_server.simulation.intensity import Intensity, fine_table, log_table, log_table_float64
-from v2v_server.simulation.pixel import simulate_pixels, words
+from v2v_server.simulation.pixel import hot_pixels, simulate_pixels
 from v2v_server.simulation.precision import Real
+from v2v_server.simulation.representations import NAMES, REPRESENTATIONS, fill_array, new_memory
 from v2v_server.simulation.voxel import (
     LARGEST_COUNT,
     Doubles,
@@ -29,12 +32,11 @@ from v2v_server.simulation.voxel import (
     Timeline,
     new_array,
     rounding_tolerance,
+    time_of,
     timeline,
 )
 
-ARRAYS = ("voxels", "event_counts", "voxels_bilinear")
-"""Arrays that a kernel makes."""
-LARGEST_FLOAT16 = 65504.0
+_NO_LIST = np.empty((0, 4))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +103,10 @@ class KernelInput:
         return timeline(self.edges, self.bins, durations, None if self.levels is None else self.levels.at)
 
     def form(self, name: str) -> tuple[str, tuple[int, ...]]:
-        """Return dtype and shape of one of :data:`ARRAYS`."""
-        grids, picture = (len(self.edges.step) - 1) // self.bins, self.frames.shape[1:]
-        if name == "event_counts":
-            return self.dtype, (grids, 2, self.bins, *picture)
-        is_bilinear = name == "voxels_bilinear" and self.dtype != "float32"
-        return "float16" if is_bilinear else self.dtype, (grids, self.bins, *picture)
+        """Return dtype and shape of a representation."""
+        height, width = self.frames.shape[1:]
+        form = cast(OfEvents, ARRAYS[name]).form
+        return form(self.dtype, (len(self.edges.step) - 1) // self.bins, self.bins, height, width)
 
 
 def fill(
@@ -117,7 +117,7 @@ def fill(
     Args:
         given: the clip.
         real: arithmetic of the pixels, float32 or float64.
-        out: by name (:data:`ARRAYS`), C-contiguous arrays to write, or None to allocate one.
+        out: by name (``representations.NAMES``), C-contiguous arrays to write, or None to allocate one.
 
     Returns:
         the arrays; the number of clipped bins of each.
@@ -128,21 +128,7 @@ def fill(
     arrays = {name: new_array(*given.form(name), array) for name, array in out.items()}
     if out.keys() == {"voxels"} and not given.needs_general:
         return arrays, {"voxels": _paper(given, real, arrays["voxels"])}
-    if not out:
-        return {}, {}
-    general = _General(given, real)
-    bilinear = None
-    if "voxels_bilinear" in arrays:
-        bilinear = np.zeros(arrays["voxels_bilinear"].shape, np.float32)
-    tally = general.run(arrays.get("voxels"), arrays.get("event_counts"), bilinear)
-    clipped = dict(zip(ARRAYS, map(int, tally), strict=False))
-    if bilinear is not None:
-        within = bilinear
-        clipped["voxels_bilinear"] = 0
-        if arrays["voxels_bilinear"].dtype == np.float16:
-            within = np.clip(bilinear, -LARGEST_FLOAT16, LARGEST_FLOAT16)
-            clipped["voxels_bilinear"] = int(np.count_nonzero(within != bilinear))
-        arrays["voxels_bilinear"][...] = within
+    clipped = _General(given, real).run(arrays) if arrays else {}
     return arrays, {name: clipped[name] for name in arrays}
 
 
@@ -161,25 +147,114 @@ def list_events(given: KernelInput, real: Real, step_us: Doubles) -> EventList:
     """
     check_duration(float(step_us.sum()))
     general = _General(given, real)
-    count = int(general.run(listing=_listing(0))[2])
-    event, passed = _listing(count)
-    general.run(listing=(event, passed))
-    pixel, segment, sign = event
-    part, since = general.timeline, np.r_[0.0, np.cumsum(step_us)]
-    steps = np.append(step_us, 0.0)
-    starts = since[part.step] + part.start * step_us[part.step]
-    first_us = whole_edges(since[given.edges.step] + given.edges.share * steps[given.edges.step])
+    rows = np.empty((general.run({}, np.empty((1, 4)))["listing"], 4))
+    general.run({}, rows)
+    pixel, segment, is_positive = rows[:, :3].T.astype(np.int64)
+    part = general.timeline
+    starts = time_of(Moments(part.step, part.start), step_us)
+    first_us = whole_edges(time_of(given.edges, step_us))
     bin_of = part.bin[segment]
-    t = np.floor(starts[segment] + passed * (part.share * step_us[part.step])[segment]).astype(np.int64)
+    t = np.floor(starts[segment] + rows[:, 3] * (part.share * step_us[part.step])[segment]).astype(np.int64)
     t = np.maximum(np.minimum(t, first_us[bin_of + 1] - 1), first_us[bin_of])
     order = np.lexsort((pixel, t))
     _, height, width = given.frames.shape
     y, x = np.divmod(pixel[order], width)
-    return EventList(x.astype(np.uint16), y.astype(np.uint16), t[order], sign[order] > 0, width, height)
+    return EventList(x.astype(np.uint16), y.astype(np.uint16), t[order], is_positive[order] > 0, width, height)
 
 
-def _listing(capacity: int) -> tuple[Longs, Doubles]:
-    return np.empty((3, capacity), np.int64), np.empty(capacity)
+@dataclass(frozen=True, slots=True, repr=False, eq=False)
+class Voxels:
+    """Result of a simulation; ``voxels, saturated_bins = simulate(...)`` unpacks it.
+
+    Attributes:
+        voxels: [T, bins, H, W] signed event counts.
+        saturated_bins: number of bins that were clipped to the range of the dtype.
+        saturated: the same for every array that was made, by name.
+        given: the inputs, and ``real``, the arithmetic: the other arrays and events are simulated from them on demand.
+    """
+
+    voxels: npt.NDArray[Any]
+    saturated_bins: int
+    saturated: Mapping[str, int]
+    given: KernelInput
+    real: Real
+
+    @classmethod
+    def of(cls, given: KernelInput, real: Real, out: Mapping[str, npt.NDArray[Any]] | None = None) -> Voxels:
+        """Simulate a clip: fill the arrays of ``out``, or make the voxels.
+
+        Raises:
+            UsageError: an array of ``out`` has another form than ``KernelInput.form`` states.
+        """
+        arrays, saturated = fill(given, real, {"voxels": None} if out is None else out)
+        return cls(arrays.get("voxels", np.empty(0)), saturated.get("voxels", 0), saturated, given, real)
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.voxels, self.saturated_bins))
+
+    def array(self, name: str) -> npt.NDArray[Any]:
+        """Simulate another array of the same clip.
+
+        Args:
+            name: "event_counts", [T, 2, bins, H, W]: negative (0) and positive (1) counts; "voxels_bilinear",
+                [T, bins, H, W]: each event is shared between the two bins next to its time; or "time_surface",
+                [T, 2, bins, H, W]: age of the last event of each polarity, s (in frames without
+                ``frames_per_second``), infinity before the first.
+
+        Raises:
+            UsageError: there is no such array.
+        """
+        if name not in NAMES:
+            raise UsageError(f"array {name!r}: choose one of {', '.join(NAMES)}")
+        return cast("npt.NDArray[Any]", fill(self.given, self.real, {name: None})[0][name])
+
+    def to_events(self, bin_us: float) -> EventList:
+        """List the events (x, y, t, p) that the voxels count, with their times, for bins of ``bin_us`` microseconds.
+
+        Raises:
+            UsageError: the duration is out of range.
+        """
+        steps = len(self.given.step_seconds)
+        return list_events(self.given, self.real, np.full(steps, bin_us * (len(self.given.edges.step) - 1) / steps))
+
+    def show(self, path: str | os.PathLike[str] | None = None) -> Any:
+        """Draw up to four voxel grids, bin by bin, as a picture that a notebook displays.
+
+        Args:
+            path: also write the picture to this PNG file; None writes no file.
+
+        Returns:
+            A PIL image.
+
+        Raises:
+            UsageError: the file cannot be written.
+        """
+        from PIL import Image
+
+        from v2v_pictures.files import write_png
+
+        image = self._picture()
+        if path is not None:
+            write_png(Path(path), image)
+        return Image.fromarray(image)
+
+    def __repr__(self) -> str:
+        return f"Voxels({self.voxels.dtype}{list(self.voxels.shape)}, {self.saturated_bins} bins saturated)"
+
+    def _picture(self) -> Any:
+        from v2v_pictures.grids import draw_grids  # drawing is for people: a worker never loads it
+
+        return draw_grids(self.voxels)
+
+    def _repr_png_(self) -> bytes:
+        from v2v_pictures.files import png_bytes
+
+        return png_bytes(self._picture())
+
+    def _repr_html_(self) -> str:
+        shape = f"{self.voxels.dtype} {list(self.voxels.shape)}"
+        table = html_table("Voxels", {"voxels": shape, "saturated_bins": self.saturated_bins})
+        return f'{table}<img src="data:image/png;base64,{base64.b64encode(self._repr_png_()).decode()}">'
 
 
 def _paper(given: KernelInput, real: Real, voxels: npt.NDArray[Any]) -> int:
@@ -187,15 +262,14 @@ def _paper(given: KernelInput, real: Real, voxels: npt.NDArray[Any]) -> int:
     threshold_pos, threshold_neg = real(params.threshold_pos), real(params.threshold_neg)
     law, fixed = given.law
     start_low, start_span = (real(fixed), real(0)) if law == FIXED else (-threshold_neg, threshold_pos + threshold_neg)
-    pixels = voxels[0, 0].size
-    steps_per_bin = int(given.edges.step[1])
+    tolerance = real(rounding_tolerance(params.threshold_pos, params.threshold_neg))
+    pixels, steps_per_bin = voxels[0, 0].size, int(given.edges.step[1])
     position, drift = _hot(params, pixels, real)
     return int(
         simulate_pixels(
             np.ascontiguousarray(given.frames).reshape(-1, pixels), _table(given.intensity, real), given.source_index,
             np.array(params.noise_key, np.uint32), _noise_scale(params, durations).astype(real), position, drift,
-            durations.astype(real), threshold_pos, threshold_neg,
-            real(rounding_tolerance(params.threshold_pos, params.threshold_neg)), start_low, start_span,
+            durations.astype(real), threshold_pos, threshold_neg, tolerance, start_low, start_span,
             law == TRIANGULAR, steps_per_bin, real(LARGEST_COUNT[given.dtype]), voxels.reshape(-1, pixels),
         )
     )  # fmt: skip
@@ -210,38 +284,28 @@ class _General:
         self._pixels = given.frames[0].size
         whole_noise = _noise_scale(params, given.noise_durations)
         rows = np.where(part.level < 0, part.level, given.source_index[np.maximum(part.level, 0)])
-        scale = (given.bins - 1) / given.bins
         self._segments = Segments(
             part.step, rows, given.source_index[part.step + 1], part.reached.astype(real), part.bin,
             (whole_noise[part.step] * part.share if len(whole_noise) else whole_noise).astype(real),
             (given.noise_durations[part.step] * part.share).astype(real),
-            (part.place[0] * scale).astype(real), (part.place[1] * scale).astype(real),
         )  # fmt: skip
-        self._tables = prepare(
+        self._tables = effects.prepare(
             params.effects, params.noise_key, given.intensity or Intensity(1.0, 1.0),
-            given.step_seconds[part.step] * part.share, self._pixels, real, _compiled_words,
+            given.step_seconds[part.step] * part.share, self._pixels, real,
         )  # fmt: skip
 
-    def run(
-        self,
-        voxels: npt.NDArray[Any] | None = None,
-        counts: npt.NDArray[Any] | None = None,
-        bilinear: npt.NDArray[np.float32] | None = None,
-        listing: tuple[Longs, Doubles] | None = None,
-    ) -> Longs:
-        """Write the arrays that are given; return ``Outputs.tally``."""
+    def run(self, arrays: Mapping[str, npt.NDArray[Any]], listing: Doubles = _NO_LIST) -> dict[str, int]:
+        """Fill arrays, by name, and the listing if it has rows; return how many values of each did not fit its dtype,
+        and the number of events that were to be listed.
+        """
         given, real, pixels, params = self._given, self._real, self._pixels, self._given.params
-        tally = np.zeros(3, np.int64)
-        out = Outputs(
-            np.empty((0, pixels), given.dtype) if voxels is None else voxels.reshape(-1, pixels),
-            np.empty((0, 2, given.bins, pixels), given.dtype)
-            if counts is None
-            else counts.reshape(-1, 2, given.bins, pixels),
-            np.empty((0, pixels), np.float32) if bilinear is None else bilinear.reshape(-1, pixels),
-            *(listing or _listing(0)),
-            tally,
-            listing is not None,
+        none = {name: np.empty((0, *shape[1:]), dtype) for name in NAMES for dtype, shape in (given.form(name),)}
+        memory = {name: new_memory(array, pixels) for name, array in (none | dict(arrays)).items()}
+        made = tuple(
+            each.prepare(own, given, self.timeline, real) if hasattr(each, "prepare") else own
+            for each, own in zip(REPRESENTATIONS.values(), (*memory.values(), listing), strict=True)
         )
+        clipped = np.zeros(len(made), np.int64)
         sigma = params.effects.get("threshold_mismatch_sigma", 0.0)
         smallest, _ = pixel_thresholds(min(params.threshold_pos, params.threshold_neg), 1.0, sigma)
         between = np.empty((0, pixels), np.uint16) if given.levels is None else given.levels.grey
@@ -251,10 +315,13 @@ class _General:
             np.ascontiguousarray(given.frames).reshape(-1, pixels), between.reshape(-1, pixels),
             table, fine_table(table), np.array(params.noise_key, np.uint32), self._segments,
             *_hot(params, pixels, real), real(params.threshold_pos), real(params.threshold_neg),
-            real(rounding_tolerance(smallest, smallest)), law, real(fixed), not params.effects, given.bins,
-            real(LARGEST_COUNT[given.dtype]), out, self._tables,
+            real(rounding_tolerance(smallest, smallest)), law, real(fixed), not params.effects,
+            len(listing) > 0 or any(hasattr(REPRESENTATIONS[name], "events") for name in arrays),
+            not params.effects and arrays.keys() == {"voxels"}, given.bins, real(LARGEST_COUNT[given.dtype]), made,
+            clipped, self._tables,
         )  # fmt: skip
-        return tally
+        counts: dict[str, int] = dict(zip(REPRESENTATIONS, clipped.tolist(), strict=True))
+        return counts | {name: counts[name] + fill_array(array, memory[name]) for name, array in arrays.items()}
 
 
 def _noise_scale(params: SampleParams, durations: Doubles) -> Doubles:
@@ -264,7 +331,7 @@ def _noise_scale(params: SampleParams, durations: Doubles) -> Doubles:
 
 def _hot(params: SampleParams, pixels: int, real: Real) -> tuple[Longs, npt.NDArray[Any]]:
     count = params.hot_pixel_count if params.hot_pixel_sigma > 0.0 else 0
-    position, normal = noise.hot_pixels(params.noise_key, count, pixels, _compiled_words)
+    position, normal = hot_pixels(params.noise_key, count, pixels)
     return position, normal.astype(real) * real(params.hot_pixel_sigma)
 
 
@@ -272,7 +339,3 @@ def _table(intensity: Intensity | None, real: Real) -> npt.NDArray[Any]:
     if intensity is None:
         return np.empty(0, real)
     return log_table(*intensity) if real is np.float32 else log_table_float64(*intensity)
-
-
-def _compiled_words(key: noise.NoiseKey, purpose: int, counters: npt.NDArray[np.int64]) -> npt.NDArray[np.uint32]:
-    return words(np.array(key, np.uint32), np.uint32(purpose), counters.astype(np.uint32))  # type: ignore[no-any-return]

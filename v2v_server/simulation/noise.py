@@ -1,10 +1,10 @@
-"""The random numbers of a virtual camera's pixels: THE definition, in numpy.
+"""The random numbers of a virtual camera's pixels: THE definition.
 
-``pixel.py`` computes the same numbers inside its loops; the tests hold the two equal bit for bit. Every number is a
-pure function of (noise_key, purpose, counter), so it does not depend on the order of the loops, on the size of a
-block, or on any other pixel. All arithmetic is unsigned 32-bit integer (modulo 2**32) or IEEE binary32 with one
-rounding per operation, in the order written, and no function of a maths library but the square root, which IEEE 754
-rounds correctly: the same bits on every host.
+``pixel.py`` computes them inside its loops; the tests hold it equal, bit for bit, to a definition in numpy
+(``tests/oracles/noise.py``). Every number is a pure function of (noise_key, purpose, counter), so it does not depend on
+the order of the loops, on the size of a block, or on any other pixel. All arithmetic is unsigned 32-bit integer (modulo
+2**32) or IEEE binary32 with one rounding per operation, in the order written, and no function of a maths library but
+the square root, which IEEE 754 rounds correctly: the same bits on every host.
 
 Words. ``scramble`` is a bijection of 32-bit words whose every output bit depends on every input bit ("triple32" of
 C. Wellons' hash prospector, public domain); the words k0..k3 are the noise key:
@@ -35,15 +35,12 @@ variance is off by less than 5e-5, which 10^8 draws would not show.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import numpy.typing as npt
 
 Words = npt.NDArray[np.uint32]
 Reals = npt.NDArray[np.float32]
 NoiseKey = tuple[int, int, int, int]
-WordsOf = Callable[[NoiseKey, int, npt.NDArray[np.int64]], Words]
 
 TIME, PIXEL_RADIUS, PIXEL_ANGLE, PAIR_RADIUS, PAIR_ANGLE, START, HOT_PLACE, HOT_RADIUS, HOT_ANGLE = range(9)
 """Purposes of words. Numbers are never reused; 9 to 15 belong to effects."""
@@ -70,51 +67,6 @@ COS_COEFFICIENTS = tuple(
 )
 
 
-def scramble(x: Words) -> Words:
-    """Apply S: a bijection of 32-bit words, three multiplications."""
-    x = x ^ (x >> np.uint32(17))
-    x = x * SCRAMBLE_FACTORS[0]
-    x = x ^ (x >> np.uint32(11))
-    x = x * SCRAMBLE_FACTORS[1]
-    x = x ^ (x >> np.uint32(15))
-    x = x * SCRAMBLE_FACTORS[2]
-    return x ^ (x >> np.uint32(14))
-
-
-def mix(z: Words, angle_word: Words) -> tuple[Words, Words]:
-    """Return x and y of the module's docstring, from the exclusive or of the two radius words and of the two angle
-    words.
-    """
-    x = z ^ (z >> np.uint32(16))
-    x = x * MIX_FACTORS[0]
-    x = x ^ (x >> np.uint32(15))
-    x = x * MIX_FACTORS[1]
-    return x, (x ^ (x >> np.uint32(15)) ^ angle_word) * MIX_FACTORS[2]
-
-
-def words(key: NoiseKey, purpose: int, counter: npt.ArrayLike) -> Words:
-    """Return word(purpose, n) of each counter n.
-
-    Args:
-        key: four words, 0 .. 2**32 - 1.
-        purpose: one of the constants above.
-        counter: any shape, 0 .. 2**32 - 1.
-
-    Returns:
-        the counter's shape (at least one dimension), uint32.
-    """
-    word = scramble(np.atleast_1d(np.asarray(counter)).astype(np.uint32) + fold(key, 2 * purpose))
-    return scramble(word + fold(key, 2 * purpose + 1))
-
-
-def fold(key: NoiseKey, constant: int) -> Words:
-    """Return a word of the whole key: [1] uint32."""
-    word = scramble(np.array([constant * int(GOLDEN) % 2**32], np.uint32))
-    for part in key:
-        word = scramble(word + np.uint32(part))
-    return word
-
-
 def box_muller(x: Words, y: Words) -> tuple[Reals, Reals]:
     """Return two independent standard normals of each pair of words: (r cos, r sin), float32."""
     value = ((x & np.uint32(0x7FFFFFFF)) | np.uint32(1)).astype(np.int32).astype(np.float32)
@@ -132,34 +84,6 @@ def box_muller(x: Words, y: Words) -> tuple[Reals, Reals]:
     sine = turn * _cubic(SIN_COEFFICIENTS, square)
     twice = sine + sine
     return radius * (np.float32(1) - twice * sine), radius * (twice * _cubic(COS_COEFFICIENTS, square))
-
-
-def hot_pixels(
-    key: NoiseKey, count: int, pixels: int, words_of: WordsOf = words
-) -> tuple[npt.NDArray[np.int64], Reals]:
-    """Choose the hot pixels: those of the smallest words, so they are distinct for any count up to all.
-
-    Args:
-        count: number of hot pixels, 0 .. pixels.
-        words_of: a faster :func:`words`, if the caller has one.
-
-    Returns:
-        positions [count] int64, ascending, in row order; their standard normals [count] float32.
-    """
-    position = smallest_words(key, HOT_PLACE, count, pixels, words_of)
-    normal, _ = box_muller(words_of(key, HOT_RADIUS, position), words_of(key, HOT_ANGLE, position))
-    return position, normal
-
-
-def smallest_words(
-    key: NoiseKey, purpose: int, count: int, pixels: int, words_of: WordsOf = words
-) -> npt.NDArray[np.int64]:
-    """Return the pixels that have the smallest words: [count] int64, ascending, in row order."""
-    if count == 0:
-        return np.empty(0, np.int64)
-    place_words = words_of(key, purpose, np.arange(pixels))
-    largest = np.partition(place_words, count - 1)[count - 1]
-    return np.flatnonzero(place_words <= largest).astype(np.int64)
 
 
 def _cubic(coefficients: tuple[np.float32, ...], x: Reals) -> Reals:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numba
 import numpy as np
+import numpy.typing as npt
 from numba.core import types
 from numba.extending import overload
 
@@ -92,12 +93,44 @@ def word(folds, counter):
 
 @numba.njit(nogil=True, cache=True)
 def words(key, purpose, counters):
-    """Return ``noise.words`` of [count] uint32 counters: [count] uint32."""
+    """Return the words of a purpose (``noise.py``).
+
+    Args:
+        key: four words, 0 .. 2**32 - 1.
+        purpose: a constant of ``noise.py``.
+        counters: [count] int64, 0 .. 2**32 - 1.
+
+    Returns:
+        [count] uint32.
+    """
     found = np.empty(len(counters), np.uint32)
-    folds = folds_of(key, purpose)
+    folds = folds_of((np.uint32(key[0]), np.uint32(key[1]), np.uint32(key[2]), np.uint32(key[3])), np.uint32(purpose))
     for i in range(len(counters)):
         found[i] = word(folds, counters[i])
     return found
+
+
+def hot_pixels(key: noise.NoiseKey, count: int, pixels: int) -> tuple[npt.NDArray[np.int64], noise.Reals]:
+    """Choose the hot pixels: those of the smallest words, so they are distinct for any count up to all.
+
+    Args:
+        count: number of hot pixels, 0 .. pixels.
+
+    Returns:
+        positions [count] int64, ascending, in row order; their standard normals [count] float32.
+    """
+    position = smallest_words(key, noise.HOT_PLACE, count, pixels)
+    normal, _ = noise.box_muller(words(key, noise.HOT_RADIUS, position), words(key, noise.HOT_ANGLE, position))
+    return position, normal
+
+
+def smallest_words(key: noise.NoiseKey, purpose: int, count: int, pixels: int) -> npt.NDArray[np.int64]:
+    """Return the pixels that have the smallest words: [count] int64, ascending, in row order."""
+    if count == 0:
+        return np.empty(0, np.int64)
+    place_words = words(key, purpose, np.arange(pixels))
+    largest = np.partition(place_words, count - 1)[count - 1]
+    return np.flatnonzero(place_words <= largest).astype(np.int64)
 
 
 @numba.njit(nogil=True, inline="always")

@@ -126,6 +126,12 @@ def timed_edges(ends: Longs, bins: int, durations: Doubles) -> Moments:
     return Moments(np.concatenate(([0], steps)), np.concatenate(([0.0], shares)))
 
 
+def time_of(moments: Moments, durations: Doubles) -> Doubles:
+    """Return the time of each moment since the clip's start, [n], in the unit of the durations, [steps]."""
+    since = np.concatenate(([0.0], np.cumsum(durations)))
+    return np.asarray(since[moments.step] + moments.share * np.append(durations, 0.0)[moments.step])
+
+
 def timeline(edges: Moments, bins: int, durations: Doubles, levels: Moments | None = None) -> Timeline:
     """Divide a clip into segments at its frames, at the edges of its bins and at intermediate levels.
 

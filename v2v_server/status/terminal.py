@@ -194,7 +194,7 @@ class StatusView:
     """Show the status at intervals. A terminal gets a few lines, replaced in place.
 
     Args:
-        log: gets the status if it writes JSON lines.
+        log: gets the status if it writes JSON lines; before each of its lines, what is shown is cleared.
         stream: gets it as text.
     """
 
@@ -204,6 +204,7 @@ class StatusView:
         self._console = Console(file=stream, highlight=False) if is_terminal else None
         self._next = 0.0
         self._lines, self._text = 0, ""
+        log.before_line = self.interrupt
 
     def is_due(self, now: float) -> bool:
         """Return whether it is time to show the status again."""
@@ -220,11 +221,12 @@ class StatusView:
                 write(self._stream, self._text + "\n")
         else:
             text = _drawn(self._console, status)
-            write(self._stream, self._clearing() + text)
-            self._lines = text.count("\n")
+            with self._log.lock:
+                write(self._stream, self._clearing() + text)
+                self._lines = text.count("\n")
 
     def interrupt(self) -> None:
-        """Clear the lines, because another line follows."""
+        """Clear the lines, because another line follows. The log calls it, with its lock."""
         if self._lines:
             write(self._stream, self._clearing())
             self._lines = 0

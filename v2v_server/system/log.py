@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -37,10 +38,16 @@ class Log:
         is_json: one JSON object per line, with ``time`` (ISO 8601, UTC), ``level``, ``text``, and fields that describe
             the subject of the line.
         wall_clock: returns the time.
+
+    Attributes:
+        before_line: called before each line; a display that is replaced in place clears itself.
+        lock: held while text is written: lines come from several threads.
     """
 
     def __init__(self, *, is_json: bool = False, wall_clock: Callable[[], str] | None = None) -> None:
         self.is_json = is_json
+        self.before_line: Callable[[], None] = lambda: None
+        self.lock = threading.Lock()
         self._wall_clock = wall_clock or _utc_now
 
     def say(self, text: str, level: Level = "info", **about: Any) -> None:
@@ -55,7 +62,9 @@ class Log:
             text = json.dumps({"time": self._wall_clock(), "level": level, "text": text, **about}, default=str)
         elif sys.stderr.isatty():
             text = f"{datetime.now():%H:%M:%S} {text}"
-        write(sys.stderr, printable(text) + "\n")
+        with self.lock:
+            self.before_line()
+            write(sys.stderr, printable(text) + "\n")
 
 
 @contextmanager

@@ -11,8 +11,8 @@ that fills it:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from importlib.resources.abc import Traversable
 from typing import Any
 
@@ -21,13 +21,13 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import SampleParams
+from v2v_protocol.sample import SampleParams, empty_value, needs_seconds
 from v2v_protocol.spec import StreamSpec
 from v2v_server.flow import FlowClip
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.intensity import tone_table
-from v2v_server.simulation.kernels import ARRAYS
-from v2v_server.simulation.result import Voxels
+from v2v_server.simulation.kernels import Voxels
+from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.view import Frames, Window
 from v2v_server.simulation.voxel import Levels
 from v2v_server.video.colour.chroma import Chroma, ChromaCut
@@ -71,12 +71,13 @@ class SampleContext:
         source: [steps + 1] int64, which frame of ``view`` each position of the clip shows.
         view: [n, H, W], the decoded frames as the camera sees them.
         signal: what the levels of ``view`` mean.
-        step_seconds: [steps] float64, duration of each step; None if the recipe does not use it.
+        step_seconds: [steps] float64, duration of each step; None if recipe and arrays do not use it, or if only an
+            array would and the video has no known frame rate.
         flow: flow of the clip; None if it was not requested.
         levels: grey levels between frames (``substep_px``); None if there are none.
         into: the arrays to fill, by name.
         saturated: number of bins that were clipped, by array; None until the clip is simulated.
-        boxes_dropped: boxes left out because of ``max_boxes``.
+        dropped: number of rows that did not fit, by label (:func:`fill_rows`).
         left_out: effects of the draw that were not simulated.
     """
 
@@ -92,8 +93,12 @@ class SampleContext:
     levels: Levels | None
     into: Mapping[str, npt.NDArray[Any]]
     saturated: Mapping[str, int] | None = None
-    boxes_dropped: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
+
+    def can_time(self, name: str) -> bool:
+        """Return whether the durations of the steps are known, if the array needs them."""
+        return self.step_seconds is not None or not needs_seconds((name,))
 
     @property
     def target_steps(self) -> npt.NDArray[np.int64]:
@@ -136,6 +141,22 @@ def makes(name: str) -> Callable[[ArrayBuilder], ArrayBuilder]:
     return register
 
 
+def fill_rows(context: SampleContext, name: str, out: npt.NDArray[Any], frames: Iterable[npt.NDArray[Any]]) -> None:
+    """Fill in a label with a number of rows in each frame, and count those that do not fit.
+
+    Args:
+        context: of the sample.
+        name: of the label; ``empty`` of its form fills the other rows.
+        out: [frames, most rows, columns].
+        frames: [n, columns] of each frame, what matters most first.
+    """
+    found = list(frames)
+    out[...] = empty_value(name)
+    for target, rows in zip(out, found, strict=True):
+        target[: len(rows)] = rows[: len(target)]
+    context.dropped[name] = sum(max(0, len(rows) - out.shape[1]) for rows in found)
+
+
 def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Voxels:
     """Simulate the sample into ``out``.
 
@@ -159,16 +180,16 @@ def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Vox
         raise VideoError(context.video, None, f"cannot be simulated: {error}") from error
 
 
-@makes("voxels")
-@makes("event_counts")
-@makes("voxels_bilinear")
 def simulated(context: SampleContext, out: npt.NDArray[Any]) -> None:
     """Fill in all arrays of the kernel together, the first time."""
     if context.saturated is None:
-        asked = {name: context.into[name] for name in ARRAYS if name in context.into}
+        asked = {name: context.into[name] for name in NAMES if name in context.into and context.can_time(name)}
         made = simulate(context, asked)
         context.saturated = made.saturated
         context.left_out = tuple(name for name in context.params.effects if name not in made.given.params.effects)
+
+
+ARRAY_BUILDERS.update(dict.fromkeys(NAMES, simulated))
 
 
 @makes("frames")

@@ -45,7 +45,7 @@ from v2v_protocol.sample import Form, Layout, new_arrays
 from v2v_protocol.wire import Buffer, Frames, encode_sample
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.schedule.sequences import MOST_LEASE_BYTES
-from v2v_server.simulation.variants import USUAL
+from v2v_server.simulation.precision import USUAL
 from v2v_server.store.cache import Cache
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.log import Log, StartTimes

@@ -40,6 +40,7 @@ from v2v_protocol.sample import (
     SampleParams,
     array_layout,
     empty_value,
+    needs_seconds,
     new_arrays,
     sidecar_endings,
 )
@@ -48,15 +49,14 @@ from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
-from v2v_server.labels.boxes import BoxTable
-from v2v_server.labels.formats import READERS, numbered_files
-from v2v_server.labels.masks import read_mask
+from v2v_server.labels.formats import READERS, BoxTable, numbered_files, read_mask
 from v2v_server.labels.views import kept_boxes, view_boxes, view_mask
 from v2v_server.motion import cells_of, levels_of
 from v2v_server.simulation.draw import choose_crop, draw
 from v2v_server.simulation.intensity import eight_bits
-from v2v_server.simulation.kernels import ARRAYS, list_events
-from v2v_server.simulation.variants import Variant, variants
+from v2v_server.simulation.kernels import list_events
+from v2v_server.simulation.precision import Variant, variants
+from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache, Cached
@@ -65,7 +65,7 @@ from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR
 from v2v_server.video.rows import Rows
-from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, makes, simulate
+from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, fill_rows, makes, simulate
 from v2v_server.worker.scene_choice import (
     CleanFrames,
     FlowPlan,
@@ -293,6 +293,10 @@ def make_sample(
     context, irregular = sample_context(lease, decoded, arrays, sidecars)
     unlabelled = dict[str, str]()
     for name, array in context.into.items():
+        if not context.can_time(name):
+            array[...] = empty_value(name)
+            unlabelled[name] = f"{lease.video}: its frame rate is unknown, and {name} needs it"
+            continue
         try:
             if name in decoded.clip.arrays:
                 array[...] = decoded.clip.arrays[name]
@@ -323,7 +327,8 @@ def make_sample(
             scene="" if plan.flow_plan is None else plan.flow_plan.reason,
             sidecars=dict(context.clip.fingerprints),
             unlabelled=unlabelled,
-            boxes_dropped=context.boxes_dropped,
+            boxes_dropped=context.dropped.pop("boxes", 0),
+            dropped={name: count for name, count in context.dropped.items() if count},
             saturated={name: count for name, count in saturated.items() if count},
             grid_seconds=_grid_seconds(context),
             left_out=context.left_out,
@@ -364,11 +369,13 @@ def sample_context(
             eight_bits(part, signal), params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods
         )
     motion = decoded.clip.motion
-    if motion is not None and motion.any() and not (into and into.keys().isdisjoint(ARRAYS)):
+    if motion is not None and motion.any() and not (into and into.keys().isdisjoint(NAMES)):
         part = without_margin(frames, params, recipe, plan.margin_px, MARGIN_PX)
         picture = within_rows(lease, plan.frames.sides)
         levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px, motion, picture)
-    seconds, irregular = _step_seconds(lease, decoded) if recipe.needs_seconds else (None, 0)
+    # An array must not make a video unusable for the others: without a rate, it is left empty.
+    is_timed = recipe.needs_seconds or (bool(lease.frames_per_second) and needs_seconds(into))
+    seconds, irregular = _step_seconds(lease, decoded) if is_timed else (None, 0)
     view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe, signal)
     clip = SourceClip(
         lease.start_frame,
@@ -417,7 +424,7 @@ def _decoder(clip: DecodedClip) -> str:
 
 def kernels_of(lease: Lease) -> frozenset[Variant]:
     """Return the compiled kernels that a lease's sample may need."""
-    made = tuple(name for name in ARRAYS if name in lease.arrays)
+    made = tuple(name for name in NAMES if name in lease.arrays)
     return _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds, made) if made else frozenset()
 
 
@@ -497,16 +504,14 @@ def boxes(context: SampleContext, out: npt.NDArray[Any]) -> None:
     clip = context.clip
     ending, opened = _only_sidecar("boxes", context.video, clip.sidecars)
     table = _boxes_of(ending, clip.fingerprints[ending], clip.picture_px, opened)
-    found = [table.at(frame) for frame in context.target_frames]
-    out[...] = -1
-    dropped = 0
-    for rows, (corners, numbers) in zip(out, found, strict=True):
-        seen, share = view_boxes(corners, context.clip.usable, context.params, context.recipe)
-        kept = kept_boxes(seen, share)
-        dropped += max(0, len(kept) - len(rows))
-        kept = kept[: len(rows)]
-        rows[: len(kept)] = np.concatenate([seen[kept], numbers[kept], share[kept, None]], axis=1)
-    context.boxes_dropped = dropped
+
+    def seen(frame: int) -> npt.NDArray[np.float64]:
+        corners, numbers = table.at(frame)
+        inside, share = view_boxes(corners, clip.usable, context.params, context.recipe)
+        kept = kept_boxes(inside, share)
+        return np.concatenate([inside[kept], numbers[kept], share[kept, None]], axis=1)
+
+    fill_rows(context, "boxes", out, map(seen, context.target_frames))
 
 
 @makes("masks")

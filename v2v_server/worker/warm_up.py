@@ -9,7 +9,7 @@ has no locks, or if the holder of the lock makes no progress.
 
 The compiler needs about 90 MB that it never frees. This memory goes with the child process that compiles.
 
-Kernels that only some streams need (``simulation/variants.py``) are compiled in the same way when they are first
+Kernels that only some streams need (``simulation/precision.py``) are compiled in the same way when they are first
 needed. By then a worker is confined (:mod:`v2v_server.system.sandbox`) and cannot start a process, so it compiles in
 its own memory.
 """
@@ -30,7 +30,7 @@ from typing import Any
 
 from v2v_server.motion import load as load_motion
 from v2v_server.simulation.pixel import simulate_pixels
-from v2v_server.simulation.variants import Variant, load, warm_up
+from v2v_server.simulation.precision import Variant, load, warm_up
 from v2v_server.system.compile_cache import sources_digest
 from v2v_server.system.process import die_with_parent
 

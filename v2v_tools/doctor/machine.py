@@ -69,9 +69,7 @@ def look_around(port: int, videos: str | None, recipe: str, rows: str, cache_dir
         UsageError: wrong recipe or rows.
     """
     yield Finding(OK, "version", f"{version_of('v2v-stream')}, Python {sys.version.split()[0]}, {sys.platform}")
-    missing: dict[str, list[str]] = {}
-    for part in EXTRAS:
-        missing[part] = _missing(part)
+    missing = {part: _missing(part) for part in EXTRAS}
     yield from _installation(missing)
     if not missing["server"]:
         yield from _libraries()

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass
-from functools import partial
+from dataclasses import astuple, replace
 
 from v2v_protocol.errors import V2VError
 from v2v_protocol.progress import Progress
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES
 from v2v_server.corpus.scenes.findings import Defect
-from v2v_server.corpus.scenes.picture_check import hides_motion, spread_videos
+from v2v_server.corpus.scenes.picture_check import Excerpt, examine, hides_motion, spread_excerpts
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.system.compile_cache import compile_cache
-from v2v_server.system.isolate import Died, run_isolated
+from v2v_server.system.isolate import Died
 from v2v_server.system.process import usable_cores
-from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.orientation import Window
 
 _MOST_VIDEOS = 6
 _SIDE_PX = 256
@@ -31,17 +26,6 @@ _Fields = tuple[tuple[float, ...], float, float, float, float, float, float, flo
 """Fields of a Prediction, in order."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Middle:
-    """Frames in the middle of a video, and the part of the picture that is looked at."""
-
-    id: str
-    index: FrameIndex
-    start: int
-    count: int
-    window: Window
-
-
 def look_at_motion(
     catalogue: Catalogue, defects: Mapping[str, Sequence[Defect]]
 ) -> Iterator[tuple[str, str, str, str]]:
@@ -52,10 +36,7 @@ def look_at_motion(
     """
     if not catalogue.source.is_local:
         return
-    results = run_isolated(
-        partial(_predicted, catalogue.source), _middles(catalogue), usable_cores(),
-        lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES, compile_cache(),
-    )  # fmt: skip
+    results = examine(_predicted, catalogue.source, _middles(catalogue), usable_cores(), _LONGEST_VIDEO_SECONDS)
     results = Progress.over("looking at motion", "videos", results, min(_MOST_VIDEOS, len(catalogue.videos)))
     found = {
         middle.id: result
@@ -79,27 +60,23 @@ def look_at_motion(
     yield "ok" if total.is_slow else "note", "motion", text.removeprefix("motion: "), change
 
 
-def _middles(catalogue: Catalogue) -> Iterator[_Middle]:
-    for video, index, (top, left, rows, columns) in spread_videos(catalogue, _MOST_VIDEOS, _LONGEST_SECONDS):
-        count = min(len(index), _FRAMES)
-        start = (len(index) - count) // 2 if index.seekable else 0
+def _middles(catalogue: Catalogue) -> Iterator[Excerpt]:
+    for each in spread_excerpts(catalogue, _MOST_VIDEOS, _LONGEST_SECONDS, _FRAMES):
+        top, left, rows, columns = each.window
         height, width = min(rows, _SIDE_PX), min(columns, _SIDE_PX)
-        window = top + (rows - height) // 2, left + (columns - width) // 2, height, width
-        if count > 1:
-            yield _Middle(video.id, index, start, count, window)
+        if each.count > 1:
+            yield replace(each, window=(top + (rows - height) // 2, left + (columns - width) // 2, height, width))
 
 
-def _predicted(source: VideoSource, middle: _Middle) -> _Fields | None:
+def _predicted(source: VideoSource, middle: Excerpt) -> _Fields | None:
     """Return the fields of the prediction; None where the frames do not decode."""
     import numpy as np
 
     from v2v_server.motion.prediction import predict
-    from v2v_server.video.collect import ClipRequest, Cut
 
     try:
         with source.open_pixels(middle.id, "") as pixels:
-            request = ClipRequest(middle.index, middle.start, (Cut(middle.count, middle.window),))
-            frames = [picture.grey for picture in pixels.pictures(request)]
+            frames = [picture.grey for picture in pixels.pictures(middle.request)]
     except V2VError:
         return None
     return astuple(predict(np.stack(frames)))

@@ -18,12 +18,12 @@ import numpy as np
 from v2v_protocol.events import EventList
 from v2v_protocol.recipe import Recipe, effect_settings
 from v2v_server.simulation.clip import simulate
+from v2v_server.simulation.effects import NOISE
 from v2v_tools.fit.interval import Doubles
 
 _SIDE_PX = 32
 DARK_GREY, BRIGHT_GREY = 70, 255
 _RAMP_GREYS = 40, 255
-_NOISE = ("shot_noise_hz", "leak_hz")
 _FREQUENCIES_HZ = np.geomspace(2.0, 1000.0, 19)
 
 
@@ -47,7 +47,7 @@ def measure(camera: Mapping[str, float]) -> dict[str, float]:
         ``background_bright_hz``, ``latency_dark_us``, ``latency_bright_us``, ``bandwidth_bright_hz``,
         ``refractory_us``. NaN where no event was seen.
     """
-    quiet = {name: 0.0 if name in (*_NOISE, "dead_pixel_share") else value for name, value in camera.items()}
+    quiet = {name: 0.0 if name in (*NOISE, "dead_pixel_share") else value for name, value in camera.items()}
     on, off = (_ramp_thresholds(quiet, 4.0, falls=falls) for falls in (False, True))
     still = [_rate(camera, grey) for grey in (DARK_GREY, BRIGHT_GREY)]
     # Between events of a ramp pass the refractory period and the time in which the ramp rises by a threshold.

@@ -13,6 +13,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.safe_yaml import format_yaml
 from v2v_protocol.settings import settings_of
 from v2v_protocol.write_aside import write_file
+from v2v_server.simulation.effects import EFFECTS
 from v2v_tools.fit.fit import FittedCamera
 from v2v_tools.fit.interval import Doubles, Estimate
 from v2v_tools.fit.statistics import BRIGHTNESS_EDGES, COUNT_EDGES, INTERVAL_EDGES_US, Panels, per_second
@@ -95,18 +96,19 @@ def draw_fit(fitted: FittedCamera, source: str) -> Image:
     gaps = ["" if number % 3 else f"{edge / 1e3:.3g} ms" for number, edge in enumerate(INTERVAL_EDGES_US[:-1])]
     counts = [f"{low}" for low in COUNT_EDGES[:-1]]
     titles = (
-        ("darker events a pixel and second, by grey level", grey),
-        ("brighter events a pixel and second, by grey level", grey),
-        ("noise, darker: pixels without a change, by grey level", grey),
-        ("noise, brighter: pixels without a change, by grey level", grey),
-        ("share of the pixels, by events of a pixel", counts),
-        ("brighter events as a share, by grey level", grey),
-        ("share of intervals between events of one polarity", gaps),
-        ("share of intervals between opposite events", gaps),
+        ("rates", "darker events a pixel and second, by grey level", grey),
+        ("rates", "brighter events a pixel and second, by grey level", grey),
+        ("still", "noise, darker: pixels without a change, by grey level", grey),
+        ("still", "noise, brighter: pixels without a change, by grey level", grey),
+        ("pixels", "share of the pixels, by events", counts),
+        ("rates", "brighter events as a share, by grey level", grey),
+        ("intervals", "share of intervals between events of one polarity", gaps),
+        ("intervals", "share of intervals between opposite events", gaps),
     )
+    shown = {name: ", ".join(effect.FIELD for effect in EFFECTS if name == effect.PANEL) for name, *_ in titles}
     panels = [
-        Curves(title, ticks, measured[number], None if simulated is None else simulated[number])
-        for number, (title, ticks) in enumerate(titles)
+        Curves(f"{title} ({shown[name]})", ticks, measured[number], None if simulated is None else simulated[number])
+        for number, (name, title, ticks) in enumerate(titles)
     ]
     lines = report_lines(fitted, source)
     return draw_comparison(lines[0], panels, lines[1:])

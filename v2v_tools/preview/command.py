@@ -9,7 +9,7 @@ from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_protocol.spec_flags import add_spec, recipe_setting, spec_fields
+from v2v_protocol.spec_flags import add_corpus, add_spec, recipe_setting, spec_fields
 from v2v_tools.preview.preview import PICTURE_SUFFIXES, Shot, preview
 
 _MOST_CAMERAS = 32
@@ -39,9 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "sources", nargs="+", metavar="VIDEO|DIR",
         help="a video, a folder of videos, or a list file; with several, each gets a FILE-NAME of its own",
     )  # fmt: skip
-    videos.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
-    videos.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
-    videos.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    add_corpus(parser, "Videos")
     out = parser.group("Output")
     parser.add_output(
         "Output", "--out", PICTURE_SUFFIXES, f"picture, film or page: {', '.join(PICTURE_SUFFIXES)}", required=True

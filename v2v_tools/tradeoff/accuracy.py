@@ -23,7 +23,7 @@ from v2v_server.corpus.sources.folder import Folder
 from v2v_server.motion.prediction import Prediction, predict
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.intensity import eight_bits
-from v2v_server.simulation.result import Voxels
+from v2v_server.simulation.kernels import Voxels
 from v2v_server.worker.arrays import SampleContext
 from v2v_server.worker.produce import decode_for, plan_sample, sample_context
 from v2v_tools.tradeoff.errors import Tally, compare

@@ -20,7 +20,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_recipe, recipe_setting
 from v2v_protocol.write_aside import write_file, write_json
 from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, Prediction
-from v2v_server.simulation.variants import warm_up
+from v2v_server.simulation.precision import warm_up
 from v2v_server.system.process import keep_freed_memory
 from v2v_server.video.rows import Rows
 from v2v_tools.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, Places, accuracy, parts, predicted_loss

@@ -1,13 +1,16 @@
 """Puts a fault into real server workers: on the PYTHONPATH of a server, this is run by every Python it starts.
 
-``V2V_FAULT`` is JSON: {"stage": decode | simulate | send, "action": a signal's name, "exit", "memory" or "hang",
-"video": only at this video (any when missing), "once": a file that is created by the one worker that does it}.
+``V2V_FAULT`` is JSON: {"stage": decode | simulate | send, "action": a signal's name, "exit", "memory", "hang" or
+"disconnect", "video": only at this video (any when missing), "once": a file that is created by the one worker that does
+it}.
 Nothing in the product knows of this.
 """
 
+import contextlib
 import json
 import os
 import signal
+import socket
 import sys
 import threading
 from pathlib import Path
@@ -33,7 +36,18 @@ def _act(fault: dict, video: str) -> None:
         raise MemoryError("injected")
     if action == "hang":
         threading.Event().wait()
+    if action == "disconnect":
+        _disconnect()
+        return
     os.kill(os.getpid(), getattr(signal, action))
+
+
+def _disconnect() -> None:
+    """Cuts the connection to the server, whose address has a name; the process itself is unharmed."""
+    for descriptor in map(int, os.listdir("/proc/self/fd")):
+        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as link:
+            if b"v2v-" in os.fsencode(link.getpeername()):
+                link.shutdown(socket.SHUT_RDWR)
 
 
 def _install(fault: dict) -> None:

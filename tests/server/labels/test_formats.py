@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from v2v_server.labels import formats
-from v2v_server.labels.boxes import Box, BoxTable
-from v2v_server.labels.formats import READERS, check_labels, frame_of, numbered_files
+from v2v_server.labels.formats import READERS, Box, BoxTable, check_labels, frame_of, numbered_files
 
 PICTURE_PX = (60, 80)
 Boxes = list[tuple[int, int, int, int, int, int, int]]

@@ -139,6 +139,19 @@ def test_it_fits_every_screen_and_both_themes(served: LocalServer, port: int, br
     assert browser.complaints == []
 
 
+def test_the_axis_of_time_shows_a_minute_whatever_has_arrived(served: LocalServer, port: int, browser: Browser) -> None:
+    browser.open(f"http://127.0.0.1:{port}/")
+    browser.until("fields.length")
+    browser.value("show = () => {}")  # the server's own states would come between
+    for points in range(3):
+        browser.value("past.speed.forEach((column) => column.splice(0))")
+        for point in range(points):
+            browser.value(f"remember('speed', [Date.now() / 1000 + {point}, 1, 2])")
+        browser.value("drawCharts()")
+        browser.until("charts.speed.scales.x.max - charts.speed.scales.x.min === 60")
+        browser.until("Math.abs(charts.speed.scales.x.max - Date.now() / 1000) < 30")
+
+
 def test_a_server_that_is_gone_is_said_and_one_that_comes_back_is_shown(
     clips: Path, port: int, browser: Browser
 ) -> None:

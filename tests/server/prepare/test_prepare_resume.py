@@ -27,7 +27,7 @@ from v2v_server.commands.prepare import main, summary
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.manifest import MANIFEST_NAME, read_manifest
 from v2v_server.prepare.prepare import prepare
-from v2v_server.prepare.resume import refuse_overlap
+from v2v_server.prepare.resume import refuse_links
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX, Transcoding
 from v2v_server.video.fingerprint import fingerprint
 
@@ -137,17 +137,17 @@ def test_a_folder_is_resolved_once(source: Path, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(Path, "resolve", lambda path: (resolved.append(path), resolve(path))[1])
     catalogue = opened(source)
     resolved.clear()
-    refuse_overlap(catalogue, out)
+    refuse_links(catalogue, out)
     assert resolved == [source, source / "sub"]
     shutil.copy(source / "0.mp4", out / "plain.mp4")  # a store file is no video
     (source / "sub" / "5.mp4").symlink_to(out / "plain.mp4")
     with pytest.raises(CorpusError, match=r"sub/5\.mp4 of the source is a link into it"):
-        refuse_overlap(opened(source), out)
+        refuse_links(opened(source), out)
     (source / "sub" / "5.mp4").unlink()
     shutil.copy(source / "0.mp4", out / "sub" / "plain.mp4")
     (source / "linked").symlink_to(out / "sub")
     with pytest.raises(CorpusError, match=r"linked/plain\.mp4 of the source is a link into it"):
-        refuse_overlap(opened(source), out)
+        refuse_links(opened(source), out)
 
 
 def test_a_prepared_file_that_cannot_be_read_is_not_given_up(

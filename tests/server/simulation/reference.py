@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tests.oracles.noise import shot_words, standard_normals, start_uniforms
+from tests.oracles.noise import mismatch_normals, shot_words, standard_normals, start_uniforms
 from v2v_server.simulation import noise
-from v2v_server.simulation.effects import EFFECTS, mismatch
+from v2v_server.simulation.effects import EFFECTS
+from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.voxel import LARGEST_COUNT, rounding_tolerance
 
 
@@ -40,7 +41,7 @@ def simulate(
     tolerance = real(rounding_tolerance(threshold_pos, threshold_neg))
     residual = start_uniforms(key, pixels).astype(real) * (positive + negative) - negative
     normals = None if noise_scale is None else standard_normals(key, steps, pixels)
-    position, normal = noise.hot_pixels(key, hot_count, pixels)
+    position, normal = hot_pixels(key, hot_count, pixels)
     drift = normal.astype(real) * real(hot_sigma)
     counts = np.zeros((steps // frames_per_bin, pixels), real)
     for step in range(steps):
@@ -84,12 +85,12 @@ def simulate_with_effects(
     real = table.dtype.type
     steps, pixels = len(grey) - 1, grey.shape[1]
     level, tolerance = table[grey], real(tolerance)
-    normal = np.stack(mismatch.normals(key, pixels)).astype(real)
+    normal = np.stack(mismatch_normals(key, pixels)).astype(real)
     share = np.maximum(real(1) + normal * spread.sigma, spread.smallest_share)
     positive, negative = real(threshold_pos) * share[0], real(threshold_neg) * share[1]
     residual = start_uniforms(key, pixels).astype(real) * (positive + negative) - negative
     normals = standard_normals(key, steps, pixels)
-    position, normal = noise.hot_pixels(key, hot_count, pixels)
+    position, normal = hot_pixels(key, hot_count, pixels)
     decided = shot_words(key, steps, pixels)
     seen, blind = level[0].copy(), np.zeros(pixels, real)
     counts = np.zeros((steps, pixels), real)

@@ -171,8 +171,9 @@ from dataclasses import replace
 import numpy as np
 from tests.server.simulation.test_clip import EFFECTS, FRAMES, PARAMS, RECIPE
 from v2v_server.simulation.clip import simulate_clip
-from v2v_server.simulation.kernels import simulate_general, simulate_pixels, words
-from v2v_server.simulation.variants import warm_up
+from v2v_server.simulation.kernels import simulate_general, simulate_pixels
+from v2v_server.simulation.pixel import words
+from v2v_server.simulation.precision import warm_up
 
 def count():
     return [len(kernel.signatures) for kernel in (simulate_pixels, simulate_general, words)]

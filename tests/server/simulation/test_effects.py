@@ -14,19 +14,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.oracles.noise import shot_words, standard_normals, start_uniforms
+from tests.oracles.noise import mismatch_normals, shot_words, standard_normals, start_uniforms
 from tests.server.simulation import effect_oracle, reference
 from tests.server.simulation.effect_oracle import Camera, Chance
 from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from tests.server.simulation.test_pixel import moving_frames
-from v2v_protocol.bounds import LARGEST_NORMAL
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe, preset
+from v2v_protocol.recipe import LARGEST_NORMAL, Recipe, preset
 from v2v_protocol.sample import SampleParams
-from v2v_server.simulation import noise, simulate, simulate_clip
+from v2v_server.simulation import simulate, simulate_clip
 from v2v_server.simulation.draw import noise_key_of_seed
-from v2v_server.simulation.effects import dead_pixels, mismatch, photoreceptor, prepare, shot_noise
+from v2v_server.simulation.effects import dead_pixels, photoreceptor, prepare, shot_noise
 from v2v_server.simulation.intensity import exponential, linear_light, log_table, log_table_float64
+from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.voxel import rounding_tolerance
 
 GAMMA, LOG_EPS, FPS = 2.2, 1e-3, 25.0
@@ -121,13 +121,13 @@ def test_kernel_equals_the_oracle(effects: Effects, noise_sigma: float, seed: in
     params = params_of(effects or ALL, seed, noise_sigma=noise_sigma, hot_pixel_count=2, hot_pixel_sigma=3.0)
     effects, key = params.effects, params.noise_key
     change = standard_normals(key, steps, pixels).astype(np.float64) * noise_sigma * np.sqrt(durations)[:, None]
-    position, normal = noise.hot_pixels(key, 2, pixels)
+    position, normal = hot_pixels(key, 2, pixels)
     change[:, position] += 3.0 * normal.astype(np.float64) * durations[:, None]
     shot = np.stack(shot_words(key, steps, pixels)).astype(np.float64) * 2.0**-32
     chance = Chance(
         start_uniforms(key, pixels).astype(np.float64),
         change,
-        np.stack(mismatch.normals(key, pixels)).astype(np.float64),
+        np.stack(mismatch_normals(key, pixels)).astype(np.float64),
         shot,
         dead_pixels.positions(key, effects.get("dead_pixel_share", 0.0), pixels),
     )
@@ -226,7 +226,7 @@ def test_mismatch_spreads_the_thresholds_by_the_stated_sigma() -> None:
         assert abs(share.std() - 0.1) < 4 * 0.1 / math.sqrt(2 * share.size) + 1e-3
     assert abs(np.corrcoef(*shares)[0, 1]) < 4 / 100
     # The numbers themselves, to what a count resolves.
-    normals = mismatch.normals(noise_key_of_seed(0), 10_000)
+    normals = mismatch_normals(noise_key_of_seed(0), 10_000)
     np.testing.assert_allclose(shares[0], 1 + 0.1 * normals[0], rtol=4e-3)
     assert abs(np.corrcoef(shares[0][1:], shares[0][:-1])[0, 1]) < 4 / 100
 

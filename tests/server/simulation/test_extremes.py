@@ -10,17 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.oracles.balance import Camera, arithmetic, balance, error_bound, imbalance, trace_of
+from tests.oracles.balance import Camera, arithmetic, balance, imbalance, trace_of
 from tests.oracles.extremes import Finding, Row, record_of, refused, rows, texture
-from tests.oracles.noise import standard_normals, start_uniforms
+from tests.oracles.noise import error_bound, standard_normals, start_uniforms
 from tests.server.simulation import oracle, reference
-from v2v_protocol.bounds import LARGEST_EVENTS, LARGEST_NORMAL, most_events
 from v2v_protocol.errors import RecipeError, UsageError
-from v2v_protocol.recipe import PRESETS, Recipe
+from v2v_protocol.recipe import LARGEST_EVENTS, LARGEST_NORMAL, PRESETS, Recipe, most_events
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation import noise, simulate, simulate_clip
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.intensity import log_table_float64
+from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.precision import AUTO, LIMITS, choose
 from v2v_server.simulation.voxel import rounding_tolerance
 
@@ -89,7 +89,7 @@ def test_the_balance_sees_a_lost_event() -> None:
 def test_the_trace_agrees_with_the_oracle(threshold: float) -> None:
     camera, frames = Camera(threshold, 1.3 * threshold, 0.05, 7, 3.0), texture(30)
     normals = standard_normals(noise_key_of_seed(0), 30, 48).astype(np.float64) * camera.noise_sigma
-    position, hot = noise.hot_pixels(noise_key_of_seed(0), 7, 48)
+    position, hot = hot_pixels(noise_key_of_seed(0), 7, 48)
     normals[:, position] += hot.astype(np.float64) * camera.hot_pixel_sigma
     expected = oracle.simulate(
         oracle.log_intensity(frames.reshape(31, 48), camera.gamma, camera.log_eps),

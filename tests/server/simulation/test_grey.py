@@ -10,7 +10,7 @@ import torch
 
 from v2v_protocol.errors import UsageError
 from v2v_server.simulation import simulate
-from v2v_server.simulation.grey import grey_levels
+from v2v_server.simulation.clip import grey_levels
 
 COLOUR = np.random.default_rng(3).integers(0, 256, (6, 8, 9, 3), np.uint8)
 GREY = np.floor(COLOUR @ np.array([0.299, 0.587, 0.114]) + 0.5 + 1e-9).astype(np.uint8)

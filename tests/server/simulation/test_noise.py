@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from tests.oracles.noise import shot_words, standard_normals, start_uniforms
-from v2v_server.simulation import noise
-from v2v_server.simulation.effects import dead_pixels, mismatch
+from tests.oracles.noise import mismatch_normals, shot_words, standard_normals, start_uniforms, words
+from v2v_server.simulation import noise, pixel
+from v2v_server.simulation.effects import dead_pixels
+from v2v_server.simulation.pixel import hot_pixels
 
 KEY = (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344)
 
@@ -106,9 +109,19 @@ def test_zero_and_tiny_keys_are_as_good_as_any() -> None:
 
 def test_words_of_one_purpose_are_distinct_and_purposes_differ() -> None:
     place = np.arange(200_000)
-    assert len(np.unique(noise.words(KEY, noise.START, place))) == len(place)
-    agreeing = noise.words(KEY, noise.PIXEL_RADIUS, place) == noise.words(KEY, noise.PIXEL_ANGLE, place)
+    assert len(np.unique(words(KEY, noise.START, place))) == len(place)
+    agreeing = words(KEY, noise.PIXEL_RADIUS, place) == words(KEY, noise.PIXEL_ANGLE, place)
     assert np.count_nonzero(agreeing) <= 2
+
+
+@given(st.tuples(*[st.integers(0, 2**32 - 1)] * 4), st.integers(0, 20), st.integers(1, 50))
+def test_the_compiled_words_are_those_of_the_definition(key: noise.NoiseKey, purpose: int, count: int) -> None:
+    counters = np.arange(count) * 85_899_345
+    np.testing.assert_array_equal(pixel.words(key, purpose, counters), words(key, purpose, counters))
+    position, normal = hot_pixels(key, count // 2, count)
+    assert set(position) == set(np.argsort(words(key, noise.HOT_PLACE, np.arange(count)))[: count // 2])
+    radius, angle = (words(key, each, position) for each in (noise.HOT_RADIUS, noise.HOT_ANGLE))
+    np.testing.assert_array_equal(normal, noise.box_muller(radius, angle)[0])
 
 
 def test_start_uniforms_are_uniform() -> None:
@@ -121,7 +134,7 @@ def test_start_uniforms_are_uniform() -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 7, 500, 999, 1000])
 def test_hot_pixels_are_distinct_for_every_count(count: Any) -> None:
-    position, normal = noise.hot_pixels(KEY, count, 1000)
+    position, normal = hot_pixels(KEY, count, 1000)
     assert len(position) == len(normal) == count
     assert (np.diff(position) > 0).all()
     assert count == 0 or (position[0] >= 0 and position[-1] < 1000)
@@ -130,7 +143,7 @@ def test_hot_pixels_are_distinct_for_every_count(count: Any) -> None:
 def test_hot_pixels_fall_everywhere_alike() -> None:
     hits = np.zeros(100)
     for seed in range(2000):
-        hits[noise.hot_pixels((seed, 0, 0, 0), 5, 100)[0]] += 1
+        hits[hot_pixels((seed, 0, 0, 0), 5, 100)[0]] += 1
     assert ((hits - 100) ** 2 / 95).sum() < 99 + 5 * math.sqrt(198)
 
 
@@ -140,13 +153,13 @@ def test_dead_and_hot_pixels_are_chosen_apart() -> None:
     assert len(set(dead.tolist())) == 500
     assert (np.diff(dead) > 0).all()
     assert dead_pixels.positions(key, 0.0, 1000).size == 0
-    hot, _ = noise.hot_pixels(key, 500, 1000)
+    hot, _ = hot_pixels(key, 500, 1000)
     # Hypergeometric: 250 in common on average, with a deviation of 7.9.
     assert abs(len(set(dead.tolist()) & set(hot.tolist())) - 250) < 4 * 7.9
 
 
 def test_mismatch_normals_are_normal_and_independent() -> None:
-    positive, negative = mismatch.normals((5, 6, 7, 8), 200_000)
+    positive, negative = mismatch_normals((5, 6, 7, 8), 200_000)
     for sample in (positive, negative):
         assert abs(sample.mean()) < 4 / math.sqrt(sample.size)
         assert abs(sample.var() - 1) < 4 * math.sqrt(2 / sample.size)

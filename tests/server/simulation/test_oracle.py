@@ -16,7 +16,8 @@ from tests.oracles.noise import standard_normals, start_uniforms
 from tests.server.simulation import oracle
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.simulation import noise, simulate_clip
+from v2v_server.simulation import simulate_clip
+from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.voxel import rounding_tolerance
 
 FOLDER = Path(os.environ.get("V2V_TEST_VIDEOS", Path(__file__).parents[4] / "shared" / "data" / "videos"))
@@ -55,7 +56,7 @@ def differing_ppm(names: list[str], threshold: float, ratio: float, sigma: float
         params = SampleParams(threshold_pos, threshold_neg, sigma, 2, 3.0, (), 1.0, 0, 0, False, 0.0, key)
         got = simulate_clip(frames, params, recipe, "float32").voxels
         noisy = standard_normals(key, recipe.steps, pixels).astype(np.float64) * sigma
-        position, normal = noise.hot_pixels(key, 2, pixels)
+        position, normal = hot_pixels(key, 2, pixels)
         noisy[:, position] += normal.astype(np.float64) * 3.0
         level = oracle.log_intensity(
             frames[: recipe.frames_needed].reshape(-1, pixels), recipe.gamma, recipe.log_eps[0]

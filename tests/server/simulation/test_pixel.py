@@ -17,9 +17,10 @@ from tests.server.simulation import oracle, reference
 from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.simulation import noise, pixel, simulate, simulate_clip, simulate_log
+from v2v_server.simulation import pixel, simulate, simulate_clip, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.intensity import log_table
+from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.voxel import rounding_tolerance
 
 LOG_RANGE = 6.9
@@ -266,7 +267,7 @@ def test_saturation_in_some_blocks_equals_the_definition(
 def test_hot_pixels_fire_and_no_other_pixel_does() -> None:
     frames = np.full((11, 50, 50), 80, np.uint8)
     got = simulate(frames, threshold_pos=0.5, hot_pixel_count=25, hot_pixel_sigma=50.0, seed=2, dtype="float32").voxels
-    position, normal = noise.hot_pixels(noise_key_of_seed(2), 25, 2500)
+    position, normal = hot_pixels(noise_key_of_seed(2), 25, 2500)
     total = got.sum((0, 1)).ravel()
     # One threshold either way for where the residual starts, one for where it ends.
     np.testing.assert_allclose(total[position], normal * 50.0 / 0.5 * 10, atol=2)

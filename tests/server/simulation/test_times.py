@@ -12,16 +12,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.oracles.in_time import bilinear_of, counts_of, stacked_histogram, watch
+from tests.oracles.in_time import ages_of, bilinear_of, counts_of, stacked_histogram, watch
 from tests.oracles.noise import standard_normals, start_uniforms
 from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from tests.server.simulation.test_pixel import moving_frames
 from tests.server.video.test_real_videos import FOLDER as REAL_VIDEOS
 from v2v_protocol.errors import UsageError
-from v2v_server.simulation import noise, simulate, simulate_log
+from v2v_server.simulation import simulate, simulate_log
 from v2v_server.simulation.intensity import log_table
-from v2v_server.simulation.kernels import ARRAYS, fill, list_events
-from v2v_server.simulation.result import Voxels
+from v2v_server.simulation.kernels import Voxels, fill, list_events
+from v2v_server.simulation.pixel import hot_pixels
+from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, bin_edges, rounding_tolerance, timeline
 from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
@@ -62,7 +63,7 @@ def test_it_counts_the_events_of_the_papers_kernel(
         seed=seed, dtype=dtype, precision=precision,
     )  # fmt: skip
     assert not made.given.needs_general
-    found = again(made, *ARRAYS)
+    found = again(made, *NAMES)
     np.testing.assert_array_equal(found["voxels"], made.voxels)
     counts = found["event_counts"].astype(np.int64)
     assert counts.min() >= 0
@@ -91,7 +92,7 @@ def test_kernel_equals_the_oracle(data: Any, precision: str, grids: int) -> None
     )  # fmt: skip
     at = Moments(np.array([0, 0, 2, 3, 3, 3]), np.array([0.25, 0.7, 1 / 3, 0.1, 0.5, 0.9]))
     levels = Levels(at, random.integers(0, 255 * FINE_STEPS + 1, (6, 4, 6), np.uint16))
-    found = again(made, *ARRAYS, levels=levels)
+    found = again(made, *NAMES, levels=levels)
     events = list_events(dataclasses.replace(made.given, levels=levels), made.real, np.full(steps, 1e6 / FPS))
 
     table = np.log(1e-3 + (np.arange(256) / 255) ** 2.2)
@@ -104,7 +105,7 @@ def test_kernel_equals_the_oracle(data: Any, precision: str, grids: int) -> None
     added = np.zeros((steps, pixels))
     if sigma:
         added += standard_normals(key, steps, pixels) * sigma
-    position, normal = noise.hot_pixels(key, 2, pixels)
+    position, normal = hot_pixels(key, 2, pixels)
     added[:, position] += 0.5 * normal
     sums = np.concatenate([np.zeros((1, pixels)), np.cumsum(added, axis=0)])
     known += np.stack([np.interp(times, np.arange(steps + 1.0), sums[:, p]) for p in range(pixels)], axis=1)
@@ -119,6 +120,8 @@ def test_kernel_equals_the_oracle(data: Any, precision: str, grids: int) -> None
         y, x = divmod(p, 6)
         got = found["event_counts"][:, :, :, y, x].astype(np.int64).transpose(1, 0, 2).reshape(2, -1)
         wrong += int(np.abs(got - counts_of(seen, edges)).sum())
+        ages = found["time_surface"][:, :, :, y, x].transpose(1, 0, 2).reshape(2, -1) * FPS
+        wrong += int(np.count_nonzero(~np.isclose(ages, ages_of(seen, edges), rtol=0.0, atol=3e-3)))
         here = (events.x == x) & (events.y == y)
         # An event within a rounding of the end of a bin may come a rounding later, and then shifts none of the others.
         if here.sum() == len(seen.times):
@@ -285,10 +288,10 @@ CONTRAST = float(np.ptp(log_table(2.2, 1e-3)))
 
 def test_every_array_saturates_and_counts_it() -> None:
     made = simulate(BLACK_WHITE_BLACK, threshold_pos=CONTRAST / 300.5, bins=1, frames_per_bin=2, start_residual=0.0)
-    arrays, saturated = fill(made.given, made.real, dict.fromkeys(ARRAYS))
+    arrays, saturated = fill(made.given, made.real, dict.fromkeys(NAMES))
     assert made.voxels.ravel().tolist() == [0]
     assert arrays["event_counts"].ravel().tolist() == [127, 127]
-    assert saturated == {"voxels": 0, "event_counts": 2, "voxels_bilinear": 0}
+    assert saturated == {"voxels": 0, "event_counts": 2, "voxels_bilinear": 0, "time_surface": 0}
 
 
 @pytest.mark.parametrize("height", [2047.5, 2049.5, 65503.5, 65504.5, 65521.5, 1e5 + 0.5])
@@ -345,7 +348,8 @@ from tests.server.simulation.test_pixel import moving_frames
 from tests.server.simulation.test_times import ALL, FPS
 from v2v_server.simulation import simulate
 from v2v_server.simulation.intensity import log_table
-from v2v_server.simulation.kernels import ARRAYS, fill
+from v2v_server.simulation.kernels import fill
+from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
 
 grey = np.linspace(0, 255 * FINE_STEPS, 80).astype(np.uint16).reshape(2, 5, 8)
@@ -357,7 +361,7 @@ for effects in ({}, ALL):
             moving_frames(9, 5, 8, 3), threshold_pos=0.2, noise_sigma=0.1, bins=3, grids_per_frame=2, dtype="float32",
             seed=5, frames_per_second=FPS, precision=precision, **effects,
         )
-        for array in fill(dataclasses.replace(made.given, levels=levels), made.real, dict.fromkeys(ARRAYS))[0].values():
+        for array in fill(dataclasses.replace(made.given, levels=levels), made.real, dict.fromkeys(NAMES))[0].values():
             digest.update(array.tobytes())
         digest.update(made.to_events(1000.0).t.tobytes())
 print(digest.hexdigest()[:32])

@@ -14,8 +14,8 @@ from tests.server.simulation.test_times import real_frames
 from v2v_protocol.recipe import Recipe
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import draw
-from v2v_server.simulation.effects.tolerance import _COSTS, changed_shares, left_out
-from v2v_server.simulation.result import Voxels
+from v2v_server.simulation.effects.tolerance import COSTS, changed_shares, left_out
+from v2v_server.simulation.kernels import Voxels
 
 CAMERA = Recipe(
     crop_height_px=64, crop_width_px=64, pause_probability=0.0102, noise_sigma=0.0,
@@ -83,32 +83,32 @@ def test_without_tolerance_every_effect_runs() -> None:
     frames = moving(101, 64, 3)
     effects = simulated(frames, 0, 0.0).given.params.effects
     slow = CAMERA.replace(photoreceptor_hz=30.0, refractory_seconds=1e-3, shot_noise_hz=5.0, leak_hz=0.2)
-    assert set(_COSTS) < set(effects)
-    assert set(_COSTS) < set(simulated(frames, 0, 0.01, slow).given.params.effects)
+    assert set(COSTS) < set(effects)
+    assert set(COSTS) < set(simulated(frames, 0, 0.01, slow).given.params.effects)
 
 
 def test_a_still_clip_keeps_its_effects() -> None:
     frames = np.full((101, 64, 64), 90, np.uint8)
     assert changed_shares(simulated(frames, 0, 0.0).given) == {}
-    assert set(_COSTS) < set(simulated(frames, 0, 0.5).given.params.effects)
+    assert set(COSTS) < set(simulated(frames, 0, 0.5).given.params.effects)
 
 
 def test_the_choice_does_not_depend_on_the_dtype_or_the_arithmetic() -> None:
     given = simulated(moving(101, 64, 5), 2, 0.0).given
     shares = changed_shares(given)
-    assert shares.keys() == _COSTS.keys()
+    assert shares.keys() == COSTS.keys()
     assert changed_shares(dataclasses.replace(given, dtype="int16")) == shares
 
 
-_shares = st.dictionaries(st.sampled_from(sorted(_COSTS)), st.floats(0.0, 0.1))
+_shares = st.dictionaries(st.sampled_from(sorted(COSTS)), st.floats(0.0, 0.1))
 
 
 @given(_shares, st.floats(1e-6, 0.2))
 def test_the_most_expensive_set_that_fits_is_left_out(shares: dict[str, float], tolerance: float) -> None:
     chosen = left_out(shares, tolerance)
     assert sum(sorted(shares[name] for name in chosen)) <= tolerance * (1 + 1e-9)
-    cost = sum(_COSTS[name] for name in chosen)
+    cost = sum(COSTS[name] for name in chosen)
     for count in range(1, len(shares) + 1):
         for names in combinations(shares, count):
             if sum(shares[name] for name in names) < tolerance * (1 - 1e-9):
-                assert sum(_COSTS[name] for name in names) <= cost
+                assert sum(COSTS[name] for name in names) <= cost

@@ -14,8 +14,7 @@ from v2v_server.simulation.clip import _log_ends, _most_events
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.intensity import Intensity
 from v2v_server.simulation.kernels import KernelInput
-from v2v_server.simulation.precision import AUTO, choose
-from v2v_server.simulation.variants import USUAL, Variant, variants
+from v2v_server.simulation.precision import AUTO, USUAL, Variant, choose, variants
 from v2v_server.simulation.voxel import bin_edges
 from v2v_server.video.luma import MOST_BITS, SDR, Signal
 
@@ -25,8 +24,8 @@ from dataclasses import replace
 from tests.server.simulation.test_clip import EFFECTS, FRAMES, PARAMS, RECIPE
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.kernels import simulate_general, simulate_pixels
-from v2v_server.simulation.variants import warm_up
-from v2v_server.simulation.variants import USUAL, Variant, load
+from v2v_server.simulation.precision import warm_up
+from v2v_server.simulation.precision import USUAL, Variant, load
 
 def count():
     return [len(kernel.signatures) for kernel in (simulate_pixels, simulate_general)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import threading
 from dataclasses import replace
 from typing import Any
 
@@ -57,6 +58,23 @@ def test_a_log_gets_a_line_every_ten_seconds_without_control_sequences() -> None
     view.interrupt()
     view.close()
     assert out.getvalue() == said(status) + "\n"
+
+
+def test_a_line_of_any_thread_stays_above_what_a_terminal_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    out, log, status = Terminal(), Log(), published(peers()).status()
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr("sys.stderr", out)
+    view = StatusView(log, out)
+    view.show(0.0, status)
+    shown = out.getvalue()
+    other = threading.Thread(target=log.say, args=("refused a connection of user 7",))
+    other.start()
+    other.join()
+    view.show(1.0, status)
+    cleared, line, again = out.getvalue()[len(shown) :].partition("refused a connection of user 7\n")
+    assert cleared.startswith(f"\x1b[{shown.count(chr(10))}F\x1b[J")
+    assert line
+    assert again == shown
 
 
 def test_an_idle_server_says_so_once_in_a_log() -> None:

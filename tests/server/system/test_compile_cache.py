@@ -151,9 +151,11 @@ def test_a_change_of_one_module_reaches_the_kernels_of_another(tmp_path: Path) -
     code = (
         "import numpy as np\n"
         "from v2v_server.simulation import noise, pixel\n"
+        f"import sys; sys.path.append({str(ROOT)!r})\n"
+        "from tests.oracles.noise import words\n"
         "key, counters = (1, 2, 3, 4), np.arange(5)\n"
-        "compiled = pixel.words(np.array(key, np.uint32), np.uint32(noise.START), counters.astype(np.uint32))\n"
-        "np.testing.assert_array_equal(compiled, noise.words(key, noise.START, counters))\n"
+        "compiled = pixel.words(key, noise.START, counters)\n"
+        "np.testing.assert_array_equal(compiled, words(key, noise.START, counters))\n"
         "print(pixel.words.stats.cache_path, sum(pixel.words.stats.cache_hits.values()), *compiled)\n"
     )
     before = run(code, tmp_path).split()

@@ -10,16 +10,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
 from tests.clips import write_clip
+from v2v_client import Batch
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import Sample
+from v2v_protocol.sample import ARRAYS, FromSidecar, Provenance, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.video.rows import Rows
+from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, fill_rows
 from v2v_tools.remake import Remaker
 
 FRAMES, HEIGHT_PX, WIDTH_PX, SIDE_PX = 40, 48, 64, 14
@@ -116,6 +119,38 @@ def test_the_smallest_boxes_are_left_out_and_counted(corpus: Path, tmp_path: Pat
         assert sample.arrays["boxes"][:, :, 5].tolist() == [[2.0, 0.0]] * 5, "the two largest"
         assert sample.provenance.boxes_dropped == 10
         assert "boxes_dropped" not in made(catalogue, RECIPE.replace(**whole), 0, ("frames",)).provenance.to_dict()
+
+
+def test_a_toy_label_with_a_cap_needs_no_field_of_its_own(
+    corpus: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Points, three a frame, of which two fit: a line and a function, as ``docs/extending.md`` says."""
+
+    def points(context: SampleContext, out: np.ndarray) -> None:
+        text = context.clip.sidecars[".points.txt"].read_text()
+        found = np.array([line.split() for line in text.splitlines()], np.float32)
+        fill_rows(context, "points", out, (found[found[:, 0] == frame, 1:] for frame in context.target_frames))
+
+    form = FromSidecar(".points.txt", lambda recipe, _: ("float32", (5, recipe.max_boxes, 2)), empty=-1)
+    monkeypatch.setitem(ARRAYS, "points", form)
+    monkeypatch.setitem(ARRAY_BUILDERS, "points", points)
+    (tmp_path / "a.mp4").symlink_to(corpus / "a.mp4")
+    lines = [f"{frame} {frame} {row}" for frame in range(FRAMES) for row in range(3 if frame % 3 < 2 else 1)]
+    (tmp_path / "a.points.txt").write_text("\n".join(lines))
+    with closing(open_catalogue(tmp_path, processes=0)) as catalogue:
+        sample = made(catalogue, RECIPE.replace(max_boxes=2), 3, ("frames", "points"))
+        plain = made(catalogue, RECIPE.replace(max_boxes=2), 3, ("frames",))
+    frames = sample.arrays["points"][:, 0, 0].astype(int)
+    dropped = int((frames % 3 < 2).sum())
+    assert sample.provenance.dropped == ({"points": dropped} if dropped else {})
+    assert 0 < dropped < 5
+    assert Provenance.from_dict(sample.provenance.to_dict()) == sample.provenance
+    assert "dropped" not in plain.provenance.to_dict()
+    arrays = {name: torch.from_numpy(array[None].copy()) for name, array in sample.arrays.items()}
+    batch = Batch(arrays, (0,), 0, (sample.provenance,), {}, 0.0, 0.0, 1)
+    for frame, rows in zip(frames, batch.rows("points")[0], strict=True):
+        assert rows.tolist() == [[frame, 0], [frame, 1]][: 2 if frame % 3 < 2 else 1]
+    assert batch.points is batch["points"]
 
 
 @pytest.mark.parametrize(

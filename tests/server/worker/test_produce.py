@@ -91,6 +91,27 @@ def test_sub_steps_do_not_depend_on_the_arrays_that_are_asked_for(catalogue: Cat
     assert not np.array_equal(alone["voxels"], plain["voxels"])
 
 
+@pytest.mark.parametrize("rate", [25.0, 0.0])
+def test_a_time_surface_changes_no_other_array(catalogue: Catalogue, lease: Lease, rate: float) -> None:
+    """Without a known frame rate there are no seconds: it is empty and says so, and the video stays of use."""
+    plain = dataclasses.replace(lease, arrays=("voxels", "frames"), frames_per_second=rate)
+    asked = dataclasses.replace(plain, arrays=("voxels", "time_surface", "frames"))
+    without, beside = (
+        make_sample(each, decode_for(each, each.indices, catalogue.source)[0]) for each in (plain, asked)
+    )
+    for name in plain.arrays:
+        np.testing.assert_array_equal(beside.arrays[name], without.arrays[name])
+    assert beside.provenance.params == without.provenance.params
+    ages = beside.arrays["time_surface"]
+    if rate:
+        assert beside.provenance.labelled
+        assert np.isfinite(ages).any()
+        assert (ages >= 0).all()
+    else:
+        assert np.isinf(ages).all()
+        assert "its frame rate is unknown, and time_surface needs it" in beside.provenance.unlabelled["time_surface"]
+
+
 def test_the_provenance_names_the_effects_that_were_left_out(catalogue: Catalogue, lease: Lease) -> None:
     camera = SMALL_SPEC.recipe.replace(threshold=0.1, refractory_seconds=1e-9, dead_pixel_share=1e-3)
     made = []

@@ -82,7 +82,7 @@ def test_a_confined_process_compiles_in_its_own_memory(tmp_path: Path) -> None:
     """A stream that needs an unusual kernel may come to workers on a host that has not compiled it yet."""
     code = (
         "import sys\nfrom pathlib import Path\n"
-        "from v2v_server.simulation.variants import Variant\n"
+        "from v2v_server.simulation.precision import Variant\n"
         "from v2v_server.system.sandbox import can_confine, confine\n"
         "from v2v_server.worker.warm_up import is_compiled, load_in_turn\n"
         "variant = Variant('int16', False, 'float64')\n"
@@ -154,7 +154,8 @@ def test_workers_neither_compile_nor_grow(tmp_path: Path) -> None:
     """The compiler's memory goes with the process that compiled: it is at least 50 MB that no worker holds."""
     code = (
         "import resource\n"
-        "from v2v_server.simulation.kernels import simulate_pixels, simulate_general, words\n"
+        "from v2v_server.simulation.kernels import simulate_pixels, simulate_general\n"
+        "from v2v_server.simulation.pixel import words\n"
         "from v2v_server.worker.warm_up import warm_up_in_turn\n"
         "warm_up_in_turn()\n"
         "from v2v_server.video.full_range import to_full_range\n"

@@ -23,7 +23,7 @@ from v2v_protocol.sample import Layout, new_arrays
 from v2v_protocol.wire import decode, encode
 from v2v_server.commands.worker import main as worker_command
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.simulation.variants import Variant
+from v2v_server.simulation.precision import Variant
 from v2v_server.worker import process as worker_module
 from v2v_server.worker.conversation import Reconnect, Send
 from v2v_server.worker.process import Clips, OutputBuffer, Worker, run_worker

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,17 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 
 from tests.trainer.losses.test_lpips import heads_file, random_metric, torchvision_like
 from tests.trainer.models import numpy_networks
-from trainer.evaluation.metrics import METRICS, make_metrics, mse, ssim
+from trainer.evaluation.config import read_config
+from trainer.evaluation.flow import FLOW_METRICS, FlowScore, flow_table
+from trainer.evaluation.metrics import METRICS, MetricEntry, make_metrics, mse, ssim
 from trainer.evaluation.readers import EventWindow, RecordedImage
 from trainer.evaluation.reconstruct import Step
 from trainer.evaluation.score import SequenceScore, SequenceScorer, mean_over_sequences
+from trainer.evaluation.tables import table
 from v2v_protocol.errors import UsageError
 
 
@@ -88,6 +93,36 @@ def test_metrics_that_cannot_be_computed_are_refused(tmp_path: Path) -> None:
         make_metrics(["psnr"], {})
     with pytest.raises(UsageError, match="at least 7 x 7"):
         ssim(np.zeros((6, 9)), np.zeros((6, 9)), data_range=1)
+
+
+def test_a_toy_metric_is_one_entry(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A configuration may ask for it, and its title is in the table."""
+    entry = MetricEntry("MAE", lambda *_: lambda prediction, target: float(abs(prediction - target).mean()))
+    monkeypatch.setitem(METRICS, "mae", entry)
+    (tmp_path / "own.yaml").write_text("metrics: [mse, mae]\ndata: [HQF]\n")
+    config = read_config(str(tmp_path / "own.yaml"))
+    assert config.metrics == ("mse", "mae")
+    prediction, target = pair(9, 11, 1)
+    means = {name: metric(prediction, target) for name, metric in make_metrics(config.metrics, {}).items()}
+    assert means["mae"] == pytest.approx(np.abs(prediction - target).mean())
+    console = Console(width=120, file=io.StringIO())
+    console.print(table(config.data_sets[0], [SequenceScore("HQF", "still_life", 1, 0, 0, 0, means, means)], ()))
+    printed = console.file.getvalue()
+    assert "MAE" in printed
+    assert f"{means['mae']:.3f}" in printed
+
+
+def test_a_toy_metric_of_flow_is_one_entry(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(FLOW_METRICS, "worst", ("worst", lambda error: float(error.max())))
+    score, truth = FlowScore(as_published=False), np.ones((2, 2, 3), np.float32)
+    events = np.zeros((2, 3), bool)
+    events[0, 0] = True
+    prediction = truth.copy()
+    prediction[:, 0, 0], prediction[0, 1, 2] = (1.0, 3.0), 6.0
+    score.add(prediction, truth, events, 2)
+    assert (score.means["worst_dense"], score.means["worst_sparse"]) == (5.0, 2.0)
+    titles = [str(column.header) for column in flow_table("a", {"b": {"network": score}}, []).columns]
+    assert titles[2:] == ["AEE", "AEE sparse", "3PE %", "3PE % sparse", "worst", "worst sparse"]
 
 
 def test_means_over_sequences_are_unweighted() -> None:

@@ -6,9 +6,10 @@ import math
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -67,6 +68,7 @@ _EFFECTS = {
     WHITE: "white stretches",
     NOISY: "still stretches with much noise",
 }
+Result = TypeVar("Result")
 _AUTO = "v2v-serve --scene auto"
 CHANGES = {
     DUPLICATES: f"a repeated frame makes no events, and the next step those of two: {_AUTO} drops repeats",
@@ -84,7 +86,7 @@ CHANGES = {
 
 
 @dataclass(frozen=True, slots=True)
-class _Excerpt:
+class Excerpt:
     """The part of a video that is looked at, in the rows that are used."""
 
     id: str
@@ -94,11 +96,16 @@ class _Excerpt:
     window: Window
     remark: str
 
+    @property
+    def request(self) -> ClipRequest:
+        """Return what reads its frames."""
+        return ClipRequest(self.index, self.start, (Cut(self.count, self.window),))
+
 
 class _Found(NamedTuple):
     """An excerpt: its frames that decode, their defects, what the video's levels mean; or why no frame decodes."""
 
-    excerpt: _Excerpt
+    excerpt: Excerpt
     frames: int = 0
     defects: tuple[Defect, ...] = ()
     signal: Signal = SDR
@@ -124,7 +131,7 @@ def hides_motion(defects: Iterable[Defect], can_be_followed: bool = True) -> boo
 def defects_of_video(catalogue: Catalogue, id: str) -> tuple[Defect, ...]:
     """Return the defects in the middle of a video, in this process; none where it does not decode."""
     (video,) = (video for video in catalogue.videos if video.id == id)
-    _, defects, _, _ = _look_at(catalogue.source, _excerpt(catalogue, video))
+    _, defects, _, _ = _look_at(catalogue.source, excerpt_of(catalogue, video))
     return defects
 
 
@@ -142,7 +149,7 @@ def look_at_pictures(
     if not catalogue.source.is_local:
         yield "ok", "pictures", "not looked at: these videos lie on another host", ""
         return {}
-    looked = _found(catalogue.source, _excerpts(catalogue, _MOST_VIDEOS), usable_cores())
+    looked = _found(catalogue.source, spread_excerpts(catalogue, _MOST_VIDEOS, _LONGEST_SECONDS), usable_cores())
     looked = Progress.over("looking at pictures", "videos", looked, min(_MOST_VIDEOS, len(catalogue.videos)))
     results = sorted(looked, key=lambda each: each.excerpt.id)
     found, sequences = [each for each in results if each.frames], _sequences_of(results, frames_needed)
@@ -189,7 +196,9 @@ def check_in_background(
     """
     if spec.scene != "off" or not catalogue.source.is_local:
         return None
-    excerpts = list(_excerpts(catalogue, _SERVED_VIDEOS))  # here: the index is open in this thread only
+    excerpts = list(
+        spread_excerpts(catalogue, _SERVED_VIDEOS, _LONGEST_SECONDS)
+    )  # here: the index is open in this thread only
 
     def check() -> None:
         if stop.wait(_SERVER_WAITS_SECONDS):
@@ -220,64 +229,69 @@ def check_in_background(
     return thread
 
 
-def spread_videos(catalogue: Catalogue, most: int, seconds: float) -> Iterator[tuple[VideoEntry, FrameIndex, Window]]:
-    """Yield some videos, spread over the catalogue, with their index and their usable rows, for a limited time."""
+def spread_excerpts(catalogue: Catalogue, most: int, seconds: float, frames: int | None = None) -> Iterator[Excerpt]:
+    """Yield the middle of some videos, spread over the catalogue, for a limited time.
+
+    Args:
+        frames: see :func:`excerpt_of`.
+    """
     begun, videos = time.monotonic(), catalogue.videos
     many = min(most, len(videos))
     for video in (videos[at * len(videos) // many] for at in range(many)):
         if time.monotonic() - begun > seconds:
             return
-        try:
-            index = catalogue.frame_index(video.id)
-            top, bottom = catalogue.rows.bounds(index.height_px)
-        except V2VError:
-            continue  # reported with the other checks of this corpus
-        yield video, index, (top, 0, bottom - top, index.width_px)
+        with suppress(V2VError):  # reported with the other checks of this corpus
+            yield excerpt_of(catalogue, video, frames)
 
 
-def _excerpts(catalogue: Catalogue, most: int) -> Iterator[_Excerpt]:
-    """Yield the middle of some videos."""
-    for video, _, _ in spread_videos(catalogue, most, _LONGEST_SECONDS):
-        yield _excerpt(catalogue, video)
+def excerpt_of(catalogue: Catalogue, video: VideoEntry, frames: int | None = None) -> Excerpt:
+    """Return the middle of a video.
 
-
-def _excerpt(catalogue: Catalogue, video: VideoEntry) -> _Excerpt:
+    Args:
+        frames: most frames; None takes those of some seconds.
+    """
     index, rate = catalogue.frame_index(video.id), video.frames_per_second
     rate = rate if rate and math.isfinite(rate) else _ASSUMED_RATE
-    count = max(1, min(len(index), _MOST_FRAMES, round(SECONDS_OF_EACH * rate)))
+    count = max(1, min(len(index), frames or min(_MOST_FRAMES, round(SECONDS_OF_EACH * rate))))
     start = (len(index) - count) // 2 if index.seekable else 0
     top, bottom = catalogue.rows.bounds(index.height_px)
-    window = top, 0, bottom - top, index.width_px
-    return _Excerpt(video.id, index, start, count, window, video.remark)
+    return Excerpt(video.id, index, start, count, (top, 0, bottom - top, index.width_px), video.remark)
 
 
-def _found(source: VideoSource, excerpts: Iterable[_Excerpt], processes: int) -> Iterator[_Found]:
+def examine(
+    look: Callable[[VideoSource, Excerpt], Result],
+    source: VideoSource,
+    excerpts: Iterable[Excerpt],
+    processes: int,
+    seconds: float,
+) -> Iterator[tuple[Excerpt, Result | Died]]:
+    """Yield what ``look`` returns of each excerpt, in processes that a video may take down, for at most ``seconds``."""
+    return run_isolated(
+        partial(look, source), excerpts, processes, lambda job: seconds, 2 * LARGEST_MEMORY_BYTES, compile_cache()
+    )
+
+
+def _found(source: VideoSource, excerpts: Iterable[Excerpt], processes: int) -> Iterator[_Found]:
     """Yield what was found in each video; no frames where it does not decode in time."""
-    results = run_isolated(
-        partial(_look_at, source), excerpts, processes, lambda job: _LONGEST_VIDEO_SECONDS, 2 * LARGEST_MEMORY_BYTES,
-        compile_cache(),
-    )  # fmt: skip
-    for excerpt, result in results:
+    for excerpt, result in examine(_look_at, source, excerpts, processes, _LONGEST_VIDEO_SECONDS):
         yield _Found(excerpt, problem=result.how) if isinstance(result, Died) else _Found(excerpt, *result)
 
 
-def _look_at(source: VideoSource, excerpt: _Excerpt) -> tuple[int, tuple[Defect, ...], Signal, str]:
+def _look_at(source: VideoSource, excerpt: Excerpt) -> tuple[int, tuple[Defect, ...], Signal, str]:
     """Return the number of frames, their defects, and what their levels mean; why where they do not decode."""
     # Import lazily: the process that draws up the report needs no OpenCV.
     from v2v_server.corpus.scenes.analysis import analyse
 
-    index, window = excerpt.index, excerpt.window
     try:
         with source.open_pixels(excerpt.id, "") as pixels:
-            request = ClipRequest(index, excerpt.start, (Cut(excerpt.count, window),))
-            scene = analyse(picture.grey for picture in pixels.pictures(request))
-            signal = pixels.signal(index)
+            scene = analyse(picture.grey for picture in pixels.pictures(excerpt.request))
+            signal = pixels.signal(excerpt.index)
     except V2VError as error:
         return 0, (), SDR, getattr(error, "reason", str(error))
     return scene.end, defects_of(scene), signal, ""
 
 
-def _has_variable_rate(excerpt: _Excerpt) -> bool:
+def _has_variable_rate(excerpt: Excerpt) -> bool:
     """Return whether a twentieth of the steps lasts a tenth longer or shorter than the median."""
     steps = np.diff(excerpt.index.seconds(excerpt.start, excerpt.count))
     if not len(steps) or np.isnan(steps).any():

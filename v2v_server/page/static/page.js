@@ -122,9 +122,10 @@ function remember(name, values) {
   });
 }
 
-function lastMinute() {
-  const now = Date.now() / 1000;
-  return [now - 60, now];
+/** The axis of time: all that is remembered, and the last minute at least. uPlot's own range of one point is years. */
+function timeRange(times) {
+  const last = times.length ? times[times.length - 1] : Date.now() / 1000;
+  return [Math.min(times.length ? times[0] : last, last - 60), last];
 }
 
 function chart(name, lines, isShare) {
@@ -137,8 +138,10 @@ function chart(name, lines, isShare) {
       height: 190,
       legend: { show: false },
       cursor: { show: false },
-      // Without data the axis of time would be an arbitrary one: show the last minute at least.
-      scales: { x: { range: (_, from, to) => (from === null ? lastMinute() : [Math.min(from, to - 60), to]) }, y: { range: isShare ? [0, 1] : (_, __, most) => [0, Math.max(most * 1.1, 0.1)] } },
+      scales: {
+        x: { range: () => timeRange(past[name][0]) },
+        y: { range: isShare ? [0, 1] : (_, __, most) => [0, Math.max(most * 1.1, 0.1)] },
+      },
       axes: [axis, { ...axis, values, size: 55 }],
       series: [{}, ...lines.map(([colour, dash]) => ({ stroke: hexOf(colour), width: 2, dash, points: { show: false } }))],
     },

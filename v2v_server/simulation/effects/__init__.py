@@ -15,7 +15,15 @@ here, named in :data:`EFFECTS`. The file states the equation, its source, and
 
     FIELD                     the recipe's field
     ROWS                      the number of rows of a block's state that it needs
+    NOISE                     whether it fires where nothing moves: its value is then a rate in Hz
+    PANEL                     the panel of ``v2v-fit`` that shows it: "rates", "still", "pixels" or "intervals"
     prepare(value, clip)      its tables; for the value 0 they have the same types and switch everything off
+
+If ``tolerance`` of the spec may leave it out (``tolerance.py``), it also states
+
+    COST, MARGIN              its processor time, relative to the others; how many times the events that change on real
+                              footage are at most those of its model
+    changed(value, fired)     the model: how many events it changes in a clip (:class:`~.state.Fired`)
 
 and, compiled, any of these functions. Each does nothing if the tables say off:
 
@@ -57,6 +65,8 @@ EFFECTS: tuple[Any, ...] = tuple(
     )
 )
 """All effects, in the order in which they run."""
+NOISE = tuple(effect.FIELD for effect in EFFECTS if effect.NOISE)
+"""Fields of the effects that fire where nothing moves."""
 
 
 def prepare(
@@ -66,7 +76,6 @@ def prepare(
     step_seconds: npt.NDArray[np.float64],
     pixels: int,
     real: Real,
-    words_of: noise.WordsOf = noise.words,
 ) -> tuple[Any, ...]:
     """Return the tables of every effect for one clip, in the order of :data:`EFFECTS`.
 
@@ -77,13 +86,10 @@ def prepare(
         step_seconds: [steps] duration of each step, which is a segment (``voxel.Timeline``).
         pixels: number of pixels of the picture.
         real: arithmetic of the pixels, float32 or float64.
-        words_of: a faster ``noise.words``, if the caller has one.
 
     Raises:
         UsageError: more shot events in a step than can be drawn.
     """
     durations, table_of_step = np.unique(step_seconds, return_inverse=True)
-    clip = Clip(
-        linear_light(*intensity), step_seconds, durations, table_of_step.astype(np.int64), pixels, real, key, words_of
-    )
+    clip = Clip(linear_light(*intensity), step_seconds, durations, table_of_step.astype(np.int64), pixels, real, key)
     return tuple(effect.prepare(values.get(effect.FIELD, 0.0), clip) for effect in EFFECTS)

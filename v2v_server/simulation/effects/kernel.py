@@ -2,12 +2,15 @@
 
 It is a separate kernel, so that a clip without these runs the simpler code. Loops, order of operations and promises
 are those of ``pixel.py``, whose inner functions it calls: where both can simulate a clip, they count the same events.
-The effects' functions are compiled into it: an effect that is off costs one comparison per block and segment.
+The functions of effects and representations are compiled into it: one that is off costs one comparison per block and
+segment.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numba
@@ -23,11 +26,11 @@ from v2v_server.simulation.pixel import (
     crossed,
     folds_of,
     look_up,
-    store,
     triangular,
     two_normals,
     word,
 )
+from v2v_server.simulation.representations import REPRESENTATIONS, Counts, Train
 from v2v_server.simulation.vectors import aligned_rows, use_widest_vectors
 
 _PIXEL_RADIUS, _PIXEL_ANGLE = np.uint32(noise.PIXEL_RADIUS), np.uint32(noise.PIXEL_ANGLE)
@@ -35,6 +38,7 @@ _PAIR_RADIUS, _PAIR_ANGLE = np.uint32(noise.PAIR_RADIUS), np.uint32(noise.PAIR_A
 _START = np.uint32(noise.START)
 _TIME = np.uint32(noise.TIME)
 _UNIT = np.float32(2.0**-24)
+_FIRST_ROW = (0, *accumulate(effect.ROWS for effect in EFFECTS))
 FIXED, UNIFORM, TRIANGULAR = range(3)
 """How residuals start."""
 
@@ -51,7 +55,6 @@ class Segments(NamedTuple):
         bin: int64.
         noise_scale: real, standard deviation of the noise; empty for no noise at all.
         hot_scale: real, its part of a hot pixel's drift.
-        start, length: real, where in its voxel grid it starts and how much of it it takes, 0 .. bins - 1.
     """
 
     step: Any
@@ -61,49 +64,24 @@ class Segments(NamedTuple):
     bin: Any
     noise_scale: Any
     hot_scale: Any
-    start: Any
-    length: Any
 
 
-class Outputs(NamedTuple):
-    """What the kernel writes; an array of no rows is not wanted.
-
-    Attributes:
-        voxels: [grids * bins, pixels], signed counts.
-        counts: [grids, 2, bins, pixels] of the same dtype, negative and positive counts.
-        bilinear: [grids * bins, pixels] float32, zeros before.
-        event: [3, capacity] int64, for each event: pixel, segment, sign; the first ``capacity`` events.
-        passed: [capacity] float64, share of the segment that has passed at the event.
-        tally: [3] int64: clipped bins of voxels, those of counts, number of events (counted if ``is_listing``).
-        is_listing: whether to list events.
-    """
-
-    voxels: Any
-    counts: Any
-    bilinear: Any
-    event: Any
-    passed: Any
-    tally: Any
-    is_listing: Any
-
-
-def _linked(name: str, link: Any) -> Any:
-    """Build one compiled function of (tables, rows, block, at) from the hooks of all effects that have it, in their
-    order.
-    """
+def _linked(entries: Sequence[Any], name: str, link: Any) -> Any:
+    """Build one compiled function from the functions of all entries that have it, in their order."""
 
     @hook
-    def chain(tables, rows, block, at):
+    def chain(*_):
         return False
 
-    for number in reversed(range(len(EFFECTS))):
-        if hasattr(EFFECTS[number], name):
-            first = sum(effect.ROWS for effect in EFFECTS[:number])
-            chain = link(number, first, first + EFFECTS[number].ROWS, getattr(EFFECTS[number], name), chain)
+    for number in reversed(range(len(entries))):
+        if hasattr(entries[number], name):
+            chain = link(number, getattr(entries[number], name), chain)
     return chain
 
 
-def _each(number: int, first: int, last: int, function: Any, rest: Any) -> Any:
+def _each(number: int, function: Any, rest: Any) -> Any:
+    first, last = _FIRST_ROW[number : number + 2]
+
     @hook
     def chain(tables, rows, block, at):
         function(tables[number], rows[first:last], block, at)
@@ -112,7 +90,9 @@ def _each(number: int, first: int, last: int, function: Any, rest: Any) -> Any:
     return chain
 
 
-def _until_true(number: int, first: int, last: int, function: Any, rest: Any) -> Any:
+def _until_true(number: int, function: Any, rest: Any) -> Any:
+    first, last = _FIRST_ROW[number : number + 2]
+
     @hook
     def chain(tables, rows, block, at):
         return function(tables[number], rows[first:last], block, at) or rest(tables, rows, block, at)
@@ -120,22 +100,32 @@ def _until_true(number: int, first: int, last: int, function: Any, rest: Any) ->
     return chain
 
 
-_start, _see, _change, _after = (_linked(name, _each) for name in ("start", "see", "change", "after"))
-_cross = _linked("cross", _until_true)
-_OWN_ROWS = sum(effect.ROWS for effect in EFFECTS)
+def _counted(number: int, function: Any, rest: Any) -> Any:
+    @hook
+    def chain(made, clipped, argument):
+        clipped[number] += function(made[number], argument)
+        return rest(made, clipped, argument)
+
+    return chain
+
+
+_start, _see, _change, _after = (_linked(EFFECTS, name, _each) for name in ("start", "see", "change", "after"))
+_cross = _linked(EFFECTS, "cross", _until_true)
+_begin, _events, _end = (
+    _linked(tuple(REPRESENTATIONS.values()), name, _counted) for name in ("begin", "events", "end")
+)
 
 
 @compiled
 def _simulate(
     frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
-    tolerance, start, start_residual, drifts_first, bins, limit, out, tables, state, words, floats,
+    tolerance, start, start_residual, drifts_first, timed, is_plain, bins, limit, made, clipped, tables,
+    state, words, floats,
 ):  # fmt: skip
     """Run the kernel in memory of the caller, so that views of arrays need no reference counting."""
     use_widest_vectors()  # type: ignore[call-arg]
     count, pixels = len(segments.step), frames.shape[1]
     noisy = len(segments.noise_scale) > 0
-    timed = out.is_listing or len(out.bilinear) > 0
-    is_plain = drifts_first and not timed and len(out.counts) == 0
     # One by one: rows that are unpacked from an array have unknown strides, and their loops are not vectorised.
     residual, change, signed, positive, negative, rises = state[0], state[1], state[2], state[3], state[4], state[5]
     falls, waited, blind, on, off, old = state[6], state[7], state[8], state[9], state[10], state[11]
@@ -160,6 +150,7 @@ def _simulate(
         now, known, known_before, row, pair_done = 0, 0, 0, 0, -1
         shown = frames[0, first:last]
         look_up(table, shown, shown, levels[now])
+        _begin(made, clipped, first)
         for i in range(BLOCK_PX):
             positive[i], negative[i] = threshold_pos, threshold_neg
         _start(tables, own, block, At(first, 0, False, now, now, shown))
@@ -251,32 +242,26 @@ def _simulate(
                     if drifts_first:
                         for spot in range(hot, next_hot):
                             change[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
-                    _time(segments, each, block, old, first, last, bins, time_folds, out)
+                    _time(each, block, old, first, last, time_folds, made, clipped)
             if each == count - 1 or segments.bin[each + 1] != of_bin:
-                if len(out.counts) > 0:
-                    grid, of_grid = of_bin // bins, of_bin % bins
-                    out.tally[1] += store(off, limit, out.counts[grid, 0, of_grid, first:last])
-                    out.tally[1] += store(on, limit, out.counts[grid, 1, of_grid, first:last])
-                if len(out.voxels) > 0:
-                    if not is_plain:
-                        for i in range(BLOCK_PX):
-                            on[i] -= off[i]
-                    out.tally[0] += store(on, limit, out.voxels[of_bin, first:last])
+                net = on if is_plain else signed
+                if not is_plain:
+                    for i in range(BLOCK_PX):
+                        net[i] = on[i] - off[i]
+                _end(made, clipped, Counts(first, last, of_bin // bins, of_bin % bins, limit, net, on, off))
 
 
 @compiled
-def _time(segments, each, block, old, first, last, bins, folds, out):
-    """Give every event of a segment its time: list it, and share it between the two bins next to it.
+def _time(each, block, old, first, last, folds, made, clipped):
+    """Give every event of a segment its time, and pass it to the representations.
 
-    Crossings of one pixel come at equal distances, so their shares are summed in closed form, in float64. Events that
-    no change of intensity caused (shot noise) come at random times.
+    Crossings of one pixel come at equal distances. Events that no change of intensity caused (shot noise) come at
+    random times.
 
     Args:
         old: [block] real, the residual at the start of the segment.
         folds: of the noise's words for these times.
     """
-    start, length = np.float64(segments.start[each]), np.float64(segments.length[each])
-    row = segments.bin[each] // bins * bins
     for i in range(last - first):
         for is_rising in range(2):
             events = int(block.rises[i] if is_rising else block.falls[i])
@@ -292,52 +277,18 @@ def _time(segments, each, block, old, first, last, bins, folds, out):
                 # An event may be due a rounding before or after the segment.
                 passed = min(max(block.waited[i] + (threshold - sign * np.float64(old[i])) / speed, 0.0), 1.0)
                 apart = min(apart, (1.0 - passed) / max(crossings - 1, 1))
-            if len(out.bilinear) > 0:
-                _share(out.bilinear, row, first + i, bins, start + length * passed, length * apart, crossings, sign)
-            if out.is_listing:
-                for k in range(crossings):
-                    _list(out, first + i, each, sign, passed + k * apart)
+            if crossings > 0:
+                _events(made, clipped, Train(first + i, i, each, is_rising, passed, apart, crossings))
             for k in range(crossings, events):
                 drawn = word((word(folds, first + i), np.uint32(each)), np.uint32(2 * k + is_rising))
                 passed = np.float64(np.int64(drawn)) * 2.0**-32
-                if len(out.bilinear) > 0:
-                    _share(out.bilinear, row, first + i, bins, start + length * passed, 0.0, 1, sign)
-                if out.is_listing:
-                    _list(out, first + i, each, sign, passed)
-
-
-@hook
-def _share(bilinear, row, pixel, bins, place, apart, count, sign):
-    """Share events at ``place``, ``place + apart`` ... between the bins beside each; they span less than a bin."""
-    lower = min(int(place), bins - 1)
-    below = count
-    if place + (count - 1) * apart >= lower + 1:
-        below = min(int(np.ceil((lower + 1 - place) / apart)), count)
-    for _ in range(2):
-        upper = below * (place - lower) + apart * 0.5 * below * (below - 1)
-        bilinear[row + lower, pixel] += np.float32(sign * (below - upper))
-        if lower + 1 < bins:
-            bilinear[row + lower + 1, pixel] += np.float32(sign * upper)
-        place, count, lower = place + below * apart, count - below, lower + 1
-        below = count
-        if count == 0:
-            break
-
-
-@hook
-def _list(out, pixel, segment, sign, passed):
-    """List one event, if there is room; count it."""
-    place = out.tally[2]
-    if place < len(out.passed):
-        out.event[0, place], out.event[1, place], out.event[2, place] = pixel, segment, sign
-        out.passed[place] = passed
-    out.tally[2] += 1
+                _events(made, clipped, Train(first + i, i, each, is_rising, passed, 0.0, 1))
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def simulate_general(
     frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
-    tolerance, start, start_residual, drifts_first, bins, limit, out, tables,
+    tolerance, start, start_residual, drifts_first, timed, is_plain, bins, limit, made, clipped, tables,
 ):  # fmt: skip
     """Simulate every pixel of a clip.
 
@@ -346,20 +297,25 @@ def simulate_general(
             first frame.
         between_frames: [K, pixels] uint16, intermediate levels: grey, in 1/FINE_STEPS.
         fine: [255 FINE_STEPS + 1] real, their log intensity (``intensity.fine_table``).
-        table, key, hot_position, hot_drift, limit: as in ``pixel.simulate_pixels``.
+        table, key, hot_position, hot_drift: as in ``pixel.simulate_pixels``.
         segments: what is simulated, and when.
         threshold_pos, threshold_neg, tolerance: real, log units (``voxel.py``).
         start: FIXED starts every residual at ``start_residual``, real; UNIFORM and TRIANGULAR draw it between the
             pixel's own thresholds.
         drifts_first: True adds a hot pixel's drift in the order of ``pixel.simulate_pixels``, for the same roundings.
+        timed: whether events need times: a representation has ``events``.
+        is_plain: whether there are no effects, and nothing but voxels is made.
         bins: of a voxel grid.
-        out: written.
+        limit: real, largest count that the dtype of the voxels stores.
+        made: tables of all representations; written.
+        clipped: [representations] int64, to which the number of values that did not fit is added.
         tables: of all effects, ``effects.prepare``.
     """
-    state = aligned_rows(16 + _OWN_ROWS, PITCH, table.dtype)
+    state = aligned_rows(16 + _FIRST_ROW[-1], PITCH, table.dtype)
     words = aligned_rows(6, PITCH, np.uint32)
     floats = aligned_rows(6, PITCH, np.float32)
     _simulate(
         frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
-        tolerance, start, start_residual, drifts_first, bins, limit, out, tables, state, words, floats,
+        tolerance, start, start_residual, drifts_first, timed, is_plain, bins, limit, made, clipped, tables,
+        state, words, floats,
     )  # fmt: skip

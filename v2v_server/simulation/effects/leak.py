@@ -6,31 +6,33 @@ They are positive events. Source: v2e; cause in Nozaki and Delbruck 2017.
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from v2v_server.simulation.effects.state import Clip, hook
+from v2v_server.simulation.effects.state import Clip, Fired, hook
 from v2v_server.simulation.pixel import BLOCK_PX
 
 FIELD, ROWS = "leak_hz", 0
+NOISE, PANEL = True, "still"
+COST, MARGIN = 1, 6.0
 
 
-class Tables(NamedTuple):
-    """[steps] real, leak of each step in thresholds; empty for none."""
+def prepare(value: float, clip: Clip) -> npt.NDArray[Any]:
+    """Return the leak of each step in thresholds, [steps] real; empty for none."""
+    return (value * clip.step_seconds).astype(clip.real) if value > 0.0 else np.empty(0, clip.real)
 
-    leak: Any
 
-
-def prepare(value: float, clip: Clip) -> Tables:
-    """Return the tables, see ``effects/__init__.py``."""
-    return Tables((value * clip.step_seconds).astype(clip.real) if value > 0.0 else np.empty(0, clip.real))
+def changed(value: float, fired: Fired) -> float:
+    """Return the events of the leak, and 2 x what has leaked before in each step with events."""
+    return value * (fired.pixel_seconds + 2.0 * fired.later)
 
 
 @hook
-def change(tables, own, block, at):
+def change(leak, own, block, at):
     """Add the leak."""
-    if len(tables.leak) > 0:
-        leaked = tables.leak[at.step]
+    if len(leak) > 0:
+        leaked = leak[at.step]
         for i in range(BLOCK_PX):
             block.change[i] += block.positive[i] * leaked

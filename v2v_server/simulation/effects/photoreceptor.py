@@ -11,30 +11,33 @@ P takes the place of L in all that follows. It starts settled.
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import math
+from typing import Any
 
 import numpy as np
 
-from v2v_server.simulation.effects.state import Clip, hook
+from v2v_server.simulation.effects.state import UNITS, Clip, Fired, hook
 from v2v_server.simulation.intensity import Doubles, exponential
 from v2v_server.simulation.pixel import BLOCK_PX, look_up
 
 FIELD, ROWS = "photoreceptor_hz", 3
+NOISE, PANEL = False, "rates"
+COST, MARGIN = 7, 2.0
 DARKEST = 20 / 255
 """v2e's offset of the light that sets the bandwidth: no pixel is slower than 1/14 of a white one."""
 
 
-class Tables(NamedTuple):
-    """[tables, 2, levels] real, a and b by grey level, no table without low-pass; which of them a step has."""
-
-    low_pass: Any
-    table_of_step: Any
-
-
-def prepare(value: float, clip: Clip) -> Tables:
-    """Return the tables, see ``effects/__init__.py``."""
+def prepare(value: float, clip: Clip) -> tuple[Any, Any]:
+    """Return a and b by grey level, real [tables, 2, levels], no table without low-pass; and which a step has."""
     durations = clip.durations if value > 0.0 else clip.durations[:0]
-    return Tables(low_pass_tables(value, clip.light, durations).astype(clip.real), clip.table_of_step)
+    return low_pass_tables(value, clip.light, durations).astype(clip.real), clip.table_of_step
+
+
+def changed(value: float, fired: Fired) -> float:
+    """Return 2 sum |dL| / c x lag / T: a low-pass lags by 1 / (2 pi f), f by grey level."""
+    lag = np.rint((1.0 + DARKEST) / (2.0 * np.pi * value * (fired.light + DARKEST)) * UNITS**2).astype(np.int64)
+    lagged = (fired.change * (lag >> 20)[fired.grey[1:]]).sum(axis=1)
+    return 2.0 * math.fsum(lagged * fired.pace) / UNITS**2
 
 
 def low_pass_tables(photoreceptor_hz: float, light: Doubles, seconds: Doubles) -> Doubles:
@@ -47,7 +50,7 @@ def low_pass_tables(photoreceptor_hz: float, light: Doubles, seconds: Doubles) -
 @hook
 def start(tables, own, block, at):
     """Set P = L."""
-    if len(tables.low_pass) > 0:
+    if len(tables[0]) > 0:
         for i in range(BLOCK_PX):
             own[0, i] = block.levels[at.now, i]
 
@@ -55,12 +58,13 @@ def start(tables, own, block, at):
 @hook
 def see(tables, own, block, at):
     """Replace the change by that of P."""
-    if len(tables.low_pass) > 0:
+    low_pass, table_of_step = tables
+    if len(low_pass) > 0:
         seen, slow, fast, levels = own[0], own[1], own[2], block.levels
-        of_step = tables.table_of_step[at.step]
-        if at.moved or at.step == 0 or of_step != tables.table_of_step[at.step - 1]:
-            look_up(tables.low_pass[of_step, 0], at.shown, at.shown, slow)
-            look_up(tables.low_pass[of_step, 1], at.shown, at.shown, fast)
+        of_step = table_of_step[at.step]
+        if at.moved or at.step == 0 or of_step != table_of_step[at.step - 1]:
+            look_up(low_pass[of_step, 0], at.shown, at.shown, slow)
+            look_up(low_pass[of_step, 1], at.shown, at.shown, fast)
         for i in range(BLOCK_PX):
             old, new = levels[at.before, i], levels[at.now, i]
             block.change[i] = slow[i] * (old - seen[i]) + fast[i] * (new - old)

@@ -7,27 +7,32 @@ threshold plus (k - 1) (c / slope + t), and the remaining blind time continues i
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba
 import numpy as np
 
-from v2v_server.simulation.effects.state import Clip, hook
+from v2v_server.simulation.effects.state import UNITS, Clip, Fired, hook
 from v2v_server.simulation.pixel import BLOCK_PX
 
 FIELD, ROWS = "refractory_seconds", 1
+NOISE, PANEL = False, "intervals"
+COST, MARGIN = 8, 4.0
 
 
-class Tables(NamedTuple):
-    """Real period; [steps] real, duration of each step."""
-
-    refractory: Any
-    seconds: Any
+def prepare(value: float, clip: Clip) -> tuple[Any, Any]:
+    """Return the period, real, and the duration of each step, [steps] real."""
+    return clip.real(value), clip.step_seconds.astype(clip.real)
 
 
-def prepare(value: float, clip: Clip) -> Tables:
-    """Return the tables, see ``effects/__init__.py``."""
-    return Tables(clip.real(value), clip.step_seconds.astype(clip.real))
+def changed(value: float, fired: Fired) -> float:
+    """Return what is lost, sum n |dL| / c x t / T, and 2 |what was lost before, rising less falling| in each step with
+    events, n; and what noise and hot drift lose.
+    """
+    lost = np.rint((fired.events * fired.change).astype(np.float64) * (value * fired.pace)[:, None]).astype(np.int64)
+    before = np.abs(np.cumsum(lost, axis=0) - lost)
+    changed = np.abs(lost) + 2 * np.minimum(before, UNITS) * (fired.events != 0)
+    return float(int(changed.sum()) / UNITS + fired.grey.shape[1] * fired.noise_events(value))
 
 
 @numba.njit(nogil=True, error_model="numpy")
@@ -70,14 +75,15 @@ def start(tables, own, block, at):
 @hook
 def cross(tables, own, block, at):
     """Fire events one after another in time."""
-    if tables.refractory > 0:
-        duration, blind = tables.seconds[at.step], own[0]
+    refractory, seconds = tables
+    if refractory > 0:
+        duration, blind = seconds[at.step], own[0]
         if block.timed:
             for i in range(BLOCK_PX):
-                block.waited[i], block.blind[i] = blind[i] / duration, tables.refractory / duration
+                block.waited[i], block.blind[i] = blind[i] / duration, refractory / duration
         for i in range(BLOCK_PX):
             block.signed[i], block.residual[i], blind[i] = crossed(
-                block.residual[i], blind[i], block.change[i], duration, tables.refractory, block.positive[i],
+                block.residual[i], blind[i], block.change[i], duration, refractory, block.positive[i],
                 block.negative[i], block.tolerance,
             )  # fmt: skip
         return True
