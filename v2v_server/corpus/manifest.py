@@ -26,7 +26,7 @@ from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.listfile import UNPRINTABLE
 from v2v_server.store.packing import SIZES
 from v2v_server.store.reader import STORE_FORMAT
-from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
+from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
 from v2v_server.video.rows import Rows
 
 MANIFEST_NAME = "v2v-prepared.jsonl"
@@ -237,7 +237,9 @@ def _video(line: bytes) -> tuple[PreparedVideo, bool]:
     if path.is_absolute() or ".." in path.parts:
         raise ValueError(f"id {video.id!r} leads out of the folder")
     sizes = (video.height_px, video.width_px)
-    if not _whole(video.frames, 1, LARGEST_FRAMES) or not all(_whole(size, 0, LARGEST_SIDE_PX) for size in sizes):
+    if not _whole(video.frames, 1, LARGEST_FRAMES) or not all(
+        _whole(size, 0, LARGEST_INDEXED_SIDE_PX) for size in sizes
+    ):
         raise ValueError(f"{video.id}: {video.frames!r} frames of {video.width_px!r}x{video.height_px!r} px")
     if video.scene:
         scene = b64decode(video.scene, validate=True)

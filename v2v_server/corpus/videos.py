@@ -27,7 +27,7 @@ from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.planes import PLANES
 from v2v_server.store.reader import StoreFile
-from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
+from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
 from v2v_server.video.rows import Rows
 
 CHUNK = 4096
@@ -214,7 +214,13 @@ def _columns(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
     numbers = tuple(array(code, column) for code, column in zip(_NUMBER_TYPES, values, strict=True))
     # Only a row with a problem may have no frames.
     least = np.array([problem is None for problem in problems]) if any(problems) else 1
-    limits = (least, LARGEST_FRAMES), (least, LARGEST_SIDE_PX), (least, LARGEST_SIDE_PX), (0, _LARGEST_RATE), (0, 1)
+    limits = (
+        (least, LARGEST_FRAMES),
+        (least, LARGEST_INDEXED_SIDE_PX),
+        (least, LARGEST_INDEXED_SIDE_PX),
+        (0, _LARGEST_RATE),
+        (0, 1),
+    )
     for column, (low, high) in zip(map(np.asarray, numbers[3:]), limits, strict=True):
         if (column < low).any() or (column > high).any():
             raise ValueError

@@ -28,7 +28,7 @@ import xxhash
 from v2v_protocol.errors import ProtocolError, VideoError
 from v2v_server.store.packing import METHODS
 from v2v_server.video.colour.chroma import DEFAULT_MATRIX
-from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
+from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR, TRANSFERS, Signal
 
 MAGIC = b"V2VSTOR1"
@@ -92,8 +92,8 @@ class Head:
             if type(value) is not kinds[str(item.type)]:
                 raise ProtocolError(f"{item.name} is {value!r:.80}")
         inside = (
-            1 <= self.height_px <= LARGEST_SIDE_PX
-            and 1 <= self.width_px <= LARGEST_SIDE_PX
+            1 <= self.height_px <= LARGEST_INDEXED_SIDE_PX
+            and 1 <= self.width_px <= LARGEST_INDEXED_SIDE_PX
             and 0 <= self.top < self.top + self.rows <= self.height_px
             and 0 <= self.first < self.first + self.count <= self.frames <= LARGEST_FRAMES
             and 1 <= self.group <= GROUP_FRAMES

@@ -18,7 +18,7 @@ NO_TIMESTAMP = -(2**63)
 LARGEST_FRAMES = 2**24
 """Most frames of one index: 77 hours at 60 frames per second."""
 
-LARGEST_SIDE_PX = 2**16 - 1
+LARGEST_INDEXED_SIDE_PX = 2**16 - 1
 
 _MAGIC = b"VFI1"
 _HEADER = struct.Struct("<4sQIIIIHHB")  # magic, first, frames, keyframes, time base (2), height, width, flags

@@ -20,7 +20,7 @@ from av.video.stream import VideoStream
 from v2v_protocol.errors import VideoError
 from v2v_server.video.colour.chroma import SMPTE_240M, stated_matrix
 from v2v_server.video.container import count_transport_pictures, describe_cut, dolby_vision_profile
-from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX, NO_TIMESTAMP, FrameIndex, unseekable
+from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX, NO_TIMESTAMP, FrameIndex, unseekable
 from v2v_server.video.listing import Delivered, is_confirmed
 from v2v_server.video.luma import LumaFormat
 from v2v_server.video.orientation import Orientation
@@ -96,8 +96,10 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
         raise VideoError(name, None, f"cannot be read: {reason(error)}") from error
     orientation = Orientation.of(head)
     height, width = orientation.size(head.height, head.width)
-    if not (1 <= height <= LARGEST_SIDE_PX and 1 <= width <= LARGEST_SIDE_PX):
-        raise VideoError(name, None, f"its pictures of {width}x{height} px are larger than {LARGEST_SIDE_PX} px a side")
+    if not (1 <= height <= LARGEST_INDEXED_SIDE_PX and 1 <= width <= LARGEST_INDEXED_SIDE_PX):
+        raise VideoError(
+            name, None, f"its pictures of {width}x{height} px are larger than {LARGEST_INDEXED_SIDE_PX} px a side"
+        )
     uncounted = unseekable(1, base, height, width, orientation)
     index, change = _index(shown, head, uncounted) if stores_pts or not reorders else None, ""
     if index is None or _is_doubtful(shown, reorders) or not is_confirmed(name, index):
