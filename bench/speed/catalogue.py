@@ -37,7 +37,7 @@ from v2v_server.corpus.catalogue import index_path, open_catalogue
 from v2v_server.corpus.index import Figures, IndexRow, Store
 from v2v_server.corpus.probe import probe_file
 from v2v_server.corpus.scenes.collect import SceneCollection, figures
-from v2v_server.corpus.scenes.scene import COLUMNS, MOST_FRAMES, SEGMENT_FRAMES, Scene
+from v2v_server.corpus.scenes.scene import COLUMNS, MOST_ANALYSED_FRAMES, SEGMENT_FRAMES, Scene
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.system.process import resident_bytes, usable_cores
@@ -87,7 +87,7 @@ def make_up(clip: Path, folder: Path, cache: Path, videos: int, scene: bool = Fa
             yield dataclasses.replace(known, id=id, mtime_ns=status.st_mtime_ns, ctime_ns=status.st_ctime_ns)
 
     def scenes() -> Iterator[Figures]:
-        end = min(known.frames, MOST_FRAMES)
+        end = min(known.frames, MOST_ANALYSED_FRAMES)
         values = np.random.default_rng(0).uniform(1.0, 10.0, (-(-end // SEGMENT_FRAMES), COLUMNS))
         whole, split = (figures(known, Scene.of(pieces, values)) for pieces in (shots(end), shots(end, end // 2)))
         for number, id in enumerate(ids):

@@ -19,7 +19,7 @@ import xxhash
 from v2v_protocol.errors import VideoError
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.scenes.analysis import SceneAnalysis
-from v2v_server.corpus.scenes.scene import MOST_FRAMES, Scene
+from v2v_server.corpus.scenes.scene import MOST_ANALYSED_FRAMES, Scene
 from v2v_server.store.packing import SIZES
 from v2v_server.store.pixels import open_pixels
 from v2v_server.store.planes import whole_cut
@@ -113,7 +113,7 @@ def look_again(job: Transcoding) -> Scene:
     analysis = SceneAnalysis()
     with open_pixels(job.source) as source:
         source.check(job.fingerprint)
-        for picture in islice(source.pictures(_request(job, FrameIndex.from_bytes(job.index))), MOST_FRAMES):
+        for picture in islice(source.pictures(_request(job, FrameIndex.from_bytes(job.index))), MOST_ANALYSED_FRAMES):
             analysis.add(picture.grey)
     return analysis.scene()
 
@@ -121,7 +121,7 @@ def look_again(job: Transcoding) -> Scene:
 def _watched(pictures: Iterable[DecodedPicture], analysis: SceneAnalysis) -> Iterator[DecodedPicture]:
     """Yield the same pictures; those at the beginning are analysed as they pass."""
     for number, picture in enumerate(pictures):
-        if number < MOST_FRAMES:
+        if number < MOST_ANALYSED_FRAMES:
             analysis.add(picture.grey)
         yield picture
 

@@ -26,7 +26,7 @@ from v2v_protocol.recipe import LARGEST_SCALE, MOST_STEPS_PER_GRID, Recipe
 from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.scenes.scene import MOST_FRAMES, NO_BARS, Flag, Pieces, Sides, sides_of
+from v2v_server.corpus.scenes.scene import MOST_ANALYSED_FRAMES, NO_BARS, Flag, Pieces, Sides, sides_of
 from v2v_server.corpus.videos import SplitVideos, VideoEntry
 from v2v_server.corpus.videos import Videos as CatalogueVideos
 from v2v_server.simulation.draw import admits, smallest_scale
@@ -546,9 +546,9 @@ def corpus_summary(
             f"scene {spec.scene}: {split} videos have shot boundaries or empty parts; {table.spoilt} sequences are "
             "left out or moved"
         )
-        if long := int(np.count_nonzero(catalogue.videos.frames > MOST_FRAMES)):
+        if long := int(np.count_nonzero(catalogue.videos.frames > MOST_ANALYSED_FRAMES)):
             lines.append(
-                f"{long} videos are longer than the {MOST_FRAMES} frames that are analysed: later frames are served "
+                f"{long} videos are longer than the {MOST_ANALYSED_FRAMES} frames that are analysed: later frames are served "
                 "only of videos without defects; split long videos to use all of them"
             )
     if refusals := table.refusals:

@@ -40,7 +40,7 @@ from v2v_server.corpus.scenes.scene import (
     DARK,
     FLICKER,
     LAG_FRAMES,
-    MOST_FRAMES,
+    MOST_ANALYSED_FRAMES,
     MOTION,
     NOISE,
     SEGMENT_FRAMES,
@@ -226,7 +226,7 @@ class SceneAnalysis:
 def analyse(pictures: Iterable[GreyPicture]) -> Scene:
     """Analyse the frames of a video; the first 4096 of them, which are read one by one."""
     analysis = SceneAnalysis()
-    for picture in islice(pictures, MOST_FRAMES):
+    for picture in islice(pictures, MOST_ANALYSED_FRAMES):
         analysis.add(picture)
     return analysis.scene()
 

@@ -21,7 +21,7 @@ from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
 from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.manifest import Manifest
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES, LONGEST_SECONDS, Progress, batches
-from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_FRAMES, PIECE, Scene
+from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_ANALYSED_FRAMES, PIECE, Scene
 from v2v_server.corpus.sources.source import Notice, VideoSource
 from v2v_server.corpus.videos import SplitVideos, VideoTable, encoded_pieces, joined
 from v2v_server.system.compile_cache import compile_cache
@@ -197,7 +197,9 @@ def _analyse(source: VideoSource, job: _Job) -> Scene | None:
         try:
             with source.open_pixels(job.id, job.fingerprint) as pixels:
                 index = FrameIndex.from_bytes(job.index)
-                for picture in pixels.pictures(ClipRequest(index, 0, (Cut(min(len(index), MOST_FRAMES), job.window),))):
+                for picture in pixels.pictures(
+                    ClipRequest(index, 0, (Cut(min(len(index), MOST_ANALYSED_FRAMES), job.window),))
+                ):
                     analysis.add(picture.grey)
         except VideoError as error:
             if isinstance(error, VideoUnreadable) or isinstance(error.__cause__, OSError):

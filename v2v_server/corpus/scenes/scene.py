@@ -21,7 +21,7 @@ ANALYSIS_VERSION = 5
 """Raise it with every change of what an analysis finds: earlier ones are then repeated."""
 SEGMENT_FRAMES = 16
 """Frames of a segment. Segment i of a video holds frames 16 i .. 16 i + 15."""
-MOST_FRAMES = 4096
+MOST_ANALYSED_FRAMES = 4096
 """Frames of a video that are analysed, from its beginning. Later ones may be like them: if those have cuts, repeats,
 fades, combing or bars, scene "auto" serves no later frame."""
 LAG_FRAMES = 4
@@ -230,7 +230,7 @@ class Scene:
         if magic != _MAGIC:
             raise ProtocolError(f"scene begins with {magic!r} instead of {_MAGIC!r}")
         covered = end <= first + rows * SEGMENT_FRAMES < end + SEGMENT_FRAMES
-        if end > MOST_FRAMES or first % SEGMENT_FRAMES or not covered or count > max(0, end - first):
+        if end > MOST_ANALYSED_FRAMES or first % SEGMENT_FRAMES or not covered or count > max(0, end - first):
             raise ProtocolError(f"scene: frames {first} .. {end - 1} in {rows} segments and {count} pieces")
         size = PIECE.itemsize * count + 2 * COLUMNS * rows
         stream = zlib.decompressobj()

@@ -28,7 +28,7 @@ from v2v_server.corpus.scenes.scene import (
     CONTRAST,
     DARK,
     FLICKER,
-    MOST_FRAMES,
+    MOST_ANALYSED_FRAMES,
     MOTION,
     NO_BARS,
     NOISE,
@@ -210,7 +210,7 @@ def test_a_scene_that_contradicts_itself_is_refused() -> None:
         dataclasses.replace(scene, pieces=shots(40, 9, 9)),
         dataclasses.replace(scene, pieces=shots(40, 41)),
         dataclasses.replace(scene, first=3),
-        dataclasses.replace(scene, end=MOST_FRAMES + 1),
+        dataclasses.replace(scene, end=MOST_ANALYSED_FRAMES + 1),
     ):
         with pytest.raises(ProtocolError):
             Scene.from_bytes(other_scene.to_bytes())
