@@ -9,7 +9,7 @@ from pathlib import Path
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.catalogue import Catalogue, index_path, list_corpus, open_catalogue, refresh_index
 from v2v_server.corpus.index import Shard, make_folder, merge_parts, parts_in, write_part
-from v2v_server.corpus.probe import Progress
+from v2v_server.corpus.probe import VideoProgress
 from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.sources.source import COPIES_GIB, Notice, SourceOptions, VideoSource, open_source
 from v2v_server.video.rows import Rows
@@ -46,7 +46,9 @@ class Part:
     problems: Counter[str]
 
 
-def catalogue_ahead(asked: Ahead, parts: Path | None, progress: Progress | None, notice: Notice | None) -> Catalogue:
+def catalogue_ahead(
+    asked: Ahead, parts: Path | None, progress: VideoProgress | None, notice: Notice | None
+) -> Catalogue:
     """Open the catalogue of a corpus with all of its files in the index. The caller closes it.
 
     Args:
@@ -74,7 +76,9 @@ def catalogue_ahead(asked: Ahead, parts: Path | None, progress: Progress | None,
     )
 
 
-def catalogue_shard(asked: Ahead, shard: Shard, out: Path, progress: Progress | None, notice: Notice | None) -> Part:
+def catalogue_shard(
+    asked: Ahead, shard: Shard, out: Path, progress: VideoProgress | None, notice: Notice | None
+) -> Part:
     """Catalogue a shard of a corpus and write its index to the parts.
 
     Progress is kept in this host's cache folder, so that a killed run continues.

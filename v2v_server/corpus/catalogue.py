@@ -27,7 +27,7 @@ from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
 from v2v_server.corpus.manifest import Header, PreparedVideo
-from v2v_server.corpus.probe import Progress, batches, probe_files
+from v2v_server.corpus.probe import VideoProgress, batches, probe_files
 from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sidecars import Sidecars, collect_sidecars, files_for_lease, sidecar_kind
@@ -140,7 +140,7 @@ def refresh_index(
     path: Path,
     scenes: SceneCollection | None,
     processes: int,
-    progress: Progress | None,
+    progress: VideoProgress | None,
     notice: Notice | None,
 ) -> tuple[Store, VideoTable, list[str]]:
     """Return an open index that knows every id, its table, and notes for the user.
@@ -181,7 +181,7 @@ def _refreshed(
     ids: list[str],
     scenes: SceneCollection | None,
     processes: int,
-    progress: Progress | None,
+    progress: VideoProgress | None,
     notice: Notice | None,
 ) -> tuple[Store, VideoTable]:
     store = Store(path, notice)
@@ -475,7 +475,7 @@ def open_catalogue(
     copies_gib: float = COPIES_GIB,
     scene: bool = False,
     processes: int = 1,
-    progress: Progress | None = None,
+    progress: VideoProgress | None = None,
     notice: Notice | None = None,
 ) -> Catalogue:
     """Open a corpus: probe what is new or changed, forget what is gone.

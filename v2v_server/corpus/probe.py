@@ -27,7 +27,7 @@ frames. A file of some kB can claim a thousand million frames, for which a demux
 
 _MOST_TOGETHER = 1024
 _MOST_SECONDS = 10.0
-Progress = Callable[[int, int], None]
+VideoProgress = Callable[[int, int], None]
 """(files done so far, files to do)."""
 ProbeFile = Callable[[VideoSource, str], IndexRow]
 """(source, id) -> what is known of that file; see :func:`probe_file`."""
@@ -142,7 +142,7 @@ def _culprit(source: VideoSource, id: str, death: Died) -> IndexRow:
 
 
 def batches(
-    items: Iterable[T], total: int, progress: Progress | None, clock: Callable[[], float] = time.monotonic
+    items: Iterable[T], total: int, progress: VideoProgress | None, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[list[T]]:
     """Yield items in batches that are written to the index at once: a kill loses at most one.
 

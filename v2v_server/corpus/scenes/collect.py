@@ -20,7 +20,7 @@ import xxhash
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
 from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.manifest import Manifest
-from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES, LONGEST_SECONDS, Progress, batches
+from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES, LONGEST_SECONDS, VideoProgress, batches
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_ANALYSED_FRAMES, PIECE, Scene
 from v2v_server.corpus.sources.source import Notice, VideoSource
 from v2v_server.corpus.videos import SplitVideos, VideoTable, encoded_pieces, joined
@@ -65,7 +65,7 @@ class SceneCollection:
         source: VideoSource,
         table: VideoTable,
         processes: int,
-        progress: Progress | None,
+        progress: VideoProgress | None,
         notice: Notice | None,
     ) -> bool:
         """Analyse each usable video without a scene in the index, and store the scene unless the analysis fails.
