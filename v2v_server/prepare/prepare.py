@@ -54,7 +54,7 @@ _STORED_BITS_PER_PIXEL = 2.2
 _TELLING_SHARE = 0.02
 _CRASHES = "crashes the transcoder: its process died"
 
-Progress = Callable[[int, int, int, int], None]
+_Progress = Callable[[int, int, int, int], None]
 """Progress callback: (source frames done, source frames in total, bytes written, bytes expected in total)."""
 
 
@@ -67,7 +67,7 @@ def prepare(
     scene: bool = False,
     planes: tuple[str, ...] = (),
     single: bool = False,
-    progress: Progress | None = None,
+    progress: _Progress | None = None,
 ) -> Report:
     """Transcode a corpus. A video that cannot be transcoded is recorded with the reason, and the others continue.
 
