@@ -36,9 +36,9 @@ from v2v_server.corpus.sources.sidecar import sidecar_id
 from v2v_server.corpus.sources.source import (
     COPIES_GIB,
     GONE,
+    FileState,
     Notice,
     SourceOptions,
-    State,
     VideoSource,
     by_parts,
     is_said,
@@ -303,7 +303,7 @@ class Catalogue:
             VideoError: the video is gone, another one by now, or (on a disk) cannot be read.
         """
         self._fingerprint(id)
-        state: State | str | None = self.sidecars[sidecar].states.get(id) if sidecar else None
+        state: FileState | str | None = self.sidecars[sidecar].states.get(id) if sidecar else None
         with suppress(sqlite3.Error):
             state = state or self._store.state(id)
         self.source.verify(sidecar_id(id, sidecar) if sidecar else id, fingerprint, state)

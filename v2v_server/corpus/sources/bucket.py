@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError, VideoDenied, VideoGone, VideoUnreadable
-from v2v_server.corpus.sources.source import State
+from v2v_server.corpus.sources.source import FileState
 
 T = TypeVar("T")
 
@@ -84,7 +84,7 @@ class Bucket:
     def _prefix(self) -> str:
         return str(self._store._strip_protocol(self.url)).rstrip("/")
 
-    def objects(self) -> dict[str, State]:
+    def objects(self) -> dict[str, FileState]:
         """Return the states of all objects below the address, by relative path.
 
         Raises:
@@ -103,7 +103,7 @@ class Bucket:
         except VideoUnreadable as error:
             raise CorpusError(f"--videos {self.url}: cannot be listed: {error.reason}") from error
 
-    def find(self, below: str, tries: int = TRIES) -> dict[str, State]:
+    def find(self, below: str, tries: int = TRIES) -> dict[str, FileState]:
         """Return the states of all objects below a folder of the address, "" or ending in a slash, by relative path.
 
         Raises:
@@ -116,7 +116,7 @@ class Bucket:
             raise VideoGone(below, None, f"is not in {self.url} any more")
         return found
 
-    def state(self, id: str, tries: int = TRIES) -> State:
+    def state(self, id: str, tries: int = TRIES) -> FileState:
         """Ask for the state of one object: its size, and 63 bits that stand for its ETag or the store's equivalent.
 
         Raises:
@@ -159,6 +159,6 @@ class Bucket:
         raise AssertionError
 
 
-def _state(info: dict[str, Any]) -> State:
+def _state(info: dict[str, Any]) -> FileState:
     mark = next((str(info[key]) for key in _MARKS if info.get(key) is not None), "")
     return int(info["size"]), int.from_bytes(hashlib.sha256(mark.encode()).digest()[:8]) >> 1, 0

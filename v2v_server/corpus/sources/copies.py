@@ -32,7 +32,7 @@ from v2v_server.corpus.sources.bucket import Bucket, is_url
 from v2v_server.corpus.sources.listfile import UNPRINTABLE, ListEntry, count_left_out, is_video_name
 from v2v_server.corpus.sources.sidecar import fingerprint_of as sidecar_fingerprint
 from v2v_server.corpus.sources.sidecar import is_sidecar, state_text
-from v2v_server.corpus.sources.source import GONE, SourceOptions, State, VideoSource
+from v2v_server.corpus.sources.source import GONE, FileState, SourceOptions, VideoSource
 from v2v_server.store.quota import MOST_GIB, PARTIAL, QuotaFolder
 from v2v_server.system.process import cache_folder, lock, make_private, open_private
 from v2v_server.video.fingerprint import fingerprint as video_fingerprint
@@ -77,7 +77,7 @@ class Copies(VideoSource):
         return Copies, (self.bucket, self.copies, self.most_bytes)
 
     @cached_property
-    def _objects(self) -> dict[str, State]:
+    def _objects(self) -> dict[str, FileState]:
         """Return the objects, as first listed.
 
         Raises:
@@ -132,7 +132,7 @@ class Copies(VideoSource):
             found.extend(self._objects.get(id, GONE))
         return found
 
-    def state(self, id: str) -> State:
+    def state(self, id: str) -> FileState:
         """Ask the store for the state of one object.
 
         Raises:
@@ -140,7 +140,7 @@ class Copies(VideoSource):
         """
         return self.bucket.state(id)
 
-    def verify(self, id: str, fingerprint: str, state: State | str | None) -> None:
+    def verify(self, id: str, fingerprint: str, state: FileState | str | None) -> None:
         """Check an object, or a sidecar, against its state, with one question. If the store gives no answer, that is no
         error.
 

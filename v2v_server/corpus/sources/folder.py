@@ -25,7 +25,7 @@ from v2v_server.corpus.sources.listfile import (
     read_list,
 )
 from v2v_server.corpus.sources.sidecar import check_local, is_sidecar, local_state, sidecar_id
-from v2v_server.corpus.sources.source import GONE, NO_STATE, SourceOptions, State, VideoSource, answers
+from v2v_server.corpus.sources.source import GONE, NO_STATE, FileState, SourceOptions, VideoSource, answers
 from v2v_server.store.pixels import open_pixels
 from v2v_server.video.fingerprint import unreadable
 
@@ -77,7 +77,7 @@ class Folder(VideoSource):
                 found.extend((status.st_size, status.st_mtime_ns, status.st_ctime_ns) if is_file else GONE)
         return found
 
-    def state(self, id: str) -> State:
+    def state(self, id: str) -> FileState:
         """Ask for the state of one file.
 
         Raises:
@@ -122,7 +122,7 @@ class Folder(VideoSource):
         except OSError as error:
             return error
 
-    def verify(self, id: str, fingerprint: str, state: State | str | None) -> None:
+    def verify(self, id: str, fingerprint: str, state: FileState | str | None) -> None:
         """Check the file against its fingerprint; of a sidecar, only sizes and times.
 
         Raises:

@@ -46,12 +46,12 @@ KINDS = ("copies", "prepared", "folder")
 """Files of the kinds of sources, in the order in which they are asked. The last one takes any name."""
 COPIES_GIB = 100.0
 """Default limit of the folder of copies."""
-State = tuple[int, int, int]
+FileState = tuple[int, int, int]
 """Size in bytes, and two numbers that change with the content: the times of the last modification and change of status,
 or a mark of an object's ETag and 0."""
-NO_STATE: State = (-1, 0, 0)
+NO_STATE: FileState = (-1, 0, 0)
 """The state cannot be told now."""
-GONE: State = (-2, 0, 0)
+GONE: FileState = (-2, 0, 0)
 """There is no such file."""
 
 
@@ -216,7 +216,7 @@ class VideoSource(ABC):
         """
 
     @abstractmethod
-    def state(self, id: str) -> State:
+    def state(self, id: str) -> FileState:
         """Ask for the state of one file now.
 
         Raises:
@@ -258,7 +258,7 @@ class VideoSource(ABC):
         """
 
     @abstractmethod
-    def verify(self, id: str, fingerprint: str, state: State | str | None) -> None:
+    def verify(self, id: str, fingerprint: str, state: FileState | str | None) -> None:
         """Check that a video or sidecar is as catalogued. A remote source that gives no answer now raises no error.
 
         Args:
