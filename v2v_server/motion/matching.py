@@ -33,7 +33,7 @@ import numpy.typing as npt
 
 from v2v_server.motion.lanes import BLOCK_PX, CELL_PX, block_difference
 from v2v_server.motion.pyramid import PAD_PX, Cells, GreyPicture, Pyramid, compiled
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 
 Vectors = npt.NDArray[np.int16]
 """[2, ceil(h / CELL_PX), ceil(w / CELL_PX)] int16: x (right) and y (down), in 1/UNITS_PER_PX px."""
@@ -95,7 +95,7 @@ def _moving_cells(first: Pyramid, second: Pyramid, cells: Cells) -> npt.NDArray[
 
 
 @lru_cache(maxsize=16)
-def _blocks_of(cells: Cells, height: int, width: int) -> tuple[Window, tuple[int, ...]]:
+def _blocks_of(cells: Cells, height: int, width: int) -> tuple[PixelRect, tuple[int, ...]]:
     """Return the part of a picture with the blocks of some cells, and the numbers that ``_mark_moving`` wants."""
     (top, bottom), (left, right) = (
         tuple(min(max(CELL_PX * cell - _AROUND_PX, 0), side - BLOCK_PX) for cell in (at, at + count - 1))

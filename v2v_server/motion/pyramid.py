@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.motion.lanes import CELL_PX
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 
 GreyPicture = npt.NDArray[np.uint8]
 PAD_PX = 16
@@ -45,36 +45,36 @@ class Pyramid:
         self,
         height: int,
         width: int,
-        read: Callable[[Window], GreyPicture],
-        raw: Callable[[Window], npt.NDArray[Any]] | None = None,
+        read: Callable[[PixelRect], GreyPicture],
+        raw: Callable[[PixelRect], npt.NDArray[Any]] | None = None,
     ) -> None:
         self.height, self.width, self._read, self._raw = height, width, read, raw
-        self._part: tuple[Window, GreyPicture] | None = None
-        self._bytes: tuple[Window, bytes] | None = None
+        self._part: tuple[PixelRect, GreyPicture] | None = None
+        self._bytes: tuple[PixelRect, bytes] | None = None
 
     @classmethod
     def of(cls, picture: GreyPicture) -> Pyramid:
         """Return the pyramid of a [h, w] uint8 picture. It is not copied, so it may not change."""
 
-        def part(window: Window) -> GreyPicture:
+        def part(window: PixelRect) -> GreyPicture:
             top, left, rows, columns = window
             return np.ascontiguousarray(picture[top : top + rows, left : left + columns])
 
         height, width = picture.shape
         return cls(height, width, part)
 
-    def is_like(self, other: Pyramid, window: Window) -> bool:
+    def is_like(self, other: Pyramid, window: PixelRect) -> bool:
         """Return whether a part is known to equal that of another picture, without reading it."""
         mine = self._raw_bytes(window)
         return mine is not None and mine == other._raw_bytes(window)
 
-    def _raw_bytes(self, window: Window) -> bytes | None:
+    def _raw_bytes(self, window: PixelRect) -> bytes | None:
         """Return the values of a part; the last ones are kept, and compared faster than an array's rows."""
         if self._raw is not None and (self._bytes is None or self._bytes[0] != window):
             self._bytes = window, self._raw(window).tobytes()
         return self._bytes and self._bytes[1]
 
-    def part(self, window: Window) -> GreyPicture:
+    def part(self, window: PixelRect) -> GreyPicture:
         """Return a part of the picture; the last one is kept."""
         if self._part is None or self._part[0] != window:
             self._part = window, self._read(window)

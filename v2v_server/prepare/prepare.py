@@ -45,7 +45,7 @@ from v2v_server.store.planes import OPTIONAL
 from v2v_server.store.reader import has_planes
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 from v2v_server.video.rows import Rows
 
 _STORED_BITS_PER_PIXEL = 2.2
@@ -283,12 +283,12 @@ class _ToPrepare:
     """A video to transcode, or only to analyse if its prepared file exists and lacks no plane."""
 
     video: VideoEntry
-    window: Window
+    window: PixelRect
     standing: PreparedVideo | None
     lacks_planes: bool
 
 
-def _window(video: VideoEntry, rows: Rows) -> Window:
+def _window(video: VideoEntry, rows: Rows) -> PixelRect:
     top, bottom = rows.bounds(video.height_px)
     return top, 0, bottom - top, video.width_px
 

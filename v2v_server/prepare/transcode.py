@@ -29,7 +29,7 @@ from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import MOST_BITS
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 
 PARTIAL_SUFFIX = ".v2v-partial"
 
@@ -57,7 +57,7 @@ class Transcoding:
     fingerprint: str
     index: bytes
     frames_per_second: float
-    window: Window
+    window: PixelRect
     size: str
     root: Path
     target: Path

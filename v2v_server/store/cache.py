@@ -36,7 +36,7 @@ from v2v_server.system.process import make_private
 from v2v_server.system.status_fields import GIB
 from v2v_server.video.collect import ClipRequest, DecodedPicture
 from v2v_server.video.decode import DecodedClip
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 
 _LOCK_SECONDS = 0.06
 """Longest wait for the lock of the folder; a sample does without the cache rather than wait."""
@@ -167,7 +167,7 @@ class Cache:
                 self._remove(Path(error.video), error.reason)
         return None
 
-    def _has_room(self, missing: Sequence[_Piece], usable: Window) -> bool:
+    def _has_room(self, missing: Sequence[_Piece], usable: PixelRect) -> bool:
         if time.monotonic() < self._rest_until:
             self.trouble = self._rest_reason
             return False

@@ -35,7 +35,7 @@ from v2v_server.video.collect import ClipRequest, DecodedPicture
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import MIXED, SDR, Signal
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 from v2v_server.video.probe import VideoFacts
 
 STORE_FORMAT = "v2v store"
@@ -67,7 +67,7 @@ class BlockReader:
         except OSError as error:
             raise VideoUnreadable(path, None, f"cannot be read: {error.strerror or error}") from error
 
-    def read(self, start: int, stride: int, window: Window, out: npt.NDArray[np.uint8]) -> bool:
+    def read(self, start: int, stride: int, window: PixelRect, out: npt.NDArray[np.uint8]) -> bool:
         """Read frames start, start + stride ... of a window.
 
         Args:
@@ -102,7 +102,7 @@ class BlockReader:
             done += more
         return has_blocks
 
-    def _read_group(self, group: int, first: int, stride: int, window: Window, out: npt.NDArray[np.uint8]) -> bool:
+    def _read_group(self, group: int, first: int, stride: int, window: PixelRect, out: npt.NDArray[np.uint8]) -> bool:
         # Import lazily: listing files must not load numba.
         from v2v_server.store.differences import from_differences
 
@@ -243,7 +243,7 @@ class StoreFile(BlockReader):
         if made_of != fingerprint:
             raise VideoChanged(self._path, None, f"was made from another file: {made_of} instead of {fingerprint}")
 
-    def require(self, first: int, end: int, usable: Window) -> None:
+    def require(self, first: int, end: int, usable: PixelRect) -> None:
         """Check that the file holds frames ``first`` .. ``end`` - 1 of a usable picture.
 
         Raises:
@@ -289,7 +289,7 @@ class StoreFile(BlockReader):
         return frozenset(name for name, place in self._places.items() if place.version == PLANES[name].version)
 
     def plane(
-        self, name: str, start: int, count: int, cells: Window, wanted: npt.NDArray[np.int64] | None = None
+        self, name: str, start: int, count: int, cells: PixelRect, wanted: npt.NDArray[np.int64] | None = None
     ) -> npt.NDArray[Any]:
         """Read a part of a plane.
 

@@ -21,7 +21,7 @@ from v2v_server.store.planes import PLANES
 from v2v_server.store.planes.plane import PlanePlace, pack_footer
 from v2v_server.video.collect import DecodedPicture
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 
 
 class _BlockWriter:
@@ -211,7 +211,7 @@ def write_pictures(
 
 
 def head_of(
-    picture: DecodedPicture, index: FrameIndex, usable: Window, *, video: str, fingerprint: str, first: int, count: int,
+    picture: DecodedPicture, index: FrameIndex, usable: PixelRect, *, video: str, fingerprint: str, first: int, count: int,
     packing: Packing, frames_per_second: float = 0.0, stored_index: bytes = b"",
 ) -> Head:  # fmt: skip
     """Return the head of a file.

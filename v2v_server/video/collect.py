@@ -15,7 +15,7 @@ from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.video.colour.chroma import DEFAULT_MATRIX, Chroma, ChromaCut, ChromaStack
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import MIXED, SDR, TRANSFERS, BeyondBits, LumaFormat, Signal, copy_luma, luma_plane, stretch
-from v2v_server.video.orientation import Orientation, Window
+from v2v_server.video.orientation import Orientation, PixelRect
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +31,10 @@ class Cut:
     """
 
     count: int
-    window: Window | None = None
+    window: PixelRect | None = None
     chroma: ChromaCut | None = None
-    cells: Window | None = None
-    still: Window | None = None
+    cells: PixelRect | None = None
+    still: PixelRect | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class ClipRequest:
         return max(cut.count for cut in self.cuts)
 
     @property
-    def usable(self) -> Window:
+    def usable(self) -> PixelRect:
         """Return the part of the upright picture that may be used."""
         top, bottom = self.rows or (0, self.index.height_px)
         return top, 0, bottom - top, self.index.width_px
@@ -76,7 +76,7 @@ class ClipRequest:
         """Return the presentation times of the frames of a cut."""
         return self.index.seconds(self.start, (cut.count - 1) * self.stride + 1)[:: self.stride]
 
-    def window(self, cut: Cut) -> Window:
+    def window(self, cut: Cut) -> PixelRect:
         """Return the window of a cut."""
         return cut.window or (0, 0, self.index.height_px, self.index.width_px)
 
@@ -139,12 +139,12 @@ class DecodedFrame(NamedTuple):
     width_px: int
     signal: Signal
 
-    def raw(self, window: Window) -> npt.NDArray[np.unsignedinteger]:
+    def raw(self, window: PixelRect) -> npt.NDArray[np.unsignedinteger]:
         """Return a window of the upright picture as the decoder stores it, without a copy."""
         top, left, height, width = self.orientation.stored_window(window, self.height_px, self.width_px)
         return self.samples[top : top + height, left : left + width]
 
-    def part(self, window: Window, signal: Signal = SDR) -> npt.NDArray[Any]:
+    def part(self, window: PixelRect, signal: Signal = SDR) -> npt.NDArray[Any]:
         """Return levels of a window of the upright picture, [h, w] of the signal's dtype, in full range."""
         stored = self.orientation.stored_window(window, self.height_px, self.width_px)
         part = np.empty((1, *stored[2:]), signal.dtype)
@@ -153,7 +153,7 @@ class DecodedFrame(NamedTuple):
         upright: npt.NDArray[Any] = self.orientation.upright(part)[0]
         return upright
 
-    def picture(self, window: Window, chroma: ChromaCut | None, codec: str, bit_exact: bool) -> DecodedPicture:
+    def picture(self, window: PixelRect, chroma: ChromaCut | None, codec: str, bit_exact: bool) -> DecodedPicture:
         """Return a window of the picture, with the colour of a cut."""
         luma = self.part(window, self.signal)
         grey = self.part(window) if self.signal.bits > SDR.bits else luma
@@ -199,7 +199,9 @@ class Stack:
             None if cut.chroma is None else ChromaStack(cut.chroma, self._orientation, *size) for cut in self._cuts
         ]
         self._luma: LumaFormat | None = None
-        self._parts: list[tuple[Window, npt.NDArray[np.unsignedinteger]]] = []  # stored window and frames of each cut
+        self._parts: list[
+            tuple[PixelRect, npt.NDArray[np.unsignedinteger]]
+        ] = []  # stored window and frames of each cut
 
     def take(self, frame: VideoFrame) -> bool:
         """Look at the next frame that the decoder delivers; True once the last asked one is in."""
@@ -276,7 +278,7 @@ class Stack:
             size = self.index.height_px, self.index.width_px
             self._show(DecodedFrame(frame, samples, self._luma, self._orientation, *size, self.signal))
 
-    def _part(self, cut: Cut) -> tuple[Window, npt.NDArray[np.unsignedinteger]]:
+    def _part(self, cut: Cut) -> tuple[PixelRect, npt.NDArray[np.unsignedinteger]]:
         window = self.wanted.window(cut)
         stored = self._orientation.stored_window(window, self.index.height_px, self.index.width_px)
         return stored, np.empty((cut.count, *stored[2:]), self.signal.dtype)

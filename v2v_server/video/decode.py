@@ -33,7 +33,7 @@ from v2v_server.video.collect import ClipRequest, Cut, DecodedFrame, DecodedPict
 from v2v_server.video.colour.chroma import Chroma
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.luma import SDR, Signal
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 from v2v_server.video.packets import is_unreferenced, length_bytes
 from v2v_server.video.source import opened, packets, reason
 
@@ -78,7 +78,7 @@ class _SeekFailed(Exception):
 
 
 def decode_luma(
-    path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: Window | None = None
+    path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: PixelRect | None = None
 ) -> DecodedClip:
     """Decode frames start .. start + count - 1 of a video, or a window of them: :func:`decode_cuts` of one cut."""
     return decode_cuts(path, ClipRequest(index, start, (Cut(count, window),)))[0]
@@ -127,7 +127,7 @@ def _filled(path: str, wanted: ClipRequest, watch: Watch | None = None) -> Stack
 
 
 def stream_luma(
-    path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: Window | None = None
+    path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: PixelRect | None = None
 ) -> Iterator[npt.NDArray[np.uint8]]:
     """Yield the frames of :func:`decode_luma` one by one, in the memory of one.
 

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from av.video.frame import VideoFrame
 from av.video.reformatter import ColorRange, ColorTrc
 
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 
 _BYTE, _WIDE = np.dtype(np.uint8), np.dtype(np.uint16)
 _LUMA_PLANE = re.compile(r"(yuvj?\d{3}p|yuva\d{3}p|gray|nv(12|16|21|24)$)((9|10|12|14|16)(le|be))?$")
@@ -158,7 +158,7 @@ def luma_plane(frame: VideoFrame, luma: LumaFormat) -> npt.NDArray[np.unsignedin
 def copy_luma(
     samples: npt.NDArray[np.unsignedinteger],
     luma: LumaFormat,
-    window: Window,
+    window: PixelRect,
     out: npt.NDArray[np.unsignedinteger],
     kept: Signal = SDR,
 ) -> None:

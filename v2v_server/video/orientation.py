@@ -11,7 +11,7 @@ import numpy.typing as npt
 from av.sidedata.sidedata import SideDataContainer
 from av.video.frame import VideoFrame
 
-Window = tuple[int, int, int, int]
+PixelRect = tuple[int, int, int, int]
 """(top, left, height, width) of a part of a picture, pixels."""
 
 
@@ -47,7 +47,7 @@ class Orientation:
         """Return (height, width) of the upright picture from the stored one's, or the reverse."""
         return (width, height) if self.transpose else (height, width)
 
-    def stored_window(self, window: Window, height: int, width: int) -> Window:
+    def stored_window(self, window: PixelRect, height: int, width: int) -> PixelRect:
         """Return the window of the stored picture that shows a window of the upright one of that height and width."""
         top, left, rows, columns = window
         if self.flip_y:

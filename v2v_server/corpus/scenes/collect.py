@@ -28,7 +28,7 @@ from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import run_twice
 from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 from v2v_server.video.rows import Rows
 
 _ENDING = f", look {ANALYSIS_VERSION}"
@@ -160,7 +160,7 @@ class SceneCollection:
             return None
         return b64decode(self.manifest.videos[record.id].scene)
 
-    def _window(self, record: IndexRow) -> Window | None:
+    def _window(self, record: IndexRow) -> PixelRect | None:
         try:
             top, bottom = self.rows.bounds(record.height_px)
         except UsageError:
@@ -181,7 +181,7 @@ class _Job:
     fingerprint: str
     frames: int
     index: bytes
-    window: Window | None
+    window: PixelRect | None
 
 
 def _analyse(source: VideoSource, job: _Job) -> Scene | None:

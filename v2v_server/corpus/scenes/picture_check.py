@@ -39,7 +39,7 @@ from v2v_server.system.process import usable_cores
 from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import SDR, Signal
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 from v2v_server.video.probe import DOLBY_VISION
 
 _MOST_VIDEOS = 12
@@ -93,7 +93,7 @@ class Excerpt:
     index: FrameIndex
     start: int
     count: int
-    window: Window
+    window: PixelRect
     remark: str
 
     @property

@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 from v2v_server.store.planes.plane import Plane
 from v2v_server.video.collect import Cut
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 
 KINDS = ("motion", "detail", "chroma")
 """Files of the planes; also the names under which files have them."""
@@ -22,7 +22,7 @@ OPTIONAL = tuple(name for name, plane in PLANES.items() if plane.serves)
 """Names of the planes that a user may choose to store."""
 
 
-def whole_cut(count: int, usable: Window, planes: Iterable[str]) -> Cut:
+def whole_cut(count: int, usable: PixelRect, planes: Iterable[str]) -> Cut:
     """Return the cut of whole usable pictures that planes are made from."""
     cut = Cut(count, usable)
     for name in planes:

@@ -17,7 +17,7 @@ from v2v_server.store.planes.plane import Files, Plane
 from v2v_server.video.collect import ClipRequest, Cut, DecodedFrame, DecodedPicture, Watch
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import SDR, Signal
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 
 if TYPE_CHECKING:
     from v2v_server.motion import Cells, MotionOfCuts, Vectors
@@ -82,7 +82,7 @@ def watch_motion(request: ClipRequest) -> tuple[Watch, list[MotionOfCuts]]:
     found: list[MotionOfCuts] = []
     first_row, first_column, height, width = request.usable
 
-    def place(window: Window) -> Window:
+    def place(window: PixelRect) -> PixelRect:
         top, left, rows, columns = window
         return first_row + top, first_column + left, rows, columns
 
@@ -119,7 +119,7 @@ def _read(files: Files, request: ClipRequest, cut: Cut) -> Vectors:
 
 
 def _pictures_in(
-    stored: StoreFile, frames: range, start: int, stride: int, picture: Window
+    stored: StoreFile, frames: range, start: int, stride: int, picture: PixelRect
 ) -> Iterator[npt.NDArray[np.uint8]]:
     """Yield frames of a clip that begins at ``start``, in the memory of a few."""
     for first in range(frames.start, frames.stop, _PICTURES):
@@ -128,7 +128,7 @@ def _pictures_in(
         yield from some
 
 
-def _motion_across(before: StoreFile, after: StoreFile, at: int, cells: Cells, picture: Window) -> Vectors:
+def _motion_across(before: StoreFile, after: StoreFile, at: int, cells: Cells, picture: PixelRect) -> Vectors:
     """Return the motion to the first frame of a file, ``at``, from the last frame of the one before."""
     from v2v_server.motion import Pyramid, motion
 

@@ -26,7 +26,7 @@ from v2v_server.store.format import BLOCK_ROWS, Head, check, group_frames_for
 from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import SDR, Signal
-from v2v_server.video.orientation import Window
+from v2v_server.video.orientation import PixelRect
 
 if TYPE_CHECKING:
     from v2v_server.store.reader import StoreFile
@@ -138,13 +138,13 @@ class Plane:
         used[...] = parts.transpose(1, 0, 4, 2, 3).reshape(used.shape)
         return picture.reshape(-1, columns)
 
-    def window(self, cells: Window) -> Window:
+    def window(self, cells: PixelRect) -> PixelRect:
         """Return the part of the picture that holds some cells (top, left, rows, columns)."""
         top, left, rows, columns = cells
         first, end = top // self._band, (top + rows - 1) // self._band + 1
         return first * BLOCK_ROWS, left, (end - first) * BLOCK_ROWS, columns
 
-    def from_pictures(self, pictures: npt.NDArray[np.uint8], cells: Window) -> npt.NDArray[Any]:
+    def from_pictures(self, pictures: npt.NDArray[np.uint8], cells: PixelRect) -> npt.NDArray[Any]:
         """Return the cells of a window of frames: [n, values, rows, columns]."""
         count, size = len(pictures), np.dtype(self.dtype).itemsize
         top, _, rows, columns = cells

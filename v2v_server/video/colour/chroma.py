@@ -24,7 +24,7 @@ from av.video.frame import VideoFrame
 from av.video.reformatter import ColorRange, Colorspace
 
 from v2v_server.video.luma import BeyondBits, LumaFormat
-from v2v_server.video.orientation import Orientation, Window
+from v2v_server.video.orientation import Orientation, PixelRect
 
 CELL_PX = 2
 DEFAULT_MATRIX = "BT.601"
@@ -58,11 +58,11 @@ class ChromaCut:
     """
 
     frames: tuple[int, ...]
-    window: Window
+    window: PixelRect
     usable_px: tuple[int, int]
 
     @property
-    def cells(self) -> Window:
+    def cells(self) -> PixelRect:
         """Return the cells that hold the window: (top, left, rows, columns)."""
         rows, columns = self._places
         top, left = int(rows[0]), int(columns[0])
