@@ -19,7 +19,7 @@ from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.flow.methods import AUTO, STILL_METHOD, Estimator, Field, GreyPicture, choose, estimator, one_thread
 from v2v_server.simulation.draw import resized_size
-from v2v_server.simulation.view import Frames, Window, crop_place, crop_region, resized
+from v2v_server.simulation.view import FrameArray, Window, crop_place, crop_region, resized
 from v2v_server.system.compile_cache import cv2
 
 SKIPPED = "skipped"
@@ -67,7 +67,7 @@ class FlowClip:
 
 
 def flow_for(
-    frames: Frames,
+    frames: FrameArray,
     params: SampleParams,
     recipe: Recipe,
     settings: FlowSettings,
@@ -157,7 +157,7 @@ class _Pictures:
     """The pictures that flow is estimated on, computed on first use."""
 
     def __init__(
-        self, frames: Frames, params: SampleParams, recipe: Recipe, margin_px: int | None, needed: int
+        self, frames: FrameArray, params: SampleParams, recipe: Recipe, margin_px: int | None, needed: int
     ) -> None:
         if frames.ndim != 3 or frames.dtype != np.uint8 or len(frames) < needed:
             raise UsageError(f"frames {frames.dtype}{list(frames.shape)}: this draw shows {needed}, uint8 [n, h, w]")

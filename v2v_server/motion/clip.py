@@ -22,7 +22,7 @@ from v2v_server.motion.plane import motions
 from v2v_server.motion.pyramid import Cells, compiled, padded
 from v2v_server.motion.warping import between
 from v2v_server.simulation.draw import resized_size
-from v2v_server.simulation.view import Frames, Window, contrast_table, crop_place, crop_region, resized
+from v2v_server.simulation.view import FrameArray, Window, contrast_table, crop_place, crop_region, resized
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
 
 _LONGEST = 1 << 14
@@ -60,7 +60,7 @@ def _shown_cells(
 
 
 def levels_of(
-    frames: Frames,
+    frames: FrameArray,
     params: SampleParams,
     recipe: Recipe,
     source_index: npt.NDArray[np.int64],
@@ -104,7 +104,7 @@ def levels_of(
 
 
 def levels_between(
-    pictures: Frames,
+    pictures: FrameArray,
     part: tuple[int, int, int, int],
     source_index: npt.NDArray[np.int64],
     substep_px: float,

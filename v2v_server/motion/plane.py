@@ -8,7 +8,7 @@ import numpy as np
 
 from v2v_server.motion.matching import Vectors, motion, motion_if_any
 from v2v_server.motion.pyramid import Cells, Pyramid
-from v2v_server.simulation.view import Frames
+from v2v_server.simulation.view import FrameArray
 from v2v_server.video.collect import Cut
 
 
@@ -65,7 +65,7 @@ class MotionOfCuts:
         self._box, self._box_until = Cells(top, left, bottom - top, right - left), min(count for count, _ in current)
 
 
-def motions(pictures: Frames) -> Vectors:
+def motions(pictures: FrameArray) -> Vectors:
     """Return the motion of pictures [n, h, w]: [n, 2, rows, columns], zero for the first."""
     following = MotionOfPictures()
     return np.stack([following.add(Pyramid.of(picture)) for picture in pictures])

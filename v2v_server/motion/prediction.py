@@ -26,7 +26,7 @@ from v2v_server.motion.plane import motions
 from v2v_server.motion.pyramid import Pyramid
 from v2v_server.motion.warping import between
 from v2v_server.simulation.intensity import fine_table, log_table
-from v2v_server.simulation.view import Frames
+from v2v_server.simulation.view import FrameArray
 from v2v_server.simulation.voxel import FINE_STEPS
 
 SUBSTEP_PX, THRESHOLD = 1.0, 0.2
@@ -124,7 +124,7 @@ class Prediction:
         return PredictedErrors(*(min(max(fit.start + fit.slope * share, 0.0), 1.0) for fit, share in found))
 
 
-def predict(pictures: Frames) -> Prediction:
+def predict(pictures: FrameArray) -> Prediction:
     """Predict the loss of a clip.
 
     Memory: about 6 bytes a pixel for each frame and each level between frames, at most 16 a frame.
@@ -183,7 +183,7 @@ def _moving(vectors: Vectors) -> npt.NDArray[np.float64]:
     return lengths[lengths > 0.0]
 
 
-def _guess(three: Frames) -> tuple[float, float]:
+def _guess(three: FrameArray) -> tuple[float, float]:
     """Return how far the middle of three pictures is from what the others predict: along the motion, and as a mean."""
     first, middle, last = three.astype(np.float64)
     if np.array_equal(first, middle) or np.array_equal(middle, last):  # a repeated frame is not halfway

@@ -19,7 +19,7 @@ from v2v_server.simulation.draw import resized_size
 from v2v_server.system.compile_cache import cv2
 from v2v_server.video.luma import SDR, Signal
 
-Frames = npt.NDArray[Any]
+FrameArray = npt.NDArray[Any]
 """Grey levels: uint8, or uint16 for a signal of more than 8 bits."""
 
 
@@ -74,8 +74,8 @@ def crop_place(params: SampleParams, margin_px: int | None) -> tuple[int, int]:
 
 
 def without_margin(
-    frames: Frames, params: SampleParams, recipe: Recipe, margin_px: int | None, kept_px: int | None = 0
-) -> Frames:
+    frames: FrameArray, params: SampleParams, recipe: Recipe, margin_px: int | None, kept_px: int | None = 0
+) -> FrameArray:
     """Return the part of frames of a :func:`source_window` that a smaller margin needs, as a view of them.
 
     Args:
@@ -91,14 +91,14 @@ def without_margin(
     return frames[:, rows, left - kept_left : left + recipe.crop_width_px + below]
 
 
-def resized(frame: Frames, size: tuple[int, int], scale: float) -> Frames:
+def resized(frame: FrameArray, size: tuple[int, int], scale: float) -> FrameArray:
     """Return a picture resized to (height, width)."""
     method = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
-    whole: Frames = np.asarray(cv2.resize(frame, (size[1], size[0]), interpolation=method), frame.dtype)
+    whole: FrameArray = np.asarray(cv2.resize(frame, (size[1], size[0]), interpolation=method), frame.dtype)
     return whole
 
 
-def apply_view(frames: Frames, params: SampleParams, recipe: Recipe, signal: Signal = SDR) -> Frames:
+def apply_view(frames: FrameArray, params: SampleParams, recipe: Recipe, signal: Signal = SDR) -> FrameArray:
     """Return the frames as the virtual camera sees them.
 
     Args:

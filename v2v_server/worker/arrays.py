@@ -28,7 +28,7 @@ from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.intensity import tone_table
 from v2v_server.simulation.kernels import Voxels
 from v2v_server.simulation.representations import NAMES
-from v2v_server.simulation.view import Frames, Window
+from v2v_server.simulation.view import FrameArray, Window
 from v2v_server.simulation.voxel import Levels
 from v2v_server.video.colour.chroma import Chroma, ChromaCut
 from v2v_server.video.luma import SDR, Signal
@@ -86,7 +86,7 @@ class SampleContext:
     spec: StreamSpec
     params: SampleParams
     source: npt.NDArray[np.int64]
-    view: Frames
+    view: FrameArray
     signal: Signal
     step_seconds: npt.NDArray[np.float64] | None
     flow: FlowClip | None
