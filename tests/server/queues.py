@@ -11,7 +11,7 @@ from v2v_protocol.messages import Message
 from v2v_protocol.wire import decode, encode
 from v2v_server.broker.actions import ToConsumer, ToWorker
 from v2v_server.broker.leases import Cause, Loss, Stall
-from v2v_server.broker.transport import Arrival, FromConsumer, FromWorker
+from v2v_server.broker.transport import BrokerInput, FromConsumer, FromWorker
 from v2v_server.supervise.pool import Death
 
 
@@ -27,10 +27,10 @@ class Queues:
     address: str = "queue://consumers"
     worker_address: str = "queue://workers"
     waited_seconds: float = 0.0
-    arrived: deque[Arrival] = field(default_factory=deque)
+    arrived: deque[BrokerInput] = field(default_factory=deque)
     sent: dict[bytes, deque[Sequence[Any]]] = field(default_factory=dict)
 
-    def receive(self, seconds: float) -> list[Arrival]:
+    def receive(self, seconds: float) -> list[BrokerInput]:
         return [self.arrived.popleft()] if self.arrived else []
 
     def send(self, action: ToConsumer | ToWorker) -> bool:

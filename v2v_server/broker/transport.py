@@ -58,7 +58,7 @@ class InFlight:
     nbytes: int
 
 
-Arrival: TypeAlias = FromConsumer | FromWorker | ConsumerGone | InFlight
+BrokerInput: TypeAlias = FromConsumer | FromWorker | ConsumerGone | InFlight
 
 
 class ServerTransport(Protocol):
@@ -76,7 +76,7 @@ class ServerTransport(Protocol):
     def waited_seconds(self) -> float:
         """Total time that :meth:`receive` has waited without a message, seconds."""
 
-    def receive(self, seconds: float) -> list[Arrival]:
+    def receive(self, seconds: float) -> list[BrokerInput]:
         """Return at most one message of each side, the workers' first, so that neither side can starve the other.
         Changes of what is in flight come first, ended connections last.
 
@@ -146,12 +146,12 @@ class Sockets:
             self.close()
             raise
 
-    def receive(self, seconds: float) -> list[Arrival]:
+    def receive(self, seconds: float) -> list[BrokerInput]:
         """Implement :meth:`ServerTransport.receive`."""
         began = time.monotonic()
         ready = self._routers.wait(seconds)
         self.waited_seconds += time.monotonic() - began
-        arrivals: list[Arrival] = [InFlight(*each) for each in self._consumers.take_in_flight().items()]
+        arrivals: list[BrokerInput] = [InFlight(*each) for each in self._consumers.take_in_flight().items()]
         if self._workers in ready and (sample := self._workers.receive(FromWorker)) is not None:
             arrivals.append(sample)
         if self._consumers in ready and (request := self._consumers.receive(FromConsumer)) is not None:

@@ -25,7 +25,7 @@ from v2v_protocol.link.router import MOST_MESSAGE_FRAMES
 from v2v_protocol.messages import Ping, Pong
 from v2v_protocol.wire import encode
 from v2v_server.broker.actions import ToConsumer, ToWorker
-from v2v_server.broker.transport import Arrival, ConsumerGone, FromConsumer, FromWorker, Sockets
+from v2v_server.broker.transport import BrokerInput, ConsumerGone, FromConsumer, FromWorker, Sockets
 from v2v_server.system.process import most_connections
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a connection guard")
@@ -90,8 +90,8 @@ def is_ended(peer: socket.socket) -> bool:
     return True
 
 
-def next_from(sockets: Sockets, kind: type) -> Arrival:
-    came: list[Arrival] = []
+def next_from(sockets: Sockets, kind: type) -> BrokerInput:
+    came: list[BrokerInput] = []
 
     def there() -> bool:
         came.extend(one for one in sockets.receive(0.05) if isinstance(one, kind))
@@ -181,7 +181,7 @@ def test_a_last_message_is_handled_after_its_connection_has_ended(
     peer.send_multipart(encode(Ping()))
     peer.close(linger=-1)
     until(lambda: not watched._connections)
-    came: list[Arrival] = []
+    came: list[BrokerInput] = []
     until(lambda: came.extend(sockets.receive(0.05)) or ConsumerGone(b"c") in came)
     until(lambda: came.extend(sockets.receive(0.05)) or came[-1] == ConsumerGone(b"c"))
     assert [one.identity for one in came if isinstance(one, FromConsumer)] == [b"c"]
@@ -209,7 +209,7 @@ def test_a_late_message_is_not_taken_for_one_of_the_next_connection_with_its_des
     honest = consumer(sockets, b"honest")
     until(lambda: list(connections) == descriptors)
     honest.send_multipart(encode(Ping()))
-    came: list[Arrival] = []
+    came: list[BrokerInput] = []
 
     def is_heard() -> bool:
         came.extend(sockets.receive(0.05))
@@ -280,7 +280,7 @@ def test_a_message_of_a_refused_connection_gets_no_user_of_the_next_one_with_its
     with raw(sockets.address) as honest:
         assert list(connections) == [descriptor]
         honest.sendall(b"\0\x06honest")
-        came: list[Arrival] = []
+        came: list[BrokerInput] = []
         until(lambda: came.extend(sockets.receive(0.05)) or [one for one in came if isinstance(one, FromConsumer)])
         came += sockets.receive(0.2)
     assert [bytes(one.frames[0]) for one in came if isinstance(one, FromConsumer)] == [b"honest"]

@@ -19,7 +19,7 @@ from v2v_protocol.link import router
 from v2v_protocol.messages import Ping, Pong, Stop
 from v2v_protocol.wire import encode
 from v2v_server.broker.actions import ToConsumer, ToWorker
-from v2v_server.broker.transport import Arrival, ConsumerGone, FromConsumer, FromWorker, InFlight, Sockets
+from v2v_server.broker.transport import BrokerInput, ConsumerGone, FromConsumer, FromWorker, InFlight, Sockets
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def test_one_message_of_each_side_comes_at_a_time_the_workers_first(sockets: Soc
             for number in range(2):
                 peer.send_multipart([*encode(Ping()), bytes([number])])
         until(lambda: len(dict(sockets._routers._poller.poll(0))) == 2)
-        came: list[Arrival] = []
+        came: list[BrokerInput] = []
         while len(came) < 4:
             both = sockets.receive(60.0)
             assert [type(one) for one in both] in ([FromWorker, FromConsumer], [FromWorker], [FromConsumer])

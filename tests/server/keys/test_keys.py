@@ -24,7 +24,7 @@ from v2v_protocol.link.dealer import Dealer, Handshakes, mechanism_of
 from v2v_protocol.messages import Ping, Pong
 from v2v_protocol.wire import encode, largest_frame_bytes
 from v2v_server.broker.actions import ToConsumer
-from v2v_server.broker.transport import Arrival, FromConsumer, FromWorker, Sockets
+from v2v_server.broker.transport import BrokerInput, FromConsumer, FromWorker, Sockets
 from v2v_server.commands.keys import main
 from v2v_server.keys.folder import KeyFolder
 from v2v_server.worker.process import pack
@@ -75,9 +75,9 @@ def refusal(link: Dealer) -> str:
     raise AssertionError("it was not told")
 
 
-def arrivals(sockets: Sockets, seconds: float) -> list[Arrival]:
+def arrivals(sockets: Sockets, seconds: float) -> list[BrokerInput]:
     ends = time.monotonic() + seconds
-    found: list[Arrival] = []
+    found: list[BrokerInput] = []
     while time.monotonic() < ends:
         found += [each for each in sockets.receive(0.05) if isinstance(each, FromConsumer | FromWorker)]
     return found
@@ -251,7 +251,7 @@ def test_who_says_nothing_until_its_key_is_revoked_is_not_heard(
         public = read_key(tmp_path / "gpu1.key").public
         until(lambda: not gate.admits("consumer", public))
         peer.send_multipart(encode(Ping()))
-        heard: list[Arrival] = []
+        heard: list[BrokerInput] = []
 
         def is_cut_off() -> bool:
             heard.extend(one for one in sockets.receive(0.05) if isinstance(one, FromConsumer))
