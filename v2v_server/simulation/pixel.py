@@ -29,10 +29,10 @@ from v2v_server.simulation.vectors import (
     use_widest_vectors,
 )
 
-BLOCK_PX = 512
+PIXELS_A_BLOCK = 512
 """Pixels of a block. Smaller blocks touch each page of frames and voxels more often; larger ones exceed the cache."""
 
-PITCH = BLOCK_PX + 16  # rows a multiple of 4096 bytes apart would alias in the processor's store buffer
+PITCH = PIXELS_A_BLOCK + 16  # rows a multiple of 4096 bytes apart would alias in the processor's store buffer
 ROWS_AHEAD = 3  # number of steps that a row of frames is prefetched before its use
 
 _GOLDEN = noise.GOLDEN
@@ -140,7 +140,7 @@ def two_normals(radius_words, angle_words, radius_word, angle_word, x_row, y_row
     Several short loops: a processor overlaps iterations only within its window of waiting instructions, and a long
     chain of dependent operations fills that window with a single iteration.
     """
-    for i in range(BLOCK_PX):
+    for i in range(PIXELS_A_BLOCK):
         x = np.uint32(radius_words[i] ^ radius_word)
         x = np.uint32(x ^ (x >> np.uint32(16)))
         x = np.uint32(x * _M0)
@@ -149,23 +149,23 @@ def two_normals(radius_words, angle_words, radius_word, angle_word, x_row, y_row
         y = np.uint32(np.uint32(x ^ (x >> np.uint32(15))) ^ np.uint32(angle_words[i] ^ angle_word))
         x_row[i] = np.uint32((x & _LOW_31_BITS) | np.uint32(1))
         y_row[i] = np.uint32(y * _M2)
-    for i in range(BLOCK_PX):
+    for i in range(PIXELS_A_BLOCK):
         bits: Any = bits_of_float(np.float32(np.int32(x_row[i])))  # type: ignore[call-arg]
         exponent = np.int32(np.int32(bits - _SQRT_HALF_BITS) >> np.int32(23))
         normal[0, i] = float_of_bits(np.int32(bits - np.int32(exponent << np.int32(23)))) - _ONE
         normal[1, i] = np.float32(np.int32(exponent - np.int32(31))) * _MINUS_2_LN_2
-    for i in range(BLOCK_PX):
+    for i in range(PIXELS_A_BLOCK):
         fraction = normal[0, i]
         square = fraction * fraction
         high = (_L2 + _L3 * fraction) + _L4 * square
         radius_row[i] = np.sqrt(normal[1, i] + fraction * ((_L0 + _L1 * fraction) + high * square))
-    for i in range(BLOCK_PX):
+    for i in range(PIXELS_A_BLOCK):
         turn = np.float32(np.int32(y_row[i])) * _TURN
         square = turn * turn
         fourth = square * square
         normal[0, i] = turn * ((_A0 + _A1 * square) + (_A2 + _A3 * square) * fourth)
         normal[1, i] = (_C0 + _C1 * square) + (_C2 + _C3 * square) * fourth
-    for i in range(BLOCK_PX):
+    for i in range(PIXELS_A_BLOCK):
         sine, cosine = normal[0, i], normal[1, i]
         twice = sine + sine
         normal[0, i] = radius_row[i] * (_ONE - twice * sine)
@@ -271,20 +271,20 @@ def simulate_pixels(
             pairs[1, pair] = word(pair_angle, pair)
     saturated, next_hot = 0, 0
 
-    for first in range(0, pixels, BLOCK_PX):
-        last = min(first + BLOCK_PX, pixels)
+    for first in range(0, pixels, PIXELS_A_BLOCK):
+        last = min(first + PIXELS_A_BLOCK, pixels)
         hot = next_hot
         while next_hot < len(hot_position) and hot_position[next_hot] < last:
             next_hot += 1
-        for i in range(BLOCK_PX):
+        for i in range(PIXELS_A_BLOCK):
             uniform = np.float32(np.int32(word(start, first + i) >> np.uint32(8))) * _UNIT
             residual[i] = uniform * start_span + start_low
         if is_triangular:
-            for i in range(BLOCK_PX):
+            for i in range(PIXELS_A_BLOCK):
                 uniform = np.float32(np.int32(word(start, first + i) >> np.uint32(8))) * _UNIT
                 residual[i] = triangular(uniform, threshold_pos, threshold_neg)
         if noisy:
-            for i in range(BLOCK_PX):
+            for i in range(PIXELS_A_BLOCK):
                 radius_words[i] = word(pixel_radius, first + i)
                 angle_words[i] = word(pixel_angle, first + i)
         now, row = 0, 0
@@ -308,11 +308,11 @@ def simulate_pixels(
             scale = noise_scale[step] if noisy else tolerance - tolerance
             of_bin = step - row * steps_per_bin
             if of_bin == 0:
-                for i in range(BLOCK_PX):
+                for i in range(PIXELS_A_BLOCK):
                     change = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
                     count[i], residual[i] = crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
             else:
-                for i in range(BLOCK_PX):
+                for i in range(PIXELS_A_BLOCK):
                     change = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
                     signed, residual[i] = crossed(residual[i] + change, threshold_pos, threshold_neg, tolerance)
                     count[i] += signed

@@ -244,9 +244,9 @@ def test_saturation_in_some_blocks_equals_the_definition(
     dtype: Any, limit: Any, frames_per_bin: Any, precision: Any
 ) -> None:
     """Counts just below, at and beyond the limit; in the second of three blocks and in the narrow last one only."""
-    width, steps, threshold = 2 * pixel.BLOCK_PX + 21, 4 * frames_per_bin, 2.0**-4
+    width, steps, threshold = 2 * pixel.PIXELS_A_BLOCK + 21, 4 * frames_per_bin, 2.0**-4
     level = np.zeros((steps + 1, width))
-    for place, beyond in ((pixel.BLOCK_PX, 0), (pixel.BLOCK_PX + 17, 1), (width - 6, 2), (width - 1, -1)):
+    for place, beyond in ((pixel.PIXELS_A_BLOCK, 0), (pixel.PIXELS_A_BLOCK + 17, 1), (width - 6, 2), (width - 1, -1)):
         jump = (limit + beyond) * threshold
         level[frames_per_bin : 2 * frames_per_bin, place] = jump
         level[3 * frames_per_bin :, place] = -jump
@@ -261,7 +261,7 @@ def test_saturation_in_some_blocks_equals_the_definition(
     )  # fmt: skip
     np.testing.assert_array_equal(got.voxels.reshape(expected.shape), expected)
     assert got.saturated_bins == saturated > 0
-    assert np.abs(expected[:, : pixel.BLOCK_PX]).max() < limit
+    assert np.abs(expected[:, : pixel.PIXELS_A_BLOCK]).max() < limit
 
 
 def test_hot_pixels_fire_and_no_other_pixel_does() -> None:

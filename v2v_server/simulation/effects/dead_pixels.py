@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from v2v_server.simulation import noise
 from v2v_server.simulation.effects.state import Clip, hook
-from v2v_server.simulation.pixel import BLOCK_PX, smallest_words
+from v2v_server.simulation.pixel import PIXELS_A_BLOCK, smallest_words
 
 FIELD, ROWS = "dead_pixel_share", 0
 NOISE, PANEL = False, "pixels"
@@ -36,7 +36,7 @@ def start(tables, own, block, at):
     if len(position) > 0:
         end = 0 if at.first == 0 else of_block[1]
         of_block[0] = end
-        while end < len(position) and position[end] < at.first + BLOCK_PX:
+        while end < len(position) and position[end] < at.first + PIXELS_A_BLOCK:
             end += 1
         of_block[1] = end
 

@@ -20,8 +20,8 @@ from v2v_server.simulation import noise
 from v2v_server.simulation.effects import EFFECTS
 from v2v_server.simulation.effects.state import At, Block, compiled, hook
 from v2v_server.simulation.pixel import (
-    BLOCK_PX,
     PITCH,
+    PIXELS_A_BLOCK,
     ROWS_AHEAD,
     crossed,
     folds_of,
@@ -141,8 +141,8 @@ def _simulate(
     pair_radius, pair_angle = folds_of(key, _PAIR_RADIUS), folds_of(key, _PAIR_ANGLE)
     next_hot = 0
 
-    for first in range(0, pixels, BLOCK_PX):
-        last = min(first + BLOCK_PX, pixels)
+    for first in range(0, pixels, PIXELS_A_BLOCK):
+        last = min(first + PIXELS_A_BLOCK, pixels)
         hot = next_hot
         while next_hot < len(hot_position) and hot_position[next_hot] < last:
             next_hot += 1
@@ -151,16 +151,16 @@ def _simulate(
         shown = frames[0, first:last]
         look_up(table, shown, shown, levels[now])
         _begin(made, clipped, first)
-        for i in range(BLOCK_PX):
+        for i in range(PIXELS_A_BLOCK):
             positive[i], negative[i] = threshold_pos, threshold_neg
         _start(tables, own, block, At(first, 0, False, now, now, shown))
-        for i in range(BLOCK_PX):
+        for i in range(PIXELS_A_BLOCK):
             uniform = np.float32(np.int32(word(start_folds, first + i) >> np.uint32(8))) * _UNIT
             residual[i] = uniform * (positive[i] + negative[i]) - negative[i] if start == UNIFORM else start_residual
             if start == TRIANGULAR:
                 residual[i] = triangular(uniform, positive[i], negative[i])
         if noisy:
-            for i in range(BLOCK_PX):
+            for i in range(PIXELS_A_BLOCK):
                 radius_words[i] = word(pixel_radius, first + i)
                 angle_words[i] = word(pixel_angle, first + i)
 
@@ -182,7 +182,7 @@ def _simulate(
                 now = known
             elif known_before != known:
                 now, reached = 2 + (each & 1), segments.reached[each]
-                for i in range(BLOCK_PX):
+                for i in range(PIXELS_A_BLOCK):
                     levels[now, i] = levels[known_before, i] + (levels[known, i] - levels[known_before, i]) * reached
             if noisy and step >> 1 != pair_done:
                 pair_done = step >> 1
@@ -199,43 +199,43 @@ def _simulate(
                 # The loops of ``simulate_pixels``, written out: a function for both makes numba count references,
                 # and the paper's kernel 4 % slower.
                 if is_first:
-                    for i in range(BLOCK_PX):
+                    for i in range(PIXELS_A_BLOCK):
                         more = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
                         on[i], residual[i] = crossed(residual[i] + more, threshold_pos, threshold_neg, tolerance)
                 else:
-                    for i in range(BLOCK_PX):
+                    for i in range(PIXELS_A_BLOCK):
                         more = (levels[now, i] - levels[before, i]) + normal[odd, i] * scale
                         events, residual[i] = crossed(residual[i] + more, threshold_pos, threshold_neg, tolerance)
                         on[i] += events
             else:
                 shown = frames[segments.shown[each], first:last]
                 at = At(first, each, moved, before, now, shown)
-                for i in range(BLOCK_PX):
+                for i in range(PIXELS_A_BLOCK):
                     change[i] = levels[now, i] - levels[before, i]
                 _see(tables, own, block, at)
                 if noisy:
-                    for i in range(BLOCK_PX):
+                    for i in range(PIXELS_A_BLOCK):
                         change[i] += normal[odd, i] * scale
                 _change(tables, own, block, at)
                 if timed:
-                    for i in range(BLOCK_PX):
+                    for i in range(PIXELS_A_BLOCK):
                         old[i], waited[i], blind[i] = residual[i], zero, zero
                 drifting = residual if drifts_first else change
                 for spot in range(hot, next_hot):
                     drifting[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
                 if _cross(tables, own, block, at):
-                    for i in range(BLOCK_PX):
+                    for i in range(PIXELS_A_BLOCK):
                         rises[i], falls[i] = max(signed[i], zero), max(zero - signed[i], zero)
                 else:
-                    for i in range(BLOCK_PX):
+                    for i in range(PIXELS_A_BLOCK):
                         events, residual[i] = crossed(residual[i] + change[i], positive[i], negative[i], tolerance)
                         signed[i], rises[i], falls[i] = events, max(events, zero), max(zero - events, zero)
                 _after(tables, own, block, at)
                 if is_first:
-                    for i in range(BLOCK_PX):
+                    for i in range(PIXELS_A_BLOCK):
                         on[i], off[i] = rises[i], falls[i]
                 else:
-                    for i in range(BLOCK_PX):
+                    for i in range(PIXELS_A_BLOCK):
                         on[i] += rises[i]
                         off[i] += falls[i]
                 if timed:
@@ -246,7 +246,7 @@ def _simulate(
             if each == count - 1 or segments.bin[each + 1] != of_bin:
                 net = on if is_plain else signed
                 if not is_plain:
-                    for i in range(BLOCK_PX):
+                    for i in range(PIXELS_A_BLOCK):
                         net[i] = on[i] - off[i]
                 _end(made, clipped, Counts(first, last, of_bin // bins, of_bin % bins, limit, net, on, off))
 

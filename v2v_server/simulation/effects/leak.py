@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.simulation.effects.state import Clip, Fired, hook
-from v2v_server.simulation.pixel import BLOCK_PX
+from v2v_server.simulation.pixel import PIXELS_A_BLOCK
 
 FIELD, ROWS = "leak_hz", 0
 NOISE, PANEL = True, "still"
@@ -34,5 +34,5 @@ def change(leak, own, block, at):
     """Add the leak."""
     if len(leak) > 0:
         leaked = leak[at.step]
-        for i in range(BLOCK_PX):
+        for i in range(PIXELS_A_BLOCK):
             block.change[i] += block.positive[i] * leaked

@@ -13,7 +13,7 @@ import numpy as np
 
 from v2v_protocol.recipe import SMALLEST_THRESHOLD_SHARE
 from v2v_server.simulation.effects.state import Clip, hook
-from v2v_server.simulation.pixel import BLOCK_PX, folds_of, two_normals, word
+from v2v_server.simulation.pixel import PIXELS_A_BLOCK, folds_of, two_normals, word
 
 FIELD, ROWS = "threshold_mismatch_sigma", 0
 NOISE, PANEL = False, "pixels"
@@ -34,10 +34,10 @@ def start(tables, own, block, at):
     if sigma > 0:
         words, normal = block.words, block.floats
         radius, angle = folds_of(block.key, np.uint32(RADIUS)), folds_of(block.key, np.uint32(ANGLE))
-        for i in range(BLOCK_PX):
+        for i in range(PIXELS_A_BLOCK):
             words[0, i] = word(radius, at.first + i)
             words[1, i] = word(angle, at.first + i)
         two_normals(words[0], words[1], _NONE, _NONE, words[2], words[3], normal[2], normal)
-        for i in range(BLOCK_PX):
+        for i in range(PIXELS_A_BLOCK):
             block.positive[i] *= max(_ONE + normal[0, i] * sigma, smallest_share)
             block.negative[i] *= max(_ONE + normal[1, i] * sigma, smallest_share)

@@ -18,7 +18,7 @@ import numpy as np
 
 from v2v_server.simulation.effects.state import UNITS, Clip, Fired, hook
 from v2v_server.simulation.intensity import Doubles, exponential
-from v2v_server.simulation.pixel import BLOCK_PX, look_up
+from v2v_server.simulation.pixel import PIXELS_A_BLOCK, look_up
 
 FIELD, ROWS = "photoreceptor_hz", 3
 NOISE, PANEL = False, "rates"
@@ -51,7 +51,7 @@ def low_pass_tables(photoreceptor_hz: float, light: Doubles, seconds: Doubles) -
 def start(tables, own, block, at):
     """Set P = L."""
     if len(tables[0]) > 0:
-        for i in range(BLOCK_PX):
+        for i in range(PIXELS_A_BLOCK):
             own[0, i] = block.levels[at.now, i]
 
 
@@ -65,7 +65,7 @@ def see(tables, own, block, at):
         if at.moved or at.step == 0 or of_step != table_of_step[at.step - 1]:
             look_up(low_pass[of_step, 0], at.shown, at.shown, slow)
             look_up(low_pass[of_step, 1], at.shown, at.shown, fast)
-        for i in range(BLOCK_PX):
+        for i in range(PIXELS_A_BLOCK):
             old, new = levels[at.before, i], levels[at.now, i]
             block.change[i] = slow[i] * (old - seen[i]) + fast[i] * (new - old)
             seen[i] += block.change[i]

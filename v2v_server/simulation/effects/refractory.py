@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from v2v_server.simulation.effects.state import UNITS, Clip, Fired, hook
-from v2v_server.simulation.pixel import BLOCK_PX
+from v2v_server.simulation.pixel import PIXELS_A_BLOCK
 
 FIELD, ROWS = "refractory_seconds", 1
 NOISE, PANEL = False, "intervals"
@@ -68,7 +68,7 @@ def crossed(residual, blind, change, seconds, refractory, threshold_pos, thresho
 @hook
 def start(tables, own, block, at):
     """Reset the blind time."""
-    for i in range(BLOCK_PX):
+    for i in range(PIXELS_A_BLOCK):
         own[0, i] = block.tolerance - block.tolerance
 
 
@@ -79,9 +79,9 @@ def cross(tables, own, block, at):
     if refractory > 0:
         duration, blind = seconds[at.step], own[0]
         if block.timed:
-            for i in range(BLOCK_PX):
+            for i in range(PIXELS_A_BLOCK):
                 block.waited[i], block.blind[i] = blind[i] / duration, refractory / duration
-        for i in range(BLOCK_PX):
+        for i in range(PIXELS_A_BLOCK):
             block.signed[i], block.residual[i], blind[i] = crossed(
                 block.residual[i], blind[i], block.change[i], duration, refractory, block.positive[i],
                 block.negative[i], block.tolerance,

@@ -17,7 +17,7 @@ from v2v_protocol.errors import UsageError
 from v2v_server.simulation import noise
 from v2v_server.simulation.effects.state import Clip, Fired, compiled, hook
 from v2v_server.simulation.intensity import Doubles, exponential
-from v2v_server.simulation.pixel import BLOCK_PX, folds_of, look_up, word
+from v2v_server.simulation.pixel import PIXELS_A_BLOCK, folds_of, look_up, word
 from v2v_server.simulation.vectors import bits_of_float, use_widest_vectors
 
 FIELD, ROWS = "shot_noise_hz", 0
@@ -55,7 +55,7 @@ def prepare(value: float, clip: Clip) -> Tables:
     shot = np.empty((0, 0, len(clip.light)), np.uint32)
     if value > 0.0:
         shot = shot_table(shot_means(value, clip.light, clip.durations))
-    drawn, of_steps = np.empty((4, BLOCK_PX), np.uint32), np.empty((2, len(clip.table_of_step)), np.uint32)
+    drawn, of_steps = np.empty((4, PIXELS_A_BLOCK), np.uint32), np.empty((2, len(clip.table_of_step)), np.uint32)
     return Tables(shot.view(np.float32), shot.max(axis=2, initial=0), clip.table_of_step, of_steps, drawn)
 
 
@@ -104,7 +104,7 @@ def start(tables, own, block, at):
     if len(tables.shot) > 0:
         pixel_pos, pixel_neg = folds_of(block.key, np.uint32(PIXEL_POS)), folds_of(block.key, np.uint32(PIXEL_NEG))
         step_pos, step_neg = folds_of(block.key, np.uint32(STEP_POS)), folds_of(block.key, np.uint32(STEP_NEG))
-        for i in range(BLOCK_PX):
+        for i in range(PIXELS_A_BLOCK):
             tables.drawn[0, i] = word(pixel_pos, at.first + i)
             tables.drawn[1, i] = word(pixel_neg, at.first + i)
         for step in range(tables.of_steps.shape[1]):
@@ -127,7 +127,7 @@ def after(tables, own, block, at):
 @hook
 def _draw(drawn, step_pos, step_neg):
     """Write the ``shot_words`` of a block and one step into the last two rows of ``drawn``."""
-    for i in range(BLOCK_PX):
+    for i in range(PIXELS_A_BLOCK):
         x = np.uint32(drawn[0, i] ^ step_pos)
         x = np.uint32(x ^ (x >> np.uint32(16)))
         x = np.uint32(x * _M0)
@@ -157,7 +157,7 @@ def _fire(chances, largest, shown, drawn, chance, rises, falls, residual):
         look_up(chances[k], shown, shown, chance)
         following = largest[k + 1] if k + 1 < len(chances) else np.uint32(0)
         any_more = False
-        for i in range(BLOCK_PX):
+        for i in range(PIXELS_A_BLOCK):
             bound = np.uint32(np.int32(bits_of_float(chance[i])))
             positive = one if drawn[2, i] < bound else none
             negative = one if drawn[3, i] < bound else none

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from v2v_server.simulation.effects.state import hook
-from v2v_server.simulation.pixel import BLOCK_PX
+from v2v_server.simulation.pixel import PIXELS_A_BLOCK
 from v2v_server.simulation.voxel import Moments, time_of
 
 
@@ -25,7 +25,7 @@ def prepare(memory, given, segments, real):
     begins, ends = time_of(Moments(segments.step, segments.start), seconds), time_of(given.edges, seconds)[1:]
     return (
         memory,
-        np.empty((2, BLOCK_PX)),
+        np.empty((2, PIXELS_A_BLOCK)),
         begins,
         segments.share * seconds[segments.step],
         ends.reshape(-1, given.bins),
