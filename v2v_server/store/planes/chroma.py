@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from v2v_server.store.planes.plane import Files, Plane
 from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
-from v2v_server.video.colour.chroma import CELL_PX, Chroma, ChromaCut
+from v2v_server.video.colour.chroma import CHROMA_CELL_PX, Chroma, ChromaCut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import Signal
 
@@ -46,7 +46,7 @@ class Colour(Plane):
 
 
 PLANE = Colour(
-    version=1, dtype="i1", values=2, cell_px=CELL_PX, serves="frames_rgb",
+    version=1, dtype="i1", values=2, cell_px=CHROMA_CELL_PX, serves="frames_rgb",
     remedy="prepare it with v2v-prepare --planes chroma",
 )  # fmt: skip
 
@@ -58,6 +58,11 @@ def _read(cut: ChromaCut, files: Files, request: ClipRequest) -> Chroma:
         if len(frames):
             first = request.start + int(frames[0]) * request.stride
             wanted = (frames - frames[0]) * request.stride
-            cells = top - stored.head.top // CELL_PX, left, rows, columns  # cells begin at the file's own first row
+            cells = (
+                top - stored.head.top // CHROMA_CELL_PX,
+                left,
+                rows,
+                columns,
+            )  # cells begin at the file's own first row
             parts.append(stored.plane("chroma", first, int(wanted[-1]) + 1, cells, wanted))
     return Chroma(np.concatenate(parts), files[0][0].head.matrix)

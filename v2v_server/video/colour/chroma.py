@@ -26,7 +26,7 @@ from av.video.reformatter import ColorRange, Colorspace
 from v2v_server.video.luma import BeyondBits, LumaFormat
 from v2v_server.video.orientation import Orientation, PixelRect
 
-CELL_PX = 2
+CHROMA_CELL_PX = 2
 DEFAULT_MATRIX = "BT.601"
 SMPTE_240M = "SMPTE 240M"
 _STATED = {
@@ -83,9 +83,9 @@ class ChromaCut:
         """
         top, left, height, width = self.window
         first, count = self.usable_px
-        last = first // CELL_PX + -(-count // CELL_PX) - 1
-        rows = np.minimum((top + np.arange(height, dtype=np.int64)) // CELL_PX, last)
-        return rows, (left + np.arange(width, dtype=np.int64)) // CELL_PX
+        last = first // CHROMA_CELL_PX + -(-count // CHROMA_CELL_PX) - 1
+        rows = np.minimum((top + np.arange(height, dtype=np.int64)) // CHROMA_CELL_PX, last)
+        return rows, (left + np.arange(width, dtype=np.int64)) // CHROMA_CELL_PX
 
 
 class ChromaStack:
@@ -100,8 +100,8 @@ class ChromaStack:
     def __init__(self, cut: ChromaCut, orientation: Orientation, height_px: int, width_px: int) -> None:
         first_row, first_column, rows, columns = cut.cells
         # The upper left pixel of each cell, in the stored picture.
-        y = CELL_PX * np.arange(first_row, first_row + rows)
-        x = CELL_PX * np.arange(first_column, first_column + columns)
+        y = CHROMA_CELL_PX * np.arange(first_row, first_row + rows)
+        x = CHROMA_CELL_PX * np.arange(first_column, first_column + columns)
         y = height_px - 1 - y if orientation.flip_y else y
         x = width_px - 1 - x if orientation.flip_x else x
         self._transpose = orientation.transpose
