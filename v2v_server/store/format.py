@@ -26,7 +26,7 @@ import numpy.typing as npt
 import xxhash
 
 from v2v_protocol.errors import ProtocolError, VideoError
-from v2v_server.store.packing import METHODS
+from v2v_server.store.packing import PACK_METHODS
 from v2v_server.video.colour.chroma import DEFAULT_MATRIX
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR, TRANSFERS, Signal
@@ -97,7 +97,7 @@ class Head:
             and 0 <= self.top < self.top + self.rows <= self.height_px
             and 0 <= self.first < self.first + self.count <= self.frames <= LARGEST_FRAMES
             and 1 <= self.group <= GROUP_FRAMES
-            and self.packing in METHODS
+            and self.packing in PACK_METHODS
             and SDR.bits <= self.bits <= MOST_BITS
             and self.transfer in (SDR.transfer, MIXED, *TRANSFERS.values())
         )

@@ -58,7 +58,7 @@ RAW = Packing("raw")
 SIZES = {"dense": DENSE, "fast": FAST, "raw": RAW}
 """How a prepared folder may store its files, by name."""
 DEFAULT_SIZE = "dense"
-METHODS = ("zstd", "lz4", "raw")
+PACK_METHODS = ("zstd", "lz4", "raw")
 
 
 class UnpackingError(Exception):
