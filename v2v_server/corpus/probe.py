@@ -21,7 +21,7 @@ from v2v_server.video.probe import VideoFacts
 LONGEST_SECONDS = 3600.0
 """Limit for reading a whole file, also on slow storage; beyond it the file is treated as endless."""
 
-LARGEST_MEMORY_BYTES = 2 << 30
+LARGEST_PROBE_BYTES = 2 << 30
 """Memory that a process may allocate to probe a file: enough for 16 pictures of the largest size, or a list of 2**24
 frames. A file of some kB can claim a thousand million frames, for which a demuxer would allocate memory."""
 
@@ -121,7 +121,7 @@ def probe_files(
         ids,
         processes,
         deadline_seconds=lambda id: longest_seconds,
-        memory_bytes=LARGEST_MEMORY_BYTES,
+        memory_bytes=LARGEST_PROBE_BYTES,
         writable=() if source.is_local else None,  # copies are fetched: from a network, into a folder
     )
     for id, found in results:

@@ -16,7 +16,7 @@ from functools import partial
 from v2v_protocol.errors import VideoError
 from v2v_protocol.programs import printable
 from v2v_server.corpus.index import FigureKind, Figures, Store
-from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES, LONGEST_SECONDS
+from v2v_server.corpus.probe import LARGEST_PROBE_BYTES, LONGEST_SECONDS
 from v2v_server.corpus.sources.sidecar import files_between, open_sidecar, read_files, sidecar_id
 from v2v_server.corpus.sources.source import Notice, VideoSource, by_parts
 from v2v_server.labels.formats import check_labels
@@ -165,7 +165,7 @@ def _read(
         jobs,
         processes,
         deadline_seconds=lambda job: LONGEST_SECONDS,
-        memory_bytes=LARGEST_MEMORY_BYTES,
+        memory_bytes=LARGEST_PROBE_BYTES,
         writable=() if source.is_local else None,  # copies are fetched: from a network, into a folder
     )
     fresh = list[Figures]()

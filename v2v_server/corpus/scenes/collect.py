@@ -20,7 +20,7 @@ import xxhash
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
 from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.manifest import Manifest
-from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES, LONGEST_SECONDS, VideoProgress, batches
+from v2v_server.corpus.probe import LARGEST_PROBE_BYTES, LONGEST_SECONDS, VideoProgress, batches
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_ANALYSED_FRAMES, PIECE, Scene
 from v2v_server.corpus.sources.source import Notice, VideoSource
 from v2v_server.corpus.videos import SplitVideos, VideoTable, encoded_pieces, joined
@@ -144,7 +144,7 @@ class SceneCollection:
             jobs(),
             processes,
             deadline_seconds=lambda job: LONGEST_SECONDS,
-            memory_bytes=2 * LARGEST_MEMORY_BYTES,
+            memory_bytes=2 * LARGEST_PROBE_BYTES,
             writable=compile_cache() if source.is_local else None,
         )
         for job, found in results:

@@ -17,7 +17,7 @@ from v2v_protocol.errors import V2VError
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES
+from v2v_server.corpus.probe import LARGEST_PROBE_BYTES
 from v2v_server.corpus.scenes.findings import (
     BARS,
     BLACK,
@@ -267,7 +267,7 @@ def examine(
 ) -> Iterator[tuple[Excerpt, Result | Died]]:
     """Yield what ``look`` returns of each excerpt, in processes that a video may take down, for at most ``seconds``."""
     return run_isolated(
-        partial(look, source), excerpts, processes, lambda job: seconds, 2 * LARGEST_MEMORY_BYTES, compile_cache()
+        partial(look, source), excerpts, processes, lambda job: seconds, 2 * LARGEST_PROBE_BYTES, compile_cache()
     )
 
 
