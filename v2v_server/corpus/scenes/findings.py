@@ -9,7 +9,7 @@ import numpy as np
 from v2v_server.corpus.scenes.scene import NOISE, SEGMENT_FRAMES, Flag, Scene, Sides, firsts_of, sides_of
 from v2v_server.corpus.scenes.stretches import Spans, pattern_of, runs_of
 
-DUPLICATES, CUTS, FADES, BARS, STILL, BLACK, WHITE, COMBED, NOISY = KINDS = (
+DUPLICATES, CUTS, FADES, BARS, STILL, BLACK, WHITE, COMBED, NOISY = FINDING_KINDS = (
     "duplicates", "cuts", "fades", "bars", "still", "black", "white", "combed", "noise",
 )  # fmt: skip
 _FLAGS = {
@@ -28,7 +28,7 @@ class Defect:
     """A defect of the frames that were analysed.
 
     Attributes:
-        kind: one of :data:`KINDS`.
+        kind: one of :data:`FINDING_KINDS`.
         spans: the frames that are affected: of a duplicate or a cut, the two frames of its step.
         per_mille: of duplicates and cuts, the share of the steps from frame to frame; otherwise of the frames.
         text: what was found, for the user.
