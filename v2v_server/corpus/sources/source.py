@@ -1,6 +1,6 @@
 """Where the videos of a corpus come from, and what every source can do.
 
-A kind of source is a file beside this one, named in :data:`KINDS`: a subclass of :class:`VideoSource`, and a function
+A kind of source is a file beside this one, named in :data:`SOURCE_KINDS`: a subclass of :class:`VideoSource`, and a function
 ``open_source(name, options)`` that returns one, or None if the name belongs to another kind.
 
 Errors are the same for every source: :class:`VideoGone` (not there), :class:`VideoDenied` (not permitted),
@@ -42,7 +42,7 @@ _TOGETHER, _MOST_TOGETHER = 64, 1024
 _SOON_SECONDS = 0.05
 _IN_TURN = 256
 """Parts that are asked many at a time before one alone is tried again."""
-KINDS = ("copies", "prepared", "folder")
+SOURCE_KINDS = ("copies", "prepared", "folder")
 """Files of the kinds of sources, in the order in which they are asked. The last one takes any name."""
 COPIES_GIB = 100.0
 """Default limit of the folder of copies."""
@@ -326,7 +326,7 @@ def open_source(name: str | os.PathLike[str], options: SourceOptions = SourceOpt
     """
     name = os.fspath(name)
     try:
-        for kind in KINDS:
+        for kind in SOURCE_KINDS:
             source: VideoSource | None = import_module(f"{__package__}.{kind}").open_source(name, options)
             if source is not None:
                 return source
