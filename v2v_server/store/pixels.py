@@ -1,6 +1,6 @@
 """What frames are read from.
 
-Each kind is a file here: its name in :data:`KINDS`, and there ``open_pixels(path)``, which returns None for another
+Each kind is a file here: its name in :data:`PIXEL_KINDS`, and there ``open_pixels(path)``, which returns None for another
 kind.
 """
 
@@ -18,7 +18,7 @@ from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import Signal
 from v2v_server.video.probe import VideoFacts
 
-KINDS = ("reader", "video_file")
+PIXEL_KINDS = ("reader", "video_file")
 """Files of the kinds, in the order in which they are asked. The last one takes any file."""
 
 
@@ -55,7 +55,7 @@ class Pixels(Protocol):
 @contextmanager
 def open_pixels(path: Path) -> Iterator[Pixels]:
     """Lend the pixels of a file of this host until the end of the context. Errors: :class:`Pixels`."""
-    for kind in KINDS:
+    for kind in PIXEL_KINDS:
         found = import_module(f"{__package__}.{kind}").open_pixels(path)
         if found is not None:
             break
