@@ -1,4 +1,4 @@
-"""The planes that a store file may have, each a file here: its name in :data:`KINDS`, and there ``PLANE``.
+"""The planes that a store file may have, each a file here: its name in :data:`PLANE_KINDS`, and there ``PLANE``.
 
 A plane knows when a request wants it, how its array is made from a picture, how it is stored, and what reading it adds
 to a clip (:class:`v2v_server.store.planes.plane.Plane`). Those that change what is read come first.
@@ -14,9 +14,11 @@ from v2v_server.store.planes.plane import Plane
 from v2v_server.video.collect import Cut
 from v2v_server.video.orientation import PixelRect
 
-KINDS = ("motion", "detail", "chroma")
+PLANE_KINDS = ("motion", "detail", "chroma")
 """Files of the planes; also the names under which files have them."""
-PLANES: Mapping[str, Plane] = MappingProxyType({name: import_module(f"{__name__}.{name}").PLANE for name in KINDS})
+PLANES: Mapping[str, Plane] = MappingProxyType(
+    {name: import_module(f"{__name__}.{name}").PLANE for name in PLANE_KINDS}
+)
 """By name."""
 OPTIONAL = tuple(name for name, plane in PLANES.items() if plane.serves)
 """Names of the planes that a user may choose to store."""
