@@ -46,7 +46,7 @@ MOST_LEASE_BYTES = 7 << 30
 """Largest memory that one lease may take, with all that its spec may ask for; a worker has a GiB more."""
 _BLOCK = 256
 """Videos whose sequences are counted again for a look-up. Larger blocks take more time, smaller ones more memory."""
-Videos = Sequence[VideoEntry]
+_Videos = Sequence[VideoEntry]
 _SHOWN = 5
 
 
@@ -230,7 +230,7 @@ class Columns:
         split: the videos that are divided into pieces; None if pieces are unknown.
     """
 
-    def __init__(self, videos: Videos) -> None:
+    def __init__(self, videos: _Videos) -> None:
         if isinstance(videos, CatalogueVideos):
             self.frames, sizes, self.split = videos.frames, _sizes(videos.height_px, videos.width_px), videos.split
             self.rates = videos.frames_per_second
@@ -247,7 +247,7 @@ def _sizes(height_px: npt.NDArray[np.integer], width_px: npt.NDArray[np.integer]
     return height_px.astype(np.int64) << 32 | width_px
 
 
-def _columns(videos: Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], SplitVideos | None]:
+def _columns(videos: _Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], SplitVideos | None]:
     """Return frames, sizes, and the videos that are divided into pieces."""
     frames, heights, widths = (
         np.array([getattr(video, name) for video in videos], np.int64) for name in ("frames", "height_px", "width_px")
@@ -277,7 +277,7 @@ class SequenceTable:
         UsageError: the spec asks for scenes and the catalogue has no scene statistics.
     """
 
-    def __init__(self, videos: Videos, rows: Rows, spec: StreamSpec, columns: Columns | None = None) -> None:
+    def __init__(self, videos: _Videos, rows: Rows, spec: StreamSpec, columns: Columns | None = None) -> None:
         self._all, self._rows, self._spec, self._columns = videos, rows, spec, columns or Columns(videos)
         if spec.scene != "off" and self._columns.split is None:
             raise UsageError(
@@ -383,7 +383,7 @@ class Refusals(Sequence[Refusal]):
         rows, spec: rows and spec that the videos do not suit.
     """
 
-    def __init__(self, places: npt.NDArray[np.intp], videos: Videos, rows: Rows, spec: StreamSpec) -> None:
+    def __init__(self, places: npt.NDArray[np.intp], videos: _Videos, rows: Rows, spec: StreamSpec) -> None:
         self._places, self._videos, self._rows, self._spec = places, videos, rows, spec
 
     def __len__(self) -> int:
