@@ -35,7 +35,7 @@ from v2v_server.worker.logbook import Logbook
 STOPPED = (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
 _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
 PROGRAM = (sys.executable, "-m", "v2v_server.commands.worker")
-Program = subprocess.Popen[bytes]
+_Process = subprocess.Popen[bytes]
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 _MEMORY_SECONDS = 5.0
 """Time after the kernel has killed a process for lack of memory in which a worker's SIGKILL is attributed to that."""
@@ -94,7 +94,7 @@ def start_ahead(config: ServeConfig) -> Iterator[list[Standby]]:
 
 def start_child(
     address: str, root: str, name: str, flags: Sequence[str], logbook: Logbook, key: PeerKey | None = None
-) -> Program:
+) -> _Process:
     """Start a worker in a process of its own, which dies with this one.
 
     Args:
@@ -116,7 +116,7 @@ def start_child(
         return start_program(arguments(address, root, name, flags, logbook), handed)
 
 
-def start_program(arguments: Sequence[str], handed: Sequence[int], stdin: int = subprocess.DEVNULL) -> Program:
+def start_program(arguments: Sequence[str], handed: Sequence[int], stdin: int = subprocess.DEVNULL) -> _Process:
     """Start the program of a worker with these arguments, which has the descriptors ``handed``.
 
     Raises:
