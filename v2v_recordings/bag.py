@@ -22,7 +22,7 @@ from v2v_recordings.archive import starts_with
 from v2v_recordings.faery_reader import read_prophesee
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, ReadProgress, SensorSize
 
-EVENT_ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
+_EVENT_TYPES = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 EVENT_PACKETS = "event_camera_msgs/msg/EventPacket"
 IMAGE = "sensor_msgs/msg/Image"
 RECORD = np.dtype([("x", "<u2"), ("y", "<u2"), ("secs", "<u4"), ("nsecs", "<u4"), ("polarity", "u1")])
@@ -174,7 +174,7 @@ def _picture(message: _Message, path: Path) -> Picture:
 
 
 def _events_topic(connections: list[Any], wanted: str | None, path: Path) -> str:
-    topics = {connection.topic for connection in connections if connection.msgtype in (*EVENT_ARRAYS, EVENT_PACKETS)}
+    topics = {connection.topic for connection in connections if connection.msgtype in (*_EVENT_TYPES, EVENT_PACKETS)}
     if wanted is not None:
         topics &= {wanted}
     if len(topics) != 1:
