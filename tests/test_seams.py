@@ -30,7 +30,7 @@ EFFECT = '''
 import numpy as np
 
 from v2v_server.simulation.effects.state import hook
-from v2v_server.simulation.pixel import BLOCK_PX, folds_of, word
+from v2v_server.simulation.pixel import PIXELS_A_BLOCK, folds_of, word
 
 FIELD, ROWS = "event_loss", 0
 NOISE, PANEL = False, "rates"
@@ -50,7 +50,7 @@ def changed(value, fired):
 def after(chance, own, block, at):
     if chance > 0:
         pixel, step = folds_of(block.key, PIXEL), word(folds_of(block.key, STEP), at.step)
-        for i in range(BLOCK_PX):
+        for i in range(PIXELS_A_BLOCK):
             if word((word(pixel, at.first + i), step), 0) < chance:
                 block.rises[i] = block.falls[i] = block.tolerance - block.tolerance
 '''

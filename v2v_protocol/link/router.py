@@ -181,7 +181,7 @@ class Router:
 
     def receive(self, kind: type[_R]) -> _R | None:
         """Return an available message as a ``kind`` of :class:`Received`. One of a connection that may not stay, of a
-        revoked key, or with more than MOST_FRAMES frames is dropped.
+        revoked key, or with more than MOST_MESSAGE_FRAMES frames is dropped.
         """
         frames: list[Any] = []
         try:

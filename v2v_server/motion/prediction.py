@@ -130,7 +130,7 @@ def predict(pictures: FrameArray) -> Prediction:
     Memory: about 6 bytes a pixel for each frame and each level between frames, at most 16 a frame.
 
     Args:
-        pictures: [n, h, w] uint8, n >= 2 consecutive frames as a camera sees them; of more than MOST_FRAMES those in
+        pictures: [n, h, w] uint8, n >= 2 consecutive frames as a camera sees them; of more than _MOST_FRAMES those in
             the middle are used.
     """
     first_used = max(0, (len(pictures) - _MOST_FRAMES) // 2)

@@ -17,10 +17,8 @@ from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.manifest import MANIFEST_NAME, Header, PreparedVideo, read_manifest
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX
+from v2v_server.store.quota import LEAST_FREE_BYTES
 from v2v_server.video.fingerprint import fingerprint
-
-LEAST_FREE_BYTES = 1 << 30
-"""Always keep this much disk space free: a full disk stops other programs."""
 
 _LOCK_NAME = ".v2v-prepare.lock"
 _NOT_THERE = frozenset((errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP))

@@ -548,8 +548,8 @@ def corpus_summary(
         )
         if long := int(np.count_nonzero(catalogue.videos.frames > MOST_ANALYSED_FRAMES)):
             lines.append(
-                f"{long} videos are longer than the {MOST_ANALYSED_FRAMES} frames that are analysed: later frames are served "
-                "only of videos without defects; split long videos to use all of them"
+                f"{long} videos are longer than the {MOST_ANALYSED_FRAMES} frames that are analysed: later frames are "
+                "served only of videos without defects; split long videos to use all of them"
             )
     if refusals := table.refusals:
         lines.append(f"{len(refusals)} videos give none under the server's own recipe:")

@@ -1,7 +1,7 @@
 """What frames are read from.
 
-Each kind is a file here: its name in :data:`PIXEL_KINDS`, and there ``open_pixels(path)``, which returns None for another
-kind.
+Each kind is a file here: its name in :data:`PIXEL_KINDS`, and there ``open_pixels(path)``, which returns None for
+another kind.
 """
 
 from __future__ import annotations

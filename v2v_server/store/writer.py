@@ -211,8 +211,8 @@ def write_pictures(
 
 
 def head_of(
-    picture: DecodedPicture, index: FrameIndex, usable: PixelRect, *, video: str, fingerprint: str, first: int, count: int,
-    packing: Packing, frames_per_second: float = 0.0, stored_index: bytes = b"",
+    picture: DecodedPicture, index: FrameIndex, usable: PixelRect, *, video: str, fingerprint: str, first: int,
+    count: int, packing: Packing, frames_per_second: float = 0.0, stored_index: bytes = b"",
 ) -> Head:  # fmt: skip
     """Return the head of a file.
 

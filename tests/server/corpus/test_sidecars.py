@@ -292,7 +292,7 @@ def test_labels_that_do_not_fit_are_said_once_read(corpus: Path) -> None:
 
 @pytest.mark.slow
 def test_a_sidecar_that_kills_its_reader_costs_itself(corpus: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collecting, "LARGEST_MEMORY_BYTES", 256 << 20)
+    monkeypatch.setattr(collecting, "LARGEST_PROBE_BYTES", 256 << 20)
     boxes = {"images": [{"id": n, "frame_id": n} for n in range(500_000)], "annotations": []}
     (corpus / "a.boxes.json").write_text(json.dumps(boxes))
     with closing(open_catalogue(corpus, cache_dir=corpus.parent / "cache", processes=1)) as catalogue:

@@ -68,7 +68,7 @@ _EFFECTS = {
     WHITE: "white stretches",
     NOISY: "still stretches with much noise",
 }
-Result = TypeVar("Result")
+T = TypeVar("T")
 _AUTO = "v2v-serve --scene auto"
 CHANGES = {
     DUPLICATES: f"a repeated frame makes no events, and the next step those of two: {_AUTO} drops repeats",
@@ -259,12 +259,12 @@ def excerpt_of(catalogue: Catalogue, video: VideoEntry, frames: int | None = Non
 
 
 def examine(
-    look: Callable[[VideoSource, Excerpt], Result],
+    look: Callable[[VideoSource, Excerpt], T],
     source: VideoSource,
     excerpts: Iterable[Excerpt],
     processes: int,
     seconds: float,
-) -> Iterator[tuple[Excerpt, Result | Died]]:
+) -> Iterator[tuple[Excerpt, T | Died]]:
     """Yield what ``look`` returns of each excerpt, in processes that a video may take down, for at most ``seconds``."""
     return run_isolated(
         partial(look, source), excerpts, processes, lambda job: seconds, 2 * LARGEST_PROBE_BYTES, compile_cache()

@@ -1,4 +1,4 @@
-"""Where the videos of a corpus come from: one file for each kind of source, named in ``source.KINDS``.
+"""Where the videos of a corpus come from: one file for each kind of source, named in ``source.SOURCE_KINDS``.
 
 source    what every source can do, and asking it about many files at a time
 folder    a folder, a video or a list file on this host

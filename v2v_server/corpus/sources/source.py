@@ -1,7 +1,7 @@
 """Where the videos of a corpus come from, and what every source can do.
 
-A kind of source is a file beside this one, named in :data:`SOURCE_KINDS`: a subclass of :class:`VideoSource`, and a function
-``open_source(name, options)`` that returns one, or None if the name belongs to another kind.
+A kind of source is a file beside this one, named in :data:`SOURCE_KINDS`: a subclass of :class:`VideoSource`, and a
+function ``open_source(name, options)`` that returns one, or None if the name belongs to another kind.
 
 Errors are the same for every source: :class:`VideoGone` (not there), :class:`VideoDenied` (not permitted),
 :class:`VideoChanged` (another file by now), and :class:`VideoUnreadable` for every other fault, which may pass.

@@ -77,7 +77,7 @@ class Fired(NamedTuple):
 
 
 class Block(NamedTuple):
-    """State of BLOCK_PX neighbouring pixels; arrays are [BLOCK_PX + padding] real unless stated otherwise.
+    """State of PIXELS_A_BLOCK neighbouring pixels; arrays are [PIXELS_A_BLOCK + padding] real unless stated otherwise.
 
     Attributes:
         residual: remaining change since the last event, log units.
