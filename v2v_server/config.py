@@ -12,9 +12,21 @@ from v2v_protocol.addresses import is_loopback
 from v2v_protocol.command import flag_of
 from v2v_protocol.errors import UsageError
 from v2v_protocol.presets import STREAM_PRESETS
-from v2v_protocol.settings import bounds, check_settings, number, require_known, settings_of, switch, text, whole, word
+from v2v_protocol.settings import (
+    bounds,
+    check_settings,
+    number,
+    require_known,
+    same_as,
+    settings_of,
+    switch,
+    text,
+    whole,
+    word,
+)
 from v2v_protocol.spec import SPEC_KEYS, StreamSpec
 from v2v_protocol.spec_flags import read_recipe, read_yaml_mapping, recipe_setting
+from v2v_server.store.pixels import VideosKind
 from v2v_server.system.log import LOG_FORMATS
 from v2v_server.video.rows import Rows
 
@@ -42,6 +54,8 @@ class ServeConfig:
         group="Videos",
     )
     list: str = text("", "list file (path frames c+ c-) that restricts --videos", metavar="FILE")
+    videos_kind: str = same_as(VideosKind, "videos_kind")
+    rate: float = same_as(VideosKind, "rate")
     rows: str = text("full", "rows of each picture to use: full, top:0.54 (WebVid), top:180px, 0.1:0.6", metavar="ROWS")
     cache_dir: str = text("", "folder of the catalogue index (default: the user's cache folder)", metavar="DIR")
     cache: str = text(
@@ -133,6 +147,7 @@ class ServeConfig:
         if not self.videos:
             raise UsageError("--videos is missing: give a folder of videos, one video, or a list file")
         Rows.parse(self.rows)
+        self.kind  # noqa: B018 - checks that its settings go together
         for flag, address in (("--bind", self.bind), ("--worker-bind", self.worker_bind)):
             _check_address(flag, address, is_safe=bool(self.keys) or self.insecure)
         if self.page and not self.insecure and not is_loopback(self.page_host):
@@ -147,6 +162,11 @@ class ServeConfig:
             )
         if self.ray_label and not all(self.ray_label.partition("=")):
             raise UsageError(f"--ray-label {self.ray_label!r}: write KEY=VALUE, as `ray start --labels KEY=VALUE` does")
+
+    @property
+    def kind(self) -> VideosKind:
+        """Return what a video is."""
+        return VideosKind(self.videos_kind, self.rate)
 
     @property
     def least_workers(self) -> int:

@@ -9,7 +9,9 @@ from collections.abc import Sequence
 from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
+from v2v_server.config import ServeConfig
 from v2v_server.offline.doctor import BAD, NOTE, look_around
+from v2v_server.store.pixels import VideosKind
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -25,9 +27,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     what.add_argument(
         "--recipe", metavar="NAME", default="paper", help="recipe to check the videos against (default paper)"
     )
-    what.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
-    what.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     what.add_argument("--port", type=int, default=5555, metavar="N", help="port that a server would use (default 5555)")
+    parser.add_settings(ServeConfig, "rows", "videos_kind", "rate", "cache_dir")
     return run_command(parser, _run, argv, failures=(V2VError,))
 
 
@@ -35,7 +36,9 @@ def _run(arguments: argparse.Namespace) -> int:
     if not 1 <= arguments.port <= 65535:
         raise UsageError(f"--port {arguments.port}: give 1 to 65535")
     found_bad = has_defects = False
-    for finding in look_around(arguments.port, arguments.videos, arguments.recipe, arguments.rows, arguments.cache_dir):
+    kind = VideosKind.of(vars(arguments))
+    corpus = arguments.videos, arguments.recipe, arguments.rows or "full", arguments.cache_dir, kind
+    for finding in look_around(arguments.port, *corpus):
         found_bad = found_bad or finding.level == BAD
         has_defects = has_defects or (finding.level, finding.about) == (NOTE, "pictures")
         show(f"{finding.level:4}  {finding.about:12}  {finding.text}")

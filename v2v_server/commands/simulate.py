@@ -10,8 +10,10 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
 from v2v_protocol.spec_flags import add_spec, recipe_setting, spec_fields
+from v2v_server.config import ServeConfig
 from v2v_server.offline.event_files import FORMS
 from v2v_server.offline.remake import simulate_to_file
+from v2v_server.store.pixels import VideosKind
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,9 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         metavar="N",
         help="number of the quarantine snapshot in the sample's provenance",
     )
-    which.add_argument("--cache-dir", metavar="DIR", help="folder of catalogue index and quarantine, as for the server")
-    which.add_argument("--list", metavar="FILE", help="list file that restricts a folder")
-    which.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
+    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "cache_dir")
     out = parser.group("Output")
     parser.add_output(
         "Output", "--out", (".npz",), "output file for the arrays and the provenance (JSON)", required=True
@@ -62,7 +62,7 @@ def _run(arguments: argparse.Namespace) -> None:
         picture=arguments.picture,
         events=arguments.events,
         list_file=arguments.list,
-        rows=arguments.rows,
+        rows=arguments.rows or "full",
         spec=spec_fields(arguments) | {"recipe": recipe_setting(arguments.recipe, arguments.set)},
         arrays=tuple(arguments.arrays.split(",")),
         seed=arguments.seed,
@@ -70,6 +70,7 @@ def _run(arguments: argparse.Namespace) -> None:
         index=arguments.index,
         snapshot=arguments.quarantine,
         cache_dir=arguments.cache_dir,
+        kind=VideosKind.of(vars(arguments)),
     )
 
 

@@ -32,6 +32,7 @@ from v2v_server.corpus.sources.sidecar import sidecar_id
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, State, VideoSource, open_source
 from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos, missing_arrays
 from v2v_server.store.format import PIECE_FRAMES
+from v2v_server.store.pixels import VIDEOS, VideosKind
 from v2v_server.store.reader import STORE_FORMAT
 from v2v_server.system.process import without_collections
 from v2v_server.system.status_fields import gauge, text
@@ -102,7 +103,7 @@ class Catalogue:
             CorpusError: there is no such id in this catalogue, or no such folder on this host.
         """
         self._fingerprint(id)
-        return self.folder / id
+        return self.folder / self.source.file_of(id)
 
     def check(self, id: str, fingerprint: str, sidecar: str = "") -> None:
         """Check that the video is as catalogued, or its sidecar of that ending, see :meth:`VideoSource.verify`.
@@ -282,6 +283,7 @@ def open_catalogue(
     cache_dir: str | os.PathLike[str] | None = None,
     copies: str | os.PathLike[str] | None = None,
     copies_gib: float = COPIES_GIB,
+    kind: VideosKind = VIDEOS,
     scene: bool = False,
     processes: int = 1,
     progress: Progress | None = None,
@@ -298,6 +300,7 @@ def open_catalogue(
             ``~/.cache/v2v``.
         copies: folder for copies of videos from object storage; None takes one where the index lies.
         copies_gib: largest size of that folder, GiB.
+        kind: what a video is.
         scene: also analyse what the videos show, which decodes those not analysed yet; see
             :mod:`v2v_server.corpus.scenes`.
         processes: number of processes that probe; 0 probes in this one, which a file that crashes the decoder ends.
@@ -308,7 +311,7 @@ def open_catalogue(
         CorpusError: the folder or list is missing, unreadable or malformed, or has no usable video.
         IndexUnreadable: the index cannot be read any more after the probes.
     """
-    opened = open_source(source, SourceOptions(list_file, copies, copies_gib, cache_dir))
+    opened = open_source(source, SourceOptions(list_file, copies, copies_gib, cache_dir, kind))
     corpus = list_corpus(opened, rows, notice)
     scenes = SceneCollection(corpus.rows, opened.manifest) if scene else None
     path = index_path(opened.name, cache_dir)
@@ -381,7 +384,7 @@ def _snapshot(
         notes = [*notes, corpus.left_out]
     if shorter:
         notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
-    digest = videos.digest(corpus.rows)
+    digest = videos.digest(corpus.rows, source.kind.videos_kind if manifest is None else manifest.header.videos_kind)
     scene_digest, unknown = None, set(absent)
     if scenes is not None:
         split, scene_digest = scenes.read(store, table, unknown, digest)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.sources.asking import Notice, is_said
-from v2v_server.corpus.sources.names import VIDEO_SUFFIXES, left_out_note
+from v2v_server.corpus.sources.names import left_out_note
 from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.store.pixels import VideosKind
 from v2v_server.video.rows import Rows
 
 
@@ -45,6 +47,7 @@ def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice | None) -
     """
     source.make()
     rows = source.rows(rows)
+    source.rates = {entry.id: entry.rate for entry in source.listed or () if entry.rate is not None}
     refused: dict[str, str] = {}
     left_out = Counter[str]()
     ids = []
@@ -54,9 +57,13 @@ def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice | None) -
             notice(f"looking for videos in {source}: {len(ids)} so far")
     note = left_out_note(left_out)
     if not ids:
+        looked_for, other = source.kind.form.LOOKED_FOR, copy(source)
+        other.kind = VideosKind("sequences")
+        hint = (
+            f"; {first} is one with --videos-kind sequences" if (first := next(other.videos({}, Counter()), "")) else ""
+        )
         raise CorpusError(
-            f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}"
-            f"{format_problems(refused)}{note and '. '}{note}"
+            f"{source}: no video found; looked for {looked_for}{format_problems(refused)}{hint}{note and '. '}{note}"
         )
     return Corpus(source, rows, tuple(ids), refused, note)
 

@@ -49,6 +49,7 @@ class Header:
         source: name of the source folder, for people.
         source_digest: digest of the source's catalogue with these rows.
         version: of this format.
+        videos_kind: what a video of the source is.
     """
 
     rows: str
@@ -57,11 +58,13 @@ class Header:
     source: str
     source_digest: str
     version: int = MANIFEST_VERSION
+    videos_kind: str = "videos"
 
     @property
     def settings(self) -> str:
         """Return what all files of a folder have in common."""
-        return f"rows {self.rows}, size {self.size}"
+        kind = f", of {self.videos_kind}" if self.videos_kind != "videos" else ""
+        return f"rows {self.rows}, size {self.size}{kind}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +72,7 @@ class PreparedVideo:
     """What was made of one video.
 
     Attributes:
-        id: of the source, and the path of the prepared file below the folder.
+        id: of the source; :func:`prepared_name` gives the path of the prepared file.
         source_fingerprint, source_bytes: of the source file.
         frames, frames_per_second: of the source (None where unknown), and so of the prepared file.
         height_px, width_px: of the source's picture, of which the file keeps some rows.
@@ -91,6 +94,11 @@ class PreparedVideo:
     problem: str | None = None
     scene: str = ""
     remark: str = ""
+
+
+def prepared_name(id: str) -> str:
+    """Return the path of a prepared file below its folder."""
+    return f"{id[:-1]}.v2v" if id.endswith("/") else id
 
 
 @dataclass(frozen=True, slots=True)

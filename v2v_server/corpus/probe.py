@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import replace
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+
 from v2v_protocol.errors import VideoError, VideoUnreadable
 from v2v_server.corpus.index.file import IndexRow
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.pixels import open_pixels
+from v2v_server.store.pixels import VIDEOS, VideosKind, open_pixels
 from v2v_server.system.isolate import Died, run_twice
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.probe import VideoFacts
@@ -25,6 +29,8 @@ LARGEST_MEMORY_BYTES = 2 << 30
 """Memory that a process may allocate to probe a file: enough for 16 pictures of the largest size, or a list of 2**24
 frames. A file of some kB can claim a thousand million frames, for which a demuxer would allocate memory."""
 
+_LARGEST_DENOMINATOR = 4000
+"""Of a rate; NTSC's have 1001. An index stores the highest rate with it in 32 bits."""
 _MOST_TOGETHER = 1024
 _MOST_SECONDS = 10.0
 Progress = Callable[[int, int], None]
@@ -43,7 +49,7 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
         before = source.state(id)
         with source.open_local(id, "") as path:
             mark = fingerprint(path)
-            facts = _facts(path)
+            facts = _at_rate(_facts(path, source.kind), source.rate(id))
         name = f"{mark}-{facts.content}" if facts.content else mark
         if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
@@ -72,13 +78,23 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
     )
 
 
-def facts_of(path: Path) -> VideoFacts:
+def facts_of(path: Path, kind: VideosKind = VIDEOS) -> VideoFacts:
     """Return what is known of the video in a file. Errors: :class:`v2v_server.store.pixels.Pixels`."""
-    with open_pixels(path) as pixels:
+    with open_pixels(path, kind) as pixels:
         return pixels.facts()
 
 
-def _facts(path: Path) -> VideoFacts:
+def _at_rate(facts: VideoFacts, rate: float) -> VideoFacts:
+    """Return the facts of pictures that follow each other at a rate, Hz, if they do not state their times."""
+    if not rate or facts.index.seekable:
+        return facts
+    tick = 1 / Fraction(rate).limit_denominator(_LARGEST_DENOMINATOR)
+    index = facts.index.timed(np.arange(facts.frames), tick.as_integer_ratio())
+    content = hashlib.sha256(f"{facts.content};{rate}".encode()).hexdigest()[:32]
+    return replace(facts, frames_per_second=rate, index=index, content=content)
+
+
+def _facts(path: Path, kind: VideosKind) -> VideoFacts:
     """Return what is known of the video; retry once after an error of the system rather than of the decoder.
 
     Raises:
@@ -86,12 +102,12 @@ def _facts(path: Path) -> VideoFacts:
         VideoError: the file is not a supported video.
     """
     try:
-        return facts_of(path)
+        return facts_of(path, kind)
     except VideoError as error:
         if not isinstance(error.__cause__, OSError):
             raise
     try:
-        return facts_of(path)
+        return facts_of(path, kind)
     except VideoError as error:
         if isinstance(error.__cause__, OSError):
             raise VideoUnreadable(error.video, error.frame, error.reason) from error

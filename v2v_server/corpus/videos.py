@@ -86,12 +86,13 @@ class Videos(Sequence[VideoEntry]):
         number = bisect_left(self.ids, id)
         return int(self.frames[number]), int(self.height_px[number]), int(self.width_px[number])
 
-    def digest(self, rows: Rows) -> str:
-        """Return 32 hexadecimal digits that name these videos with these rows.
+    def digest(self, rows: Rows, kind: str = "videos") -> str:
+        """Return 32 hexadecimal digits that name these videos, of this kind, with these rows.
 
         Fingerprints cover the track and its orientation.
         """
-        sha = hashlib.sha256(f"v2v catalogue 2\n{rows}\n".encode())
+        of_kind = f"{kind}\n" if kind != "videos" else ""
+        sha = hashlib.sha256(f"v2v catalogue 2\n{rows}\n{of_kind}".encode())
         pos, neg = NO_THRESHOLDS
         none, limits = f"{pos}\0{neg}", {number: f"{pos}\0{neg}" for number, (pos, neg) in self._thresholds.items()}
         table = self._table

@@ -15,6 +15,7 @@ from v2v_server.corpus.refresh import index_path, refresh_index
 from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
+from v2v_server.store.pixels import VIDEOS, VideosKind
 from v2v_server.video.rows import Rows
 
 
@@ -28,6 +29,7 @@ class Ahead:
     cache_dir: str | None = None
     copies: str | None = None
     copies_gib: float = COPIES_GIB
+    kind: VideosKind = VIDEOS
     scene: bool = False
     processes: int = 1
 
@@ -70,6 +72,7 @@ def catalogue_ahead(asked: Ahead, parts: Path | None, progress: Progress | None,
         cache_dir=asked.cache_dir,
         copies=asked.copies,
         copies_gib=asked.copies_gib,
+        kind=asked.kind,
         scene=asked.scene,
         processes=asked.processes,
         progress=progress,
@@ -109,4 +112,5 @@ def catalogue_shard(asked: Ahead, shard: Shard, out: Path, progress: Progress | 
 
 
 def _source(asked: Ahead) -> VideoSource:
-    return open_source(asked.videos, SourceOptions(asked.list_file, asked.copies, asked.copies_gib, asked.cache_dir))
+    options = SourceOptions(asked.list_file, asked.copies, asked.copies_gib, asked.cache_dir, asked.kind)
+    return open_source(asked.videos, options)

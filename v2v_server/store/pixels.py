@@ -1,25 +1,81 @@
 """What frames are read from.
 
-Each kind is a file here: its name in :data:`KINDS`, and there ``open_pixels(path)``, which returns None for another
-kind.
+Each form of a video is a file here: its name in :data:`KINDS`, and there ``open_pixels(path)``, which returns None for
+another form.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from v2v_server.video.collect import ClipRequest, DecodedPicture
-from v2v_server.video.decode import DecodedClip
-from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import Signal
-from v2v_server.video.probe import VideoFacts
+from v2v_protocol.command import flag_of
+from v2v_protocol.errors import UsageError
+from v2v_protocol.settings import check_settings, number, settings_of, word
 
-KINDS = ("reader", "video_file")
-"""Files of the kinds, in the order in which they are asked. The last one takes any file."""
+if TYPE_CHECKING:  # a server's command line, which reads the settings, starts without the decoder
+    from v2v_server.video.collect import ClipRequest, DecodedPicture
+    from v2v_server.video.decode import DecodedClip
+    from v2v_server.video.frame_index import FrameIndex
+    from v2v_server.video.luma import Signal
+    from v2v_server.video.probe import VideoFacts
+
+KINDS: Mapping[str, tuple[str, ...]] = {
+    "videos": ("reader", "video_file"),
+    "sequences": ("reader", "sequence"),
+}
+"""What a video of a corpus is, by ``--videos-kind``: the files here, in the order in which they are asked. The last one
+takes any path. It has ``id_of(path)``, the id of the video that a file belongs to, and ``LOOKED_FOR``, for people."""
+
+
+@dataclass(frozen=True, slots=True)
+class VideosKind:
+    """What a video of a corpus is, and the settings of that kind.
+
+    Raises:
+        UsageError: there is no such kind, or a setting is malformed or belongs to another kind.
+    """
+
+    videos_kind: str = word(
+        "videos",
+        KINDS,
+        "what a video is: videos is a file; sequences is a folder, or a zip archive, of numbered pictures",
+        group="Videos",
+    )
+    rate: float = number(
+        0.0, 0.001, 1e6, "rate of picture sequences without time stamps; 0: unknown", unit="Hz", metavar="N", off=True
+    )
+
+    def __post_init__(self) -> None:
+        check_settings(self, flag_of)
+        if self.rate and not self.has_parts:
+            raise UsageError(f"--rate {self.rate:g}: {self.videos_kind} state their rate; it is for picture sequences")
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> VideosKind:
+        """Return the kind of a command's flags; a flag that is missing or None has its default."""
+        return cls(**{name: given[name] for name in settings_of(cls) if given.get(name) is not None})
+
+    @property
+    def has_parts(self) -> bool:
+        """Return whether a video is a folder or an archive of files."""
+        return self.videos_kind == "sequences"
+
+    @property
+    def form(self) -> Any:
+        """Return the file that defines the kind, the last of its :data:`KINDS`."""
+        return import_module(f"{__package__}.{KINDS[self.videos_kind][-1]}")
+
+    def flags(self) -> list[str]:
+        """Return the flags by which another process reads these videos."""
+        return [] if self == VIDEOS else [flag_of("videos_kind"), self.videos_kind]
+
+
+VIDEOS = VideosKind()
 
 
 class Pixels(Protocol):
@@ -53,10 +109,10 @@ class Pixels(Protocol):
 
 
 @contextmanager
-def open_pixels(path: Path) -> Iterator[Pixels]:
-    """Lend the pixels of a file of this host until the end of the context. Errors: :class:`Pixels`."""
-    for kind in KINDS:
-        found = import_module(f"{__package__}.{kind}").open_pixels(path)
+def open_pixels(path: Path, kind: VideosKind = VIDEOS) -> Iterator[Pixels]:
+    """Lend the pixels of a file or folder of this host until the end of the context. Errors: :class:`Pixels`."""
+    for form in KINDS[kind.videos_kind]:
+        found = import_module(f"{__package__}.{form}").open_pixels(path)
         if found is not None:
             break
     with found as pixels:

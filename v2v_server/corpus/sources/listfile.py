@@ -1,8 +1,9 @@
-"""List files like the paper's: one video a line, ``path frames c+ c-``.
+"""List files like the paper's: one video a line, ``path frames c+ c- rate``.
 
-The columns after the path may be left out from the right. A single threshold holds for both polarities. Paths may hold
-spaces, since no path ends in a number of its own; ``#`` at the beginning of a line makes it a comment. In a ``.csv``
-file commas separate the columns, and a first line whose first column reads ``path`` is its heading. WebVid's own tables
+The columns after the path may be left out from the right. A single threshold holds for both polarities. The rate is for
+picture sequences without time stamps. Paths may hold spaces, since no path ends in a number of its own; ``#`` at the
+beginning of a line makes it a comment. In a ``.csv`` file commas separate the columns, which may be empty, and a first
+line whose first column reads ``path`` is its heading. WebVid's own tables
 (``videoid,contentUrl,duration,page_dir,name``) name ``page_dir/videoid.mp4``, as its downloaders write them.
 """
 
@@ -18,12 +19,13 @@ from pathlib import Path, PurePosixPath
 
 from v2v_protocol.errors import CorpusError
 from v2v_protocol.programs import printable
+from v2v_server.store.pixels import VIDEOS, VideosKind
 
 LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
 _SUFFIX = re.compile(r"\.(?=.*[a-z]|26[45]$)[a-z0-9]+", re.IGNORECASE)
-_MOST_COLUMNS = 4
+_MOST_COLUMNS = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,16 +36,21 @@ class ListEntry:
         id: relative POSIX path of the video, normalised ("./a//b.mp4" is "a/b.mp4").
         frames: the frame count the list states, or None.
         threshold_pos, threshold_neg: contrast thresholds the list states, log units, or None.
+        rate: frames per second, or None.
     """
 
     id: str
     frames: int | None = None
     threshold_pos: float | None = None
     threshold_neg: float | None = None
+    rate: float | None = None
 
 
-def read_list(path: str | os.PathLike[str]) -> tuple[ListEntry, ...]:
+def read_list(path: str | os.PathLike[str], kind: VideosKind = VIDEOS) -> tuple[ListEntry, ...]:
     """Read the entries of a list file, in its order.
+
+    Args:
+        kind: what a video is; a path without an ending names a folder if videos have parts.
 
     Raises:
         CorpusError: the file cannot be read, is empty, or a line makes no sense; the message gives the line number.
@@ -68,7 +75,7 @@ def read_list(path: str | os.PathLike[str]) -> tuple[ListEntry, ...]:
             if not found and {"videoid", "page_dir"} <= set(fields):
                 webvid = [fields.index("page_dir"), fields.index("videoid")]
                 continue
-            entry = _webvid_entry(fields, *webvid) if webvid else _entry(fields)
+            entry = _webvid_entry(fields, *webvid) if webvid else _entry(fields, kind)
             if entry.id in entries:
                 raise ValueError(f"{entry.id} is listed already in line {entries[entry.id]}")
         except (ValueError, csv.Error) as error:
@@ -105,19 +112,21 @@ def _webvid_entry(fields: list[str], folder: int, video: int) -> ListEntry:
     return ListEntry(_relative(f"{fields[folder]}/{fields[video]}.mp4"))
 
 
-def _entry(fields: list[str]) -> ListEntry:
+def _entry(fields: list[str], kind: VideosKind) -> ListEntry:
     if len(fields) > _MOST_COLUMNS:
-        raise ValueError(f"{len(fields)} columns; there are at most {_MOST_COLUMNS}: path frames c+ c-")
-    values = [_number(field) for field in fields[1:]]
-    frames = values[0] if values else None
+        raise ValueError(f"{len(fields)} columns; there are at most {_MOST_COLUMNS}: path frames c+ c- rate")
+    values = [_number(field) if field else None for field in fields[1:]]
+    frames, positive, negative, rate = (*values, *[None] * (_MOST_COLUMNS - len(fields)))
     if frames is not None and (frames < 1 or frames != int(frames)):
         raise ValueError(f"{fields[1]} frames; give a whole number from 1")
-    thresholds = values[1:] * (2 if len(values) == 2 else 1)
-    for value in thresholds:
-        if value <= 0:
-            raise ValueError(f"contrast threshold {value:g}; give one above 0")
-    positive, negative = thresholds or (None, None)
-    return ListEntry(_relative(fields[0]), None if frames is None else int(frames), positive, negative)
+    for what, value in ("contrast threshold", positive), ("contrast threshold", negative), ("rate", rate):
+        if value is not None and value <= 0:
+            raise ValueError(f"{what} {value:g}; give one above 0")
+    if rate is not None:
+        VideosKind(kind.videos_kind, rate)  # checks it
+    negative = positive if negative is None else negative
+    frames = None if frames is None else int(frames)
+    return ListEntry(_relative(fields[0], kind), frames, positive, negative, rate)
 
 
 def _number(field: str) -> float:
@@ -126,14 +135,15 @@ def _number(field: str) -> float:
     return float(field)
 
 
-def _relative(text: str) -> str:
+def _relative(text: str, kind: VideosKind = VIDEOS) -> str:
     path = PurePosixPath(text.replace("\\", "/"))
     if path.is_absolute() or re.match(r"[A-Za-z]:/", str(path)):
         raise ValueError(f"{text} is absolute; give paths relative to the folder of the videos")
     if ".." in path.parts:
         raise ValueError(f"{text} leaves the folder of the videos")
-    if not _SUFFIX.fullmatch(path.suffix):
+    is_folder = kind.has_parts and path.suffix.lower() != ".zip"
+    if not (is_folder or _SUFFIX.fullmatch(path.suffix)):
         raise ValueError(f"{text!r} does not name a video file")
     if printable(text) != text:
         raise ValueError(f"{printable(text)} holds control characters")
-    return str(path)
+    return f"{path}/" if is_folder else str(path)

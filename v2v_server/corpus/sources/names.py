@@ -1,15 +1,10 @@
-"""Recognise the names of video files."""
+"""Names that are refused, and files that are not looked at."""
 
 from __future__ import annotations
 
 from collections import Counter
 
 from v2v_protocol.programs import printable
-
-VIDEO_SUFFIXES = frozenset({
-    ".3gp", ".avi", ".flv", ".h264", ".h265", ".hevc", ".ivf", ".m2ts", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov",
-    ".mp4", ".mpeg", ".mpg", ".mts", ".mxf", ".obu", ".ogv", ".ts", ".vob", ".webm", ".wmv", ".y4m",
-})  # fmt: skip
 
 _NO_VIDEO_SUFFIXES = frozenset({
     ".7z", ".aac", ".ac3", ".aedat", ".aedat4", ".ass", ".bag", ".bib", ".bin", ".bmp", ".bz2", ".c", ".cfg", ".conf",
@@ -22,12 +17,6 @@ _NO_VIDEO_SUFFIXES = frozenset({
 _MOST_SUFFIXES_SHOWN = 10
 
 UNPRINTABLE = "its name is not UTF-8 text, or holds control characters; rename it"
-
-
-def is_video_name(name: str) -> bool:
-    """Return whether a file of this name is listed as a video."""
-    _, dot, ending = name.rpartition(".")
-    return bool(dot) and f".{ending.lower()}" in VIDEO_SUFFIXES
 
 
 def count_left_out(name: str, left_out: Counter[str]) -> None:
