@@ -147,7 +147,6 @@ class ServeConfig:
         if not self.videos:
             raise UsageError("--videos is missing: give a folder of videos, one video, or a list file")
         Rows.parse(self.rows)
-        self.kind  # noqa: B018 - checks that its settings go together
         for flag, address in (("--bind", self.bind), ("--worker-bind", self.worker_bind)):
             _check_address(flag, address, is_safe=bool(self.keys) or self.insecure)
         if self.page and not self.insecure and not is_loopback(self.page_host):

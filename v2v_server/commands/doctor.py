@@ -36,9 +36,10 @@ def _run(arguments: argparse.Namespace) -> int:
     if not 1 <= arguments.port <= 65535:
         raise UsageError(f"--port {arguments.port}: give 1 to 65535")
     found_bad = has_defects = False
-    kind = VideosKind.of(vars(arguments))
-    corpus = arguments.videos, arguments.recipe, arguments.rows or "full", arguments.cache_dir, kind
-    for finding in look_around(arguments.port, *corpus):
+    for finding in look_around(
+        arguments.port, arguments.videos, arguments.recipe, arguments.rows or "full", arguments.cache_dir,
+        VideosKind.of(vars(arguments)),
+    ):  # fmt: skip
         found_bad = found_bad or finding.level == BAD
         has_defects = has_defects or (finding.level, finding.about) == (NOTE, "pictures")
         show(f"{finding.level:4}  {finding.about:12}  {finding.text}")

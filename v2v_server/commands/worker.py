@@ -88,8 +88,9 @@ def _work(times: StartTimes, arguments: argparse.Namespace) -> None:
     # A server names its own workers, and recognises them by these names.
     name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
     kind = VideosKind.of(vars(arguments))
-    options = SourceOptions(copies=arguments.copies, copies_gib=arguments.copies_gib, kind=kind)
-    source = open_source(arguments.videos, options)
+    source = open_source(
+        arguments.videos, SourceOptions(copies=arguments.copies, copies_gib=arguments.copies_gib, kind=kind)
+    )
     source.make()
     cache = None
     if arguments.cache is not None:

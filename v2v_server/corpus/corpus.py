@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import dataclass
 
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.sources.asking import Notice, is_said
 from v2v_server.corpus.sources.names import left_out_note
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.pixels import VideosKind
 from v2v_server.video.rows import Rows
 
 
@@ -50,20 +48,17 @@ def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice | None) -
     source.rates = {entry.id: entry.rate for entry in source.listed or () if entry.rate is not None}
     refused: dict[str, str] = {}
     left_out = Counter[str]()
-    ids = []
+    ids = list[str]()
     for id in source.videos(refused, left_out):
-        ids.append(id)
+        if [id] != ids[-1:]:  # a folder of pictures may be named by each
+            ids.append(id)
         if notice is not None and is_said(len(ids)):
             notice(f"looking for videos in {source}: {len(ids)} so far")
     note = left_out_note(left_out)
     if not ids:
-        looked_for, other = source.kind.form.LOOKED_FOR, copy(source)
-        other.kind = VideosKind("sequences")
-        hint = (
-            f"; {first} is one with --videos-kind sequences" if (first := next(other.videos({}, Counter()), "")) else ""
-        )
         raise CorpusError(
-            f"{source}: no video found; looked for {looked_for}{format_problems(refused)}{hint}{note and '. '}{note}"
+            f"{source}: no video found; looked for {source.kind.form.LOOKED_FOR}"
+            f"{format_problems(refused)}{note and '. '}{note}"
         )
     return Corpus(source, rows, tuple(ids), refused, note)
 

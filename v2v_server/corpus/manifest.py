@@ -63,8 +63,7 @@ class Header:
     @property
     def settings(self) -> str:
         """Return what all files of a folder have in common."""
-        kind = f", of {self.videos_kind}" if self.videos_kind != "videos" else ""
-        return f"rows {self.rows}, size {self.size}{kind}"
+        return f"rows {self.rows}, size {self.size}"
 
 
 @dataclass(frozen=True, slots=True)

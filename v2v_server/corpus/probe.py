@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import replace
-from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -29,8 +27,6 @@ LARGEST_MEMORY_BYTES = 2 << 30
 """Memory that a process may allocate to probe a file: enough for 16 pictures of the largest size, or a list of 2**24
 frames. A file of some kB can claim a thousand million frames, for which a demuxer would allocate memory."""
 
-_LARGEST_DENOMINATOR = 4000
-"""Of a rate; NTSC's have 1001. An index stores the highest rate with it in 32 bits."""
 _MOST_TOGETHER = 1024
 _MOST_SECONDS = 10.0
 Progress = Callable[[int, int], None]
@@ -88,10 +84,8 @@ def _at_rate(facts: VideoFacts, rate: float) -> VideoFacts:
     """Return the facts of pictures that follow each other at a rate, Hz, if they do not state their times."""
     if not rate or facts.index.seekable:
         return facts
-    tick = 1 / Fraction(rate).limit_denominator(_LARGEST_DENOMINATOR)
-    index = facts.index.timed(np.arange(facts.frames), tick.as_integer_ratio())
-    content = hashlib.sha256(f"{facts.content};{rate}".encode()).hexdigest()[:32]
-    return replace(facts, frames_per_second=rate, index=index, content=content)
+    index = facts.index.timed(np.rint(np.arange(facts.frames) * 1e9 / rate).astype(np.int64))
+    return replace(facts, frames_per_second=rate, index=index, content=f"{facts.content}@{rate:g}")
 
 
 def _facts(path: Path, kind: VideosKind) -> VideoFacts:

@@ -112,5 +112,6 @@ def catalogue_shard(asked: Ahead, shard: Shard, out: Path, progress: Progress | 
 
 
 def _source(asked: Ahead) -> VideoSource:
-    options = SourceOptions(asked.list_file, asked.copies, asked.copies_gib, asked.cache_dir, asked.kind)
-    return open_source(asked.videos, options)
+    return open_source(
+        asked.videos, SourceOptions(asked.list_file, asked.copies, asked.copies_gib, asked.cache_dir, asked.kind)
+    )

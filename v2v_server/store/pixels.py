@@ -70,10 +70,6 @@ class VideosKind:
         """Return the file that defines the kind, the last of its :data:`KINDS`."""
         return import_module(f"{__package__}.{KINDS[self.videos_kind][-1]}")
 
-    def flags(self) -> list[str]:
-        """Return the flags by which another process reads these videos."""
-        return [] if self == VIDEOS else [flag_of("videos_kind"), self.videos_kind]
-
 
 VIDEOS = VideosKind()
 

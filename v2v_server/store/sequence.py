@@ -8,9 +8,10 @@ each picture, with seconds and, if given, its name. Without such a file the rate
 from __future__ import annotations
 
 import io
+import math
 import os
 import posixpath
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -29,12 +30,11 @@ from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_server.labels.formats import frame_of
 from v2v_server.store.video_file import VideoFile
 from v2v_server.video.collect import Stack
-from v2v_server.video.decode import Way
 from v2v_server.video.fingerprint import TIMES, files_in, unreadable
 from v2v_server.video.frame_index import unseekable
 from v2v_server.video.luma import LumaFormat
 from v2v_server.video.orientation import Orientation
-from v2v_server.video.probe import VideoFacts, average_rate
+from v2v_server.video.probe import VideoFacts
 from v2v_server.video.source import LARGEST_PICTURE_PX, reason
 
 _SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
@@ -45,7 +45,6 @@ _CODECS = {
 """FFmpeg's name of the decoder, by the first bytes of a file."""
 _LARGEST_FILE_BYTES = 8 * LARGEST_PICTURE_PX + (1 << 20)
 """Most bytes that are read of a file: a picture of the most pixels and 16 bits without compression."""
-_MOST_SECONDS = 2.0**33
 
 
 def id_of(path: str) -> str:
@@ -53,10 +52,8 @@ def id_of(path: str) -> str:
     "" for other files, and for the pictures of a sidecar, such as masks.
     """
     suffix, folder = PurePosixPath(path).suffix.lower(), f"{posixpath.dirname(path)}/"
-    if suffix == ".zip":
-        return path
-    folders = tuple(ending for ending in sidecar_endings(tuple(ARRAYS)) if ending.endswith("/"))
-    return folder if suffix in _SUFFIXES and not any(ending in folder for ending in folders) else ""
+    is_sidecar = any(ending in folder for ending in sidecar_endings(tuple(ARRAYS)) if ending.endswith("/"))
+    return path if suffix == ".zip" else folder if suffix in _SUFFIXES and not is_sidecar else ""
 
 
 class PictureSequence(VideoFile):
@@ -64,37 +61,34 @@ class PictureSequence(VideoFile):
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         super().__init__(path)
-        self.ways: Sequence[Way] = (self._frames,)
-        self._frame: int | None = None  # with the name of its file in errors
-        self._name = ""
+        self.ways = (self._frames,)
+        self._at: tuple[int | None, str] = None, ""  # frame and file in errors
 
     def facts(self) -> VideoFacts:
         """Read all files; decode the first picture, and the heads of the others."""
         stored, looks = xxhash.xxh3_128(), list[str]()
         with self._opened() as (files, read):
             pictures = self._pictures(files)
-            for self._frame, self._name in enumerate(pictures):
-                data = read(self._name)
-                stored.update(b"%d;" % len(data) + data)
-                looks = [*looks[:1], _look(data)]
+            for self._at in enumerate(pictures):
+                stored.update(data := read(self._at[1]))
+                looks.append(_look(data))
                 if looks[-1] != looks[0]:
                     raise ValueError(f"is {looks[-1]}, and {pictures[0]} {looks[0]}: give all one size and format")
-                if not self._frame:
-                    head, codec = _decoded(data)
+            self._at = 0, pictures[0]
+            head, codec = _decoded(read(pictures[0]))
             times = self._times(files, pictures, read)
         lies = Orientation.of(head)
-        height, width = lies.size(head.height, head.width)
-        index = unseekable(len(pictures), (1, 1), height, width, lies)
-        if times is not None:
-            index = index.timed(times, (1, 10**9))
+        index = unseekable(len(pictures), (1, 1), *lies.size(head.height, head.width), lies)
+        if len(times):
+            index = index.timed(times)
             stored.update(times.astype("<i8").tobytes())
         return VideoFacts(
             frames=len(index),
-            height_px=height,
-            width_px=width,
+            height_px=index.height_px,
+            width_px=index.width_px,
             codec=codec,
             pixel_format=head.format.name,
-            frames_per_second=average_rate(index),
+            frames_per_second=(len(times) - 1) * 1e9 / (times[-1] - times[0]) if len(times) > 1 else math.nan,
             rotation_degrees=head.rotation,
             full_range=LumaFormat.of(head).full_range,
             index=index,
@@ -107,24 +101,24 @@ class PictureSequence(VideoFile):
         wanted, index = stack.wanted, stack.wanted.index
         with self._opened() as (files, read):
             pictures = self._pictures(files)
-            for self._frame in range(wanted.start, index.end, wanted.stride):
-                self._name = pictures[self._frame]
-                picture, codec = _decoded(read(self._name))
+            for frame in range(wanted.start, index.end, wanted.stride):
+                self._at = frame, pictures[frame]
+                picture, codec = _decoded(read(pictures[frame]))
                 if Orientation.of(picture) != index.orientation or codec != (stack.codec or codec):
                     raise ValueError("has another format than the pictures before it, or is turned another way")
-                picture.pts = int(index.pts[self._frame - index.first]) if index.seekable else None
-                stack.codec, stack.seen, stack.name = codec, self._frame, f"{self._name}: "
+                picture.pts = int(index.pts[frame - index.first]) if index.seekable else None
+                stack.codec, stack.seen, stack.name = codec, frame, f"{pictures[frame]}: "
                 yield picture
 
     @contextmanager
     def _opened(self) -> Iterator[tuple[list[str], Callable[[str], bytes]]]:
-        """Lend the names of all files, and what reads one. Errors name the current picture.
+        """Lend the names of all files, and what reads one. Any error becomes one of the current picture.
 
         Raises:
             VideoError: it is neither a folder nor an archive, or the file that is read is damaged.
             VideoUnreadable: the system reports an error.
         """
-        path, self._frame, self._name = os.fspath(self._path), None, ""
+        path, self._at = os.fspath(self._path), (None, "")
         try:
             with nullcontext() if os.path.isdir(path) else ZipFile(path) as packed:
 
@@ -138,7 +132,8 @@ class PictureSequence(VideoFile):
         except Exception as error:  # zipfile and Pillow have no common class of them
             if isinstance(error, OSError) and error.errno and not isinstance(error, av.FFmpegError):
                 raise unreadable(path, error) from error
-            raise VideoError(path, self._frame, f"{printable(self._name)}: {reason(error)}".strip(": ")) from error
+            frame, name = self._at
+            raise VideoError(path, frame, f"{printable(name)}: {reason(error)}".removeprefix(": ")) from error
 
     def _pictures(self, files: list[str]) -> list[str]:
         """Return the names of the pictures by number, which follow each other."""
@@ -147,35 +142,27 @@ class PictureSequence(VideoFile):
             raise ValueError(
                 f"holds pictures in {len(folders)} folders, not in one: {', '.join(sorted(folders))[:200]}"
             )
-        for self._name, number in named.items():
-            if number is None or printable(self._name) != self._name:
-                raise ValueError("no number ends its name: rename it, or move it away")
-        pictures = sorted(named, key=lambda name: (named[name], name))
-        for self._frame, self._name in enumerate(pictures):
-            if (missing := named[pictures[0]] + self._frame) != named[self._name]:
-                before = pictures[self._frame - 1]
-                raise ValueError(f"follows {before}, and number {missing} is missing: number them one after the other")
+        pictures = sorted(named, key=lambda name: (-1 if named[name] is None else named[name], name))
+        for frame, name in enumerate(pictures):
+            if named[name] is None or named[name] - named[pictures[0]] != frame or printable(name) != name:
+                self._at = frame, name
+                after = f"is not the next one after {pictures[frame - 1]}" if frame else "has no number"
+                raise ValueError(f"{after}: end all names with numbers that follow each other, in printable text")
         return pictures
 
-    def _times(
-        self, files: list[str], pictures: list[str], read: Callable[[str], bytes]
-    ) -> npt.NDArray[np.int64] | None:
-        """Return the times of the pictures, in nanoseconds; None without a file of times."""
+    def _times(self, files: list[str], pictures: list[str], read: Callable[[str], bytes]) -> npt.NDArray[np.int64]:
+        """Return the times of the pictures, in nanoseconds; empty without a file of times."""
         places = (posixpath.normpath(posixpath.join(posixpath.dirname(pictures[0]), name)) for name in TIMES)
-        self._frame, self._name = None, next((place for place in places if place in files), "")
-        if not self._name:
-            return None
-        lines = [line.split() for line in read(self._name).decode().splitlines() if line.partition("#")[0].strip()]
-        if len(lines) != len(pictures):
-            raise ValueError(f"states {len(lines)} times for {len(pictures)} pictures: give each picture a line")
-        for (_, *named), picture in zip(lines, pictures, strict=True):
-            if named and posixpath.basename(named[0]) != posixpath.basename(picture):
-                raise ValueError(f"names {named[0]:.80} in the place of {picture}")
-        seconds = np.array([line[0] for line in lines], float)
-        times = np.rint(seconds * 1e9).astype(np.int64) if np.all(np.abs(seconds) < _MOST_SECONDS) else seconds[:0]
-        if len(times) < len(lines) or np.any(times[1:] <= times[:-1]):
-            raise ValueError(f"states times that do not increase, or lie beyond {_MOST_SECONDS:.0f} s")
-        return times
+        self._at = None, next((place for place in places if place in files), "")
+        text = read(self._at[1]).decode() if self._at[1] else ""
+        lines = [line.split() for line in text.splitlines() if line.partition("#")[0].strip()]
+        names = [posixpath.basename(line[1]) for line in lines if len(line) > 1]
+        if self._at[1] and (len(lines) != len(pictures) or names not in ([], list(map(posixpath.basename, pictures)))):
+            raise ValueError(f"has {len(lines)} lines: give each of the {len(pictures)} pictures one, in their order")
+        times = np.rint(1e9 * np.array([line[0] for line in lines], float))
+        if not np.all(np.abs(times) < 2**62) or np.any(times[1:] <= times[:-1]):
+            raise ValueError("states times that do not increase, or are beyond 4e9 s")
+        return times.astype(np.int64)
 
 
 def _decoded(data: bytes) -> tuple[VideoFrame, str]:

@@ -19,7 +19,7 @@ SUFFIXES = frozenset({
     ".3gp", ".avi", ".flv", ".h264", ".h265", ".hevc", ".ivf", ".m2ts", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov",
     ".mp4", ".mpeg", ".mpg", ".mts", ".mxf", ".obu", ".ogv", ".ts", ".vob", ".webm", ".wmv", ".y4m",
 })  # fmt: skip
-LOOKED_FOR = " ".join(sorted(SUFFIXES))
+LOOKED_FOR = f"{' '.join(sorted(SUFFIXES))}; with --videos-kind sequences, folders of numbered pictures are videos"
 
 
 class VideoFile:

@@ -32,8 +32,7 @@ def fingerprint(path: str | os.PathLike[str]) -> str:
     try:
         if os.path.isdir(path):
             files = [(name, status.st_size) for name, status in files_in(path)]
-            digest = hashlib.sha256(f"v2v folder 1\n{files}".encode())
-            return f"{sum(size for _, size in files)}-{digest.hexdigest()[:32]}"
+            return f"{sum(size for _, size in files)}-{hashlib.sha256(f'{files}'.encode()).hexdigest()[:32]}"
         # An ordinary open of a named pipe would wait for somebody at its other end.
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
             status = os.fstat(file.fileno())

@@ -112,16 +112,12 @@ class FrameIndex:
             keyframe_dts=self.keyframe_dts[keys],
         )
 
-    def timed(self, pts: npt.NDArray[np.int64], time_base: tuple[int, int]) -> FrameIndex:
-        """Return the index of the same frames with time stamps, where decoding may begin at each.
-
-        Args:
-            pts: [n] int64, strictly increasing.
-            time_base: their unit.
-        """
-        frames = np.arange(self.first, self.end)
-        none = np.full(len(frames), NO_TIMESTAMP)
-        return replace(self, pts=pts, keyframes=frames, keyframe_dts=none, time_base=time_base, seekable=True)
+    def timed(self, pts: npt.NDArray[np.int64]) -> FrameIndex:
+        """Return the index of the same frames with time stamps, [n] nanoseconds; decoding may begin at each."""
+        return replace(
+            self, pts=pts, keyframes=np.arange(self.first, self.end), keyframe_dts=np.full(len(pts), NO_TIMESTAMP),
+            time_base=(1, 10**9), seekable=True,
+        )  # fmt: skip
 
     def seconds(self, start: int, count: int) -> npt.NDArray[np.float64]:
         """Return the presentation times of frames start .. start + count - 1.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 import time
 from array import array
@@ -264,21 +263,13 @@ def _content(shown: _Shown, index: FrameIndex, head: VideoFrame) -> str:
     return stored.hexdigest()[:32]
 
 
-def average_rate(index: FrameIndex) -> float:
-    """Return frames per second without gaps, by the time stamps; NaN if they do not tell."""
-    if not index.seekable or len(index) < 2:
-        return math.nan
-    numerator, denominator = index.time_base
-    steps, are_gaps = steps_and_gaps(index.pts)
-    steps = steps[~are_gaps]
-    return len(steps) * denominator / (int(steps.sum()) * numerator)
-
-
 def _rate(index: FrameIndex, shown: _Shown, stated: Sequence[float]) -> float:
     """Return frames per second: the average without gaps, else the first that the file states."""
     numerator, denominator = index.time_base
-    if not math.isnan(average := average_rate(index)):
-        return average
+    if index.seekable and len(index) > 1:
+        steps, are_gaps = steps_and_gaps(index.pts)
+        steps = steps[~are_gaps]
+        return len(steps) * denominator / (int(steps.sum()) * numerator)
     span = max(shown.pts, default=0) - min(shown.pts, default=0)
     if (
         0 < span < min(len(shown.pts), 2 * len(set(shown.pts))) - 1

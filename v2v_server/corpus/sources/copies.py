@@ -103,7 +103,6 @@ class Copies(VideoSource):
         if self.listed is not None:
             yield from (entry.id for entry in self.listed)
             return
-        folders = set[str]()
         for name in self._objects:
             parts = name.split("/")
             if any(part.startswith(".") for part in parts):
@@ -116,8 +115,7 @@ class Copies(VideoSource):
                 refused[name] = "has an empty part between two slashes"
             elif id == "/":
                 refused["."] = "holds pictures itself: give the address of the folder above it"
-            elif id == name or id not in folders:
-                folders.add(id)
+            else:
                 yield id
 
     def make(self) -> None:

@@ -53,10 +53,9 @@ class Folder(VideoSource):
     def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
         """List the videos, see :meth:`VideoSource.videos` and :func:`video_files`."""
         folders: set[str] = set()
-        kind = self.kind
-        found = (
-            video_files(self.folder, refused, left_out, kind) if self.listed is None else self._regular_files(refused)
-        )
+        found = self._regular_files(refused)
+        if self.listed is None:
+            found = video_files(self.folder, refused, left_out, self.kind)
         for id in found:
             folders.add(id.rpartition("/")[0])
             yield id
@@ -86,11 +85,9 @@ class Folder(VideoSource):
     def _state(self, id: str) -> State:
         path = f"{self.name}/{self.file_of(id)}"
         if path.endswith("/"):
-            files = [(name, (each.st_size, each.st_mtime_ns, each.st_ctime_ns)) for name, each in files_in(path)]
-            return self.state_of_parts(id, files)
-        status = os.stat(path)
-        is_file = stat.S_ISREG(status.st_mode)
-        return (status.st_size, status.st_mtime_ns, status.st_ctime_ns ^ self.mark(id)) if is_file else GONE
+            return self.state_of_parts(id, [(name, _numbers(status)) for name, status in files_in(path)])
+        size, modified, changed = _numbers(status := os.stat(path))
+        return (size, modified, changed ^ self.mark(id)) if stat.S_ISREG(status.st_mode) else GONE
 
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
         """Lend the file; only a sidecar of one file is checked.
@@ -183,6 +180,10 @@ class Folder(VideoSource):
                     f"{self.folder / folder} is a prepared folder and cannot be a part of another corpus: serve it "
                     "alone, or move it out"
                 )
+
+
+def _numbers(status: os.stat_result) -> State:
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def _names_with(folder: Path, endings: Sequence[str]) -> frozenset[str] | None:
@@ -297,7 +298,6 @@ class _Walk:
             refused[name] = f"the folder cannot be read: {error.strerror or error}"
             return
         found: list[str] = []
-        is_video = False  # the folder itself
         for entry in entries:
             if entry.name[0] == ".":
                 continue
@@ -321,8 +321,7 @@ class _Walk:
                     refused[relative] = "is not a regular file, or is a broken link"
                 elif is_pseudo:
                     refused[relative] = PSEUDO
-                elif id == relative or not is_video:
-                    is_video |= id != relative
+                else:
                     found.append(id)
             elif is_file:
                 count_left_out(entry.name, self._left_out)

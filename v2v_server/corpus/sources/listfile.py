@@ -25,7 +25,7 @@ LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
 _SUFFIX = re.compile(r"\.(?=.*[a-z]|26[45]$)[a-z0-9]+", re.IGNORECASE)
-_MOST_COLUMNS = 5
+_COLUMNS = "path", "frames", "c+", "c-", "rate"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ def read_list(path: str | os.PathLike[str], kind: VideosKind = VIDEOS) -> tuple[
         raise CorpusError(f"list {path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise CorpusError(f"list {path} is not UTF-8 text ({error.reason} at byte {error.start})") from error
-    columns = _comma_columns if Path(path).suffix.lower() == ".csv" else _space_columns
+    is_csv, most = Path(path).suffix.lower() == ".csv", len(_COLUMNS) - (not kind.has_parts)
     entries: dict[str, int] = {}
     found: list[ListEntry] = []
     webvid: list[int] = []
@@ -69,13 +69,13 @@ def read_list(path: str | os.PathLike[str], kind: VideosKind = VIDEOS) -> tuple[
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         try:
-            fields = columns(line.strip())
+            fields = _comma_columns(line.strip()) if is_csv else _space_columns(line.strip(), most)
             if not found and fields[0].lower() == "path":
                 continue
             if not found and {"videoid", "page_dir"} <= set(fields):
                 webvid = [fields.index("page_dir"), fields.index("videoid")]
                 continue
-            entry = _webvid_entry(fields, *webvid) if webvid else _entry(fields, kind)
+            entry = _webvid_entry(fields, *webvid) if webvid else _entry(fields, kind, most)
             if entry.id in entries:
                 raise ValueError(f"{entry.id} is listed already in line {entries[entry.id]}")
         except (ValueError, csv.Error) as error:
@@ -91,14 +91,14 @@ def _comma_columns(line: str) -> list[str]:
     return [field.strip() for field in next(csv.reader([line], strict=True))]
 
 
-def _space_columns(line: str) -> list[str]:
-    words = list(_words_from_the_right(line))
+def _space_columns(line: str, most: int) -> list[str]:
+    words = list(_words_from_the_right(line, most))
     return [line[: len(line) - sum(map(len, words))].strip(), *(word.strip() for word in reversed(words))]
 
 
-def _words_from_the_right(line: str) -> Iterator[str]:
+def _words_from_the_right(line: str, most: int) -> Iterator[str]:
     """Yield the numbers that end a line, last first, each with the space in front of it; never the whole line."""
-    for _ in range(_MOST_COLUMNS - 1):
+    for _ in range(most - 1):
         match = re.search(r"\s+(\S+)$", line)
         if match is None or not _NUMBER.fullmatch(match[1]):
             return
@@ -112,20 +112,17 @@ def _webvid_entry(fields: list[str], folder: int, video: int) -> ListEntry:
     return ListEntry(_relative(f"{fields[folder]}/{fields[video]}.mp4"))
 
 
-def _entry(fields: list[str], kind: VideosKind) -> ListEntry:
-    if len(fields) > _MOST_COLUMNS:
-        raise ValueError(f"{len(fields)} columns; there are at most {_MOST_COLUMNS}: path frames c+ c- rate")
+def _entry(fields: list[str], kind: VideosKind, most: int) -> ListEntry:
+    if len(fields) > most:
+        raise ValueError(f"{len(fields)} columns; there are at most {most}: {' '.join(_COLUMNS[:most])}")
     values = [_number(field) if field else None for field in fields[1:]]
-    frames, positive, negative, rate = (*values, *[None] * (_MOST_COLUMNS - len(fields)))
+    frames, positive, negative, rate = (*values, *[None] * (len(_COLUMNS) - len(fields)))
     if frames is not None and (frames < 1 or frames != int(frames)):
         raise ValueError(f"{fields[1]} frames; give a whole number from 1")
     for what, value in ("contrast threshold", positive), ("contrast threshold", negative), ("rate", rate):
         if value is not None and value <= 0:
             raise ValueError(f"{what} {value:g}; give one above 0")
-    if rate is not None:
-        VideosKind(kind.videos_kind, rate)  # checks it
-    negative = positive if negative is None else negative
-    frames = None if frames is None else int(frames)
+    frames, negative = None if frames is None else int(frames), positive if negative is None else negative
     return ListEntry(_relative(fields[0], kind), frames, positive, negative, rate)
 
 

@@ -269,7 +269,7 @@ class VideoSource(ABC):
 
     def worker_flags(self) -> list[str]:
         """Return the flags of ``v2v-worker`` with which another process opens this source, beside its name."""
-        return self.kind.flags()
+        return [] if self.kind == VIDEOS else ["--videos-kind", self.kind.videos_kind]
 
 
 def open_source(name: str | os.PathLike[str], options: SourceOptions = SourceOptions()) -> VideoSource:
