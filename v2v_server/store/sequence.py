@@ -43,6 +43,7 @@ _CODECS = {
     b"\x89PNG": "png", b"\xff\xd8\xff": "mjpeg", b"II*\0": "tiff", b"MM\0*": "tiff", b"RIFF": "webp", b"BM": "bmp",
 }  # fmt: skip
 """FFmpeg's name of the decoder, by the first bytes of a file."""
+_ORIENTATION, _MIRRORED = 0x0112, (2, 4, 5, 7)
 _LARGEST_FILE_BYTES = 8 * LARGEST_PICTURE_PX + (1 << 20)
 """Most bytes that are read of a file: a picture of the most pixels and 16 bits without compression."""
 
@@ -133,7 +134,8 @@ class PictureSequence(VideoFile):
             if isinstance(error, OSError) and error.errno and not isinstance(error, av.FFmpegError):
                 raise unreadable(path, error) from error
             frame, name = self._at
-            raise VideoError(path, frame, f"{printable(name)}: {reason(error)}".removeprefix(": ")) from error
+            why = "is damaged, or of a format that is not read" if isinstance(error, OSError) else reason(error)
+            raise VideoError(path, frame, f"{printable(name)}: {why}".removeprefix(": ")) from None
 
     def _pictures(self, files: list[str]) -> list[str]:
         """Return the names of the pictures by number, which follow each other."""
@@ -183,6 +185,8 @@ def _look(data: bytes) -> str:
     from PIL import Image  # only a catalogue needs it
 
     with Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "TIFF", "WEBP", "BMP")) as picture:
+        if picture.getexif().get(_ORIENTATION) in _MIRRORED:
+            raise ValueError("is mirrored by its Exif orientation: convert it to a plain one")
         transparent = "; its transparency is left out" if picture.has_transparency_data else ""
         return f"{picture.width}x{picture.height} px of {picture.format} {picture.mode}{transparent}"
 
