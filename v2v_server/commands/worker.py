@@ -13,7 +13,6 @@ from v2v_protocol.errors import UsageError, V2VError
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_source
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.packing import QUICK, RAW
-from v2v_server.store.pixels import VideosKind
 from v2v_server.store.quota import MOST_GIB
 from v2v_server.system.log import LOG_FORMATS, Log, report_errors
 from v2v_server.system.process import die_with_parent
@@ -48,7 +47,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     work.add_argument(
         "--videos", required=True, metavar="DIR", help="the corpus on this host, the same as the server's, or s3://..."
     )
-    parser.add_settings(VideosKind)
     work.add_argument("--name", help="prefix of the worker's name in logs (default: host and process id)")
     work.add_argument("--cache", metavar="DIR", help="folder of this host that caches decoded frames for later epochs")
     work.add_argument(
@@ -87,10 +85,7 @@ def _run(times: StartTimes, arguments: argparse.Namespace) -> None:
 def _work(times: StartTimes, arguments: argparse.Namespace) -> None:
     # A server names its own workers, and recognises them by these names.
     name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
-    kind = VideosKind.of(vars(arguments))
-    source = open_source(
-        arguments.videos, SourceOptions(copies=arguments.copies, copies_gib=arguments.copies_gib, kind=kind)
-    )
+    source = open_source(arguments.videos, SourceOptions(copies=arguments.copies, copies_gib=arguments.copies_gib))
     source.make()
     cache = None
     if arguments.cache is not None:

@@ -384,7 +384,7 @@ def _snapshot(
         notes = [*notes, corpus.left_out]
     if shorter:
         notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
-    digest = videos.digest(corpus.rows, source.kind.videos_kind if manifest is None else manifest.header.videos_kind)
+    digest = videos.digest(corpus.rows)
     scene_digest, unknown = None, set(absent)
     if scenes is not None:
         split, scene_digest = scenes.read(store, table, unknown, digest)

@@ -49,7 +49,6 @@ class Header:
         source: name of the source folder, for people.
         source_digest: digest of the source's catalogue with these rows.
         version: of this format.
-        videos_kind: what a video of the source is.
     """
 
     rows: str
@@ -58,7 +57,6 @@ class Header:
     source: str
     source_digest: str
     version: int = MANIFEST_VERSION
-    videos_kind: str = "videos"
 
     @property
     def settings(self) -> str:

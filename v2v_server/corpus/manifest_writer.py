@@ -12,9 +12,6 @@ from types import TracebackType
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.manifest import MANIFEST_NAME, Header, PreparedVideo
 
-_LEFT_OUT = ("remark", ""), ("videos_kind", "videos")
-"""Fields that earlier releases do not know, at their defaults."""
-
 
 class ManifestWriter:
     """Writes a manifest: first afresh and in one piece, then line by line.
@@ -56,7 +53,7 @@ class ManifestWriter:
 
 
 def _line(item: Header | PreparedVideo, aside: bool = False) -> bytes:
-    values: dict[str, object] = {name: value for name, value in asdict(item).items() if (name, value) not in _LEFT_OUT}
+    values: dict[str, object] = {name: value for name, value in asdict(item).items() if name != "remark" or value}
     if aside:
         values["aside"] = True
     return json.dumps(values, allow_nan=False).encode() + b"\n"

@@ -15,7 +15,7 @@ import numpy as np
 from v2v_protocol.errors import VideoError, VideoUnreadable
 from v2v_server.corpus.index.file import IndexRow
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.pixels import VIDEOS, VideosKind, open_pixels
+from v2v_server.store.pixels import open_pixels
 from v2v_server.system.isolate import Died, run_twice
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.probe import VideoFacts
@@ -45,7 +45,7 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
         before = source.state(id)
         with source.open_local(id, "") as path:
             mark = fingerprint(path)
-            facts = _at_rate(_facts(path, source.kind), source.rate(id))
+            facts = _at_rate(_facts(path, source.kind.videos_kind), source.rate(id))
         name = f"{mark}-{facts.content}" if facts.content else mark
         if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
@@ -74,7 +74,7 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
     )
 
 
-def facts_of(path: Path, kind: VideosKind = VIDEOS) -> VideoFacts:
+def facts_of(path: Path, kind: str = "videos") -> VideoFacts:
     """Return what is known of the video in a file. Errors: :class:`v2v_server.store.pixels.Pixels`."""
     with open_pixels(path, kind) as pixels:
         return pixels.facts()
@@ -88,7 +88,7 @@ def _at_rate(facts: VideoFacts, rate: float) -> VideoFacts:
     return replace(facts, frames_per_second=rate, index=index, content=f"{facts.content}@{rate:g}")
 
 
-def _facts(path: Path, kind: VideosKind) -> VideoFacts:
+def _facts(path: Path, kind: str) -> VideoFacts:
     """Return what is known of the video; retry once after an error of the system rather than of the decoder.
 
     Raises:

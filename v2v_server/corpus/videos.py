@@ -15,6 +15,7 @@ from v2v_server.corpus.index.columns import CHUNK, NO_STRINGS, VideoTable
 from v2v_server.corpus.scenes.pieces import SplitVideos
 from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.store.pixels import kind_of
 from v2v_server.store.planes import PLANES
 from v2v_server.store.reader import StoreFile
 from v2v_server.video.rows import Rows
@@ -86,12 +87,12 @@ class Videos(Sequence[VideoEntry]):
         number = bisect_left(self.ids, id)
         return int(self.frames[number]), int(self.height_px[number]), int(self.width_px[number])
 
-    def digest(self, rows: Rows, kind: str = "videos") -> str:
-        """Return 32 hexadecimal digits that name these videos, of this kind, with these rows.
+    def digest(self, rows: Rows) -> str:
+        """Return 32 hexadecimal digits that name these videos with these rows.
 
         Fingerprints cover the track and its orientation.
         """
-        of_kind = f"{kind}\n" if kind != "videos" else ""
+        of_kind = "".join(f"{kind}\n" for kind in {kind_of(id) for id in self.ids[:1]} if kind != "videos")
         sha = hashlib.sha256(f"v2v catalogue 2\n{rows}\n{of_kind}".encode())
         pos, neg = NO_THRESHOLDS
         none, limits = f"{pos}\0{neg}", {number: f"{pos}\0{neg}" for number, (pos, neg) in self._thresholds.items()}

@@ -93,10 +93,7 @@ def prepare(
     tell(0, total, 0, 0)
     target = Path(destination).resolve()
     refuse_overlap(catalogue, target, single)
-    header = Header(
-        str(catalogue.rows), size, len(catalogue.videos), catalogue.folder.name, catalogue.digest,
-        videos_kind=catalogue.source.kind.videos_kind,
-    )  # fmt: skip
+    header = Header(str(catalogue.rows), size, len(catalogue.videos), catalogue.folder.name, catalogue.digest)
     made: dict[str, PreparedVideo] = {}
     not_looked_at = []
     try:
@@ -266,7 +263,7 @@ def _outcomes(
             yield job, Transcoding(
                 id, catalogue.path(id), job.video.fingerprint, index, job.video.frames_per_second,
                 job.window, size, target, target / prepared_name(id), scene or keeps_scene,
-                tuple(dict.fromkeys((*planes, *more))), catalogue.source.kind,
+                tuple(dict.fromkeys((*planes, *more))),
             )  # fmt: skip
 
     isolated = run_isolated(

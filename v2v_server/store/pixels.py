@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # a server's command line, which reads the settings, starts w
 
 KINDS: Mapping[str, tuple[str, ...]] = {
     "videos": ("reader", "video_file"),
-    "sequences": ("reader", "sequence"),
+    "sequences": ("reader", "picture_sequence"),
 }
 """What a video of a corpus is, by ``--videos-kind``: the files here, in the order in which they are asked. The last one
 takes any path. It has ``id_of(path)``, the id of the video that a file belongs to, and ``LOOKED_FOR``, for people."""
@@ -58,7 +58,7 @@ class VideosKind:
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> VideosKind:
         """Return the kind of a command's flags; a flag that is missing or None has its default."""
-        return cls(**{name: given[name] for name in settings_of(cls) if given.get(name) is not None})
+        return cls(**{name: given[name] for name in settings_of(VideosKind) if given.get(name) is not None})
 
     @property
     def has_parts(self) -> bool:
@@ -104,10 +104,15 @@ class Pixels(Protocol):
         """Return what the levels mean, by the first frame."""
 
 
+def kind_of(id: str) -> str:
+    """Return what a catalogued video is, one of :data:`KINDS`."""
+    return "sequences" if id.lower().endswith(("/", ".zip")) else "videos"
+
+
 @contextmanager
-def open_pixels(path: Path, kind: VideosKind = VIDEOS) -> Iterator[Pixels]:
+def open_pixels(path: Path, kind: str = "videos") -> Iterator[Pixels]:
     """Lend the pixels of a file or folder of this host until the end of the context. Errors: :class:`Pixels`."""
-    for form in KINDS[kind.videos_kind]:
+    for form in KINDS[kind]:
         found = import_module(f"{__package__}.{form}").open_pixels(path)
         if found is not None:
             break

@@ -131,7 +131,7 @@ class Copies(VideoSource):
 
     def worker_flags(self) -> list[str]:
         """Return the flags that name the folder of copies and its limit."""
-        return [*super().worker_flags(), "--copies", str(self.copies), "--copies-gib", str(self.most_bytes / (1 << 30))]
+        return ["--copies", str(self.copies), "--copies-gib", str(self.most_bytes / (1 << 30))]
 
     def states(self, ids: Sequence[str]) -> array[int]:
         """Return the states of many objects, from the listing."""

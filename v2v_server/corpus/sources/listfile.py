@@ -115,15 +115,15 @@ def _webvid_entry(fields: list[str], folder: int, video: int) -> ListEntry:
 def _entry(fields: list[str], kind: VideosKind, most: int) -> ListEntry:
     if len(fields) > most:
         raise ValueError(f"{len(fields)} columns; there are at most {most}: {' '.join(_COLUMNS[:most])}")
-    values = [_number(field) if field else None for field in fields[1:]]
-    frames, positive, negative, rate = (*values, *[None] * (len(_COLUMNS) - len(fields)))
+    fields += [""] * (len(_COLUMNS) - len(fields))
+    frames, positive, negative, rate = (_number(field) if field else None for field in fields[1:])
     if frames is not None and (frames < 1 or frames != int(frames)):
         raise ValueError(f"{fields[1]} frames; give a whole number from 1")
     for what, value in ("contrast threshold", positive), ("contrast threshold", negative), ("rate", rate):
         if value is not None and value <= 0:
             raise ValueError(f"{what} {value:g}; give one above 0")
-    frames, negative = None if frames is None else int(frames), positive if negative is None else negative
-    return ListEntry(_relative(fields[0], kind), frames, positive, negative, rate)
+    count, negative = None if frames is None else int(frames), positive if negative is None else negative
+    return ListEntry(_relative(fields[0], kind), count, positive, negative, rate)
 
 
 def _number(field: str) -> float:

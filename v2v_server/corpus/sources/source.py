@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.sources.listfile import ListEntry, read_list
 from v2v_server.corpus.sources.sidecar import state_text
-from v2v_server.store.pixels import VIDEOS, Pixels, VideosKind, open_pixels
+from v2v_server.store.pixels import VIDEOS, Pixels, VideosKind, kind_of, open_pixels
 from v2v_server.video.rows import Rows
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class VideoSource(ABC):
     Attributes:
         name: names the source for people, and to workers, who open it by this name; equal names share an index.
         is_local: whether the files lie on this host. False: opening one fetches it over the network.
-        kind: what a video is.
+        kind: what a video is, for listing and probing.
         rates: rates of videos that a list states, Hz, by id.
     """
 
@@ -179,7 +179,7 @@ class VideoSource(ABC):
             VideoUnreadable, VideoChanged: see :meth:`open_local`.
             VideoError: the video is damaged.
         """
-        with self.open_local(id, fingerprint) as path, open_pixels(path, self.kind) as pixels:
+        with self.open_local(id, fingerprint) as path, open_pixels(path, kind_of(id)) as pixels:
             yield pixels
 
     def rate(self, id: str) -> float:
@@ -269,7 +269,7 @@ class VideoSource(ABC):
 
     def worker_flags(self) -> list[str]:
         """Return the flags of ``v2v-worker`` with which another process opens this source, beside its name."""
-        return [] if self.kind == VIDEOS else ["--videos-kind", self.kind.videos_kind]
+        return []
 
 
 def open_source(name: str | os.PathLike[str], options: SourceOptions = SourceOptions()) -> VideoSource:

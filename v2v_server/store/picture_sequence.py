@@ -139,7 +139,9 @@ class PictureSequence(VideoFile):
 
     def _pictures(self, files: list[str]) -> list[str]:
         """Return the names of the pictures by number, which follow each other."""
-        named = {name: frame_of(name) for name in files if id_of(name).endswith("/") and "/." not in f"/{name}"}
+        named: dict[str, Any] = {
+            name: frame_of(name) for name in files if id_of(name).endswith("/") and "/." not in f"/{name}"
+        }
         if len(folders := {posixpath.dirname(name) for name in named}) != 1:
             raise ValueError(
                 f"holds pictures in {len(folders)} folders, not in one: {', '.join(sorted(folders))[:200]}"
