@@ -53,7 +53,7 @@ class ServeConfig:
         metavar="DIR",
         group="Videos",
     )
-    list: str = text("", "list file (path frames c+ c-) that restricts --videos", metavar="FILE")
+    list: str = text("", "list file (path frames c+ c-) that restricts the videos", metavar="FILE")
     videos_kind: str = same_as(VideosKind, "videos_kind")
     rate: float = same_as(VideosKind, "rate")
     rows: str = text("full", "rows of each picture to use: full, top:0.54 (WebVid), top:180px, 0.1:0.6", metavar="ROWS")
