@@ -182,11 +182,6 @@ def text(default: str, help: str, **more: Any) -> Any:
     return _field(Setting("text", default, help, **more))
 
 
-def same_as(cls: Any, name: str) -> Any:
-    """Return a field with the declaration of another class's."""
-    return _field(settings_of(cls)[name])
-
-
 def of_type(hint: Any) -> Setting | None:
     """Return the setting that a type alone implies: for a Literal, bool, int, float or str; None for any other."""
     if typing.get_origin(hint) is Literal:

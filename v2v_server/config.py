@@ -17,7 +17,6 @@ from v2v_protocol.settings import (
     check_settings,
     number,
     require_known,
-    same_as,
     settings_of,
     switch,
     text,
@@ -26,7 +25,7 @@ from v2v_protocol.settings import (
 )
 from v2v_protocol.spec import SPEC_KEYS, StreamSpec
 from v2v_protocol.spec_flags import read_recipe, read_yaml_mapping, recipe_setting
-from v2v_server.store.pixels import VideosKind
+from v2v_server.store.pixels import HIGHEST_RATE_HZ, KINDS
 from v2v_server.system.log import LOG_FORMATS
 from v2v_server.video.rows import Rows
 
@@ -54,8 +53,14 @@ class ServeConfig:
         group="Videos",
     )
     list: str = text("", "list file (path frames c+ c-) that restricts the videos", metavar="FILE")
-    videos_kind: str = same_as(VideosKind, "videos_kind")
-    rate: float = same_as(VideosKind, "rate")
+    videos_kind: str = word(
+        "videos",
+        KINDS,
+        "what a video is: videos is a file; sequences is a folder, or a zip archive, of numbered pictures",
+    )
+    rate: float = number(
+        0.0, 0.0, HIGHEST_RATE_HZ, "rate of picture sequences without time stamps; 0: unknown", unit="Hz", metavar="N"
+    )
     rows: str = text("full", "rows of each picture to use: full, top:0.54 (WebVid), top:180px, 0.1:0.6", metavar="ROWS")
     cache_dir: str = text("", "folder of the catalogue index (default: the user's cache folder)", metavar="DIR")
     cache: str = text(
@@ -161,11 +166,6 @@ class ServeConfig:
             )
         if self.ray_label and not all(self.ray_label.partition("=")):
             raise UsageError(f"--ray-label {self.ray_label!r}: write KEY=VALUE, as `ray start --labels KEY=VALUE` does")
-
-    @property
-    def kind(self) -> VideosKind:
-        """Return what a video is."""
-        return VideosKind(self.videos_kind, self.rate)
 
     @property
     def least_workers(self) -> int:

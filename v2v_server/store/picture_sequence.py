@@ -8,7 +8,6 @@ each picture, with seconds and, if given, its name. Without such a file the rate
 from __future__ import annotations
 
 import io
-import math
 import os
 import posixpath
 from collections.abc import Callable, Iterator
@@ -19,7 +18,6 @@ from zipfile import ZipFile
 
 import av
 import numpy as np
-import numpy.typing as npt
 import xxhash
 from av.packet import Packet
 from av.video.frame import VideoFrame
@@ -44,6 +42,7 @@ _CODECS = {
 }  # fmt: skip
 """FFmpeg's name of the decoder, by the first bytes of a file."""
 _ORIENTATION, _MIRRORED = 0x0112, (2, 4, 5, 7)
+"""Exif's tag of the orientation, and its values that PyAV cannot tell from turned ones."""
 _LARGEST_FILE_BYTES = 8 * LARGEST_PICTURE_PX + (1 << 20)
 """Most bytes that are read of a file: a picture of the most pixels and 16 bits without compression."""
 
@@ -89,7 +88,7 @@ class PictureSequence(VideoFile):
             width_px=index.width_px,
             codec=codec,
             pixel_format=head.format.name,
-            frames_per_second=(len(times) - 1) * 1e9 / (times[-1] - times[0]) if len(times) > 1 else math.nan,
+            frames_per_second=(len(times) - 1) * 1e9 / (times[-1] - times[0]) if len(times) > 1 else float("nan"),
             rotation_degrees=head.rotation,
             full_range=LumaFormat.of(head).full_range,
             index=index,
@@ -105,8 +104,6 @@ class PictureSequence(VideoFile):
             for frame in range(wanted.start, index.end, wanted.stride):
                 self._at = frame, pictures[frame]
                 picture, codec = _decoded(read(pictures[frame]))
-                if Orientation.of(picture) != index.orientation or codec != (stack.codec or codec):
-                    raise ValueError("has another format than the pictures before it, or is turned another way")
                 picture.pts = int(index.pts[frame - index.first]) if index.seekable else None
                 stack.codec, stack.seen, stack.name = codec, frame, f"{pictures[frame]}: "
                 yield picture
@@ -154,7 +151,7 @@ class PictureSequence(VideoFile):
                 raise ValueError(f"{after}: end all names with numbers that follow each other, in printable text")
         return pictures
 
-    def _times(self, files: list[str], pictures: list[str], read: Callable[[str], bytes]) -> npt.NDArray[np.int64]:
+    def _times(self, files: list[str], pictures: list[str], read: Callable[[str], bytes]) -> Any:
         """Return the times of the pictures, in nanoseconds; empty without a file of times."""
         places = (posixpath.normpath(posixpath.join(posixpath.dirname(pictures[0]), name)) for name in TIMES)
         self._at = None, next((place for place in places if place in files), "")
@@ -174,9 +171,9 @@ def _decoded(data: bytes) -> tuple[VideoFrame, str]:
     codec = next((codec for magic, codec in _CODECS.items() if data.startswith(magic)), "png")
     decoder: Any = av.CodecContext.create(codec, "r")
     decoder.thread_type, decoder.thread_count = "NONE", 1
-    # Without "explode" a truncated JPEG is filled up with grey.
-    strict = {"err_detect": "explode"} if codec == "mjpeg" else {}
-    decoder.options = {"max_pixels": str(LARGEST_PICTURE_PX), **strict}
+    # Without "explode" the rest of a truncated JPEG is filled up with grey; with it, some sound TIFF files fail.
+    strict = "explode" if codec == "mjpeg" else "crccheck"
+    decoder.options = {"max_pixels": str(LARGEST_PICTURE_PX), "err_detect": strict}
     (picture,) = decoder.decode(Packet(data))
     # swscale rounds the grey of a palette to the levels of limited range.
     return picture.reformat(format="rgb24") if picture.format.name == "pal8" else picture, codec
@@ -187,10 +184,12 @@ def _look(data: bytes) -> str:
     from PIL import Image  # only a catalogue needs it
 
     with Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "TIFF", "WEBP", "BMP")) as picture:
-        if picture.getexif().get(_ORIENTATION) in _MIRRORED:
+        turned = picture.getexif().get(_ORIENTATION, 1)
+        if turned in _MIRRORED:
             raise ValueError("is mirrored by its Exif orientation: convert it to a plain one")
         transparent = "; its transparency is left out" if picture.has_transparency_data else ""
-        return f"{picture.width}x{picture.height} px of {picture.format} {picture.mode}{transparent}"
+        form = f"{picture.format} {picture.mode}{f' with Exif orientation {turned}' * (turned != 1)}"
+        return f"{picture.width}x{picture.height} px of {form}{transparent}"
 
 
 def open_pixels(path: str | os.PathLike[str]) -> AbstractContextManager[PictureSequence]:

@@ -13,11 +13,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from v2v_protocol.command import flag_of
 from v2v_protocol.errors import UsageError
-from v2v_protocol.settings import check_settings, number, settings_of, word
 
-if TYPE_CHECKING:  # a server's command line, which reads the settings, starts without the decoder
+if TYPE_CHECKING:  # a server's command line, which names the kinds, starts without the decoder
     from v2v_server.video.collect import ClipRequest, DecodedPicture
     from v2v_server.video.decode import DecodedClip
     from v2v_server.video.frame_index import FrameIndex
@@ -31,34 +29,35 @@ KINDS: Mapping[str, tuple[str, ...]] = {
 """What a video of a corpus is, by ``--videos-kind``: the files here, in the order in which they are asked. The last one
 takes any path. It has ``id_of(path)``, the id of the video that a file belongs to, and ``LOOKED_FOR``, for people."""
 
+HIGHEST_RATE_HZ = 1e6
+
 
 @dataclass(frozen=True, slots=True)
 class VideosKind:
-    """What a video of a corpus is, and the settings of that kind.
+    """What a video of a corpus is.
+
+    Attributes:
+        videos_kind: one of :data:`KINDS`.
+        rate: of picture sequences without time stamps, Hz; 0: unknown.
 
     Raises:
-        UsageError: there is no such kind, or a setting is malformed or belongs to another kind.
+        UsageError: there is no such kind, or it has no such rate.
     """
 
-    videos_kind: str = word(
-        "videos",
-        KINDS,
-        "what a video is: videos is a file; sequences is a folder, or a zip archive, of numbered pictures",
-        group="Videos",
-    )
-    rate: float = number(
-        0.0, 0.001, 1e6, "rate of picture sequences without time stamps; 0: unknown", unit="Hz", metavar="N", off=True
-    )
+    videos_kind: str = "videos"
+    rate: float = 0.0
 
     def __post_init__(self) -> None:
-        check_settings(self, flag_of)
-        if self.rate and not self.has_parts:
-            raise UsageError(f"--rate {self.rate:g}: {self.videos_kind} state their rate; it is for picture sequences")
+        if self.videos_kind not in KINDS or not 0 <= self.rate <= (HIGHEST_RATE_HZ if self.has_parts else 0):
+            what = f"--videos-kind {self.videos_kind}, --rate {self.rate:g}"
+            raise UsageError(
+                f"{what}: choose one of {', '.join(KINDS)}; sequences can have a rate up to {HIGHEST_RATE_HZ:g} Hz"
+            )
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> VideosKind:
-        """Return the kind of a command's flags; a flag that is missing or None has its default."""
-        return cls(**{name: given[name] for name in settings_of(VideosKind) if given.get(name) is not None})
+        """Return the kind of a command's flags; None stands for a default."""
+        return cls(given["videos_kind"] or "videos", given["rate"] or 0.0)
 
     @property
     def has_parts(self) -> bool:

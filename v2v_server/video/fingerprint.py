@@ -56,8 +56,7 @@ def files_in(folder: str | os.PathLike[str]) -> list[tuple[str, os.stat_result]]
     with os.scandir(folder) as listing:
         found = [(entry.name, entry.stat()) for entry in listing if entry.name[0] != "." and entry.is_file()]
     above = [(name, os.path.join(folder, name)) for name in TIMES_ABOVE]
-    found += [(name, os.stat(path)) for name, path in above if os.path.isfile(path)]
-    return sorted(found, key=lambda file: file[0])
+    return sorted(found + [(name, os.stat(path)) for name, path in above if os.path.isfile(path)])
 
 
 def unreadable(video: str, error: OSError) -> VideoUnreadable:

@@ -111,10 +111,8 @@ class Copies(VideoSource):
                 count_left_out(parts[-1], left_out)
             elif printable(name) != name:
                 refused[printable(name)] = UNPRINTABLE
-            elif "" in parts:
-                refused[name] = "has an empty part between two slashes"
-            elif id == "/":
-                refused["."] = "holds pictures itself: give the address of the folder above it"
+            elif "" in parts or id == "/":
+                refused[name] = "has an empty part between two slashes, or is a picture outside of a folder"
             else:
                 yield id
 

@@ -53,9 +53,11 @@ class Folder(VideoSource):
     def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
         """List the videos, see :meth:`VideoSource.videos` and :func:`video_files`."""
         folders: set[str] = set()
-        found = self._regular_files(refused)
-        if self.listed is None:
-            found = video_files(self.folder, refused, left_out, self.kind)
+        found = (
+            video_files(self.folder, refused, left_out, self.kind)
+            if self.listed is None
+            else self._regular_files(refused)
+        )
         for id in found:
             folders.add(id.rpartition("/")[0])
             yield id
@@ -147,8 +149,8 @@ class Folder(VideoSource):
                 status = os.stat(os.path.join(self.name, id))
             except OSError:
                 return True
-            is_right = stat.S_ISDIR if id.endswith("/") else stat.S_ISREG
-            return is_right(status.st_mode) and status.st_dev not in pseudo
+            wanted = stat.S_IFDIR if id.endswith("/") else stat.S_IFREG
+            return stat.S_IFMT(status.st_mode) == wanted and status.st_dev not in pseudo
 
         for id, is_regular in answers(may_be_read, [entry.id for entry in self.listed or ()]):
             if is_regular:
@@ -216,14 +218,11 @@ def locate(name: str, options: SourceOptions) -> tuple[Path, Callable[[], tuple[
     """
     path = Path(name)
     if path.is_dir():
-        path = path.resolve()
-        if (
-            options.list_file is None
-            and options.kind.has_parts
-            and "/" in map(options.kind.form.id_of, os.listdir(path))
-        ):
-            return path.parent, lambda: (ListEntry(f"{path.name}/"),)
-        return path, options.listed
+        root = path.resolve()
+        is_video = options.kind.has_parts and "/" in map(options.kind.form.id_of, os.listdir(root))
+        if options.list_file is None and is_video:
+            return root.parent, lambda: (ListEntry(f"{root.name}/"),)
+        return root, options.listed
     if not path.is_file():
         raise CorpusError(f"{name}: there is no such folder, video or list file on this host")
     if options.list_file is not None:

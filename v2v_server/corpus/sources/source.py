@@ -196,9 +196,8 @@ class VideoSource(ABC):
         Raises:
             OSError: it is beyond the limits of :func:`v2v_server.corpus.sources.sidecar.state_text`.
         """
-        if not files:
-            return GONE
-        return sum(state[0] for _, state in files), int(state_text(files)[:15], 16), self.mark(id)
+        size = sum(state[0] for _, state in files)
+        return (size, int(state_text(files)[:15], 16), self.mark(id)) if files else GONE
 
     def file_of(self, id: str) -> str:
         """Return the path of a video's file or folder from :attr:`folder`."""
