@@ -365,7 +365,7 @@ def test_pictures_that_change_later_fail_by_frame_and_file(tmp_path: Path) -> No
     for change, why in (
         ("size", "the picture is 8x8 px here"),
         ("colour", "format changes"),
-        ("format", "another for"),
+        ("format", "format changes"),
     ):
         broken(change, tmp_path)
         with pytest.raises(VideoError, match=f"0002.png: .*{why}") as caught:
