@@ -159,6 +159,21 @@ def test_sequences_within_sequences_are_prepared(tmp_path: Path) -> None:
         assert list(store.videos.ids) == ["a/", "a/0000x/", "a/depth/"]
 
 
+def test_labels_lie_beside_the_folder(tmp_path: Path) -> None:
+    luma = panned_luma(8, HEIGHT, WIDTH)
+    write_pictures(tmp_path / "seqs/a.v1", luma)
+    write_pictures(tmp_path / "seqs/b", luma)
+    write_pictures(tmp_path / "seqs/a.v1.masks", luma // 64)
+    row = Row({"voxels_per_clip": 2, "bins": 1}, ("masks",), count=1)
+    with opened(tmp_path / "seqs", AT_25) as catalogue:
+        assert list(catalogue.videos.ids) == ["a.v1/", "b/"]
+        assert list(catalogue.sidecars[".masks/"].fingerprints) == ["a.v1/"]
+    with closing(open_catalogue(tmp_path / "seqs/a.v1", cache_dir=tmp_path, kind=AT_25, processes=0)) as catalogue:
+        (sample,) = samples_of(catalogue, row)
+        assert not sample.provenance.unlabelled
+        assert set(np.unique(sample.arrays["masks"])) <= {0, 1, 2, 3}
+
+
 def test_without_the_flag_pictures_are_no_videos(grey: Path, tmp_path: Path) -> None:
     message = refusal(grey / "seqs", VideosKind())
     assert "no video found" in message
