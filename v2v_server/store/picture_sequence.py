@@ -122,7 +122,9 @@ class PictureSequence(VideoFile):
 
                 def read(name: str) -> bytes:
                     with packed.open(name) if packed else Path(path, name).open("rb") as file:
-                        return file.read(_LARGEST_FILE_BYTES)
+                        # Memory for all bytes that are asked for is allocated first, except by zipfile.
+                        size = _LARGEST_FILE_BYTES if packed else os.fstat(file.fileno()).st_size
+                        return file.read(min(size, _LARGEST_FILE_BYTES))
 
                 yield packed.namelist() if packed else [name for name, _ in files_in(path)], read
         except VideoError:
@@ -184,7 +186,7 @@ def _look(data: bytes) -> str:
     from PIL import Image  # only a catalogue needs it
 
     with Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "TIFF", "WEBP", "BMP")) as picture:
-        turned = picture.getexif().get(_ORIENTATION, 1)
+        turned = Image.Image.getexif(picture).get(_ORIENTATION, 1)  # that of PNG files would decode the picture
         if turned in _MIRRORED:
             raise ValueError("is mirrored by its Exif orientation: convert it to a plain one")
         transparent = "; its transparency is left out" if picture.has_transparency_data else ""
