@@ -88,7 +88,7 @@ class PictureSequence(VideoFile):
             width_px=index.width_px,
             codec=codec,
             pixel_format=head.format.name,
-            frames_per_second=(len(times) - 1) * 1e9 / (times[-1] - times[0]) if len(times) > 1 else float("nan"),
+            frames_per_second=(len(times) - 1) * 1e9 / int(times[-1] - times[0]) if len(times) > 1 else float("nan"),
             rotation_degrees=head.rotation,
             full_range=LumaFormat.of(head).full_range,
             index=index,

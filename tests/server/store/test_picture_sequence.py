@@ -190,9 +190,9 @@ def test_without_the_flag_pictures_are_no_videos(grey: Path, tmp_path: Path) -> 
 
 
 def test_a_rate_needs_sequences() -> None:
-    with pytest.raises(UsageError, match="--rate 25: videos state their rate"):
+    with pytest.raises(UsageError, match=r"--videos-kind videos, --rate 25: .*sequences can have a rate"):
         VideosKind("videos", 25.0)
-    with pytest.raises(UsageError, match="--videos-kind = 'films': choose one of videos, sequences"):
+    with pytest.raises(UsageError, match="--videos-kind films, --rate 0: choose one of videos, sequences"):
         VideosKind("films")
 
 
