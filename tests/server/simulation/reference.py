@@ -80,13 +80,13 @@ def simulate_with_effects(
         prepared: the effects' tables.
     """
     of = {effect.FIELD: tables for effect, tables in zip(EFFECTS, prepared, strict=True)}
-    spread, low_pass = of["threshold_mismatch_sigma"], of["photoreceptor_hz"]
-    leak, blindness, shot = of["leak_hz"].leak, of["refractory_seconds"], of["shot_noise_hz"]
+    (sigma, smallest_share), (low_pass, table_of_step) = of["threshold_mismatch_sigma"], of["photoreceptor_hz"]
+    leak, (refractory, seconds), shot = of["leak_hz"], of["refractory_seconds"], of["shot_noise_hz"]
     real = table.dtype.type
     steps, pixels = len(grey) - 1, grey.shape[1]
     level, tolerance = table[grey], real(tolerance)
     normal = np.stack(mismatch_normals(key, pixels)).astype(real)
-    share = np.maximum(real(1) + normal * spread.sigma, spread.smallest_share)
+    share = np.maximum(real(1) + normal * sigma, smallest_share)
     positive, negative = real(threshold_pos) * share[0], real(threshold_neg) * share[1]
     residual = start_uniforms(key, pixels).astype(real) * (positive + negative) - negative
     normals = standard_normals(key, steps, pixels)
@@ -96,9 +96,9 @@ def simulate_with_effects(
     counts = np.zeros((steps, pixels), real)
     for step in range(steps):
         change = level[step + 1] - level[step]
-        of_step = low_pass.table_of_step[step]
-        if len(low_pass.low_pass):
-            slow, fast = low_pass.low_pass[of_step][:, grey[step + 1]]
+        of_step = table_of_step[step]
+        if len(low_pass):
+            slow, fast = low_pass[of_step][:, grey[step + 1]]
             change = slow * (level[step] - seen) + fast * change
             seen += change
         if noise_sigma:
@@ -106,9 +106,9 @@ def simulate_with_effects(
         if len(leak):
             change += positive * leak[step]
         change[position] += normal.astype(real) * real(hot_sigma)
-        if blindness.refractory > 0:
+        if refractory > 0:
             signed, residual, blind = _with_refractory(
-                residual, blind, change, blindness.seconds[step], blindness.refractory, positive, negative,
+                residual, blind, change, seconds[step], refractory, positive, negative,
                 tolerance,
             )  # fmt: skip
         else:
@@ -123,7 +123,7 @@ def simulate_with_effects(
             signed = signed + (rising - falling).astype(real)
             residual = np.where(rising + falling > 0, real(0), residual)
         counts[step] = signed
-    counts[:, of["dead_pixel_share"].position] = 0
+    counts[:, of["dead_pixel_share"][0]] = 0
     return counts
 
 
