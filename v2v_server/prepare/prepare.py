@@ -31,7 +31,6 @@ from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.report import Report
 from v2v_server.prepare.resume import (
-    LEAST_FREE_BYTES,
     check_destination,
     check_free_space,
     has_failed,
@@ -42,6 +41,7 @@ from v2v_server.prepare.resume import (
 from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode
 from v2v_server.store.packing import DEFAULT_SIZE, SIZES
 from v2v_server.store.planes import OPTIONAL
+from v2v_server.store.quota import LEAST_FREE_BYTES
 from v2v_server.store.reader import has_planes
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
