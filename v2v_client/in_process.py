@@ -68,6 +68,7 @@ class V2VDataset(Dataset[Sample]):
         rows: rows of each picture to use, as for ``v2v-serve --rows``.
         list_file: list file that restricts a folder.
         cache_dir: folder of the catalogue's index; None uses the user's cache.
+        videos_kind, rate: what a video is, as for ``v2v-serve --videos-kind`` and ``--rate``.
         labels: see :class:`v2v_client.V2VStreamDataset`.
         options: ``preset`` and other fields of :class:`v2v_protocol.spec.StreamSpec`.
 
@@ -86,6 +87,8 @@ class V2VDataset(Dataset[Sample]):
         rows: str = "full",
         list_file: str | None = None,
         cache_dir: str | None = None,
+        videos_kind: str = "videos",
+        rate: float = 0.0,
         labels: Labels = "required",
         **options: Unpack[SpecOptions],
     ) -> None:
@@ -95,7 +98,7 @@ class V2VDataset(Dataset[Sample]):
         self._needs_labels = check_labels(labels)
         self.spec = StreamSpec.from_dict({**options, "recipe": read_recipe(recipe)})
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
-        self._source = (os.fspath(videos), rows, list_file, cache_dir)
+        self._source = (os.fspath(videos), rows, list_file, cache_dir, videos_kind, rate)
         self._maker: Any = None
         self._process = 0
         self._length = int(self._open().count)
@@ -161,7 +164,14 @@ class V2VDataset(Dataset[Sample]):
 
 
 def _open_remaker(
-    videos: str, rows: str, list_file: str | None, cache_dir: str | None, spec: StreamSpec, arrays: tuple[str, ...]
+    videos: str,
+    rows: str,
+    list_file: str | None,
+    cache_dir: str | None,
+    videos_kind: str,
+    rate: float,
+    spec: StreamSpec,
+    arrays: tuple[str, ...],
 ) -> Any:
     try:
         remake = importlib.import_module("v2v_tools.remake")
@@ -170,7 +180,10 @@ def _open_remaker(
             f"V2VDataset makes samples in this process, which needs the package {error.name}: pip install '.[server]' "
             "in a checkout"
         ) from error
-    return remake.open_remaker(videos, rows=rows, list_file=list_file, cache_dir=cache_dir, spec=spec, arrays=arrays)
+    return remake.open_remaker(
+        videos, rows=rows, list_file=list_file, cache_dir=cache_dir, kind=remake.VideosKind(videos_kind, rate),
+        spec=spec, arrays=arrays,
+    )  # fmt: skip
 
 
 def _collate(samples: Sequence[Sample], *, collate_fn_map: Any) -> Batch:

@@ -72,9 +72,10 @@ class Parser(argparse.ArgumentParser):
             self._groups[title] = self.add_argument_group(title)
         return self._groups[title]
 
-    def add_settings(self, cls: Any) -> None:
-        """Add a flag for each setting of a dataclass; the value of a flag that is not given is None."""
-        for name, setting in settings_of(cls).items():
+    def add_settings(self, cls: Any, *names: str) -> None:
+        """Add a flag for each setting of a dataclass, or for some; the value of a flag that is not given is None."""
+        settings = settings_of(cls)
+        for name, setting in [(name, settings[name]) for name in names or settings]:
             flag = flag_of(name)
             if setting.is_hidden:
                 self.add_argument(flag, type=_reader(setting), help=argparse.SUPPRESS)

@@ -20,16 +20,6 @@ from v2v_protocol.spec import StreamSpec
 _RECIPE_FILES = (".yaml", ".yml")
 
 
-def add_corpus(parser: Parser, group: str) -> None:
-    """Add what restricts videos that are named by another argument, and ``--cache-dir``."""
-    videos = parser.group(group)
-    videos.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
-    videos.add_argument("--list", metavar="FILE", help="list file (path frames c+ c-) that restricts the videos")
-    videos.add_argument(
-        "--cache-dir", metavar="DIR", help="folder of catalogue index and quarantine (default: the user's cache)"
-    )
-
-
 def add_recipe(parser: Parser, group: str = "Stream") -> None:
     """Add ``--recipe`` and ``--set``."""
     named = ", ".join(PRESETS)

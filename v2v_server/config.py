@@ -12,9 +12,20 @@ from v2v_protocol.addresses import is_loopback
 from v2v_protocol.command import flag_of
 from v2v_protocol.errors import UsageError
 from v2v_protocol.presets import STREAM_PRESETS
-from v2v_protocol.settings import bounds, check_settings, number, require_known, settings_of, switch, text, whole, word
+from v2v_protocol.settings import (
+    bounds,
+    check_settings,
+    number,
+    require_known,
+    settings_of,
+    switch,
+    text,
+    whole,
+    word,
+)
 from v2v_protocol.spec import SPEC_KEYS, StreamSpec
 from v2v_protocol.spec_flags import read_recipe, read_yaml_mapping, recipe_setting
+from v2v_server.store.pixels import HIGHEST_RATE_HZ, PIXEL_KINDS
 from v2v_server.system.log import LOG_FORMATS
 from v2v_server.video.rows import Rows
 
@@ -41,7 +52,15 @@ class ServeConfig:
         metavar="DIR",
         group="Videos",
     )
-    list: str = text("", "list file (path frames c+ c-) that restricts --videos", metavar="FILE")
+    list: str = text("", "list file (path frames c+ c-) that restricts the videos", metavar="FILE")
+    videos_kind: str = word(
+        "videos",
+        PIXEL_KINDS,
+        "what a video is: videos is a file; sequences is a folder, or a zip archive, of numbered pictures",
+    )
+    rate: float = number(
+        0.0, 0.0, HIGHEST_RATE_HZ, "rate of picture sequences without time stamps; 0: unknown", unit="Hz", metavar="N"
+    )
     rows: str = text("full", "rows of each picture to use: full, top:0.54 (WebVid), top:180px, 0.1:0.6", metavar="ROWS")
     cache_dir: str = text("", "folder of the catalogue index (default: the user's cache folder)", metavar="DIR")
     cache: str = text(

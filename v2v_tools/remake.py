@@ -29,6 +29,7 @@ from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogu
 from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
+from v2v_server.store.pixels import VIDEOS, VideosKind
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample, open_sidecars
@@ -135,12 +136,12 @@ class Remaker:
 
 
 def open_shown(
-    source: str, *, list_file: str | None, rows: str, cache_dir: str | None, scene: bool = False
+    source: str, *, list_file: str | None, rows: str, cache_dir: str | None, kind: VideosKind, scene: bool = False
 ) -> Catalogue:
     """Call :func:`open_catalogue` on all cores, with progress on stderr."""
     with Progress("probing videos") as progress:
         return open_catalogue(
-            source, list_file=list_file, rows=Rows.parse(rows), scene=scene, cache_dir=cache_dir,
+            source, list_file=list_file, rows=Rows.parse(rows), scene=scene, cache_dir=cache_dir, kind=kind,
             processes=usable_cores(), progress=progress, notice=progress.notice,
         )  # fmt: skip
 
@@ -151,12 +152,13 @@ def open_remaker(
     rows: str,
     list_file: str | None,
     cache_dir: str | None,
+    kind: VideosKind,
     spec: StreamSpec,
     arrays: tuple[str, ...],
 ) -> Remaker:
     """Open a corpus and return its remaker. Errors: :func:`open_catalogue` and :class:`Remaker`."""
     scene = spec.scene != "off"
-    catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
+    catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir, kind=kind)
     return Remaker(catalogue, spec, arrays)
 
 
@@ -194,6 +196,7 @@ def simulate_to_file(
     index: int,
     snapshot: int = 0,
     cache_dir: str | None = None,
+    kind: VideosKind = VIDEOS,
     events: Path | None = None,
 ) -> None:
     """Make one sample and write it as .npz: the requested arrays and ``provenance``, a JSON text.
@@ -206,6 +209,7 @@ def simulate_to_file(
         arrays, seed, epoch, index: see :func:`remake`.
         snapshot: number of the quarantine snapshot to make it under.
         cache_dir: folder of the catalogue index and the quarantine; None: the user's cache.
+        kind: what a video is.
         events: a file for the sample's events (``event_files.py``), or None. Their clock is that of the video's frames.
 
     Raises:
@@ -218,7 +222,7 @@ def simulate_to_file(
     if events is not None:
         check_event_file(events)
     scene = stream.scene != "off"
-    catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
+    catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir, kind=kind)
     quarantine = read_quarantine(quarantine_path(catalogue.source.name, cache_dir)) if snapshot else Quarantine()
     quarantine.entries(snapshot)  # before any work: whether there is such a snapshot
     for refusal in catalogue.refusals:

@@ -9,7 +9,9 @@ from collections.abc import Sequence
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
-from v2v_protocol.spec_flags import add_corpus, add_spec, recipe_setting, spec_fields
+from v2v_protocol.spec_flags import add_spec, recipe_setting, spec_fields
+from v2v_server.config import ServeConfig
+from v2v_server.store.pixels import VideosKind
 from v2v_tools.event_files import EVENT_WRITERS
 from v2v_tools.remake import simulate_to_file
 
@@ -36,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         metavar="N",
         help="number of the quarantine snapshot in the sample's provenance",
     )
-    add_corpus(parser, "Which sample")
+    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "cache_dir")
     out = parser.group("Output")
     parser.add_output(
         "Output", "--out", (".npz",), "output file for the arrays and the provenance (JSON)", required=True
@@ -65,7 +67,7 @@ def _run(arguments: argparse.Namespace) -> None:
         picture=arguments.picture,
         events=arguments.events,
         list_file=arguments.list,
-        rows=arguments.rows,
+        rows=arguments.rows or "full",
         spec=spec_fields(arguments) | {"recipe": recipe_setting(arguments.recipe, arguments.set)},
         arrays=tuple(arguments.arrays.split(",")),
         seed=arguments.seed,
@@ -73,6 +75,7 @@ def _run(arguments: argparse.Namespace) -> None:
         index=arguments.index,
         snapshot=arguments.quarantine,
         cache_dir=arguments.cache_dir,
+        kind=VideosKind.of(vars(arguments)),
     )
 
 

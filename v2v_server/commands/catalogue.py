@@ -14,11 +14,12 @@ from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress, format_duration
 from v2v_protocol.spec import SCENES
-from v2v_protocol.spec_flags import add_corpus
+from v2v_server.config import ServeConfig
 from v2v_server.corpus.ahead import Ahead, Part, catalogue_ahead, catalogue_shard
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.index import Shard
 from v2v_server.corpus.sources.source import COPIES_GIB
+from v2v_server.store.pixels import VideosKind
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 
@@ -41,18 +42,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     videos.add_argument(
         "--videos", required=True, metavar="DIR", help="folder, video, list file, or s3://bucket/prefix"
     )
-    add_corpus(parser, "Videos, as for v2v-serve")
     videos.add_argument(
         "--scene", choices=SCENES, default="off", help="auto: also compute the statistics that --scene auto needs"
     )
-    videos.add_argument("--copies", metavar="DIR", help="folder that videos are fetched to from object storage")
-    videos.add_argument(
-        "--copies-gib",
-        type=float,
-        default=COPIES_GIB,
-        metavar="N",
-        help=f"size limit of --copies, GiB (default {COPIES_GIB:g})",
-    )
+    names = "list", "rows", "videos_kind", "rate", "cache_dir", "copies", "copies_gib"
+    parser.add_settings(ServeConfig, *names)
     run = parser.group("Run")
     run.add_argument(
         "--workers",
@@ -78,10 +72,11 @@ def _run(arguments: argparse.Namespace) -> None:
     asked = Ahead(
         videos=arguments.videos,
         list_file=arguments.list,
-        rows=Rows.parse(arguments.rows),
+        rows=Rows.parse(arguments.rows or "full"),
         cache_dir=arguments.cache_dir,
         copies=arguments.copies,
-        copies_gib=arguments.copies_gib,
+        copies_gib=arguments.copies_gib or COPIES_GIB,
+        kind=VideosKind.of(vars(arguments)),
         scene=arguments.scene != "off",
         processes=arguments.workers,
     )

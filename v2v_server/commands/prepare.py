@@ -19,14 +19,15 @@ from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec import SCENES
-from v2v_protocol.spec_flags import add_corpus
 from v2v_protocol.write_aside import write_json
+from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
 from v2v_server.prepare.report import Report
 from v2v_server.prepare.resume import check_destination
 from v2v_server.store.packing import DEFAULT_SIZE, SIZES
+from v2v_server.store.pixels import VideosKind
 from v2v_server.store.planes import OPTIONAL, PLANES
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
@@ -48,13 +49,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     videos = parser.group("Videos")
     videos.add_argument("source", metavar="SRC", help="folder of videos, a video, or a list file; never written to")
     videos.add_argument("destination", metavar="DST", help="folder to create, or to continue after an interruption")
-    add_corpus(parser, "Videos")
     videos.add_argument(
         "--scene",
         choices=SCENES,
         default="off",
         help="auto: also compute the statistics that v2v-serve --scene auto uses",
     )
+    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "cache_dir")
     stored = parser.group("Files")
     stored.add_argument(
         "--size", choices=tuple(SIZES), default=DEFAULT_SIZE,
@@ -89,8 +90,9 @@ def _run(arguments: argparse.Namespace) -> int:
         catalogue = open_catalogue(
             arguments.source,
             list_file=arguments.list,
-            rows=Rows.parse(arguments.rows),
+            rows=Rows.parse(arguments.rows or "full"),
             cache_dir=arguments.cache_dir,
+            kind=VideosKind.of(vars(arguments)),
             processes=arguments.workers,
             progress=probing,
             notice=probing.notice,
@@ -103,7 +105,7 @@ def _run(arguments: argparse.Namespace) -> int:
             processes=arguments.workers,
             scene=arguments.scene != "off",
             planes=tuple(dict.fromkeys(arguments.planes)),
-            single=single,
+            single=_is_video(Path(arguments.source), catalogue.folder),
             progress=lambda done, total, made, expected: shown(done, total, _size(made, expected)),
         )
     for line in summary(report, arguments.size, time.monotonic() - started):
@@ -119,6 +121,10 @@ def _run(arguments: argparse.Namespace) -> int:
         ]
         write_json(arguments.json, records)
     return 0 if report.complete else FAILED
+
+
+def _is_video(source: Path, root: Path) -> bool:
+    return source.resolve() != root and source.suffix.lower() not in LIST_SUFFIXES
 
 
 def summary(report: Report, size: str, seconds: float) -> list[str]:

@@ -9,12 +9,12 @@ from functools import partial
 from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
-from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.errors import V2VError
+from v2v_server.config import ServeConfig
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_source
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.packing import QUICK, RAW
-from v2v_server.store.quota import MOST_GIB
-from v2v_server.system.log import LOG_FORMATS, Log, StartTimes, report_errors
+from v2v_server.system.log import Log, StartTimes, report_errors
 from v2v_server.system.process import die_with_parent
 from v2v_server.system.status_fields import GIB
 from v2v_server.worker.process import run_worker, unshared_name
@@ -47,28 +47,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--videos", required=True, metavar="DIR", help="the corpus on this host, the same as the server's, or s3://..."
     )
     work.add_argument("--name", help="prefix of the worker's name in logs (default: host and process id)")
-    work.add_argument("--cache", metavar="DIR", help="folder of this host that caches decoded frames for later epochs")
-    work.add_argument(
-        "--cache-gib", type=float, default=100.0, metavar="N", help="size limit of --cache, GiB (default 100)"
-    )
-    work.add_argument("--cache-raw", action="store_true", help="store frames in --cache without compression")
-    work.add_argument(
-        "--copies",
-        metavar="DIR",
-        help="folder of this host for videos fetched from s3:// (default: in the user's cache folder)",
-    )
-    work.add_argument(
-        "--copies-gib", type=float, default=COPIES_GIB, metavar="N", help="size limit of --copies, GiB (default 100)"
-    )
     work.add_argument(
         "--keys", metavar="FILE", help="its key file, see v2v-keys (default: the file that V2V_KEYS names)"
     )
-    work.add_argument(
-        "--log-format",
-        choices=LOG_FORMATS,
-        default="text",
-        help="log format: text for people, or json, one object per line (default text)",
-    )
+    parser.add_settings(ServeConfig, "cache", "cache_gib", "cache_raw", "copies", "copies_gib", "log_format")
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--arenas-fd", type=int, help=argparse.SUPPRESS)
@@ -77,24 +59,26 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(times: StartTimes, arguments: argparse.Namespace) -> None:
     times.is_logged = arguments.debug
-    with report_errors(lambda: arguments.log_format):
+    with report_errors(lambda: arguments.log_format or "text"):
         _work(times, arguments)
 
 
 def _work(times: StartTimes, arguments: argparse.Namespace) -> None:
     # A server names its own workers, and recognises them by these names.
     name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
-    source = open_source(arguments.videos, SourceOptions(copies=arguments.copies, copies_gib=arguments.copies_gib))
+    source = open_source(
+        arguments.videos, SourceOptions(copies=arguments.copies, copies_gib=arguments.copies_gib or COPIES_GIB)
+    )
     source.make()
     cache = None
     if arguments.cache is not None:
-        if not 0 <= arguments.cache_gib <= MOST_GIB:
-            raise UsageError(f"--cache-gib {arguments.cache_gib:g}: give 0 to {MOST_GIB:g}")
         folder = Path(arguments.cache)
         if arguments.logbook_fd is None:  # a server has already made the name of its own workers unique
             make_cache(folder)
         packing = RAW if arguments.cache_raw else QUICK
-        cache = Cache(folder, int(arguments.cache_gib * GIB), packing=packing)
+        cache = Cache(
+            folder, int((100.0 if arguments.cache_gib is None else arguments.cache_gib) * GIB), packing=packing
+        )
     log = Log(is_json=arguments.log_format == "json")
     run_worker(
         arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log, times,

@@ -12,6 +12,7 @@ from v2v_server.corpus.index import Shard, make_folder, merge_parts, parts_in, w
 from v2v_server.corpus.probe import VideoProgress
 from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.sources.source import COPIES_GIB, Notice, SourceOptions, VideoSource, open_source
+from v2v_server.store.pixels import VIDEOS, VideosKind
 from v2v_server.video.rows import Rows
 
 
@@ -25,6 +26,7 @@ class Ahead:
     cache_dir: str | None = None
     copies: str | None = None
     copies_gib: float = COPIES_GIB
+    kind: VideosKind = VIDEOS
     scene: bool = False
     processes: int = 1
 
@@ -69,6 +71,7 @@ def catalogue_ahead(
         cache_dir=asked.cache_dir,
         copies=asked.copies,
         copies_gib=asked.copies_gib,
+        kind=asked.kind,
         scene=asked.scene,
         processes=asked.processes,
         progress=progress,
@@ -110,4 +113,6 @@ def catalogue_shard(
 
 
 def _source(asked: Ahead) -> VideoSource:
-    return open_source(asked.videos, SourceOptions(asked.list_file, asked.copies, asked.copies_gib, asked.cache_dir))
+    return open_source(
+        asked.videos, SourceOptions(asked.list_file, asked.copies, asked.copies_gib, asked.cache_dir, asked.kind)
+    )

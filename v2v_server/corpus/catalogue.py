@@ -31,7 +31,7 @@ from v2v_server.corpus.probe import VideoProgress, batches, probe_files
 from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sidecars import Sidecars, collect_sidecars, files_for_lease, sidecar_kind
-from v2v_server.corpus.sources.listfile import VIDEO_SUFFIXES, ListEntry, left_out_note
+from v2v_server.corpus.sources.listfile import ListEntry, left_out_note
 from v2v_server.corpus.sources.sidecar import sidecar_id
 from v2v_server.corpus.sources.source import (
     COPIES_GIB,
@@ -46,6 +46,7 @@ from v2v_server.corpus.sources.source import (
 )
 from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos, VideoTable, joined, missing_arrays
 from v2v_server.store.format import PIECE_FRAMES
+from v2v_server.store.pixels import VIDEOS, VideosKind
 from v2v_server.store.reader import STORE_FORMAT
 from v2v_server.system.process import cache_folder, without_collections
 from v2v_server.system.status_fields import gauge, text
@@ -92,17 +93,19 @@ def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice | None) -
     """
     source.make()
     rows = source.rows(rows)
+    source.rates = {entry.id: entry.rate for entry in source.listed or () if entry.rate is not None}
     refused: dict[str, str] = {}
     left_out = Counter[str]()
-    ids = []
+    ids = list[str]()
     for id in source.videos(refused, left_out):
-        ids.append(id)
+        if [id] != ids[-1:]:  # a folder of pictures may be named by each
+            ids.append(id)
         if notice is not None and is_said(len(ids)):
             notice(f"looking for videos in {source}: {len(ids)} so far")
     note = left_out_note(left_out)
     if not ids:
         raise CorpusError(
-            f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}"
+            f"{source}: no video found; looked for {source.kind.form.LOOKED_FOR}"
             f"{format_problems(refused)}{note and '. '}{note}"
         )
     return Corpus(source, rows, tuple(ids), refused, note)
@@ -293,7 +296,7 @@ class Catalogue:
             CorpusError: there is no such id in this catalogue, or no such folder on this host.
         """
         self._fingerprint(id)
-        return self.folder / id
+        return self.folder / self.source.file_of(id)
 
     def check(self, id: str, fingerprint: str, sidecar: str = "") -> None:
         """Check that the video is as catalogued, or its sidecar of that ending, see :meth:`VideoSource.verify`.
@@ -473,6 +476,7 @@ def open_catalogue(
     cache_dir: str | os.PathLike[str] | None = None,
     copies: str | os.PathLike[str] | None = None,
     copies_gib: float = COPIES_GIB,
+    kind: VideosKind = VIDEOS,
     scene: bool = False,
     processes: int = 1,
     progress: VideoProgress | None = None,
@@ -489,6 +493,7 @@ def open_catalogue(
             ``~/.cache/v2v``.
         copies: folder for copies of videos from object storage; None takes one where the index lies.
         copies_gib: largest size of that folder, GiB.
+        kind: what a video is.
         scene: also analyse what the videos show, which decodes those not analysed yet; see
             :mod:`v2v_server.corpus.scenes`.
         processes: number of processes that probe; 0 probes in this one, which a file that crashes the decoder ends.
@@ -499,7 +504,7 @@ def open_catalogue(
         CorpusError: the folder or list is missing, unreadable or malformed, or has no usable video.
         IndexUnreadable: the index cannot be read any more after the probes.
     """
-    opened = open_source(source, SourceOptions(list_file, copies, copies_gib, cache_dir))
+    opened = open_source(source, SourceOptions(list_file, copies, copies_gib, cache_dir, kind))
     corpus = list_corpus(opened, rows, notice)
     scenes = SceneCollection(corpus.rows, opened.manifest) if scene else None
     path = index_path(opened.name, cache_dir)

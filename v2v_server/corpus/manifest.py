@@ -69,7 +69,7 @@ class PreparedVideo:
     """What was made of one video.
 
     Attributes:
-        id: of the source, and the path of the prepared file below the folder.
+        id: of the source; :func:`prepared_name` gives the path of the prepared file.
         source_fingerprint, source_bytes: of the source file.
         frames, frames_per_second: of the source (None where unknown), and so of the prepared file.
         height_px, width_px: of the source's picture, of which the file keeps some rows.
@@ -91,6 +91,11 @@ class PreparedVideo:
     problem: str | None = None
     scene: str = ""
     remark: str = ""
+
+
+def prepared_name(id: str) -> str:
+    """Return the path of a prepared file below its folder."""
+    return f"{id[:-1]}.v2v" if id.endswith("/") else id
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+
 from v2v_protocol.errors import VideoError, VideoUnreadable
 from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.sources.source import VideoSource
@@ -43,7 +45,7 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
         before = source.state(id)
         with source.open_local(id, "") as path:
             mark = fingerprint(path)
-            facts = _facts(path)
+            facts = _at_rate(_facts(path, source.kind.videos_kind), source.rate(id))
         name = f"{mark}-{facts.content}" if facts.content else mark
         if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
@@ -72,13 +74,21 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
     )
 
 
-def facts_of(path: Path) -> VideoFacts:
+def facts_of(path: Path, kind: str = "videos") -> VideoFacts:
     """Return what is known of the video in a file. Errors: :class:`v2v_server.store.pixels.Pixels`."""
-    with open_pixels(path) as pixels:
+    with open_pixels(path, kind) as pixels:
         return pixels.facts()
 
 
-def _facts(path: Path) -> VideoFacts:
+def _at_rate(facts: VideoFacts, rate: float) -> VideoFacts:
+    """Return the facts of pictures that follow each other at a rate, Hz, if they do not state their times."""
+    if not rate or facts.index.seekable:
+        return facts
+    index = facts.index.timed(np.rint(np.arange(facts.frames) * 1e9 / rate).astype(np.int64))
+    return replace(facts, frames_per_second=rate, index=index, content=f"{facts.content}@{rate:g}")
+
+
+def _facts(path: Path, kind: str) -> VideoFacts:
     """Return what is known of the video; retry once after an error of the system rather than of the decoder.
 
     Raises:
@@ -86,12 +96,12 @@ def _facts(path: Path) -> VideoFacts:
         VideoError: the file is not a supported video.
     """
     try:
-        return facts_of(path)
+        return facts_of(path, kind)
     except VideoError as error:
         if not isinstance(error.__cause__, OSError):
             raise
     try:
-        return facts_of(path)
+        return facts_of(path, kind)
     except VideoError as error:
         if isinstance(error.__cause__, OSError):
             raise VideoUnreadable(error.video, error.frame, error.reason) from error

@@ -25,6 +25,7 @@ from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import PIECE, Pieces, clip_pieces, firsts_of, sides_of
 from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.store.pixels import kind_of
 from v2v_server.store.planes import PLANES
 from v2v_server.store.reader import StoreFile
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
@@ -409,7 +410,8 @@ class Videos(Sequence[VideoEntry]):
 
         Fingerprints cover the track and its orientation.
         """
-        sha = hashlib.sha256(f"v2v catalogue 2\n{rows}\n".encode())
+        of_kind = "".join(f"{kind}\n" for kind in {kind_of(id) for id in self.ids[:1]} if kind != "videos")
+        sha = hashlib.sha256(f"v2v catalogue 2\n{rows}\n{of_kind}".encode())
         pos, neg = NO_THRESHOLDS
         none, limits = f"{pos}\0{neg}", {number: f"{pos}\0{neg}" for number, (pos, neg) in self._thresholds.items()}
         table = self._table

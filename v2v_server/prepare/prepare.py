@@ -25,7 +25,7 @@ from pathlib import Path
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_protocol.refusal import Refusal
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.manifest import Header, PreparedVideo
+from v2v_server.corpus.manifest import Header, PreparedVideo, prepared_name
 from v2v_server.corpus.manifest_writer import ManifestWriter
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.videos import VideoEntry
@@ -208,7 +208,7 @@ def _earlier(
         for video, stands in files:
             if stands:
                 record = earlier.standing[video.id] = known[video.id]
-                if not has_planes(target / video.id, planes):
+                if not has_planes(target / prepared_name(video.id), planes):
                     earlier.lacking.add(video.id)
                 elif record.scene or not scene:
                     earlier.finished.add(video.id)
@@ -245,7 +245,7 @@ def _outcomes(
             id = job.video.id
             keeps_scene = job.standing is not None and job.standing.scene != ""
             # A file that is made again for one plane keeps its others.
-            more = [name for name in OPTIONAL if job.lacks_planes and has_planes(target / id, (name,))]
+            more = [name for name in OPTIONAL if job.lacks_planes and has_planes(target / prepared_name(id), (name,))]
             try:
                 index = catalogue.frame_index(id).to_bytes()
             except VideoError as error:
@@ -253,7 +253,7 @@ def _outcomes(
                 continue
             yield job, Transcoding(
                 id, catalogue.path(id), job.video.fingerprint, index, job.video.frames_per_second,
-                job.window, size, target, target / id, scene or keeps_scene,
+                job.window, size, target, target / prepared_name(id), scene or keeps_scene,
                 tuple(dict.fromkeys((*planes, *more))),
             )  # fmt: skip
 

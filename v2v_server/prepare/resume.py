@@ -14,7 +14,7 @@ from pathlib import Path
 from v2v_protocol.errors import CorpusError, VideoError
 from v2v_protocol.write_aside import is_writable
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.manifest import MANIFEST_NAME, Header, PreparedVideo, read_manifest
+from v2v_server.corpus.manifest import MANIFEST_NAME, Header, PreparedVideo, prepared_name, read_manifest
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX
 from v2v_server.store.quota import LEAST_FREE_BYTES
@@ -201,11 +201,11 @@ def _stands(target: Path, video: VideoEntry, known: dict[str, PreparedVideo]) ->
     if record is None or record.problem is not None or record.source_fingerprint != video.fingerprint:
         return False
     try:
-        return fingerprint(target / video.id) == record.fingerprint
+        return fingerprint(target / prepared_name(video.id)) == record.fingerprint
     except VideoError as error:
         if isinstance(error.__cause__, OSError) and error.__cause__.errno not in _NOT_THERE:
             raise CorpusError(
-                f"{target / video.id} {error.reason}, so it cannot be checked, and "
+                f"{target / prepared_name(video.id)} {error.reason}, so it cannot be checked, and "
                 "nothing was changed; make it readable, or delete it to prepare it again"
             ) from error
         return False

@@ -21,7 +21,7 @@ from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.scenes.analysis import SceneAnalysis
 from v2v_server.corpus.scenes.scene import MOST_ANALYSED_FRAMES, Scene
 from v2v_server.store.packing import SIZES
-from v2v_server.store.pixels import open_pixels
+from v2v_server.store.pixels import kind_of, open_pixels
 from v2v_server.store.planes import whole_cut
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter, head_of, planes_of, write_pictures
@@ -94,7 +94,10 @@ def transcode(job: Transcoding) -> Made:
     # Hidden, so that no catalogue includes it; hashed, so that the suffix fits even with the longest names.
     name = hashlib.sha256(os.fsencode(job.target.name)).hexdigest()[:16]
     hidden = job.target.with_name(f".{name}{PARTIAL_SUFFIX}")
-    with open_pixels(job.source) as source, write_aside_and_rename(job.target, partial=hidden) as partial:
+    with (
+        open_pixels(job.source, kind_of(job.video)) as source,
+        write_aside_and_rename(job.target, partial=hidden) as partial,
+    ):
         source.check(job.fingerprint)
         analysis = SceneAnalysis()
         pictures = source.pictures(_request(job, index, job.planes))
@@ -111,7 +114,7 @@ def look_again(job: Transcoding) -> Scene:
         VideoError: the source is not the catalogued file, or a frame of it does not decode.
     """
     analysis = SceneAnalysis()
-    with open_pixels(job.source) as source:
+    with open_pixels(job.source, kind_of(job.video)) as source:
         source.check(job.fingerprint)
         for picture in islice(source.pictures(_request(job, FrameIndex.from_bytes(job.index))), MOST_ANALYSED_FRAMES):
             analysis.add(picture.grey)

@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 from v2v_server.store.planes.motion import by_cut, watch_motion
 from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
-from v2v_server.video.decode import DecodedClip, decode_cuts, stream_pictures
+from v2v_server.video.decode import DecodedClip, Way, decode_cuts, stream_pictures
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import MOST_BITS, Signal
 from v2v_server.video.probe import VideoFacts, probe
+
+SUFFIXES = frozenset({
+    ".3gp", ".avi", ".flv", ".h264", ".h265", ".hevc", ".ivf", ".m2ts", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov",
+    ".mp4", ".mpeg", ".mpg", ".mts", ".mxf", ".obu", ".ogv", ".ts", ".vob", ".webm", ".wmv", ".y4m",
+})  # fmt: skip
+LOOKED_FOR = f"{' '.join(sorted(SUFFIXES))}; with --videos-kind sequences, folders of numbered pictures are videos"
 
 
 class VideoFile:
     """:class:`v2v_server.store.pixels.Pixels` of a file, which is opened by each call."""
 
     is_stored = False
+    ways: Sequence[Way] = ()
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._path = path
@@ -35,20 +42,26 @@ class VideoFile:
     def clips(self, request: ClipRequest) -> tuple[DecodedClip, ...]:
         """Decode, see :func:`v2v_server.video.decode.decode_cuts`."""
         if all(cut.cells is None for cut in request.cuts):
-            return decode_cuts(self._path, request)
+            return decode_cuts(self._path, request, ways=self.ways)
         watch, found = watch_motion(request)
-        clips = decode_cuts(self._path, request, watch)
+        clips = decode_cuts(self._path, request, watch, self.ways)
         motion = by_cut(request, found[-1])
         return tuple(replace(clip, motion=of_cut) for clip, of_cut in zip(clips, motion, strict=True))
 
     def pictures(self, request: ClipRequest) -> Iterator[DecodedPicture]:
         """Decode one by one, see :func:`v2v_server.video.decode.stream_pictures`."""
-        return stream_pictures(self._path, request)
+        return stream_pictures(self._path, request, self.ways)
 
     def signal(self, index: FrameIndex) -> Signal:
         """Decode the first frame."""
         request = ClipRequest(index, index.first, (Cut(1, (0, 0, 1, 1)),), most_bits=MOST_BITS)
-        return decode_cuts(self._path, request)[0].signal
+        return decode_cuts(self._path, request, ways=self.ways)[0].signal
+
+
+def id_of(path: str) -> str:
+    """Return the id of the video in a file, its path; "" if the file is not named like a video."""
+    _, dot, ending = path.rpartition(".")
+    return path if dot and f".{ending.lower()}" in SUFFIXES else ""
 
 
 def open_pixels(path: str | os.PathLike[str]) -> AbstractContextManager[VideoFile]:

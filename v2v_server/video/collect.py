@@ -190,7 +190,8 @@ class Stack:
         first, most = wanted.start - index.first, wanted.count
         self._pts: list[int] = index.pts.tolist()  # single numbers of an array take longer to get
         self._expected = self._pts[first : first + (most - 1) * stride + 1 : stride]
-        self._seen = 0  # frames delivered by the decoder, for files where they must be counted
+        self.seen = 0  # ordinal of the next delivered frame, for files where they must be counted
+        self.name = ""  # of the next frame in error messages
         self.taken = 0
         self._cursor = 0  # where the next frame is expected in the index
         self._damaged = False
@@ -205,9 +206,9 @@ class Stack:
 
     def take(self, frame: VideoFrame) -> bool:
         """Look at the next frame that the decoder delivers; True once the last asked one is in."""
-        if frame.is_corrupt and not self.index.seekable and not self._seen:
+        if frame.is_corrupt and not self.index.seekable and not self.seen:
             return False  # frames are counted from the first sound one
-        ordinal, self._seen = self._seen, self._seen + 1
+        ordinal, self.seen = self.seen, self.seen + 1
         # A damaged or lost frame spoils what refers to it, until decoding starts afresh.
         lost = not self.sparse and self._after_a_gap(frame)
         self._damaged = frame.is_corrupt or ((self._damaged or lost) and not frame.key_frame)
@@ -289,7 +290,7 @@ class Stack:
         Raises:
             VideoError: always.
         """
-        raise VideoError(self.path, self.wanted.start + self.taken * self._stride, why)
+        raise VideoError(self.path, self.wanted.start + self.taken * self._stride, f"{self.name}{why}")
 
     def chroma(self) -> list[Chroma | None]:
         """Return the collected colour of each cut; None if it takes none."""

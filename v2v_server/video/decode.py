@@ -14,7 +14,7 @@ version: 4:4:4 H.264 of x264 before build 151 comes out wrong otherwise. So they
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import chain
@@ -37,7 +37,10 @@ from v2v_server.video.orientation import PixelRect
 from v2v_server.video.packets import is_unreferenced, length_bytes
 from v2v_server.video.source import opened, packets, reason
 
-BIT_EXACT_CODECS = frozenset({"h264", "hevc", "vp8", "vp9", "av1", "ffv1", "huffyuv", "ffvhuff", "png", "utvideo"})
+BIT_EXACT_CODECS = frozenset({
+    "h264", "hevc", "vp8", "vp9", "av1", "ffv1", "huffyuv", "ffvhuff", "png", "utvideo",
+    "tiff", "webp", "bmp",
+})  # fmt: skip
 """Codecs whose standard fixes every bit of the decoded picture, or that are lossless, so that all hosts agree. Not so
 MPEG-1, 2, 4 and MJPEG: their standards leave the precision of the inverse transform open."""
 
@@ -73,6 +76,10 @@ class DecodedClip:
     arrays: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
 
 
+Way = Callable[[Stack], Iterator[VideoFrame]]
+"""Yields the decoded frames for a stack."""
+
+
 class _SeekFailed(Exception):
     """Decoding did not begin at the keyframe that the index names."""
 
@@ -85,7 +92,10 @@ def decode_luma(
 
 
 def decode_cuts(
-    path: str | os.PathLike[str], request: ClipRequest, watch: Watch | None = None
+    path: str | os.PathLike[str],
+    request: ClipRequest,
+    watch: Watch | None = None,
+    ways: Sequence[Way] = (),
 ) -> tuple[DecodedClip, ...]:
     """Return several cuts of some frames, from one pass of the decoder.
 
@@ -95,6 +105,7 @@ def decode_cuts(
         path: the file.
         request: what is wanted.
         watch: looks at the frames of the longest cut.
+        ways: of getting the frames, each tried where the one before failed; none: those of a video file.
 
     Raises:
         UsageError: a range outside the index, or a window outside the picture.
@@ -102,7 +113,7 @@ def decode_cuts(
             picture's size or format changes. Its ``frame`` is the ordinal of the first frame that was not delivered.
     """
     request.check()
-    stack = _filled(os.fspath(path), request, watch)
+    stack = _filled(os.fspath(path), request, watch, ways)
     return tuple(
         DecodedClip(
             grey, request.seconds(cut), stack.codec, stack.codec in BIT_EXACT_CODECS, signal=stack.signal, chroma=chroma
@@ -111,8 +122,8 @@ def decode_cuts(
     )
 
 
-def _filled(path: str, wanted: ClipRequest, watch: Watch | None = None) -> Stack:
-    for frames_of in (_from_keyframe_on, _from_beginning):
+def _filled(path: str, wanted: ClipRequest, watch: Watch | None = None, ways: Sequence[Way] = ()) -> Stack:
+    for frames_of in ways or _WAYS:
         stack = Stack(path, wanted, watch)
         try:
             for _ in _fill(stack, frames_of(stack)):
@@ -121,9 +132,9 @@ def _filled(path: str, wanted: ClipRequest, watch: Watch | None = None) -> Stack
         except _SeekFailed:
             continue
         except VideoError:
-            if frames_of is _from_beginning:
+            if frames_of is (ways or _WAYS)[-1]:
                 raise
-    raise AssertionError("decoding from the beginning has the last word")
+    raise AssertionError("the last way has the last word")
 
 
 def stream_luma(
@@ -141,8 +152,10 @@ def stream_luma(
         yield picture.grey
 
 
-def stream_pictures(path: str | os.PathLike[str], request: ClipRequest) -> Generator[DecodedPicture, None, None]:
-    """Yield the frames of the only cut of a request, in the memory of one. Errors: :func:`decode_cuts`."""
+def stream_pictures(
+    path: str | os.PathLike[str], request: ClipRequest, ways: Sequence[Way] = ()
+) -> Generator[DecodedPicture, None, None]:
+    """Yield the frames of the only cut of a request, in the memory of one. See :func:`decode_cuts`."""
     request.check()
     (cut,), done = request.cuts, 0
     shown: list[DecodedPicture] = []
@@ -150,7 +163,7 @@ def stream_pictures(path: str | os.PathLike[str], request: ClipRequest) -> Gener
     def see(frame: DecodedFrame) -> None:
         shown[:] = [frame.picture(request.window(cut), cut.chroma, stack.codec, stack.codec in BIT_EXACT_CODECS)]
 
-    for frames_of in (_from_keyframe_on, _from_beginning):
+    for frames_of in ways or _WAYS:
         stack = Stack(os.fspath(path), request, lambda: see, collects=False)
         try:
             for _ in _fill(stack, frames_of(stack)):
@@ -161,7 +174,7 @@ def stream_pictures(path: str | os.PathLike[str], request: ClipRequest) -> Gener
         except _SeekFailed:
             continue
         except VideoError:
-            if frames_of is _from_beginning:
+            if frames_of is (ways or _WAYS)[-1]:
                 raise
 
 
@@ -223,6 +236,9 @@ def _from_beginning(stack: Stack) -> Iterator[VideoFrame]:
                 continue  # a file may begin in the middle of a group of frames
             begun |= any(not frame.is_corrupt for frame in frames)
             yield from frames
+
+
+_WAYS: Sequence[Way] = (_from_keyframe_on, _from_beginning)
 
 
 def _fill(stack: Stack, frames: Iterator[VideoFrame]) -> Iterator[None]:

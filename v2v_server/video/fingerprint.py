@@ -2,6 +2,8 @@
 
     <size in bytes>-<hash of head and tail>-<hash of every packet>
 
+A folder of pictures has the size of its files, a hash of their names and sizes, and a hash of what they hold.
+
 The whole name is known once the file has been probed, which reads it from end to end anyhow. What is opened later is
 compared by the first two parts: a worker that read everything would read a film for each two seconds of it.
 """
@@ -14,16 +16,23 @@ import stat
 
 from v2v_protocol.errors import VideoChanged, VideoDenied, VideoGone, VideoUnreadable
 
+TIMES_ABOVE = ("../timestamps.txt", "../images.txt")
+TIMES = ("timestamps.txt", "images.txt", *TIMES_ABOVE)
+"""Files with the times of the pictures of a folder, by their places from there; the first that is found counts."""
 _BLOCK_BYTES = 64 * 1024
 
 
 def fingerprint(path: str | os.PathLike[str]) -> str:
-    """Size in bytes and a hash of the first and last 64 KiB: ``"<size>-<32 hexadecimal digits>"``.
+    """Size in bytes and a hash of the first and last 64 KiB: ``"<size>-<32 hexadecimal digits>"``; of a folder, see
+    above.
 
     Raises:
         VideoUnreadable: the file cannot be read, or is not a regular file.
     """
     try:
+        if os.path.isdir(path):
+            files = [(name, status.st_size) for name, status in files_in(path)]
+            return f"{sum(size for _, size in files)}-{hashlib.sha256(f'{files}'.encode()).hexdigest()[:32]}"
         # An ordinary open of a named pipe would wait for somebody at its other end.
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
             status = os.fstat(file.fileno())
@@ -35,6 +44,19 @@ def fingerprint(path: str | os.PathLike[str]) -> str:
     except OSError as error:
         raise unreadable(os.fspath(path), error) from error
     return f"{status.st_size}-{digest.hexdigest()[:32]}"
+
+
+def files_in(folder: str | os.PathLike[str]) -> list[tuple[str, os.stat_result]]:
+    """Return the regular files of a folder of pictures, by name, and their status: those in it that are not hidden, and
+    its :data:`TIMES`.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with os.scandir(folder) as listing:
+        found = [(entry.name, entry.stat()) for entry in listing if entry.name[0] != "." and entry.is_file()]
+    above = [(name, os.path.join(folder, name)) for name in TIMES_ABOVE]
+    return sorted(found + [(name, os.stat(path)) for name, path in above if os.path.isfile(path)])
 
 
 def unreadable(video: str, error: OSError) -> VideoUnreadable:

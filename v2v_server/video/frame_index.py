@@ -112,6 +112,13 @@ class FrameIndex:
             keyframe_dts=self.keyframe_dts[keys],
         )
 
+    def timed(self, pts: npt.NDArray[np.int64]) -> FrameIndex:
+        """Return the index of the same frames with time stamps, [n] nanoseconds; decoding may begin at each."""
+        return replace(
+            self, pts=pts, keyframes=np.arange(self.first, self.end), keyframe_dts=np.full(len(pts), NO_TIMESTAMP),
+            time_base=(1, 10**9), seekable=True,
+        )  # fmt: skip
+
     def seconds(self, start: int, count: int) -> npt.NDArray[np.float64]:
         """Return the presentation times of frames start .. start + count - 1.
 

@@ -34,7 +34,11 @@ class Orientation:
 
         A matrix that turns by another angle than a multiple of 90 degrees counts as the nearest one.
         """
-        notes = cast(SideDataContainer, frame.side_data)  # PyAV's type hints describe something else
+        try:
+            notes = cast(SideDataContainer, frame.side_data)  # PyAV's type hints describe something else
+        except ValueError:  # it does not know Exif data; the angle is all that it tells then
+            turned = {0: cls(), 90: cls(True, flip_y=True), -90: cls(True, flip_x=True)}
+            return turned.get(frame.rotation, cls(flip_y=True, flip_x=True))
         if "DISPLAYMATRIX" not in notes:
             return cls()
         # x' = a x + c y, y' = b x + d y (16.16 fixed point; libavutil/display.h). Only the signs matter here.

@@ -23,6 +23,7 @@ from v2v_server.corpus.scenes.picture_check import look_at_pictures, name_all
 from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
 from v2v_server.labels.formats import READERS
 from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.store.pixels import VideosKind
 from v2v_server.video.container import clean_aperture
 from v2v_server.video.rows import Rows
 from v2v_tools.doctor.motion import look_at_motion
@@ -35,11 +36,11 @@ _VIDEOS_OPENED = 10_000
 """Most videos of which more is read than their line of the index."""
 
 
-def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None) -> Iterator[Line]:
+def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, kind: VideosKind) -> Iterator[Line]:
     """Check a corpus and yield lines of the report.
 
     Args:
-        videos, rows, cache_dir: as of :func:`v2v_server.corpus.catalogue.open_catalogue`.
+        videos, rows, cache_dir, kind: as of :func:`v2v_server.corpus.catalogue.open_catalogue`.
         recipe: name of a preset, or a YAML file.
 
     Raises:
@@ -48,7 +49,7 @@ def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None) -
     spec = StreamSpec.from_dict({"recipe": recipe_setting(recipe, [])})
     Rows.parse(rows)  # before any work
     try:
-        catalogue = open_shown(videos, list_file=None, rows=rows, cache_dir=cache_dir)
+        catalogue = open_shown(videos, list_file=None, rows=rows, cache_dir=cache_dir, kind=kind)
     except CorpusError as error:
         yield "bad", "corpus", str(error), "give a folder, a video or a list file that this user can read"
         return
@@ -122,7 +123,7 @@ def _rates(rates: npt.NDArray[np.float64], recipe: Recipe) -> Iterator[Line]:
 
 
 def _how_videos_are_stored(catalogue: Catalogue) -> Iterator[Line]:
-    if catalogue.prepared is not None:
+    if catalogue.prepared is not None or catalogue.source.kind.has_parts:
         return
     ids = [video.id for video in islice(catalogue.videos, _VIDEOS_OPENED)]
     counted = [id for id in ids if not catalogue.frame_index(id).seekable]

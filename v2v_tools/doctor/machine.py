@@ -24,6 +24,7 @@ from typing import Any
 from packaging.requirements import Requirement
 
 from v2v_protocol.command import version_of
+from v2v_server.store.pixels import VideosKind
 from v2v_server.system.process import usable_cores
 from v2v_server.system.sandbox import can_confine
 
@@ -62,7 +63,9 @@ class Finding:
     change: str = ""
 
 
-def look_around(port: int, videos: str | None, recipe: str, rows: str, cache_dir: str | None) -> Iterator[Finding]:
+def look_around(
+    port: int, videos: str | None, recipe: str, rows: str, cache_dir: str | None, kind: VideosKind
+) -> Iterator[Finding]:
     """Run all checks and yield each finding at once; arguments as of the command.
 
     Raises:
@@ -84,7 +87,7 @@ def look_around(port: int, videos: str | None, recipe: str, rows: str, cache_dir
     else:
         # Needs packages of that extra.
         corpus = importlib.import_module("v2v_tools.doctor.corpus")
-        yield from (Finding(*line) for line in corpus.look_at_corpus(videos, recipe, rows, cache_dir))
+        yield from (Finding(*line) for line in corpus.look_at_corpus(videos, recipe, rows, cache_dir, kind))
 
 
 def _missing(part: str) -> list[str]:

@@ -9,7 +9,9 @@ from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_protocol.spec_flags import add_corpus, add_spec, recipe_setting, spec_fields
+from v2v_protocol.spec_flags import add_spec, recipe_setting, spec_fields
+from v2v_server.config import ServeConfig
+from v2v_server.store.pixels import VideosKind
 from v2v_tools.preview.preview import PICTURE_SUFFIXES, Shot, preview
 
 _MOST_CAMERAS = 32
@@ -39,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "sources", nargs="+", metavar="VIDEO|DIR",
         help="a video, a folder of videos, or a list file; with several, each gets a FILE-NAME of its own",
     )  # fmt: skip
-    add_corpus(parser, "Videos")
+    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "cache_dir")
     out = parser.group("Output")
     parser.add_output(
         "Output", "--out", PICTURE_SUFFIXES, f"picture, film or page: {', '.join(PICTURE_SUFFIXES)}", required=True
@@ -87,10 +89,11 @@ def _run(arguments: argparse.Namespace) -> None:
             title=f"{Path(source).name}: {what}",
             find_motion=arguments.seed is None,
             list_file=arguments.list,
-            rows=arguments.rows,
+            rows=arguments.rows or "full",
             with_flow=not arguments.no_flow,
             moments=arguments.moments,
             cache_dir=arguments.cache_dir,
+            kind=VideosKind.of(vars(arguments)),
         )
 
 

@@ -31,6 +31,7 @@ from v2v_server.corpus.scenes.picture_check import defects_of_video
 from v2v_server.motion.prediction import Prediction
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.simulation.intensity import tone_table
+from v2v_server.store.pixels import VIDEOS, VideosKind
 from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.luma import SDR
 from v2v_server.video.probe import DOLBY_VISION
@@ -72,6 +73,7 @@ def preview(
     with_flow: bool = True,
     moments: int = 1,
     cache_dir: str | None = None,
+    kind: VideosKind = VIDEOS,
     say: Callable[[str], None] = print,
 ) -> None:
     """Make the cameras' clips, draw them, and write the file.
@@ -86,6 +88,7 @@ def preview(
         with_flow: show optical flow too.
         moments: voxel grids to show of each camera on a sheet.
         cache_dir: folder of the catalogue index; None: the user's cache.
+        kind: what a video is.
         say: called with each line for the user.
 
     Raises:
@@ -95,7 +98,7 @@ def preview(
     """
     check_output("--out", out, PICTURE_SUFFIXES, [source])  # before any work
     scene = StreamSpec.from_dict({**spec, "recipe": shots[0].recipe}).scene != "off"
-    catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir)
+    catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir, kind=kind)
     cameras: list[Camera] = []
     loss, notes = Prediction(), dict[str, list[str]]()
     try:

@@ -246,13 +246,13 @@ def test_a_video_that_is_a_pipe_for_a_moment_is_not_condemned(
     path, aside = corpus / "a.mp4", corpus / "aside"
     work = getattr(probe_module, step)
 
-    def in_that_moment(of: Path) -> object:
+    def in_that_moment(of: Path, *kind: str) -> object:
         if of != path:
-            return work(of)
+            return work(of, *kind)
         path.rename(aside)
         os.mkfifo(path)
         try:
-            return work(of)
+            return work(of, *kind)
         finally:
             aside.rename(path)
 
@@ -268,8 +268,8 @@ def test_a_video_that_changes_while_it_is_probed_is_probed_again(
 ) -> None:
     work = probe_module.facts_of
 
-    def meanwhile(path: Path) -> object:
-        facts = work(path)
+    def meanwhile(path: Path, *kind: str) -> object:
+        facts = work(path, *kind)
         if path.name == "a.mp4":
             write_clip(path, panned_luma(12))
         return facts

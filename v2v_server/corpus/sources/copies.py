@@ -13,6 +13,7 @@ import errno
 import fcntl
 import hashlib
 import os
+import posixpath
 import time
 from array import array
 from bisect import bisect_left
@@ -28,16 +29,18 @@ from zipfile import ZipFile
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoGone, VideoUnreadable
 from v2v_protocol.programs import printable
 from v2v_server.corpus.manifest import MANIFEST_NAME
-from v2v_server.corpus.sources.bucket import Bucket, is_url
-from v2v_server.corpus.sources.listfile import UNPRINTABLE, ListEntry, count_left_out, is_video_name
+from v2v_server.corpus.sources.bucket import TRIES, Bucket, is_url
+from v2v_server.corpus.sources.listfile import UNPRINTABLE, ListEntry, count_left_out
 from v2v_server.corpus.sources.sidecar import fingerprint_of as sidecar_fingerprint
 from v2v_server.corpus.sources.sidecar import is_sidecar, state_text
 from v2v_server.corpus.sources.source import GONE, FileState, SourceOptions, VideoSource
 from v2v_server.store.quota import MOST_GIB, PARTIAL, QuotaFolder
 from v2v_server.system.process import cache_folder, lock, make_private, open_private
+from v2v_server.video.fingerprint import TIMES_ABOVE, is_same_file
 from v2v_server.video.fingerprint import fingerprint as video_fingerprint
-from v2v_server.video.fingerprint import is_same_file
 
+_ZIP_EPOCH = 315_619_200
+"""A time that archives can state, 1980-01-02, in seconds since 1970."""
 _SLOTS = 64
 """Videos that a host can fetch at a time, and so the most unfinished files that killed processes leave behind."""
 _LOCK_SECONDS = 30.0
@@ -73,8 +76,8 @@ class Copies(VideoSource):
         self._quota = QuotaFolder(copies, most_bytes, _LOCK_SECONDS)
         self._at_hand: dict[tuple[str, str], IO[bytes]] = {}
 
-    def __reduce__(self) -> tuple[type[Copies], tuple[Bucket, Path, int]]:
-        return Copies, (self.bucket, self.copies, self.most_bytes)
+    def __reduce__(self) -> tuple[type[Copies], tuple[Bucket, Path, int], dict[str, object]]:
+        return Copies, (self.bucket, self.copies, self.most_bytes), {"kind": self.kind, "rates": self.rates}
 
     @cached_property
     def _objects(self) -> dict[str, FileState]:
@@ -101,14 +104,14 @@ class Copies(VideoSource):
             parts = name.split("/")
             if any(part.startswith(".") for part in parts):
                 continue
-            if not is_video_name(parts[-1]):
+            if not (id := self.kind.form.id_of(name)):
                 count_left_out(parts[-1], left_out)
             elif printable(name) != name:
                 refused[printable(name)] = UNPRINTABLE
-            elif "" in parts:
-                refused[name] = "has an empty part between two slashes"
+            elif "" in parts or id == "/":
+                refused[name] = "has an empty part between two slashes, or is a picture outside of a folder"
             else:
-                yield name
+                yield id
 
     def make(self) -> None:
         """Create the folder of copies.
@@ -129,7 +132,7 @@ class Copies(VideoSource):
         """Return the states of many objects, from the listing."""
         found = array("q")
         for id in ids:
-            found.extend(self._objects.get(id, GONE))
+            found.extend(self._state(id, self._objects))
         return found
 
     def state(self, id: str) -> FileState:
@@ -138,7 +141,30 @@ class Copies(VideoSource):
         Raises:
             VideoUnreadable: the store does not answer, or has no such object.
         """
-        return self.bucket.state(id)
+        return self._state(id)
+
+    def _state(self, id: str, listed: Mapping[str, FileState] | None = None, tries: int = TRIES) -> FileState:
+        """Return the state of one video, from the listing or else from the store."""
+        if id.endswith("/"):
+            return self.state_of_parts(id, self._parts(id, listed, tries))
+        size, content, _ = self.bucket.state(id, tries) if listed is None else listed.get(id, GONE)
+        return size, content, self.mark(id)
+
+    def _parts(
+        self, id: str, listed: Mapping[str, FileState] | None = None, tries: int = TRIES
+    ) -> list[tuple[str, FileState]]:
+        """Return the objects that make up a folder of pictures, by their places from there, and their states."""
+        names = (
+            self.bucket.find(id, tries)
+            if listed is None
+            else {name[len(id) :]: listed[name] for name in self._below(id)}
+        )
+        found = {name: state for name, state in names.items() if "/" not in name}
+        for name in TIMES_ABOVE:
+            with contextlib.suppress(VideoGone, KeyError):
+                place = posixpath.normpath(id + name)
+                found[name] = self.bucket.state(place, tries) if listed is None else listed[place]
+        return sorted(found.items())
 
     def verify(self, id: str, fingerprint: str, state: FileState | str | None) -> None:
         """Check an object, or a sidecar, against its state, with one question. If the store gives no answer, that is no
@@ -152,7 +178,7 @@ class Copies(VideoSource):
                 found = self.bucket.find(id, tries=1) if id.endswith("/") else {"": self.bucket.state(id, tries=1)}
                 changed = state_text(sorted(found.items())) != state and state is not None
             else:
-                changed = self.bucket.state(id, tries=1) != state and state is not None
+                changed = self._state(id, tries=1) != state and state is not None
         except VideoGone:
             raise
         except VideoUnreadable:
@@ -314,8 +340,11 @@ class Copies(VideoSource):
         part = slot.with_suffix(".part")
         try:
             with ZipFile(slot, "w") as packed:
-                for name in self.bucket.find(id):
-                    self.bucket.fetch(f"{id}{name}", part)
+                for name in self.bucket.find(id) if is_sidecar(id) else dict(self._parts(id)):
+                    place = posixpath.normpath(id + name) if name in TIMES_ABOVE else id + name
+                    self.bucket.fetch(place, part)
+                    part.chmod(0o600)
+                    os.utime(part, (_ZIP_EPOCH, _ZIP_EPOCH))  # equal objects give equal archives
                     packed.write(part, name)
         finally:
             part.unlink(missing_ok=True)

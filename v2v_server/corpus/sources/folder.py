@@ -21,13 +21,12 @@ from v2v_server.corpus.sources.listfile import (
     UNPRINTABLE,
     ListEntry,
     count_left_out,
-    is_video_name,
     read_list,
 )
 from v2v_server.corpus.sources.sidecar import check_local, is_sidecar, local_state, sidecar_id
 from v2v_server.corpus.sources.source import GONE, NO_STATE, FileState, SourceOptions, VideoSource, answers
-from v2v_server.store.pixels import open_pixels
-from v2v_server.video.fingerprint import unreadable
+from v2v_server.store.pixels import VIDEOS, VideosKind
+from v2v_server.video.fingerprint import files_in, unreadable
 
 PSEUDO_FILE_SYSTEMS = frozenset({
     "binfmt_misc", "bpf", "cgroup", "cgroup2", "configfs", "debugfs", "devpts", "devtmpfs", "efivarfs", "fusectl",
@@ -58,7 +57,11 @@ class Folder(VideoSource):
     def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
         """List the videos, see :meth:`VideoSource.videos` and :func:`video_files`."""
         folders: set[str] = set()
-        found = video_files(self.folder, refused, left_out) if self.listed is None else self._regular_files(refused)
+        found = (
+            video_files(self.folder, refused, left_out, self.kind)
+            if self.listed is None
+            else self._regular_files(refused)
+        )
         for id in found:
             folders.add(id.rpartition("/")[0])
             yield id
@@ -66,15 +69,12 @@ class Folder(VideoSource):
 
     def states(self, ids: Sequence[str]) -> array[int]:
         """Return the states of many files, see :meth:`VideoSource.states`."""
-        root, found = os.path.join(self.name, ""), array("q")
+        found = array("q")
         for id in ids:
             try:
-                status = os.stat(root + id)
+                found.extend(self._state(id))
             except OSError as error:
                 found.extend(GONE if isinstance(error, FileNotFoundError | NotADirectoryError) else NO_STATE)
-            else:
-                is_file = stat.S_ISREG(status.st_mode)
-                found.extend((status.st_size, status.st_mtime_ns, status.st_ctime_ns) if is_file else GONE)
         return found
 
     def state(self, id: str) -> FileState:
@@ -84,10 +84,16 @@ class Folder(VideoSource):
             VideoUnreadable: the file is missing or cannot be read.
         """
         try:
-            status = (self.folder / id).stat()
+            return self._state(id)
         except OSError as error:
             raise unreadable(id, error) from error
-        return status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+    def _state(self, id: str) -> FileState:
+        path = f"{self.name}/{self.file_of(id)}"
+        if path.endswith("/"):
+            return self.state_of_parts(id, [(name, _numbers(status)) for name, status in files_in(path)])
+        size, modified, changed = _numbers(status := os.stat(path))
+        return (size, modified, changed ^ self.mark(id)) if stat.S_ISREG(status.st_mode) else GONE
 
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
         """Lend the file; only a sidecar of one file is checked.
@@ -97,14 +103,14 @@ class Folder(VideoSource):
         """
         if fingerprint and is_sidecar(id) and not id.endswith("/"):
             check_local(self.folder / id, id, fingerprint)
-        return nullcontext(self.folder / id)
+        return nullcontext(self.folder / (id if is_sidecar(id) else self.file_of(id)))
 
     def with_sidecars(self, ids: Sequence[str], endings: Sequence[str]) -> Mapping[str, Sequence[str]]:
         """Return the videos beside which such a name is listed. Each folder is listed once."""
         names = dict[str, frozenset[str] | None]()
         found: dict[str, list[str]] = {ending: [] for ending in endings}
         for id in ids:
-            below = id.rpartition("/")[0]
+            below = id.rstrip("/").rpartition("/")[0]
             if below not in names:
                 names[below] = _names_with(self.folder / below, endings)
             there = names[below]
@@ -131,7 +137,7 @@ class Folder(VideoSource):
         if is_sidecar(id):
             check_local(self.folder / id, id, fingerprint, str(state or ""))
         else:
-            with open_pixels(self.folder / id) as pixels:
+            with self.open_pixels(id, fingerprint) as pixels:
                 pixels.check(fingerprint)
 
     def _regular_files(self, refused: dict[str, str]) -> Iterator[str]:
@@ -147,13 +153,14 @@ class Folder(VideoSource):
                 status = os.stat(os.path.join(self.name, id))
             except OSError:
                 return True
-            return stat.S_ISREG(status.st_mode) and status.st_dev not in pseudo
+            wanted = stat.S_IFDIR if id.endswith("/") else stat.S_IFREG
+            return stat.S_IFMT(status.st_mode) == wanted and status.st_dev not in pseudo
 
         for id, is_regular in answers(may_be_read, [entry.id for entry in self.listed or ()]):
             if is_regular:
                 yield id
             else:
-                refused[id] = "is not a regular file"
+                refused[id] = "is not a regular file" if id[-1] != "/" else "is not a folder"
 
     def _refuse_prepared(self, below: set[str]) -> None:
         """Check that no video comes from a prepared folder, whose rows are cut already.
@@ -179,6 +186,10 @@ class Folder(VideoSource):
                     f"{self.folder / folder} is a prepared folder and cannot be a part of another corpus: serve it "
                     "alone, or move it out"
                 )
+
+
+def _numbers(status: os.stat_result) -> FileState:
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def _names_with(folder: Path, endings: Sequence[str]) -> frozenset[str] | None:
@@ -211,19 +222,25 @@ def locate(name: str, options: SourceOptions) -> tuple[Path, Callable[[], tuple[
     """
     path = Path(name)
     if path.is_dir():
-        return path.resolve(), options.listed
+        root = path.resolve()
+        is_video = options.kind.has_parts and "/" in map(options.kind.form.id_of, os.listdir(root))
+        if options.list_file is None and is_video:
+            return root.parent, lambda: (ListEntry(f"{root.name}/"),)
+        return root, options.listed
     if not path.is_file():
         raise CorpusError(f"{name}: there is no such folder, video or list file on this host")
     if options.list_file is not None:
         raise CorpusError(f"{name}: not a folder; a list file names videos of a folder")
     if path.suffix.lower() in LIST_SUFFIXES:
-        return path.parent.resolve(), partial(read_list, path)
+        return path.parent.resolve(), partial(read_list, path, options.kind)
     if printable(path.name) != path.name:
         raise CorpusError(f"{printable(path.name)}: {UNPRINTABLE}")
     return path.parent.resolve(), lambda: (ListEntry(path.name),)
 
 
-def video_files(root: Path, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
+def video_files(
+    root: Path, refused: dict[str, str], left_out: Counter[str], kind: VideosKind = VIDEOS
+) -> Iterator[str]:
     """Return relative POSIX paths of the video files below ``root``, known by their suffixes.
 
     Links are followed; a link to a folder that it lies in is not. A folder that several links lead to has its videos
@@ -236,8 +253,9 @@ def video_files(root: Path, refused: dict[str, str], left_out: Counter[str]) -> 
         root: the folder.
         refused: receives, by relative path, why a folder or file cannot be taken in.
         left_out: counts, by suffix, files that may be videos of other endings.
+        kind: what a video is; the id of a folder of pictures ends with a slash.
     """
-    walk = _Walk(refused, left_out)
+    walk = _Walk(refused, left_out, kind)
     return chain.from_iterable(walk.below(root, "", frozenset(), 0))
 
 
@@ -245,11 +263,11 @@ class _Walk:
     """One search of a folder for videos.
 
     Args:
-        refused, left_out: as in :func:`video_files`.
+        refused, left_out, kind: as in :func:`video_files`.
     """
 
-    def __init__(self, refused: dict[str, str], left_out: Counter[str]) -> None:
-        self._refused, self._left_out = refused, left_out
+    def __init__(self, refused: dict[str, str], left_out: Counter[str], kind: VideosKind) -> None:
+        self._refused, self._left_out, self._id_of = refused, left_out, kind.form.id_of
         self._pseudo = pseudo_devices()
         self._paths = Counter[tuple[int, int]]()
 
@@ -299,7 +317,7 @@ class _Walk:
                 found = []
                 more = links + entry.is_symlink()
                 yield from self.below(folder / entry.name, f"{relative}/", above | {identity}, more)
-            elif is_video_name(entry.name):
+            elif id := self._id_of(relative):
                 if printable(relative) != relative:
                     refused[printable(relative)] = UNPRINTABLE
                 elif not is_file:
@@ -307,7 +325,7 @@ class _Walk:
                 elif is_pseudo:
                     refused[relative] = PSEUDO
                 else:
-                    found.append(relative)
+                    found.append(id)
             elif is_file:
                 count_left_out(entry.name, self._left_out)
         yield found

@@ -1,8 +1,9 @@
-"""List files like the paper's: one video a line, ``path frames c+ c-``; and which names are videos'.
+"""List files like the paper's: one video a line, ``path frames c+ c- rate``; and which names are not looked at.
 
-The columns after the path may be left out from the right. A single threshold holds for both polarities. Paths may hold
-spaces, since no path ends in a number of its own; ``#`` at the beginning of a line makes it a comment. In a ``.csv``
-file commas separate the columns, and a first line whose first column reads ``path`` is its heading. WebVid's own tables
+The columns after the path may be left out from the right. A single threshold holds for both polarities. The rate is for
+picture sequences without time stamps. Paths may hold spaces, since no path ends in a number of its own; ``#`` at the
+beginning of a line makes it a comment. In a ``.csv`` file commas separate the columns, which may be empty, and a first
+line whose first column reads ``path`` is its heading. WebVid's own tables
 (``videoid,contentUrl,duration,page_dir,name``) name ``page_dir/videoid.mp4``, as its downloaders write them.
 """
 
@@ -19,11 +20,7 @@ from pathlib import Path, PurePosixPath
 
 from v2v_protocol.errors import CorpusError
 from v2v_protocol.programs import printable
-
-VIDEO_SUFFIXES = frozenset({
-    ".3gp", ".avi", ".flv", ".h264", ".h265", ".hevc", ".ivf", ".m2ts", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov",
-    ".mp4", ".mpeg", ".mpg", ".mts", ".mxf", ".obu", ".ogv", ".ts", ".vob", ".webm", ".wmv", ".y4m",
-})  # fmt: skip
+from v2v_server.store.pixels import VIDEOS, VideosKind
 
 _NO_VIDEO_SUFFIXES = frozenset({
     ".7z", ".aac", ".ac3", ".aedat", ".aedat4", ".ass", ".bag", ".bib", ".bin", ".bmp", ".bz2", ".c", ".cfg", ".conf",
@@ -39,13 +36,7 @@ UNPRINTABLE = "its name is not UTF-8 text, or holds control characters; rename i
 LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
 _SUFFIX = re.compile(r"\.(?=.*[a-z]|26[45]$)[a-z0-9]+", re.IGNORECASE)
-_MOST_COLUMNS = 4
-
-
-def is_video_name(name: str) -> bool:
-    """Return whether a file of this name is listed as a video."""
-    _, dot, ending = name.rpartition(".")
-    return bool(dot) and f".{ending.lower()}" in VIDEO_SUFFIXES
+_COLUMNS = "path", "frames", "c+", "c-", "rate"
 
 
 def count_left_out(name: str, left_out: Counter[str]) -> None:
@@ -76,16 +67,21 @@ class ListEntry:
         id: relative POSIX path of the video, normalised ("./a//b.mp4" is "a/b.mp4").
         frames: the frame count the list states, or None.
         threshold_pos, threshold_neg: contrast thresholds the list states, log units, or None.
+        rate: frames per second, or None.
     """
 
     id: str
     frames: int | None = None
     threshold_pos: float | None = None
     threshold_neg: float | None = None
+    rate: float | None = None
 
 
-def read_list(path: str | os.PathLike[str]) -> tuple[ListEntry, ...]:
+def read_list(path: str | os.PathLike[str], kind: VideosKind = VIDEOS) -> tuple[ListEntry, ...]:
     """Read the entries of a list file, in its order.
+
+    Args:
+        kind: what a video is; a path without an ending names a folder if videos have parts.
 
     Raises:
         CorpusError: the file cannot be read, is empty, or a line makes no sense; the message gives the line number.
@@ -96,7 +92,7 @@ def read_list(path: str | os.PathLike[str]) -> tuple[ListEntry, ...]:
         raise CorpusError(f"list {path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise CorpusError(f"list {path} is not UTF-8 text ({error.reason} at byte {error.start})") from error
-    columns = _comma_columns if Path(path).suffix.lower() == ".csv" else _space_columns
+    is_csv, most = Path(path).suffix.lower() == ".csv", len(_COLUMNS) - (not kind.has_parts)
     entries: dict[str, int] = {}
     found: list[ListEntry] = []
     webvid: list[int] = []
@@ -104,13 +100,13 @@ def read_list(path: str | os.PathLike[str]) -> tuple[ListEntry, ...]:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         try:
-            fields = columns(line.strip())
+            fields = _comma_columns(line.strip()) if is_csv else _space_columns(line.strip(), most)
             if not found and fields[0].lower() == "path":
                 continue
             if not found and {"videoid", "page_dir"} <= set(fields):
                 webvid = [fields.index("page_dir"), fields.index("videoid")]
                 continue
-            entry = _webvid_entry(fields, *webvid) if webvid else _entry(fields)
+            entry = _webvid_entry(fields, *webvid) if webvid else _entry(fields, kind, most)
             if entry.id in entries:
                 raise ValueError(f"{entry.id} is listed already in line {entries[entry.id]}")
         except (ValueError, csv.Error) as error:
@@ -126,14 +122,14 @@ def _comma_columns(line: str) -> list[str]:
     return [field.strip() for field in next(csv.reader([line], strict=True))]
 
 
-def _space_columns(line: str) -> list[str]:
-    words = list(_words_from_the_right(line))
+def _space_columns(line: str, most: int) -> list[str]:
+    words = list(_words_from_the_right(line, most))
     return [line[: len(line) - sum(map(len, words))].strip(), *(word.strip() for word in reversed(words))]
 
 
-def _words_from_the_right(line: str) -> Iterator[str]:
+def _words_from_the_right(line: str, most: int) -> Iterator[str]:
     """Yield the numbers that end a line, last first, each with the space in front of it; never the whole line."""
-    for _ in range(_MOST_COLUMNS - 1):
+    for _ in range(most - 1):
         match = re.search(r"\s+(\S+)$", line)
         if match is None or not _NUMBER.fullmatch(match[1]):
             return
@@ -147,19 +143,18 @@ def _webvid_entry(fields: list[str], folder: int, video: int) -> ListEntry:
     return ListEntry(_relative(f"{fields[folder]}/{fields[video]}.mp4"))
 
 
-def _entry(fields: list[str]) -> ListEntry:
-    if len(fields) > _MOST_COLUMNS:
-        raise ValueError(f"{len(fields)} columns; there are at most {_MOST_COLUMNS}: path frames c+ c-")
-    values = [_number(field) for field in fields[1:]]
-    frames = values[0] if values else None
+def _entry(fields: list[str], kind: VideosKind, most: int) -> ListEntry:
+    if len(fields) > most:
+        raise ValueError(f"{len(fields)} columns; there are at most {most}: {' '.join(_COLUMNS[:most])}")
+    fields += [""] * (len(_COLUMNS) - len(fields))
+    frames, positive, negative, rate = (_number(field) if field else None for field in fields[1:])
     if frames is not None and (frames < 1 or frames != int(frames)):
         raise ValueError(f"{fields[1]} frames; give a whole number from 1")
-    thresholds = values[1:] * (2 if len(values) == 2 else 1)
-    for value in thresholds:
-        if value <= 0:
-            raise ValueError(f"contrast threshold {value:g}; give one above 0")
-    positive, negative = thresholds or (None, None)
-    return ListEntry(_relative(fields[0]), None if frames is None else int(frames), positive, negative)
+    for what, value in ("contrast threshold", positive), ("contrast threshold", negative), ("rate", rate):
+        if value is not None and value <= 0:
+            raise ValueError(f"{what} {value:g}; give one above 0")
+    count, negative = None if frames is None else int(frames), positive if negative is None else negative
+    return ListEntry(_relative(fields[0], kind), count, positive, negative, rate)
 
 
 def _number(field: str) -> float:
@@ -168,14 +163,15 @@ def _number(field: str) -> float:
     return float(field)
 
 
-def _relative(text: str) -> str:
+def _relative(text: str, kind: VideosKind = VIDEOS) -> str:
     path = PurePosixPath(text.replace("\\", "/"))
     if path.is_absolute() or re.match(r"[A-Za-z]:/", str(path)):
         raise ValueError(f"{text} is absolute; give paths relative to the folder of the videos")
     if ".." in path.parts:
         raise ValueError(f"{text} leaves the folder of the videos")
-    if not _SUFFIX.fullmatch(path.suffix):
+    is_folder = kind.has_parts and path.suffix.lower() != ".zip"
+    if not (is_folder or _SUFFIX.fullmatch(path.suffix)):
         raise ValueError(f"{text!r} does not name a video file")
     if printable(text) != text:
         raise ValueError(f"{printable(text)} holds control characters")
-    return str(path)
+    return f"{path}/" if is_folder else str(path)

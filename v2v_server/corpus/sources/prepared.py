@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from functools import cached_property
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.corpus.manifest import MANIFEST_NAME, Manifest, read_manifest
+from v2v_server.corpus.manifest import MANIFEST_NAME, Manifest, prepared_name, read_manifest
 from v2v_server.corpus.sources.folder import Folder, locate
 from v2v_server.corpus.sources.source import SourceOptions
 from v2v_server.video.rows import Rows
@@ -29,6 +29,10 @@ class Prepared(Folder):
         """List the videos of the manifest; other files are passed over."""
         listed = None if self.listed is None else [entry.id for entry in self.listed]
         return iter(self.manifest.wanted(listed, refused))
+
+    def file_of(self, id: str) -> str:
+        """Return the path of the prepared file."""
+        return prepared_name(id)
 
     def rows(self, asked: Rows | None) -> Rows:
         """Return which rows of the pictures may be used, see :meth:`Manifest.served_rows`."""

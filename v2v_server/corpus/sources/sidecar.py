@@ -50,7 +50,7 @@ _DIGEST = 16
 
 def sidecar_id(video: str, ending: str) -> str:
     """Return the id of a video's sidecar."""
-    return f"{PurePosixPath(video).with_suffix('')}{ending}"
+    return f"{video.rstrip('/') if video.endswith('/') else PurePosixPath(video).with_suffix('')}{ending}"
 
 
 def is_sidecar(id: str) -> bool:

@@ -27,7 +27,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.sources.listfile import ListEntry, read_list
-from v2v_server.store.pixels import Pixels, open_pixels
+from v2v_server.corpus.sources.sidecar import state_text
+from v2v_server.store.pixels import VIDEOS, Pixels, VideosKind, kind_of, open_pixels
 from v2v_server.video.rows import Rows
 
 Q = TypeVar("Q")
@@ -127,12 +128,14 @@ class SourceOptions:
         copies: folder for copies of videos from object storage; None: a folder where the index lies.
         copies_gib: limit of that folder, GiB.
         cache_dir: see :func:`v2v_server.system.process.cache_folder`.
+        kind: what a video is.
     """
 
     list_file: str | os.PathLike[str] | None = None
     copies: str | os.PathLike[str] | None = None
     copies_gib: float = COPIES_GIB
     cache_dir: str | os.PathLike[str] | None = None
+    kind: VideosKind = VIDEOS
 
     def listed(self) -> tuple[ListEntry, ...] | None:
         """Return the entries of the list; None without one.
@@ -140,7 +143,7 @@ class SourceOptions:
         Raises:
             CorpusError: the list cannot be read, or makes no sense.
         """
-        return None if self.list_file is None else read_list(self.list_file)
+        return None if self.list_file is None else read_list(self.list_file, self.kind)
 
 
 class VideoSource(ABC):
@@ -153,12 +156,16 @@ class VideoSource(ABC):
     Attributes:
         name: names the source for people, and to workers, who open it by this name; equal names share an index.
         is_local: whether the files lie on this host. False: opening one fetches it over the network.
+        kind: what a video is, for listing and probing.
+        rates: rates of videos that a list states, Hz, by id.
     """
 
     is_local = True
+    kind = VIDEOS
 
     def __init__(self, name: str, listed: Callable[[], tuple[ListEntry, ...] | None] = lambda: None) -> None:
         self.name, self._read_list = name, listed
+        self.rates: dict[str, float] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only lists: it may be large."""
@@ -246,8 +253,29 @@ class VideoSource(ABC):
             VideoUnreadable, VideoChanged: see :meth:`open_local`.
             VideoError: the video is damaged.
         """
-        with self.open_local(id, fingerprint) as path, open_pixels(path) as pixels:
+        with self.open_local(id, fingerprint) as path, open_pixels(path, kind_of(id)) as pixels:
             yield pixels
+
+    def rate(self, id: str) -> float:
+        """Return the rate of a video that does not state one, Hz; 0 if it is unknown."""
+        return self.rates.get(id, self.kind.rate)
+
+    def mark(self, id: str) -> int:
+        """Return a number for the state of a video, which changes with the rate that is stated for it."""
+        return 1 + int(1e6 * self.rate(id)) if self.kind.has_parts else 0
+
+    def state_of_parts(self, id: str, files: Sequence[tuple[str, FileState]]) -> FileState:
+        """Return the state of a folder of pictures from those of its files.
+
+        Raises:
+            OSError: it is beyond the limits of :func:`v2v_server.corpus.sources.sidecar.state_text`.
+        """
+        size = sum(state[0] for _, state in files)
+        return (size, int(state_text(files)[:15], 16), self.mark(id)) if files else GONE
+
+    def file_of(self, id: str) -> str:
+        """Return the path of a video's file or folder from :attr:`folder`."""
+        return id
 
     def keep_as(self, id: str, found: str, fingerprint: str) -> None:  # noqa: B027 - a local source has no copies
         """Let the copy that was made for probing be found under the video's full fingerprint.
@@ -329,6 +357,7 @@ def open_source(name: str | os.PathLike[str], options: SourceOptions = SourceOpt
         for kind in SOURCE_KINDS:
             source: VideoSource | None = import_module(f"{__package__}.{kind}").open_source(name, options)
             if source is not None:
+                source.kind = options.kind
                 return source
     except OSError as error:  # a folder that this user may not enter, a share that has gone
         raise CorpusError(f"{name}: cannot be read: {error.strerror or error}") from error
