@@ -15,11 +15,13 @@ from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import MOST_BITS, Signal
 from v2v_server.video.probe import VideoFacts, probe
 
-SUFFIXES = frozenset({
+VIDEO_SUFFIXES = frozenset({
     ".3gp", ".avi", ".flv", ".h264", ".h265", ".hevc", ".ivf", ".m2ts", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov",
     ".mp4", ".mpeg", ".mpg", ".mts", ".mxf", ".obu", ".ogv", ".ts", ".vob", ".webm", ".wmv", ".y4m",
 })  # fmt: skip
-LOOKED_FOR = f"{' '.join(sorted(SUFFIXES))}; with --videos-kind sequences, folders of numbered pictures are videos"
+LOOKED_FOR = (
+    f"{' '.join(sorted(VIDEO_SUFFIXES))}; with --videos-kind sequences, folders of numbered pictures are videos"
+)
 
 
 class VideoFile:
@@ -61,7 +63,7 @@ class VideoFile:
 def id_of(path: str) -> str:
     """Return the id of the video in a file, its path; "" if the file is not named like a video."""
     _, dot, ending = path.rpartition(".")
-    return path if dot and f".{ending.lower()}" in SUFFIXES else ""
+    return path if dot and f".{ending.lower()}" in VIDEO_SUFFIXES else ""
 
 
 def open_pixels(path: str | os.PathLike[str]) -> AbstractContextManager[VideoFile]:
