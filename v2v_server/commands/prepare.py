@@ -23,7 +23,7 @@ from v2v_protocol.write_aside import write_json
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
-from v2v_server.prepare.report import Report
+from v2v_server.prepare.prepare import Report
 from v2v_server.store.packing import DEFAULT_SIZE, SIZES
 from v2v_server.store.planes import OPTIONAL, PLANES
 from v2v_server.system.process import usable_cores
@@ -132,11 +132,6 @@ def summary(report: Report, size: str, seconds: float) -> list[str]:
     ]
     if report.looked_at:
         lines.append(f"{report.looked_at} were prepared earlier; only statistics of their scenes were added")
-    if report.aside:
-        lines.append(
-            f"{report.aside} others that were prepared earlier are set aside: not served, and not prepared again if a "
-            "later run includes them"
-        )
     if prepared:
         before, after = report.source_bytes, report.prepared_bytes
         change = "saves" if after <= before else "costs"

@@ -1,26 +1,31 @@
-"""Bring the index of a corpus up to date: probe what is new or changed, forget what is gone."""
+"""List the files of a corpus, and bring its index up to date: probe what is new or changed, forget what is gone."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import sqlite3
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.index.columns import VideoTable, joined
 from v2v_server.corpus.index.file import SCHEMA_VERSION, FigureKind, Store
 from v2v_server.corpus.index.parts import Shard
 from v2v_server.corpus.probe import Progress, batches, probe_files
 from v2v_server.corpus.scenes.collect import SceneCollection
-from v2v_server.corpus.sources.asking import Notice, by_parts
+from v2v_server.corpus.sources.asking import Notice, by_parts, is_said
+from v2v_server.corpus.sources.names import VIDEO_SUFFIXES, left_out_note
 from v2v_server.corpus.sources.source import GONE, VideoSource
 from v2v_server.system.process import cache_folder, without_collections
+from v2v_server.video.rows import Rows
 
 
 def index_path(
@@ -98,6 +103,7 @@ def _refreshed(
         with without_collections():
             unasked = list[str]()
             table, states = VideoTable.read(joined(ids, store.rows(kind), unasked), len(ids))
+            states[table.codec == "v2v store"] = GONE  # earlier releases named store files by their own bytes
             stale = _changed(source, ids, states, notice)
         del states
         store.forget(_gone(source, unasked, notice))
@@ -141,3 +147,60 @@ def _gone(source: VideoSource, ids: Sequence[str], notice: Notice | None) -> lis
         if notice is not None:
             notice(f"looking for files that are gone from {source}: {done} of {len(ids)} that are not listed")
     return gone
+
+
+@dataclass(frozen=True)
+class Corpus:
+    """A listed source.
+
+    Attributes:
+        source: where the videos come from.
+        rows: which rows of the pictures may be used.
+        ids: of the files that may be videos.
+        refused: files, folders and lines of the list that give no video, by id, with reasons.
+        left_out: reports files of other endings; "" if there are none.
+    """
+
+    source: VideoSource
+    rows: Rows
+    ids: tuple[str, ...]
+    refused: Mapping[str, str]
+    left_out: str = ""
+
+
+def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice | None) -> Corpus:
+    """List the files of a source.
+
+    Args:
+        source: where the videos come from.
+        rows, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
+
+    Raises:
+        CorpusError: the source cannot be listed, makes no sense, or has no video; or its folder of copies cannot be
+            written to.
+    """
+    source.make()
+    rows = source.rows(rows)
+    refused: dict[str, str] = {}
+    left_out = Counter[str]()
+    ids = []
+    for id in source.videos(refused, left_out):
+        ids.append(id)
+        if notice is not None and is_said(len(ids)):
+            notice(f"looking for videos in {source}: {len(ids)} so far")
+    note = left_out_note(left_out)
+    if not ids:
+        raise CorpusError(
+            f"{source}: no video found; looked for {' '.join(sorted(VIDEO_SUFFIXES))}"
+            f"{format_problems(refused)}{note and '. '}{note}"
+        )
+    return Corpus(source, rows, tuple(ids), refused, note)
+
+
+def format_problems(problems: Mapping[str, str]) -> str:
+    """Return the first few reasons, for an error message; "" without one."""
+    if not problems:
+        return ""
+    shown = "; ".join(f"{id}: {problems[id]}" for id in sorted(problems)[:3])
+    more = f"; and {len(problems) - 3} more" if len(problems) > 3 else ""
+    return f" ({shown}{more})"

@@ -8,10 +8,9 @@ from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.corpus import list_corpus
 from v2v_server.corpus.index.parts import Shard, make_folder, merge_parts, parts_in, write_part
 from v2v_server.corpus.probe import Progress
-from v2v_server.corpus.refresh import index_path, refresh_index
+from v2v_server.corpus.refresh import index_path, list_corpus, refresh_index
 from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
@@ -94,7 +93,7 @@ def catalogue_shard(asked: Ahead, shard: Shard, out: Path, progress: Progress | 
     source = _source(asked)
     corpus = list_corpus(source, asked.rows, notice)
     ids = [id for id in corpus.ids if shard.holds(id)]
-    scenes = SceneCollection(corpus.rows, source.manifest) if asked.scene else None
+    scenes = SceneCollection(corpus.rows) if asked.scene else None
     index = index_path(source.name, asked.cache_dir, shard)
     store, table, notes = refresh_index(source, ids, index, scenes, asked.processes, progress, notice)
     store.close()

@@ -26,7 +26,7 @@ import numpy.typing as npt
 import xxhash
 
 from v2v_protocol.errors import ProtocolError, VideoError
-from v2v_server.store.packing import METHODS
+from v2v_server.store.packing import METHODS, UnpackingError
 from v2v_server.video.colour.chroma import DEFAULT_MATRIX
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR, TRANSFERS, Signal
@@ -204,15 +204,23 @@ class BlockRecord:
     checks: list[int]
 
 
-def unpack_record(group: int, data: bytes) -> BlockRecord | None:
-    """Decode the record of a group; None if it is damaged."""
-    if len(data) < 16 or check(data[:-8], group + 1) != struct.unpack("<Q", data[-8:])[0]:
-        return None
-    if struct.unpack("<Q", data[:8])[0] >= 1 << 62:  # longer than any file; offsets are signed
-        return None
+def unpack_record(group: int, data: bytes) -> BlockRecord:
+    """Decode the record of a group.
+
+    Raises:
+        UnpackingError: it is damaged, or a block is larger than any that is written.
+    """
+    start = int.from_bytes(data[:8], "little")
+    is_sound = len(data) >= 16 and check(data[:-8], group + 1) == int.from_bytes(data[-8:], "little")
+    if not is_sound or start >= 1 << 62:  # longer than any file; offsets are signed
+        raise UnpackingError("its record in the table is damaged")
     blocks: npt.NDArray[np.void] = np.frombuffer(data[8:-8], _BLOCK)
-    starts = np.cumsum(np.concatenate([[struct.unpack("<Q", data[:8])[0]], blocks["bytes"].astype(np.int64)]))
-    return BlockRecord(starts.tolist(), blocks["check"].tolist())
+    sizes = blocks["bytes"].astype(np.int64)
+    # Check before a reader allocates: the author of a hostile file also wrote its checksums.
+    if sizes.max(initial=0) > LARGEST_BLOCK_BYTES:
+        number = int(sizes.argmax())
+        raise UnpackingError(f"block {number} has {sizes[number]} bytes, the limit is {LARGEST_BLOCK_BYTES}")
+    return BlockRecord(np.cumsum(np.concatenate([[start], sizes])).tolist(), blocks["check"].tolist())
 
 
 def block_check(block: bytes | memoryview, group: int, number: int) -> int:

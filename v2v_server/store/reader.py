@@ -7,7 +7,6 @@ import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NoReturn
@@ -20,7 +19,6 @@ from v2v_server.store.format import (
     BLOCK_COLUMNS,
     BLOCK_ROWS,
     GROUP_FRAMES,
-    LARGEST_BLOCK_BYTES,
     MAGIC,
     BlockRecord,
     Head,
@@ -38,7 +36,7 @@ from v2v_server.video.luma import MIXED, SDR, Signal
 from v2v_server.video.orientation import Window
 from v2v_server.video.probe import VideoFacts
 
-STORE_FORMAT = "v2v store"
+STORE_FORMAT = "v2v store file"
 """Name of the store file format, which only a prepared folder can serve."""
 _REMEDY = "re-create it with v2v-prepare"
 _ZEROS = np.empty(0, np.uint8)
@@ -131,14 +129,10 @@ class BlockReader:
 
     def _record(self, group: int) -> BlockRecord:
         size = self.head.record_bytes
-        record = unpack_record(group, self._pread(size, self._table + group * size, group))
-        if record is None:
-            self._refuse(group, "its record in the table is damaged")
-        # Check before allocating: the author of a hostile file also wrote its checksums.
-        for number, (start, end) in enumerate(pairwise(record.starts)):
-            if end - start > LARGEST_BLOCK_BYTES:
-                self._refuse(group, f"block {number} has {end - start} bytes, the limit is {LARGEST_BLOCK_BYTES}")
-        return record
+        try:
+            return unpack_record(group, self._pread(size, self._table + group * size, group))
+        except UnpackingError as error:
+            self._refuse(group, str(error))
 
     def _blocks(
         self, group: int, record: BlockRecord, before: int, columns: range, column_bytes: int
@@ -231,6 +225,7 @@ class StoreFile(BlockReader):
             rotation_degrees=0,
             full_range=True,
             index=index,
+            made_of=head.fingerprint,
         )
 
     def check(self, fingerprint: str) -> None:
@@ -253,6 +248,11 @@ class StoreFile(BlockReader):
         is_there = head.first <= first < end <= head.first + head.count
         if not is_there or usable != (head.top, 0, head.rows, head.width_px):
             raise VideoError(self._path, None, f"holds other frames or rows than its name says: {head}"[:200])
+
+    @property
+    def is_whole(self) -> bool:
+        """Return whether the file ends behind its last block."""
+        return self._record(self.head.groups - 1).starts[-1] <= os.fstat(self._file).st_size
 
     def clips(self, request: ClipRequest) -> tuple[DecodedClip, ...]:
         """Read the cuts of a request, see :func:`read_clips`."""

@@ -33,7 +33,6 @@ from v2v_server.video.collect import ClipRequest, Cut, DecodedFrame, DecodedPict
 from v2v_server.video.colour.chroma import Chroma
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.luma import SDR, Signal
-from v2v_server.video.orientation import Window
 from v2v_server.video.packets import is_unreferenced, length_bytes
 from v2v_server.video.source import opened, packets, reason
 
@@ -77,13 +76,6 @@ class _SeekFailed(Exception):
     """Decoding did not begin at the keyframe that the index names."""
 
 
-def decode_luma(
-    path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: Window | None = None
-) -> DecodedClip:
-    """Decode frames start .. start + count - 1 of a video, or a window of them: :func:`decode_cuts` of one cut."""
-    return decode_cuts(path, ClipRequest(index, start, (Cut(count, window),)))[0]
-
-
 def decode_cuts(
     path: str | os.PathLike[str], request: ClipRequest, watch: Watch | None = None
 ) -> tuple[DecodedClip, ...]:
@@ -102,43 +94,14 @@ def decode_cuts(
             picture's size or format changes. Its ``frame`` is the ordinal of the first frame that was not delivered.
     """
     request.check()
-    stack = _filled(os.fspath(path), request, watch)
+    for stack in _passes(path, request, watch):  # noqa: B007 - the last one is complete
+        pass
     return tuple(
         DecodedClip(
             grey, request.seconds(cut), stack.codec, stack.codec in BIT_EXACT_CODECS, signal=stack.signal, chroma=chroma
         )
         for grey, chroma, cut in zip(stack.grey(), stack.chroma(), request.cuts, strict=True)
     )
-
-
-def _filled(path: str, wanted: ClipRequest, watch: Watch | None = None) -> Stack:
-    for frames_of in (_from_keyframe_on, _from_beginning):
-        stack = Stack(path, wanted, watch)
-        try:
-            for _ in _fill(stack, frames_of(stack)):
-                pass
-            return stack
-        except _SeekFailed:
-            continue
-        except VideoError:
-            if frames_of is _from_beginning:
-                raise
-    raise AssertionError("decoding from the beginning has the last word")
-
-
-def stream_luma(
-    path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: Window | None = None
-) -> Iterator[npt.NDArray[np.uint8]]:
-    """Yield the frames of :func:`decode_luma` one by one, in the memory of one.
-
-    Yields:
-        [h, w] uint8, C-contiguous, full-range luma.
-
-    Raises:
-        UsageError, VideoError: see :func:`decode_cuts`.
-    """
-    for picture in stream_pictures(path, ClipRequest(index, start, (Cut(count, window),))):
-        yield picture.grey
 
 
 def stream_pictures(path: str | os.PathLike[str], request: ClipRequest) -> Generator[DecodedPicture, None, None]:
@@ -150,19 +113,10 @@ def stream_pictures(path: str | os.PathLike[str], request: ClipRequest) -> Gener
     def see(frame: DecodedFrame) -> None:
         shown[:] = [frame.picture(request.window(cut), cut.chroma, stack.codec, stack.codec in BIT_EXACT_CODECS)]
 
-    for frames_of in (_from_keyframe_on, _from_beginning):
-        stack = Stack(os.fspath(path), request, lambda: see, collects=False)
-        try:
-            for _ in _fill(stack, frames_of(stack)):
-                if stack.taken > done:
-                    done += 1
-                    yield shown[0]
-            return
-        except _SeekFailed:
-            continue
-        except VideoError:
-            if frames_of is _from_beginning:
-                raise
+    for stack in _passes(path, request, lambda: see, collects=False):
+        if stack.taken > done:
+            done += 1
+            yield shown[0]
 
 
 def decodes_as_listed(path: str, index: FrameIndex, start: int, count: int) -> bool:
@@ -173,13 +127,35 @@ def decodes_as_listed(path: str, index: FrameIndex, start: int, count: int) -> b
     """
     index.position(start, count)
     try:
-        _filled(path, ClipRequest(index, start, (Cut(count, (0, 0, 1, 1)),)))
+        for _ in _passes(path, ClipRequest(index, start, (Cut(count, (0, 0, 1, 1)),))):
+            pass
     except VideoError:
         return False
     return True
 
 
-def _from_keyframe_on(stack: Stack) -> Iterator[VideoFrame]:
+def _passes(
+    path: str | os.PathLike[str], wanted: ClipRequest, watch: Watch | None = None, *, collects: bool = True
+) -> Generator[Stack, None, None]:
+    """Decode from a keyframe, or else from the beginning; yield the stack of the pass after each frame."""
+    for frames_of in (_from_keyframe_on, _from_beginning):
+        stack = Stack(os.fspath(path), wanted, watch, collects=collects)
+        try:
+            with closing(frames_of(stack)) as frames:
+                for frame in frames:
+                    complete = stack.take(frame)
+                    yield stack
+                    if complete:
+                        return
+            stack.refuse("the file ends before it")
+        except _SeekFailed:
+            continue
+        except VideoError:
+            if frames_of is _from_beginning:
+                raise
+
+
+def _from_keyframe_on(stack: Stack) -> Generator[VideoFrame, None, None]:
     """Yield the frames from the last keyframe at or before the range, without unreferenced ones.
 
     Raises:
@@ -209,7 +185,7 @@ def _from_keyframe_on(stack: Stack) -> Iterator[VideoFrame]:
             raise _SeekFailed from error
 
 
-def _from_beginning(stack: Stack) -> Iterator[VideoFrame]:
+def _from_beginning(stack: Stack) -> Generator[VideoFrame, None, None]:
     """Every frame of the file."""
     with opened(stack.path) as (container, stream):
         stack.codec = stream.codec_context.codec.canonical_name
@@ -223,17 +199,6 @@ def _from_beginning(stack: Stack) -> Iterator[VideoFrame]:
                 continue  # a file may begin in the middle of a group of frames
             begun |= any(not frame.is_corrupt for frame in frames)
             yield from frames
-
-
-def _fill(stack: Stack, frames: Iterator[VideoFrame]) -> Iterator[None]:
-    """Pass frame after frame to a stack until it is complete, and yield after each."""
-    with closing(frames):  # type: ignore[type-var]  # a generator
-        for frame in frames:
-            complete = stack.take(frame)
-            yield
-            if complete:
-                return
-    stack.refuse("the file ends before it")
 
 
 def _decoded(stream: VideoStream, source: Iterator[Packet[VideoStream]]) -> Iterator[VideoFrame]:

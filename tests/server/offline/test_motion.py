@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from tests.clips import panned_luma, write_clip
+from tests.oracles.decoded import stream_luma
 from v2v_pictures.camera import Camera
 from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
@@ -21,7 +22,6 @@ from v2v_server.offline import motion
 from v2v_server.offline.motion import WholePictures, moving_seeds, noise_rate, quiet_voxels
 from v2v_server.offline.remake import Remaker
 from v2v_server.simulation import simulate
-from v2v_server.video.decode import stream_luma
 from v2v_server.video.rows import Rows
 
 RECIPE = {"voxels_per_clip": 3, "bins": 2, "crop_height_px": 48, "crop_width_px": 48, "frame_stride": 2}

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from tests.bench.small import FLAGS, clips, records
 from tests.clips import panned_luma, write_clip
+from tests.oracles.decoded import decode_luma
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
@@ -28,7 +29,6 @@ from v2v_server.tradeoff.forms import BESIDE, SOURCE, STORES
 from v2v_server.tradeoff.front import best, dominates, dominators
 from v2v_server.tradeoff.settings import ServeSetting, axes, full_model, settings
 from v2v_server.tradeoff.speed import Speed, TimedWork, leases_of, measure
-from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
 
 

@@ -3,8 +3,7 @@
 scene       the statistics of one video, and its pieces
 analysis    measuring them in one pass
 steps       repeated frames and their pattern
-stretches   still, black and white stretches, fades, combing
-bars        bars at the sides of the picture
+stretches   still, black and white stretches, fades, combing, bars
 findings    all of it, said for people
 pieces      the pieces of all videos
 collect     the statistics of all videos of a corpus

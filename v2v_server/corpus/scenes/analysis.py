@@ -32,7 +32,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.corpus.scenes.bars import bars_of
 from v2v_server.corpus.scenes.scene import (
     CHANGE,
     CLIPPED,
@@ -50,7 +49,7 @@ from v2v_server.corpus.scenes.scene import (
     Sides,
 )
 from v2v_server.corpus.scenes.steps import change_of, duplicated, is_cut
-from v2v_server.corpus.scenes.stretches import is_flat, is_still, pieces_of
+from v2v_server.corpus.scenes.stretches import bars_of, is_flat, is_still, pieces_of
 from v2v_server.flow.methods import ULTRAFAST, Picture, dis, one_thread
 
 DARK_BELOW_LEVEL = 16
