@@ -16,8 +16,7 @@ from v2v_protocol.errors import VideoError
 from v2v_protocol.recipe import preset
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.scenes.pieces import encoded_pieces
-from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.corpus.scenes.scene import Scene, encoded_pieces
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.offline.motion import quiet_voxels
 from v2v_server.offline.remake import Remaker

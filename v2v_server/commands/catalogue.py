@@ -15,7 +15,7 @@ from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress, format_duration
 from v2v_protocol.spec import SCENES
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.index.parts import Shard
+from v2v_server.corpus.index.file import Shard
 from v2v_server.corpus.sources.source import COPIES_GIB
 from v2v_server.offline.ahead import Ahead, Part, catalogue_ahead, catalogue_shard
 from v2v_server.system.process import usable_cores

@@ -165,13 +165,15 @@ class Catalogue:
             return unseekable(frames, (1, 1), height_px, width_px).to_bytes()
         return self._stored(id, partial(self._store.frame_index, id))
 
-    def _stored(self, id: str, read: Callable[[str], bytes | None]) -> bytes:
-        """Return what the index has for the fingerprint of the file that was catalogued."""
+    def _read(self, id: str, read: Callable[[str], bytes | None]) -> bytes | None:
+        """Return what the index has for the fingerprint of the file that was catalogued; None: nothing."""
         try:
-            data = read(self._fingerprint(id))
+            return read(self._fingerprint(id))
         except sqlite3.Error as error:
             raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
-        if data is None:
+
+    def _stored(self, id: str, read: Callable[[str], bytes | None]) -> bytes:
+        if (data := self._read(id, read)) is None:
             reason = "has changed since this catalogue was opened; start again to serve it as it is now"
             raise VideoChanged(id, None, reason)
         return data
@@ -197,10 +199,7 @@ class Catalogue:
         Raises:
             CorpusError, IndexUnreadable: see :meth:`frame_index`.
         """
-        try:
-            data = self._store.figures(id, self._fingerprint(id), sidecar_kind(ending))
-        except sqlite3.Error as error:
-            raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
+        data = self._read(id, partial(self._store.figures, id, kind=sidecar_kind(ending)))
         return files_for_lease(data, fingerprint, start, count)
 
     @property

@@ -14,10 +14,10 @@ import json
 import math
 import os
 from base64 import b64decode
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import MISSING, asdict, dataclass, fields, replace
 from pathlib import Path, PurePosixPath
-from types import TracebackType
 from typing import Any, TypeVar
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
@@ -108,49 +108,6 @@ class Manifest:
     root: Path
     header: Header
     videos: dict[str, PreparedVideo]
-
-    def served_rows(self, rows: Rows | None) -> Rows:
-        """Return the rows that a corpus of this folder may use.
-
-        A folder that stores all rows may be served with any rows, another one only with its stored rows.
-
-        Args:
-            rows: the requested rows.
-
-        Raises:
-            CorpusError: the folder is not finished, or lacks requested rows.
-        """
-        if len(self.videos) != self.header.videos:
-            raise CorpusError(
-                f"{self.root}: {len(self.videos)} of {self.header.videos} videos are prepared; run v2v-prepare again "
-                "to finish (what is done is kept)"
-            )
-        asked = None if rows is None or str(rows) == "full" else rows
-        kept = Rows.parse(self.header.rows)
-        if asked is not None and kept == Rows():
-            return asked
-        if asked is not None and asked != kept:
-            raise CorpusError(
-                f"{self.root}: rows {rows} asked for, but this prepared folder holds rows {self.header.rows} of its "
-                "source only; leave --rows out, or serve the source"
-            )
-        return kept
-
-    def wanted(self, listed: Iterable[str] | None, refused: dict[str, str]) -> tuple[str, ...]:
-        """Return the ids that a corpus of this folder has, without files that the manifest does not know.
-
-        Args:
-            listed: the ids that a list file names; None takes all.
-            refused: receives, by id, why one cannot be taken in.
-        """
-        wanted = sorted(self.videos) if listed is None else list(listed)
-        for id in wanted:
-            if id not in self.videos:
-                refused[id] = (
-                    "is not in the prepared folder's manifest: the source had no such usable video, or the last "
-                    "v2v-prepare was not asked for it; run it once for all of them"
-                )
-        return tuple(id for id in wanted if id not in refused)
 
     def as_source(self, record: IndexRow) -> IndexRow:
         """Return the record of a prepared file with the facts that have to agree with its source.
@@ -290,8 +247,11 @@ _FIELD_CHECKS: dict[str, Callable[[object], bool]] = {
 }
 
 
-class ManifestWriter:
-    """Write a manifest: the known records in one piece, then one line at a time.
+@contextmanager
+def write_manifest(
+    root: Path, header: Header, videos: Iterable[PreparedVideo]
+) -> Iterator[Callable[[PreparedVideo], None]]:
+    """Write a manifest: the known records in one piece; yield what appends one more, and waits until it is on disk.
 
     Args:
         root: the prepared folder.
@@ -301,28 +261,19 @@ class ManifestWriter:
     Raises:
         OSError: the folder cannot be written to.
     """
+    path = root / MANIFEST_NAME
+    aside = path.with_name(f".{MANIFEST_NAME}.new")  # one name, so that killed runs leave one file at most
+    with write_aside_and_rename(path, partial=aside, durable=True) as fresh, fresh.open("wb") as file:
+        file.write(_line(header))
+        file.writelines(map(_line, videos))
+    with path.open("ab") as file:
 
-    def __init__(self, root: Path, header: Header, videos: Iterable[PreparedVideo]) -> None:
-        path = root / MANIFEST_NAME
-        aside_path = path.with_name(f".{MANIFEST_NAME}.new")  # one name, so that killed runs leave one file at most
-        with write_aside_and_rename(path, partial=aside_path, durable=True) as fresh, fresh.open("wb") as file:
-            file.write(_line(header))
-            file.writelines(map(_line, videos))
-        self._file = path.open("ab")
+        def add(video: PreparedVideo) -> None:
+            file.write(_line(video))
+            file.flush()
+            os.fsync(file.fileno())
 
-    def add(self, video: PreparedVideo) -> None:
-        """Append one record, and make sure that it stays."""
-        self._file.write(_line(video))
-        self._file.flush()
-        os.fsync(self._file.fileno())
-
-    def __enter__(self) -> ManifestWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._file.close()
+        yield add
 
 
 def _line(item: Header | PreparedVideo) -> bytes:

@@ -17,8 +17,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.index.columns import VideoTable, joined
-from v2v_server.corpus.index.file import SCHEMA_VERSION, FigureKind, Store
-from v2v_server.corpus.index.parts import Shard
+from v2v_server.corpus.index.file import SCHEMA_VERSION, FigureKind, Shard, Store
 from v2v_server.corpus.probe import Progress, batches, probe_files
 from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.sources.asking import Notice, by_parts, is_said

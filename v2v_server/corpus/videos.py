@@ -12,7 +12,7 @@ from typing import overload
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_server.corpus.index.columns import CHUNK, NO_STRINGS, VideoTable
-from v2v_server.corpus.scenes.pieces import SplitVideos
+from v2v_server.corpus.scenes.scene import SplitVideos
 from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.planes import PLANES
@@ -35,7 +35,7 @@ class VideoEntry:
         frames_per_second: average rate; NaN where unknown.
         codec: FFmpeg's name of the format.
         threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
-        pieces: its pieces, see :func:`v2v_server.corpus.scenes.pieces.encoded_pieces`; None where the catalogue was
+        pieces: its pieces, see :func:`v2v_server.corpus.scenes.scene.encoded_pieces`; None where the catalogue was
             opened without ``scene``.
         remark: what of it is not served, or served with wrong grey levels (:class:`v2v_server.video.probe.VideoFacts`).
     """

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.index.parts import Shard, make_folder, merge_parts, parts_in, write_part
+from v2v_server.corpus.index.file import Shard, make_folder, merge_parts, parts_in, write_part
 from v2v_server.corpus.probe import Progress
 from v2v_server.corpus.refresh import index_path, list_corpus, refresh_index
 from v2v_server.corpus.scenes.collect import SceneCollection

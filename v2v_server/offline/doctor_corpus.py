@@ -25,8 +25,8 @@ from v2v_server.offline.doctor_motion import look_at_motion
 from v2v_server.offline.doctor_pictures import look_at_pictures, name_all
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.video.container import clean_aperture
 from v2v_server.video.rows import Rows
+from v2v_server.video.source import clean_aperture
 
 Line = tuple[str, str, str, str]
 """(level, about, text, change)"""

@@ -33,6 +33,7 @@ from v2v_server.offline.motion import WholePictures, describe_loss, moving_seeds
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.simulation.intensity import tone_table
+from v2v_server.store.pixels import signal_of
 from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.luma import SDR
 from v2v_server.video.probe import DOLBY_VISION
@@ -214,7 +215,7 @@ def _signal_note(catalogue: Catalogue, provenance: Provenance, recipe: Recipe) -
     """Return what the video states about its levels, and whether the recipe uses it; "" for 8 bits of SDR."""
     id = provenance.video
     with catalogue.source.open_pixels(id, provenance.fingerprint) as pixels:
-        signal = pixels.signal(catalogue.frame_index(id))
+        signal = signal_of(pixels, catalogue.frame_index(id))
     if DOLBY_VISION in provenance.remark:
         return ""  # the stated transfer does not hold for IPT-PQ
     if signal == SDR or recipe.light == "declared":

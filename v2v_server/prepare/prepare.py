@@ -28,7 +28,7 @@ from pathlib import Path
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_protocol.refusal import Refusal
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.manifest import MANIFEST_NAME, Header, ManifestWriter, PreparedVideo, read_manifest
+from v2v_server.corpus.manifest import MANIFEST_NAME, Header, PreparedVideo, read_manifest, write_manifest
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX, Made, Transcoding, transcode
@@ -170,7 +170,7 @@ def prepare(
                         jobs.append(Transcoding(video, catalogue.path(video.id), size, target, stands, looks, wanted))
                     tell(done, total, 0, 0)
             room = _Room(target, catalogue, [job.video for job in jobs])
-            with ManifestWriter(target, header, records.values()) as manifest:
+            with write_manifest(target, header, records.values()) as add:
                 for job, made in _outcomes(catalogue, jobs, target, processes):
                     video, before = job.video, records.get(job.video.id)
                     if isinstance(made, Made):
@@ -182,7 +182,7 @@ def prepare(
                     else:
                         record = _record(video, problem=made)
                     records[video.id] = record
-                    manifest.add(record)
+                    add(record)
                     done += video.frames
                     room.done(video, made.bytes if isinstance(made, Made) and not job.stands else 0)
                     tell(done, total, room.made, room.expected)

@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.scenes.pieces import SplitVideos
-from v2v_server.corpus.scenes.scene import Flag, Pieces, Sides, sides_of
+from v2v_server.corpus.scenes.scene import Flag, Pieces, Sides, SplitVideos, sides_of
 
 _SKIPPED = {
     "fades": Flag.FADE,

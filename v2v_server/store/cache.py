@@ -29,7 +29,7 @@ from v2v_server.store.packing import QUICK, RAW, Packing
 from v2v_server.store.pixels import Pixels
 from v2v_server.store.planes import OPTIONAL, PLANES, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
-from v2v_server.store.reader import StoreFile, has_planes, read_clips
+from v2v_server.store.reader import StoreFile, read_clips
 from v2v_server.store.writer import write_store
 from v2v_server.system.private import make_private
 from v2v_server.system.status_fields import GIB
@@ -114,11 +114,12 @@ class Cache:
             for number in range(start // size, last // size + 1)
         ]
         planes = [name for name in OPTIONAL if PLANES[name].is_worth_storing(request)]
-        lacking = [piece for piece in pieces if not has_planes(piece.path, planes)]
+        held = {piece: _planes_in(piece.path) for piece in pieces} if planes else {}
+        lacking = {piece: names for piece, names in held.items() if not names.issuperset(planes)}
         needed = [name for name in planes if PLANES[name].remedy]
-        is_readable = all(has_planes(piece.path, needed) for piece in lacking)
+        is_readable = all(names.issuperset(needed) for names in lacking.values())
         # Keep what other streams stored; otherwise two streams would replace each other's pieces.
-        kept = [name for name in OPTIONAL if any(has_planes(piece.path, (name,)) for piece in lacking)]
+        kept = [name for name in OPTIONAL if any(name in names for names in lacking.values())]
         made = self._read(pieces, fingerprint, request) if is_readable else None
         if made is not None and not lacking:
             return made
@@ -134,7 +135,7 @@ class Cache:
                 break
             except VideoError:
                 break  # the damage may lie beyond the frames that this sample needs
-            made, lacking = made or self._read(pieces, fingerprint, request), []
+            made, lacking = made or self._read(pieces, fingerprint, request), {}
             if made is not None:
                 return tuple(replace(clip, origin="") for clip in made)
         return made
@@ -250,7 +251,7 @@ class Cached:
 
     def __init__(self, pixels: Pixels, cache: Cache, video: str, fingerprint: str) -> None:
         self._pixels, self._cache, self._name = pixels, cache, (video, fingerprint)
-        self.facts, self.pictures, self.signal = pixels.facts, pixels.pictures, pixels.signal
+        self.facts, self.pictures = pixels.facts, pixels.pictures
 
     def check(self, fingerprint: str) -> None:
         """Do nothing: a piece states what it was made from, and the video is checked before it is decoded."""
@@ -271,6 +272,15 @@ class _Piece:
     path: Path
     first: int
     end: int
+
+
+def _planes_in(path: Path) -> frozenset[str]:
+    """Return the planes of a piece; all of one that cannot be read, since whatever reads it says why."""
+    try:
+        with StoreFile(path) as stored:
+            return stored.planes
+    except VideoError:
+        return frozenset(PLANES)
 
 
 def make_cache(folder: Path) -> None:

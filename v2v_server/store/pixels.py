@@ -12,10 +12,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Protocol
 
-from v2v_server.video.collect import ClipRequest, DecodedPicture
+from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import Signal
+from v2v_server.video.luma import MOST_BITS, Signal
 from v2v_server.video.probe import VideoFacts
 
 KINDS = ("reader", "video_file")
@@ -48,8 +48,11 @@ class Pixels(Protocol):
     def pictures(self, request: ClipRequest) -> Iterator[DecodedPicture]:
         """Yield the pictures of the only cut of a request, in the memory of a few."""
 
-    def signal(self, index: FrameIndex) -> Signal:
-        """Return what the levels mean, by the first frame."""
+
+def signal_of(pixels: Pixels, index: FrameIndex) -> Signal:
+    """Return what the levels of a video mean, by its first frame."""
+    request = ClipRequest(index, index.first, (Cut(1, (0, 0, 1, 1)),), most_bits=MOST_BITS)
+    return pixels.clips(request)[0].signal
 
 
 @contextmanager

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -174,7 +175,7 @@ class BlockReader:
         )
 
 
-class StoreFile(BlockReader):
+class StoreFile(BlockReader, AbstractContextManager["StoreFile"]):
     """An open store file: :class:`v2v_server.store.pixels.Pixels` of the video that it was made from.
 
     Args:
@@ -266,13 +267,6 @@ class StoreFile(BlockReader):
             self.read(request.start + done * request.stride, request.stride, request.window(cut), grey)
             for picture in grey:
                 yield DecodedPicture(picture, picture, SDR, self.head.codec, self.head.bit_exact)
-
-    def signal(self, index: FrameIndex) -> Signal:
-        """Return what the levels of the source mean."""
-        return self.head.signal
-
-    def __enter__(self) -> StoreFile:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -392,14 +386,3 @@ def is_store_file(path: str | os.PathLike[str]) -> bool:
             return file.read(len(MAGIC)) == MAGIC
     except OSError:
         return False
-
-
-def has_planes(path: Path, planes: Collection[str]) -> bool:
-    """Return whether a store file has planes; True if it cannot be read, since whatever reads it says why."""
-    if not planes:
-        return True
-    try:
-        with StoreFile(path) as stored:
-            return stored.planes.issuperset(planes)
-    except VideoError:
-        return True

@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from itertools import chain, islice
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -104,7 +104,7 @@ class _BlockWriter:
         self._file.flush()
 
 
-class StoreWriter:
+class StoreWriter(AbstractContextManager["StoreWriter"]):
     """Write the frames that a head announces. The file is a store file once it is closed without an error.
 
     Memory: one group of frames, twice (see :func:`v2v_server.store.format.group_frames_for`), and the compressed blocks
@@ -175,9 +175,6 @@ class StoreWriter:
             places[name] = PlanePlace(PLANES[name].version, self._file.tell(), writer.end)
             shutil.copyfileobj(file, self._file)
         self._file.write(pack_footer(places))
-
-    def __enter__(self) -> StoreWriter:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -1,7 +1,6 @@
 """One video file: from its bytes to luma.
 
-source       opening it, for sequential reading
-container    what its container states beyond that
+source       opening it, for sequential reading, and what its container states beyond that
 probe        what it holds, and which frames decode
 packets      what a packet says without being decoded
 frame_index  which frames it has, and where decoding may begin

@@ -29,16 +29,12 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError
-from v2v_server.video.collect import ClipRequest, Cut, DecodedFrame, DecodedPicture, Stack, Watch
+from v2v_server.video.collect import BIT_EXACT_CODECS, ClipRequest, Cut, DecodedFrame, DecodedPicture, Stack, Watch
 from v2v_server.video.colour.chroma import Chroma
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.packets import is_unreferenced, length_bytes
 from v2v_server.video.source import opened, packets, reason
-
-BIT_EXACT_CODECS = frozenset({"h264", "hevc", "vp8", "vp9", "av1", "ffv1", "huffyuv", "ffvhuff", "png", "utvideo"})
-"""Codecs whose standard fixes every bit of the decoded picture, or that are lossless, so that all hosts agree. Not so
-MPEG-1, 2, 4 and MJPEG: their standards leave the precision of the inverse transform open."""
 
 _VERSIONED_CODECS = frozenset({"h264", "mpeg4"})
 
@@ -111,7 +107,7 @@ def stream_pictures(path: str | os.PathLike[str], request: ClipRequest) -> Gener
     shown: list[DecodedPicture] = []
 
     def see(frame: DecodedFrame) -> None:
-        shown[:] = [frame.picture(request.window(cut), cut.chroma, stack.codec, stack.codec in BIT_EXACT_CODECS)]
+        shown[:] = [frame.picture(request.window(cut), cut.chroma)]
 
     for stack in _passes(path, request, lambda: see, collects=False):
         if stack.taken > done:

@@ -24,13 +24,21 @@ from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError
 from v2v_server.video.colour.chroma import SMPTE_240M, stated_matrix
-from v2v_server.video.container import count_transport_pictures, describe_cut, dolby_vision_profile
 from v2v_server.video.decode import decodes_as_listed
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_SIDE_PX, NO_TIMESTAMP, FrameIndex, unseekable
 from v2v_server.video.luma import LumaFormat
 from v2v_server.video.orientation import Orientation
 from v2v_server.video.packets import Fields, PacketSigns, is_hidden, steps_and_gaps, times_are_doubtful
-from v2v_server.video.source import moving_tracks, opened, packets, reason, time_base
+from v2v_server.video.source import (
+    count_transport_pictures,
+    describe_cut,
+    dolby_vision_profile,
+    moving_tracks,
+    opened,
+    packets,
+    reason,
+    time_base,
+)
 
 LONGEST_CPU_SECONDS = 1200.0
 """Processor time that listing the frames of a file may take: of the longest films it is seconds, and some minutes where

@@ -14,8 +14,7 @@ from v2v_protocol.errors import CorpusError, UsageError, V2VError
 from v2v_protocol.messages import Hello
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.session import MOST_BATCH_SIZE, Admission
-from v2v_server.corpus.scenes.pieces import encoded_pieces
-from v2v_server.corpus.scenes.scene import Flag
+from v2v_server.corpus.scenes.scene import Flag, encoded_pieces
 from v2v_server.corpus.videos import CorpusFacts
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.schedule import sequences

@@ -21,8 +21,7 @@ from tests.waiting import until
 from v2v_protocol.errors import UsageError
 from v2v_server.commands import catalogue
 from v2v_server.commands.catalogue import main
-from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Store
-from v2v_server.corpus.index.parts import Shard
+from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Shard, Store
 from v2v_server.corpus.refresh import index_path
 from v2v_server.offline.ahead import Ahead
 

@@ -15,8 +15,7 @@ from tests.pieces import pieces, shots
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import DEFECTS, StreamSpec
-from v2v_server.corpus.scenes.pieces import SplitVideos, encoded_pieces
-from v2v_server.corpus.scenes.scene import NO_BARS, Flag, Pieces, Sides
+from v2v_server.corpus.scenes.scene import NO_BARS, Flag, Pieces, Sides, SplitVideos, encoded_pieces
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.schedule.runs import Cleaning, Runs
 from v2v_server.schedule.sequences import SequenceTable

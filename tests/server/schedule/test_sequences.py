@@ -20,8 +20,7 @@ from tests.pieces import pieces
 from tests.server.named_corpus import SMALL, SMALL_SPEC, video
 from v2v_protocol.recipe import MOST_STEPS_PER_GRID, Recipe, preset
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.scenes.pieces import encoded_pieces
-from v2v_server.corpus.scenes.scene import Flag
+from v2v_server.corpus.scenes.scene import Flag, encoded_pieces
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.schedule import sequences
 from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule

@@ -16,8 +16,8 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.offline.remake import Remaker
-from v2v_server.video.container import describe_cut, dolby_vision_profile
 from v2v_server.video.probe import probe
+from v2v_server.video.source import describe_cut, dolby_vision_profile
 
 CODECS = {
     "huffyuv.avi": ("huffyuv", "yuv422p"),

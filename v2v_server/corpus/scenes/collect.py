@@ -22,8 +22,7 @@ from v2v_server.corpus.index.columns import VideoTable, joined
 from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.manifest import Manifest
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES, LONGEST_SECONDS, Progress, batches
-from v2v_server.corpus.scenes.pieces import SplitVideos, encoded_pieces
-from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_FRAMES, PIECE, Scene
+from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_FRAMES, PIECE, Scene, SplitVideos, encoded_pieces
 from v2v_server.corpus.sources.asking import Notice
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.system.compile_cache import compile_cache

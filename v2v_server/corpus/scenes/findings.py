@@ -15,7 +15,7 @@ from v2v_server.corpus.scenes.scene import (
     firsts_of,
     sides_of,
 )
-from v2v_server.corpus.scenes.steps import Spans, pattern_of, runs_of
+from v2v_server.corpus.scenes.stretches import Spans, pattern_of, runs_of
 
 DUPLICATES, CUTS, FADES, BARS, STILL, BLACK, WHITE, COMBED, NOISY = KINDS = (
     "duplicates", "cuts", "fades", "bars", "still", "black", "white", "combed", "noise",

@@ -18,8 +18,7 @@ from v2v_server.corpus import videos as videos_module
 from v2v_server.corpus.index import columns
 from v2v_server.corpus.index.columns import StringColumn, VideoTable, joined
 from v2v_server.corpus.index.file import IndexRow
-from v2v_server.corpus.scenes.pieces import SplitVideos
-from v2v_server.corpus.scenes.scene import Flag
+from v2v_server.corpus.scenes.scene import Flag, SplitVideos
 from v2v_server.corpus.videos import NO_THRESHOLDS, Thresholds, Videos
 from v2v_server.video.rows import Rows
 

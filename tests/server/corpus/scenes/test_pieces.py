@@ -7,8 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.pieces import pieces
-from v2v_server.corpus.scenes.pieces import SplitVideos, encoded_pieces
-from v2v_server.corpus.scenes.scene import NO_BARS, Flag, Pieces, Sides, clip_pieces, firsts_of
+from v2v_server.corpus.scenes.scene import (
+    NO_BARS,
+    Flag,
+    Pieces,
+    Sides,
+    SplitVideos,
+    clip_pieces,
+    encoded_pieces,
+    firsts_of,
+)
 
 TELLING = Flag.CUT | Flag.REPEAT | Flag.FADE | Flag.COMBED
 SIDES = st.sampled_from([NO_BARS, Sides(2, 4, 0, 0)])

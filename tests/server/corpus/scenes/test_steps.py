@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v2v_server.corpus.scenes.steps import duplicated, pattern_of, runs_of
+from v2v_server.corpus.scenes.stretches import duplicated, pattern_of, runs_of
 
 BLOCKS = 100
 MOVING = 64**2 * BLOCKS
