@@ -133,7 +133,7 @@ def summary(report: Report, size: str, seconds: float) -> list[str]:
     if report.looked_at:
         lines.append(f"{report.looked_at} were prepared earlier; only statistics of their scenes were added")
     if prepared:
-        before, after = report.source_bytes, report.prepared_bytes
+        before, after = sum(video.source_bytes for video in prepared), sum(video.bytes for video in prepared)
         change = "saves" if after <= before else "costs"
         lines.append(
             f"{before / 1e6:.1f} MB -> {after / 1e6:.1f} MB ({after / before:.2f} of the size): "

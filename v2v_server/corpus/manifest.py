@@ -100,12 +100,10 @@ class Manifest:
     """A manifest as read.
 
     Attributes:
-        root: the prepared folder.
         header: see :class:`Header`.
         videos: by id.
     """
 
-    root: Path
     header: Header
     videos: dict[str, PreparedVideo]
 
@@ -157,7 +155,7 @@ def read_manifest(root: Path) -> Manifest:
         except (ValueError, TypeError, UsageError) as error:
             remedy = "" if NO_LOSSY in str(error) else "; prepare another folder"
             raise CorpusError(f"{path}, line {number}: {error}{remedy}") from error
-    return Manifest(root, header, videos)
+    return Manifest(header, videos)
 
 
 def _header(line: bytes) -> Header:

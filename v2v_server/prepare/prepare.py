@@ -87,16 +87,6 @@ class Report:
         return tuple(video for video in self.videos if video.problem is not None)
 
     @property
-    def source_bytes(self) -> int:
-        """Size of the sources that were prepared, bytes."""
-        return sum(video.source_bytes for video in self.prepared)
-
-    @property
-    def prepared_bytes(self) -> int:
-        """Size of the prepared files, bytes."""
-        return sum(video.bytes for video in self.prepared)
-
-    @property
     def complete(self) -> bool:
         """Return whether every video file was prepared, with everything requested."""
         return not (self.failed or self.unusable or self.not_looked_at)

@@ -120,7 +120,6 @@ def test_the_manifest(source: Path, prepared: tuple[Path, Report]) -> None:
             (source / video.id).stat().st_size,
             (target / video.id).stat().st_size,
         )
-    assert report.prepared_bytes == sum(video.bytes for video in report.prepared)
 
 
 def test_a_corrupt_source_is_listed_and_the_others_go_on(prepared: tuple[Path, Report]) -> None:
