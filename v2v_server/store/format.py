@@ -223,11 +223,8 @@ def unpack_record(group: int, data: bytes) -> BlockRecord:
     return BlockRecord(np.cumsum(np.concatenate([[start], sizes])).tolist(), blocks["check"].tolist())
 
 
-def block_check(block: bytes | memoryview, group: int, number: int) -> int:
-    """Return the hash of a block at its position."""
-    return check(block, group << 32 | number)
-
-
 def check(data: bytes | memoryview, place: int) -> int:
-    """Return the hash of data at a place."""
+    """Return the hash of data at a place: 0 for the head, ``group + 1`` for a record, ``group << 32 | number`` for a
+    block.
+    """
     return xxhash.xxh3_64_intdigest(data, place)

@@ -19,11 +19,10 @@ from v2v_protocol.errors import ProtocolError, UsageError, VideoChanged, VideoEr
 from v2v_server.store.format import (
     BLOCK_COLUMNS,
     BLOCK_ROWS,
-    GROUP_FRAMES,
     MAGIC,
     BlockRecord,
     Head,
-    block_check,
+    check,
     read_head,
     unpack_record,
 )
@@ -149,7 +148,7 @@ class BlockReader:
         for column in columns:
             number = before + column
             packed = data[record.starts[number] - start : record.starts[number + 1] - start]
-            if block_check(packed, group, number) != record.checks[number]:
+            if check(packed, group << 32 | number) != record.checks[number]:
                 self._refuse(group, f"block {number} is damaged or truncated")
             if self._is_sparse and not packed:
                 yield _ZEROS
@@ -262,8 +261,8 @@ class StoreFile(BlockReader, AbstractContextManager["StoreFile"]):
     def pictures(self, request: ClipRequest) -> Iterator[DecodedPicture]:
         """Yield the frames of the only cut of a request in 8 bits, in the memory of a few."""
         (cut,) = request.cuts
-        for done in range(0, cut.count, GROUP_FRAMES):
-            grey = np.empty((min(GROUP_FRAMES, cut.count - done), *request.window(cut)[2:]), np.uint8)
+        for done in range(0, cut.count, self.head.group):
+            grey = np.empty((min(self.head.group, cut.count - done), *request.window(cut)[2:]), np.uint8)
             self.read(request.start + done * request.stride, request.stride, request.window(cut), grey)
             for picture in grey:
                 yield DecodedPicture(picture, picture, SDR, self.head.codec, self.head.bit_exact)

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.store.format import BLOCK_COLUMNS, BLOCK_ROWS, Head, block_check, group_frames_for, pack_record
+from v2v_server.store.format import BLOCK_COLUMNS, BLOCK_ROWS, Head, check, group_frames_for, pack_record
 from v2v_server.store.packing import Packing
 from v2v_server.store.planes import PLANES
 from v2v_server.store.planes.plane import PlanePlace, pack_footer
@@ -79,7 +79,7 @@ class _BlockWriter:
                 block = view[left * column : (left + BLOCK_COLUMNS) * column]
                 is_empty = self._is_sparse and not np.frombuffer(block, np.uint8).any()
                 blocks.append(b"" if is_empty else self._pack(block))
-        checks = [block_check(block, group, number) for number, block in enumerate(blocks)]
+        checks = [check(block, group << 32 | number) for number, block in enumerate(blocks)]
         self._table.append(pack_record(head, group, self.end, [len(block) for block in blocks], checks))
         self._file.seek(self.end)
         self._file.write(b"".join(blocks))
