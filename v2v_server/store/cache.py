@@ -31,7 +31,6 @@ from v2v_server.store.planes import OPTIONAL, PLANES, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
 from v2v_server.store.reader import StoreFile, read_clips
 from v2v_server.store.writer import write_store
-from v2v_server.system.private import make_private
 from v2v_server.system.status_fields import GIB
 from v2v_server.video.collect import ClipRequest
 from v2v_server.video.decode import DecodedClip
@@ -208,10 +207,9 @@ class Cache:
                 next(frames)
             begin = piece.end
             try:
-                make_private(partial)
                 write_store(
                     partial, frames, index, usable, piece.first, piece.end - piece.first, video=video,
-                    fingerprint=fingerprint, packing=self._packing, planes=planes,
+                    fingerprint=fingerprint, packing=self._packing, planes=planes, is_private=True,
                 )  # fmt: skip
                 with self._waiting():
                     self._quota.add(partial, piece.path)

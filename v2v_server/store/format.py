@@ -41,6 +41,8 @@ LARGEST_BLOCK_BYTES = 2 * GROUP_FRAMES * BLOCK_ROWS * BLOCK_COLUMNS
 _LARGEST_GROUP_BYTES = 64 << 20
 _PREFIX = struct.Struct("<8sIQ")
 _LARGEST_HEAD_BYTES = 64 << 20
+_LONGEST_FINGERPRINT = 200
+"""An index keeps it for every video."""
 _BLOCK = np.dtype([("bytes", "<u4"), ("check", "<u8")])
 
 
@@ -98,6 +100,7 @@ class Head:
             and 0 <= self.first < self.first + self.count <= self.frames <= LARGEST_FRAMES
             and 1 <= self.group <= GROUP_FRAMES
             and self.packing in METHODS
+            and len(self.fingerprint) <= _LONGEST_FINGERPRINT
             and SDR.bits <= self.bits <= MOST_BITS
             and self.transfer in (SDR.transfer, MIXED, *TRANSFERS.values())
         )
@@ -105,7 +108,7 @@ class Head:
             raise ProtocolError(
                 f"{self.count} frames from {self.first} of {self.frames}, rows {self.top} + {self.rows} of "
                 f"{self.width_px}x{self.height_px} px, groups of {self.group}, packed by {self.packing!r:.20}, "
-                f"{self.bits} bits, transfer {self.transfer!r:.20}"
+                f"{self.bits} bits, transfer {self.transfer!r:.20}, fingerprint {self.fingerprint!r:.100}"
             )
 
     @property

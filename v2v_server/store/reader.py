@@ -251,8 +251,13 @@ class StoreFile(BlockReader, AbstractContextManager["StoreFile"]):
 
     @property
     def is_whole(self) -> bool:
-        """Return whether the file ends behind its last block."""
-        return self._record(self.head.groups - 1).starts[-1] <= os.fstat(self._file).st_size
+        """Return whether the file ends behind its last block, or behind a list of planes.
+
+        Raises:
+            VideoUnreadable, VideoError: see :meth:`plane`.
+        """
+        end, size = self._record(self.head.groups - 1).starts[-1], os.fstat(self._file).st_size
+        return end == size or (end < size and bool(self._places))
 
     def clips(self, request: ClipRequest) -> tuple[DecodedClip, ...]:
         """Read the cuts of a request, see :func:`read_clips`."""
@@ -279,7 +284,8 @@ class StoreFile(BlockReader, AbstractContextManager["StoreFile"]):
         Raises:
             VideoUnreadable, VideoError: see :meth:`plane`.
         """
-        return frozenset(name for name, place in self._places.items() if place.version == PLANES[name].version)
+        places = self._places
+        return frozenset(name for name in PLANES if name in places and places[name].version == PLANES[name].version)
 
     def plane(
         self, name: str, start: int, count: int, cells: Window, wanted: npt.NDArray[np.int64] | None = None
@@ -322,10 +328,9 @@ class StoreFile(BlockReader, AbstractContextManager["StoreFile"]):
     @cached_property
     def _places(self) -> Mapping[str, PlanePlace]:
         try:
-            places = read_footer(self._path, self._file)
+            return read_footer(self._path, self._file)
         except OSError as error:
             raise VideoUnreadable(self._path, None, f"cannot be read: {error.strerror or error}") from error
-        return {name: place for name, place in places.items() if name in PLANES}
 
 
 def read_clips(files: Sequence[StoreFile], request: ClipRequest, origin: str) -> tuple[DecodedClip, ...]:

@@ -21,6 +21,7 @@ from v2v_server.store.format import BLOCK_COLUMNS, BLOCK_ROWS, Head, check, grou
 from v2v_server.store.packing import Packing
 from v2v_server.store.planes import PLANES
 from v2v_server.store.planes.plane import PlanePlace, pack_footer
+from v2v_server.system.private import make_private
 from v2v_server.video.collect import DecodedPicture
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import Window
@@ -183,9 +184,9 @@ class StoreWriter(AbstractContextManager["StoreWriter"]):
 
 
 def write_store(
-    path: str | os.PathLike[str], pictures: Iterator[DecodedPicture], index: FrameIndex, usable: Window, first: int,
+    path: Path, pictures: Iterator[DecodedPicture], index: FrameIndex, usable: Window, first: int,
     count: int, *, video: str, fingerprint: str, packing: Packing, planes: Iterable[str],
-    frames_per_second: float = 0.0, stored_index: bytes = b"", lasting: bool = False,
+    frames_per_second: float = 0.0, stored_index: bytes = b"", lasting: bool = False, is_private: bool = False,
     see: Callable[[Arrays], object] = lambda arrays: None,
 ) -> None:  # fmt: skip
     """Write a store file of the next pictures of a video, with the planes that every file of their signal has.
@@ -202,6 +203,7 @@ def write_store(
         frames_per_second: of the video; 0 if unknown.
         stored_index: the encoded index; empty in a piece of a video.
         lasting: wait until the data is on disk.
+        is_private: let no other user open it.
         see: called with the arrays of each frame by the names of their planes; "" names the luma.
 
     Raises:
@@ -218,6 +220,8 @@ def write_store(
     )  # fmt: skip
     own = (name for name, plane in PLANES.items() if plane.is_part_of(head.signal))
     makers = {name: PLANES[name].maker() for name in (*planes, *own)}
+    if is_private:
+        make_private(path)
     with StoreWriter(path, head, packing, makers) as writer:
         for picture in chain((beginning,), islice(pictures, count - 1)):
             if picture.signal.transfer != head.transfer:

@@ -282,6 +282,10 @@ def test_a_file_that_is_cut_short_or_of_other_settings_is_written_again(source: 
     assert run(source, out).kept == 1
     assert (out / "0.mp4").read_bytes() == whole_file
     assert run(source, out).kept == 5
+    run(source, tmp_path / "colour", planes=("chroma",))
+    with (tmp_path / "colour" / "0.mp4").open("r+b") as file:
+        file.truncate(file.seek(0, os.SEEK_END) - 1)
+    assert run(source, tmp_path / "colour").kept == 4
 
 
 def test_a_folder_of_an_earlier_release_goes_on(source: Path, tmp_path: Path) -> None:
