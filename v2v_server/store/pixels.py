@@ -50,9 +50,9 @@ class Pixels(Protocol):
 
 
 def signal_of(pixels: Pixels, index: FrameIndex) -> Signal:
-    """Return what the levels of a video mean, by its first frame."""
-    request = ClipRequest(index, index.first, (Cut(1, (0, 0, 1, 1)),), most_bits=MOST_BITS)
-    return pixels.clips(request)[0].signal
+    """Return what the levels of a video mean, by its first frame, whatever the sample."""
+    cut = Cut(1, (0, 0, 1, 1))
+    return pixels.clips(ClipRequest(index, index.first, (cut,), most_bits=MOST_BITS, samples=((0, 0, 0),)))[0].signal
 
 
 @contextmanager
