@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from PIL import Image
 from bench.frame import Column, Report, add_whole
 from v2v_protocol.command import Parser
 from v2v_server.video.probe import probe
-from v2v_server.video.source import opened, pictures
+from v2v_server.video.source import opened, packets
 
 WIDTH_PX, HEIGHT_PX = 596, 336
 BITS_PER_SECOND = 800_000
@@ -83,7 +84,8 @@ def _pictures(source: Path, order: Sequence[int]) -> Iterator[VideoFrame]:
     # Kept as planes (0.3 MB each): a clip of 450 frames takes 135 MB while it is made.
     kept = {}
     with opened(source) as (container, stream):
-        for number, frame in enumerate(pictures(container, stream)):
+        frames = chain.from_iterable(stream.decode(packet) for packet in chain(packets(container, stream), [None]))
+        for number, frame in enumerate(frames):
             if number in wanted:
                 kept[number] = _framed(frame)
             if number == last:

@@ -23,6 +23,7 @@ from v2v_server.schedule.sequences import VideoSequence
 from v2v_server.simulation.effects import NOISE
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.view import apply_view, without_margin
+from v2v_server.store.pixels import signal_of
 from v2v_server.system.compile_cache import cv2
 from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.decode import DecodedClip
@@ -171,7 +172,7 @@ class WholePictures:
         count = (len(frames) - 1) * stride + 1
         cut = Cut(len(frames), (top, 0, bottom - top, video.width_px))
         with catalogue.source.open_pixels(video.id, video.fingerprint) as pixels:
-            signal = SDR if recipe.light == "sdr" else pixels.signal(index)._replace(bits=8)
+            signal = SDR if recipe.light == "sdr" else signal_of(pixels, index)._replace(bits=8)
             taken = pixels.pictures(ClipRequest(index, sequence.start_frame, (cut,), stride))
             for frame, picture in zip(frames, taken, strict=True):
                 cv2.resize(picture.grey, (width, height), frame, interpolation=cv2.INTER_AREA)

@@ -34,13 +34,13 @@ import numpy.typing as npt
 from bench.accuracy.false_events import SCENES, Film, between, compared, noisy_samples, sequences
 from bench.frame import Column, Report, add_videos, add_whole, progress
 from tests.clips import write_clip
+from tests.oracles.decoded import stream_luma
 from tests.oracles.rendered import Reals
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.corpus.scenes.analysis import analyse
 from v2v_server.corpus.scenes.findings import BARS, COMBED, CUTS, DUPLICATES, FADES, STILL, Defect, defects_of
 from v2v_server.corpus.scenes.scene import MOTION, Scene
-from v2v_server.video.decode import stream_luma
 from v2v_server.video.probe import probe
 from v2v_server.worker.scene_choice import CleanFrames
 

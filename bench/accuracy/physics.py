@@ -26,6 +26,7 @@ import numpy.typing as npt
 
 from bench.frame import Column, Record, Report, beyond, panels
 from tests.oracles.analytic_scenes import SECONDS, START_SHARE, analytic_scenes, moved_photograph
+from tests.oracles.decoded import decode_luma
 from tests.oracles.dense import bin_events, dense_events
 from tests.oracles.noise import start_uniforms
 from tests.oracles.rendered import GAMMA, LOG_EPS, Reals, log_levels
@@ -33,7 +34,6 @@ from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_server.simulation import simulate, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
-from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
 
 Records = list[dict[str, Any]]

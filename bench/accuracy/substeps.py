@@ -27,6 +27,7 @@ import numpy.typing as npt
 
 from bench.accuracy.physics import VIDEO_SIDE_PX, liveliest
 from bench.frame import Column, Report, beyond, progress
+from tests.oracles.decoded import decode_luma
 from tests.oracles.rendered import (
     NAMES,
     PHOTOGRAPHS,
@@ -43,7 +44,6 @@ from v2v_protocol.errors import UsageError
 from v2v_server.motion import levels_between, motions
 from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, predict
 from v2v_server.simulation.voxel import FINE_STEPS, Levels
-from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
 
 Records = list[dict[str, Any]]

@@ -27,6 +27,7 @@ from v2v_protocol.command import Parser
 from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
 from v2v_server.store.cache import Cache, make_cache
+from v2v_server.store.quota import used_bytes
 
 FILL_BAR = 1.2
 WAYS = ("source", "fill", "hits")
@@ -59,7 +60,7 @@ def compare(leases: Sequence[Lease], root: Path, turns: int) -> list[dict[str, A
             cache = Cache(Path(folder), 1 << 40, least_free_bytes=0)
             for way, where in zip(WAYS, (None, cache, cache), strict=True):
                 found[way].append(epoch(leases, root, where))
-            cache_bytes = cache.used_bytes
+            cache_bytes = used_bytes(Path(folder))
     return [
         {
             "way": way,

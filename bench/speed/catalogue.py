@@ -97,7 +97,7 @@ def make_up(clip: Path, folder: Path, cache: Path, videos: int, scene: bool = Fa
         store.put(rows())
         if scene:
             store.make_figures()
-            store.put_figures(SceneCollection(Rows(), None).kind, scenes())
+            store.put_figures(SceneCollection(Rows()).kind, scenes())
     finally:
         store.close()
 

@@ -30,13 +30,13 @@ import numpy as np
 
 from bench.frame import Column, Report, add_whole, progress
 from tests.clips import write_clip
+from tests.oracles.decoded import decode_luma
 from tests.oracles.leases import open_leases, whole_sample
 from v2v_protocol.command import Parser
 from v2v_protocol.messages import Lease
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.prepare import prepare
-from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
 
 BARS = {("walking", "source"): 2.0, ("walking", "motion"): 5.0, ("still", "source"): 1.03, ("still", "motion"): 1.05}

@@ -31,6 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.frame import Column, Record, Report, add_videos, add_whole, medians, progress
+from tests.oracles.decoded import decode_luma, stream_luma
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.catalogue import open_catalogue
@@ -39,7 +40,6 @@ from v2v_server.store.format import Head, group_frames_for
 from v2v_server.store.packing import DEFAULT_SIZE, DENSE, FAST, QUICK, RAW, Packing
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.writer import StoreWriter
-from v2v_server.video.decode import decode_luma, stream_luma
 from v2v_server.video.rows import Rows
 
 Luma = npt.NDArray[np.uint8]
@@ -148,10 +148,8 @@ def prepared(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
             progress(f"{video.id}: prepare")
             top, bottom = catalogue.rows.bounds(video.height_px)
             index = catalogue.frame_index(video.id).to_bytes()
-            job = Transcoding(
-                video.id, catalogue.path(video.id), video.fingerprint, index, video.frames_per_second,
-                (top, 0, bottom - top, video.width_px), DEFAULT_SIZE, root, root / "made",
-            )  # fmt: skip
+            window = top, 0, bottom - top, video.width_px
+            job = Transcoding(video, catalogue.path(video.id), DEFAULT_SIZE, root, window=window, index=index)
             fastest = {"prepare_cpu_seconds": math.inf, "prepare_scene_cpu_seconds": math.inf}
             for name in _TURNS * list(fastest):
                 started = time.process_time()

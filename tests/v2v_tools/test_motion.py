@@ -12,12 +12,12 @@ import numpy.typing as npt
 import pytest
 
 from tests.clips import panned_luma, write_clip
+from tests.oracles.decoded import stream_luma
 from v2v_pictures.camera import Camera
 from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.simulation import simulate
-from v2v_server.video.decode import stream_luma
 from v2v_server.video.rows import Rows
 from v2v_tools import motion
 from v2v_tools.motion import WholePictures, moving_seeds, noise_rate, quiet_voxels

@@ -24,8 +24,7 @@ from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
-from v2v_server.prepare.report import Report
-from v2v_server.prepare.resume import check_destination
+from v2v_server.prepare.prepare import Report, check_destination
 from v2v_server.store.packing import DEFAULT_SIZE, SIZES
 from v2v_server.store.pixels import VideosKind
 from v2v_server.store.planes import OPTIONAL, PLANES
@@ -136,13 +135,8 @@ def summary(report: Report, size: str, seconds: float) -> list[str]:
     ]
     if report.looked_at:
         lines.append(f"{report.looked_at} were prepared earlier; only statistics of their scenes were added")
-    if report.aside:
-        lines.append(
-            f"{report.aside} others that were prepared earlier are set aside: not served, and not prepared again if a "
-            "later run includes them"
-        )
     if prepared:
-        before, after = report.source_bytes, report.prepared_bytes
+        before, after = sum(video.source_bytes for video in prepared), sum(video.bytes for video in prepared)
         change = "saves" if after <= before else "costs"
         lines.append(
             f"{before / 1e6:.1f} MB -> {after / 1e6:.1f} MB ({after / before:.2f} of the size): "

@@ -9,5 +9,4 @@ index            what probing found, on disk
 ahead            a corpus catalogued before a server needs it, on one host or many
 scenes           what the videos show, and what is wrong with it
 manifest         what a prepared folder states about itself
-manifest_writer  writing a manifest
 """

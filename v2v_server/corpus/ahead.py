@@ -98,7 +98,7 @@ def catalogue_shard(
     source = _source(asked)
     corpus = list_corpus(source, asked.rows, notice)
     ids = [id for id in corpus.ids if shard.holds(id)]
-    scenes = SceneCollection(corpus.rows, source.manifest) if asked.scene else None
+    scenes = SceneCollection(corpus.rows) if asked.scene else None
     index = index_path(source.name, asked.cache_dir, shard)
     store, table, notes = refresh_index(source, ids, index, scenes, asked.processes, progress, notice)
     store.close()

@@ -26,7 +26,7 @@ from v2v_protocol.refusal import Refusal, RefusalKind
 from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
-from v2v_server.corpus.manifest import Header, PreparedVideo
+from v2v_server.corpus.manifest import ABSENT, Header
 from v2v_server.corpus.probe import VideoProgress, batches, probe_files
 from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.scenes.scene import Scene
@@ -277,8 +277,7 @@ class Catalogue:
     scene_digest: str | None
     sidecars: Mapping[str, Sidecars]
     _store: Store = field(repr=False, compare=False)
-    _files: dict[str, str] = field(repr=False, compare=False)  # of what is prepared, that of the file that lies here
-    _absent: dict[str, PreparedVideo] = field(repr=False, compare=False)
+    _absent: frozenset[str] = field(repr=False, compare=False)  # without a prepared file
     _scenes: SceneCollection | None = field(repr=False, compare=False)
     _unknown: frozenset[str] = field(repr=False, compare=False)
     _slices: dict[tuple[str, int, int], bytes] = field(repr=False, compare=False, default_factory=dict)
@@ -357,18 +356,19 @@ class Catalogue:
 
     def _stored_index(self, id: str) -> bytes:
         if id in self._absent:
-            video = self._absent[id]
-            return unseekable(video.frames, (1, 1), video.height_px, video.width_px).to_bytes()
+            frames, height_px, width_px = self.videos.shape(id)
+            return unseekable(frames, (1, 1), height_px, width_px).to_bytes()
         return self._stored(id, partial(self._store.frame_index, id))
 
-    def _stored(self, id: str, read: Callable[[str], bytes | None]) -> bytes:
-        """Return what the index has for the fingerprint of the file that was catalogued."""
-        fingerprint = self._fingerprint(id)
+    def _read(self, id: str, read: Callable[[str], bytes | None]) -> bytes | None:
+        """Return what the index has for the fingerprint of the file that was catalogued; None: nothing."""
         try:
-            data = read(self._files.get(id, fingerprint))
+            return read(self._fingerprint(id))
         except sqlite3.Error as error:
             raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
-        if data is None:
+
+    def _stored(self, id: str, read: Callable[[str], bytes | None]) -> bytes:
+        if (data := self._read(id, read)) is None:
             reason = "has changed since this catalogue was opened; start again to serve it as it is now"
             raise VideoChanged(id, None, reason)
         return data
@@ -394,10 +394,7 @@ class Catalogue:
         Raises:
             CorpusError, IndexUnreadable: see :meth:`frame_index`.
         """
-        try:
-            data = self._store.figures(id, self._files.get(id, self._fingerprint(id)), sidecar_kind(ending))
-        except sqlite3.Error as error:
-            raise IndexUnreadable(f"the catalogue's index cannot be read: {error}") from error
+        data = self._read(id, partial(self._store.figures, id, kind=sidecar_kind(ending)))
         return files_for_lease(data, fingerprint, start, count)
 
     @property
@@ -506,7 +503,7 @@ def open_catalogue(
     """
     opened = open_source(source, SourceOptions(list_file, copies, copies_gib, cache_dir, kind))
     corpus = list_corpus(opened, rows, notice)
-    scenes = SceneCollection(corpus.rows, opened.manifest) if scene else None
+    scenes = SceneCollection(corpus.rows) if scene else None
     path = index_path(opened.name, cache_dir)
     store, table, notes = refresh_index(opened, corpus.ids, path, scenes, processes, progress, notice)
     try:
@@ -529,14 +526,11 @@ def _snapshot(
     notice: Notice | None,
 ) -> Catalogue:
     source, manifest, table = corpus.source, corpus.source.manifest, on_disk
-    problems, files = dict(corpus.refused), dict[str, str]()
-    absent: dict[str, PreparedVideo] = {}
+    problems, absent = dict(corpus.refused), frozenset[str]()
     if manifest is not None:
-        records = [on_disk.row(at) for at in range(len(on_disk))]
-        files = {record.id: record.fingerprint for record in records}
-        absent = {record.id: manifest.videos[record.id] for record in records if not manifest.describes(record)}
-        rows = ((*manifest.as_source(record).columns, None) for record in records)
-        table = replace(VideoTable.read(rows, len(records))[0], summaries=on_disk.summaries)
+        rows = ((*manifest.as_source(on_disk.row(at)).columns, None) for at in range(len(on_disk)))
+        table = replace(VideoTable.read(rows, len(on_disk))[0], summaries=on_disk.summaries)
+        absent = frozenset(table.ids[at] for at in np.flatnonzero(table.codec == ABSENT).tolist())
     else:
         table.problem[table.codec == STORE_FORMAT] = "is one file of a lossless corpus: serve the whole folder"
     usable = table.problem == np.array(None)
@@ -546,19 +540,13 @@ def _snapshot(
     videos = Videos(table, thresholds)
     if not videos:
         raise CorpusError(f"{source}: none of {len(problems)} videos can be used{format_problems(problems)}")
-    if absent:
+    if manifest is not None and absent:
         if len(absent) == len(videos):
             raise CorpusError(f"{source}: none of {len(absent)} prepared files is there as its manifest says")
-        reasons = {id: video.problem or "its file is missing or changed" for id, video in absent.items()}
+        reasons = {id: manifest.videos[id].problem or "its file is missing or changed" for id in absent}
         notes = [
             *notes,
             f"{len(absent)} videos have no prepared file, so others stand in for them{format_problems(reasons)}",
-        ]
-    if manifest is not None and manifest.aside:
-        notes = [
-            *notes,
-            f"{len(manifest.aside)} prepared videos are set aside: the last v2v-prepare was not asked for "
-            "them; run it once for all to have them served",
         ]
     if len(woven := np.flatnonzero(videos.interlaced)):
         first = videos[int(woven[0])].id
@@ -582,9 +570,9 @@ def _snapshot(
     if scenes is not None:
         split, scene_digest = scenes.read(store, table, unknown, digest)
         videos = Videos(table, thresholds, split)
-        if died := sorted(unknown - absent.keys()):
+        if died := sorted(unknown - absent):
             notes = [*notes, f"{len(died)} videos crash the decoder that analyses their scenes: {died[0]}"]
-    marks = {id: files.get(id, mark) for id, mark in zip(videos.ids, videos.fingerprints, strict=True)}
+    marks = dict(zip(videos.ids, videos.fingerprints, strict=True))
     endings = sidecar_endings(tuple(ARRAYS))
     sidecars, said = collect_sidecars(source, store, marks, videos.shape, endings, processes, notice)
     notes = [*notes, *said]
@@ -599,7 +587,6 @@ def _snapshot(
         scene_digest=scene_digest,
         sidecars=sidecars,
         _store=store,
-        _files=files,
         _absent=absent,
         _scenes=scenes,
         _unknown=frozenset(unknown),

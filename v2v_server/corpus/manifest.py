@@ -4,35 +4,39 @@ The file has one JSON object per line. The first line describes the folder; ever
 ones included. Lines are only appended. An unfinished last line, which a killed process leaves, is ignored. Of two lines
 with the same id the later one counts.
 
-The folder serves the corpus of the latest run that wrote a first line. Videos of earlier runs that this corpus lacks
-(a list left them out, or their folder could not be read) are set aside: they are not served, but their lines stay, so
-that a later run can use them without preparing them again.
+The folder serves the corpus of the latest run that wrote a first line. Files of videos of earlier runs that this corpus
+lacks (a list left them out, or their folder could not be read) are not served; a later run can use them.
 """
 
 from __future__ import annotations
 
+import json
 import math
+import os
 from base64 import b64decode
-from collections.abc import Callable, Iterable
-from dataclasses import MISSING, dataclass, field, fields, replace
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_protocol.programs import printable
 from v2v_protocol.safe_json import parse_json
+from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.listfile import UNPRINTABLE
 from v2v_server.store.packing import SIZES
-from v2v_server.store.reader import STORE_FORMAT
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
 from v2v_server.video.rows import Rows
 
 MANIFEST_NAME = "v2v-prepared.jsonl"
 MANIFEST_VERSION = 2
-_OF_LOSSY = frozenset({"codec", "quality", "gop", "psnr_db", "worst_psnr_db"})
-"""Fields of releases that could also prepare lossy files."""
+ABSENT = "no prepared file"
+"""Codec of a video that has none."""
+_OF_EARLIER = frozenset({"codec", "quality", "gop", "psnr_db", "worst_psnr_db", "fingerprint"})
+"""Fields of earlier releases, whose files say the same themselves, or could be lossy."""
 NO_LOSSY = "which this release does not serve: re-encode the videos with ffmpeg, and serve them as videos"
 _Record = TypeVar("_Record", "Header", "PreparedVideo")
 
@@ -44,8 +48,7 @@ class Header:
     Attributes:
         rows: rows of the source's pictures that it holds, canonical.
         size: how its files are packed, a key of :data:`v2v_server.store.packing.SIZES`.
-        videos: how many videos the source corpus has; the folder is finished when it has a record of each. Those
-            that are set aside do not count.
+        videos: how many videos the source corpus has; the folder is finished when it has a record of each.
         source: name of the source folder, for people.
         source_digest: digest of the source's catalogue with these rows.
         version: of this format.
@@ -73,7 +76,7 @@ class PreparedVideo:
         source_fingerprint, source_bytes: of the source file.
         frames, frames_per_second: of the source (None where unknown), and so of the prepared file.
         height_px, width_px: of the source's picture, of which the file keeps some rows.
-        fingerprint, bytes: of the prepared file; "" and 0 with a problem.
+        bytes: size of the prepared file; 0 with a problem.
         problem: why there is no prepared file; None if there is one.
         remark: of the source, see :class:`v2v_server.video.probe.VideoFacts`.
         scene: statistics of the source's frames, base64 of ``Scene.to_bytes()``; "" where they were not asked for.
@@ -86,7 +89,6 @@ class PreparedVideo:
     frames_per_second: float | None
     height_px: int
     width_px: int
-    fingerprint: str = ""
     bytes: int = 0
     problem: str | None = None
     scene: str = ""
@@ -103,76 +105,22 @@ class Manifest:
     """A manifest as read.
 
     Attributes:
-        root: the prepared folder.
         header: see :class:`Header`.
         videos: by id.
-        aside: by id, those of earlier runs that the last one was not asked for; no corpus has them.
     """
 
-    root: Path
     header: Header
     videos: dict[str, PreparedVideo]
-    aside: dict[str, PreparedVideo] = field(default_factory=dict)
-
-    def served_rows(self, rows: Rows | None) -> Rows:
-        """Return the rows that a corpus of this folder may use.
-
-        A folder that stores all rows may be served with any rows, another one only with its stored rows.
-
-        Args:
-            rows: the requested rows.
-
-        Raises:
-            CorpusError: the folder is not finished, or lacks requested rows.
-        """
-        if len(self.videos) != self.header.videos:
-            raise CorpusError(
-                f"{self.root}: {len(self.videos)} of {self.header.videos} videos are prepared; run v2v-prepare again "
-                "to finish (what is done is kept)"
-            )
-        asked = None if rows is None or str(rows) == "full" else rows
-        kept = Rows.parse(self.header.rows)
-        if asked is not None and kept == Rows():
-            return asked
-        if asked is not None and asked != kept:
-            raise CorpusError(
-                f"{self.root}: rows {rows} asked for, but this prepared folder holds rows {self.header.rows} of its "
-                "source only; leave --rows out, or serve the source"
-            )
-        return kept
-
-    def wanted(self, listed: Iterable[str] | None, refused: dict[str, str]) -> tuple[str, ...]:
-        """Return the ids that a corpus of this folder has, without files that the manifest does not know.
-
-        Args:
-            listed: the ids that a list file names; None takes all.
-            refused: receives, by id, why one cannot be taken in.
-        """
-        wanted = sorted(self.videos) if listed is None else list(listed)
-        for id in wanted:
-            if id in self.aside:
-                refused[id] = "is prepared, but the last v2v-prepare was not asked for it; run it once for all of them"
-            elif id not in self.videos:
-                refused[id] = "is not in the prepared folder's manifest: the source had no such usable video"
-        return tuple(id for id in wanted if id not in refused)
-
-    def describes(self, record: IndexRow) -> bool:
-        """Return whether the probed file is the prepared one.
-
-        It may be damaged since: it says itself what it was made of, and each of its blocks is checked when it is read.
-        The source itself will do in its place.
-        """
-        video = self.videos[record.id]
-        is_either = record.codec == STORE_FORMAT or record.fingerprint == video.source_fingerprint
-        return record.problem is None and record.frames == video.frames and is_either
 
     def as_source(self, record: IndexRow) -> IndexRow:
         """Return the record of a prepared file with the facts that have to agree with its source.
 
-        This includes videos without a usable file: the sequences of the others keep their places only if the source's
-        frames are counted.
+        This includes videos without a usable file, whose codec is ABSENT: the sequences of the others keep their places
+        only if the source's frames are counted. A usable file may be damaged: each of its blocks is checked when it is
+        read. The source itself will do in its place.
         """
         video = self.videos[record.id]
+        is_there = record.problem is None and record.fingerprint == video.source_fingerprint
         return replace(
             record,
             fingerprint=video.source_fingerprint,
@@ -180,6 +128,7 @@ class Manifest:
             height_px=video.height_px,
             width_px=video.width_px,
             frames_per_second=video.frames_per_second,
+            codec=record.codec if is_there else ABSENT,
             remark=video.remark,
             problem=None,
         )
@@ -200,20 +149,18 @@ def read_manifest(root: Path) -> Manifest:
     if not lines:
         raise CorpusError(f"{path}: holds no whole line; prepare another folder")
     videos: dict[str, PreparedVideo] = {}
-    aside: dict[str, PreparedVideo] = {}
     for number, line in enumerate(lines, 1):
         try:
             if number == 1:
                 header = _header(line)
             else:
-                video, is_aside = _video(line)
-                for records in (videos, aside):
-                    records.pop(video.id, None)
-                (aside if is_aside else videos)[video.id] = video
+                video = _video(line)
+                if video is not None:
+                    videos[video.id] = video
         except (ValueError, TypeError, UsageError) as error:
             remedy = "" if NO_LOSSY in str(error) else "; prepare another folder"
             raise CorpusError(f"{path}, line {number}: {error}{remedy}") from error
-    return Manifest(root, header, videos, aside)
+    return Manifest(header, videos)
 
 
 def _header(line: bytes) -> Header:
@@ -231,10 +178,11 @@ def _header(line: bytes) -> Header:
     return header
 
 
-def _video(line: bytes) -> tuple[PreparedVideo, bool]:
-    """Read the line of a video: return its record, and whether the video is set aside."""
+def _video(line: bytes) -> PreparedVideo | None:
+    """Read the line of a video: return its record; None if an earlier release set the video aside."""
     data = _object(line)
-    aside = data.pop("aside", False) is True
+    if data.pop("aside", False) is True:
+        return None
     video = _record(PreparedVideo, data)
     path = PurePosixPath(video.id)
     if printable(video.id) != video.id:
@@ -249,12 +197,12 @@ def _video(line: bytes) -> tuple[PreparedVideo, bool]:
     if video.scene:
         scene = b64decode(video.scene, validate=True)
         if not Scene.is_encoding(scene):  # of another release: it counts as not asked for
-            return replace(video, scene=""), aside
+            return replace(video, scene="")
         try:
             Scene.from_bytes(scene)
         except ProtocolError as error:
             raise ValueError(f"{video.id}: {error}") from error
-    return video, aside
+    return video
 
 
 def _record(kind: type[_Record], data: dict[str, Any]) -> _Record:
@@ -264,7 +212,7 @@ def _record(kind: type[_Record], data: dict[str, Any]) -> _Record:
         ValueError: a field is unknown, missing or of another type.
     """
     known = {each.name: each for each in fields(kind)}
-    data = {name: value for name, value in data.items() if name not in _OF_LOSSY}
+    data = {name: value for name, value in data.items() if name not in _OF_EARLIER}
     if unknown := data.keys() - known.keys():
         raise ValueError(f"unknown fields {', '.join(sorted(unknown))}")
     for name, each in known.items():
@@ -302,3 +250,37 @@ _FIELD_CHECKS: dict[str, Callable[[object], bool]] = {
     "str | None": lambda value: value is None or _is_text(value),
     "float | None": lambda value: value is None or _is_rate(value),
 }
+
+
+@contextmanager
+def write_manifest(
+    root: Path, header: Header, videos: Iterable[PreparedVideo]
+) -> Iterator[Callable[[PreparedVideo], None]]:
+    """Write a manifest: the known records in one piece; yield what appends one more, and waits until it is on disk.
+
+    Args:
+        root: the prepared folder.
+        header: its first line.
+        videos: what is known already.
+
+    Raises:
+        OSError: the folder cannot be written to.
+    """
+    path = root / MANIFEST_NAME
+    aside = path.with_name(f".{MANIFEST_NAME}.new")  # one name, so that killed runs leave one file at most
+    with write_aside_and_rename(path, partial=aside, durable=True) as fresh, fresh.open("wb") as file:
+        file.write(_line(header))
+        file.writelines(map(_line, videos))
+    with path.open("ab") as file:
+
+        def add(video: PreparedVideo) -> None:
+            file.write(_line(video))
+            file.flush()
+            os.fsync(file.fileno())
+
+        yield add
+
+
+def _line(item: Header | PreparedVideo) -> bytes:
+    values = {name: value for name, value in asdict(item).items() if name != "remark" or value}
+    return json.dumps(values, allow_nan=False).encode() + b"\n"

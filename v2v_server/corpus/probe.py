@@ -46,7 +46,7 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
         with source.open_local(id, "") as path:
             mark = fingerprint(path)
             facts = _at_rate(_facts(path, source.kind.videos_kind), source.rate(id))
-        name = f"{mark}-{facts.content}" if facts.content else mark
+        name = facts.made_of or (f"{mark}-{facts.content}" if facts.content else mark)
         if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
         source.keep_as(id, mark, name)
@@ -95,17 +95,15 @@ def _facts(path: Path, kind: str) -> VideoFacts:
         VideoUnreadable: the system reported an error twice.
         VideoError: the file is not a supported video.
     """
-    try:
-        return facts_of(path, kind)
-    except VideoError as error:
-        if not isinstance(error.__cause__, OSError):
-            raise
-    try:
-        return facts_of(path, kind)
-    except VideoError as error:
-        if isinstance(error.__cause__, OSError):
-            raise VideoUnreadable(error.video, error.frame, error.reason) from error
-        raise
+    for is_last in (False, True):
+        try:
+            return facts_of(path, kind)
+        except VideoError as error:
+            if not isinstance(error.__cause__, OSError):
+                raise
+            if is_last:
+                raise VideoUnreadable(error.video, error.frame, error.reason) from error
+    raise AssertionError("the last try returns or raises")
 
 
 def probe_files(

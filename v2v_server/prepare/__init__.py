@@ -1,7 +1,5 @@
 """`v2v-prepare`: decode a corpus once, and store what training needs.
 
-prepare    a run over a corpus
+prepare    a run over a corpus, and what earlier runs left
 transcode  one video into its prepared form, verified
-resume     what earlier runs left in a folder
-report     the results of a run
 """

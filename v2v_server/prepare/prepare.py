@@ -5,57 +5,99 @@ files are store files (:mod:`v2v_server.store.format`), whatever their suffixes,
 A manifest lists them.
 
 The folder stays consistent after any interruption: a file gets its final name only when complete and verified, and its
-line in the manifest after that. A second run keeps files that the manifest lists if file and source are unchanged, and
-does the rest. Records of videos that a run does not include are set aside, not dropped (see
-:mod:`v2v_server.corpus.manifest`).
+line in the manifest after that. A second run keeps every file that is what it would write (:func:`find_standing`), and
+does the rest. Files of videos that a run does not include stay, for a later run that includes them.
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import fcntl
 import math
 import os
 import shutil
 from base64 import b64encode
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import chain
+from functools import partial
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_protocol.refusal import Refusal
+from v2v_protocol.write_aside import is_writable
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.manifest import Header, PreparedVideo, prepared_name
-from v2v_server.corpus.manifest_writer import ManifestWriter
+from v2v_server.corpus.manifest import (
+    MANIFEST_NAME,
+    Header,
+    PreparedVideo,
+    prepared_name,
+    read_manifest,
+    write_manifest,
+)
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.videos import VideoEntry
-from v2v_server.prepare.report import Report
-from v2v_server.prepare.resume import (
-    check_destination,
-    check_free_space,
-    has_failed,
-    known_records,
-    locked,
-    standing_files,
-)
-from v2v_server.prepare.transcode import Made, Transcoding, look_again, transcode
+from v2v_server.prepare.transcode import PARTIAL_SUFFIX, Made, Transcoding, transcode
 from v2v_server.store.packing import DEFAULT_SIZE, SIZES
 from v2v_server.store.planes import OPTIONAL
-from v2v_server.store.quota import LEAST_FREE_BYTES
-from v2v_server.store.reader import has_planes
+from v2v_server.store.reader import StoreFile
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.orientation import PixelRect
 from v2v_server.video.rows import Rows
 
+LEAST_FREE_BYTES = 1 << 30
+"""Always keep this much disk space free: a full disk stops other programs."""
+
 _STORED_BITS_PER_PIXEL = 2.2
 """Size of a store file, median of the measured clips (docs/prepare.md): 0.7 to 3.4."""
 
 _TELLING_SHARE = 0.02
+_LOCK_NAME = ".v2v-prepare.lock"
+_NOT_THERE = frozenset((errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP))
+_READERS = 16
+_AT_A_TIME = 1024
+"""Files that are read at a time, so that the memory for the requests does not grow with the corpus."""
 _CRASHES = "crashes the transcoder: its process died"
 
-_Progress = Callable[[int, int, int, int], None]
+Progress = Callable[[int, int, int, int], None]
 """Progress callback: (source frames done, source frames in total, bytes written, bytes expected in total)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Results of a run.
+
+    Attributes:
+        videos: a record of every video of the source, by id.
+        kept: number of videos that an earlier run had finished.
+        looked_at: number of videos that an earlier run had finished except for their scene statistics.
+        not_looked_at: prepared videos whose statistics could not be computed, and why. Their files stay.
+        unusable: files of the source that a server cannot use either.
+    """
+
+    videos: tuple[PreparedVideo, ...]
+    kept: int
+    unusable: tuple[Refusal, ...]
+    looked_at: int = 0
+    not_looked_at: tuple[Refusal, ...] = ()
+
+    @property
+    def prepared(self) -> tuple[PreparedVideo, ...]:
+        """Return the videos that have a prepared file."""
+        return tuple(video for video in self.videos if video.problem is None)
+
+    @property
+    def failed(self) -> tuple[PreparedVideo, ...]:
+        """Return the videos that have no prepared file."""
+        return tuple(video for video in self.videos if video.problem is not None)
+
+    @property
+    def complete(self) -> bool:
+        """Return whether every video file was prepared, with everything requested."""
+        return not (self.failed or self.unusable or self.not_looked_at)
 
 
 def prepare(
@@ -67,7 +109,7 @@ def prepare(
     scene: bool = False,
     planes: tuple[str, ...] = (),
     single: bool = False,
-    progress: _Progress | None = None,
+    progress: Progress | None = None,
 ) -> Report:
     """Transcode a corpus. A video that cannot be transcoded is recorded with the reason, and the others continue.
 
@@ -99,39 +141,57 @@ def prepare(
     target = Path(destination).resolve()
     check_destination(target, catalogue.folder, single, catalogue)
     header = Header(str(catalogue.rows), size, len(catalogue.videos), catalogue.folder.name, catalogue.digest)
-    made: dict[str, PreparedVideo] = {}
-    not_looked_at = []
+    records: dict[str, PreparedVideo] = {}
+    jobs: list[Transcoding] = []
+    done, looked_at, not_looked_at = 0, 0, list[Refusal]()
     try:
         target.mkdir(parents=True, exist_ok=True)
         with locked(target):
             known = known_records(target, header, catalogue.videos)
-            earlier = _earlier(target, catalogue, known, scene, planes, lambda done: tell(done, total, 0, 0))
-            standing, finished, lacking = earlier.standing, earlier.finished, earlier.lacking
-            left = [video for video in catalogue.videos if video.id not in finished]
-            done = total - sum(video.frames for video in left)
-            room = _Room(target, catalogue, left)
-            wanted = {video.id for video in catalogue.videos}
-            aside = [record for id, record in known.items() if id not in wanted]
-            with ManifestWriter(target, header, [*standing.values(), *earlier.failed], aside) as manifest:
-                for video, outcome in _outcomes(catalogue, left, earlier, target, size, scene, planes, processes):
-                    if isinstance(outcome, Refusal):
-                        not_looked_at.append(outcome)
+            with closing(_standing_files(target, catalogue, size)) as files:
+                for video, file in files:
+                    record = known.get(video.id)
+                    record = record if record and record.source_fingerprint == video.fingerprint else None
+                    if file is not None:
+                        records[video.id] = _record(video, file.bytes, record.scene if record else "")
+                    elif record and record.problem:
+                        # It stays until the video was tried again: a finished folder stays finished.
+                        records[video.id] = record
+                    stands = file is not None and file.planes.issuperset(planes)
+                    looks = scene and not (file and records[video.id].scene)
+                    if stands and not looks:
+                        done += video.frames
                     else:
-                        manifest.add(outcome)
-                        made[outcome.id] = outcome
+                        # A file that is written again for one plane keeps its others.
+                        kept = file.planes.intersection(OPTIONAL) if file else ()
+                        wanted = tuple(dict.fromkeys((*planes, *sorted(kept))))
+                        jobs.append(Transcoding(video, catalogue.path(video.id), size, target, stands, looks, wanted))
+                    tell(done, total, 0, 0)
+            room = _Room(target, catalogue, [job.video for job in jobs])
+            with write_manifest(target, header, records.values()) as add:
+                for job, made in _outcomes(catalogue, jobs, target, processes):
+                    video, before = job.video, records.get(job.video.id)
+                    if isinstance(made, Made):
+                        record = _record(video, made.bytes, _text(made.scene) or (before.scene if before else ""))
+                        looked_at += job.stands
+                    elif before and before.problem is None:
+                        record = before
+                        not_looked_at.append(Refusal(video.id, None, made))
+                    else:
+                        record = _record(video, problem=made)
+                    records[video.id] = record
+                    add(record)
                     done += video.frames
-                    room.done(video, 0 if isinstance(outcome, Refusal) else outcome.bytes)
+                    room.done(video, made.bytes if isinstance(made, Made) and not job.stands else 0)
                     tell(done, total, room.made, room.expected)
                     check_free_space(target)
     except OSError as error:
         raise CorpusError(f"{target}: cannot be written to: {error.strerror or error}") from error
-    records = standing | made
     return Report(
         videos=tuple(records[id] for id in sorted(records)),
-        kept=len(finished),
+        kept=len(catalogue.videos) - len(jobs),
         unusable=catalogue.refusals,
-        looked_at=len((made.keys() & standing.keys()) - lacking),
-        aside=len(aside),
+        looked_at=looked_at,
         not_looked_at=tuple(not_looked_at),
     )
 
@@ -177,115 +237,28 @@ def _pixels(video: VideoEntry, rows: Rows) -> int:
     return video.frames * (bottom - top) * video.width_px
 
 
-@dataclass(frozen=True, slots=True)
-class _Earlier:
-    """Results of earlier runs for the videos of this one.
-
-    Attributes:
-        standing: records by id, whose prepared file exists.
-        finished: ids of those that are complete.
-        lacking: ids of those whose files lack a requested plane.
-        failed: records without a file. They stay until the video was tried again: a finished folder stays finished.
-    """
-
-    standing: dict[str, PreparedVideo]
-    finished: set[str]
-    lacking: set[str]
-    failed: list[PreparedVideo]
-
-
-def _earlier(
-    target: Path,
-    catalogue: Catalogue,
-    known: dict[str, PreparedVideo],
-    scene: bool,
-    planes: tuple[str, ...],
-    tell: Callable[[int], None],
-) -> _Earlier:
-    earlier = _Earlier({}, set(), set(), [])
-    done = 0
-    with closing(standing_files(target, catalogue.videos, known)) as files:
-        for video, stands in files:
-            if stands:
-                record = earlier.standing[video.id] = known[video.id]
-                if not has_planes(target / prepared_name(video.id), planes):
-                    earlier.lacking.add(video.id)
-                elif record.scene or not scene:
-                    earlier.finished.add(video.id)
-                    done += video.frames
-            elif has_failed(video, known):
-                earlier.failed.append(known[video.id])
-            tell(done)
-    return earlier
-
-
 def _outcomes(
-    catalogue: Catalogue,
-    videos: Iterable[VideoEntry],
-    earlier: _Earlier,
-    target: Path,
-    size: str,
-    scene: bool,
-    planes: tuple[str, ...],
-    processes: int,
-) -> Iterator[tuple[VideoEntry, PreparedVideo | Refusal]]:
-    """Yield the new record of each video, in order of completion, or a problem if the existing record has to stay."""
-    jobs = []
-    for video in videos:
-        try:
-            window = _window(video, catalogue.rows)
-            jobs.append(_ToPrepare(video, window, earlier.standing.get(video.id), video.id in earlier.lacking))
-        except UsageError as error:
-            yield video, _record(video, str(error))
+    catalogue: Catalogue, jobs: Sequence[Transcoding], target: Path, processes: int
+) -> Iterator[tuple[Transcoding, Made | str]]:
+    """Yield the file of each job, or why there is none, in order of completion."""
+    failed: list[tuple[Transcoding, str]] = []
 
-    changed: list[tuple[_ToPrepare, str]] = []
-
-    def transcodings() -> Iterator[tuple[_ToPrepare, Transcoding]]:
+    def begun() -> Iterator[Transcoding]:
         for job in jobs:
-            id = job.video.id
-            keeps_scene = job.standing is not None and job.standing.scene != ""
-            # A file that is made again for one plane keeps its others.
-            more = [name for name in OPTIONAL if job.lacks_planes and has_planes(target / prepared_name(id), (name,))]
             try:
-                index = catalogue.frame_index(id).to_bytes()
-            except VideoError as error:
-                changed.append((job, error.reason))
-                continue
-            yield job, Transcoding(
-                id, catalogue.path(id), job.video.fingerprint, index, job.video.frames_per_second,
-                job.window, size, target, target / prepared_name(id), scene or keeps_scene,
-                tuple(dict.fromkeys((*planes, *more))),
-            )  # fmt: skip
+                window, index = _window(job.video, catalogue.rows), catalogue.frame_index(job.video.id).to_bytes()
+            except (UsageError, VideoError) as error:
+                failed.append((job, getattr(error, "reason", str(error))))
+            else:
+                yield replace(job, window=window, index=index)
 
-    isolated = run_isolated(
-        _attempt,
-        transcodings(),
-        processes,
-        lambda job: _deadline_seconds(job[0]),
-        writable=(target, *compile_cache()),
-    )
-    found: Iterator[tuple[_ToPrepare, Made | Scene | str | Died]] = ((job, result) for (job, _), result in isolated)
-    for job, result in chain(found, changed):
+    for job, result in run_isolated(
+        _attempt, begun(), processes, lambda job: _deadline_seconds(job), writable=(target, *compile_cache())
+    ):
         if isinstance(result, Died):
             result = f"hangs the transcoder: {result.how}" if result.overdue_seconds else f"{_CRASHES} ({result.how})"
-        if isinstance(result, Scene) and job.standing is not None:
-            yield job.video, replace(job.standing, scene=_text(result))
-        elif isinstance(result, str) and job.standing is not None:
-            yield job.video, Refusal(job.video.id, None, result)
-        else:
-            # Only a process that a video has taken over analyses what it was told to transcode.
-            made = f"{_CRASHES} (it sent a malformed result)" if isinstance(result, Scene) else result
-            yield job.video, _record(job.video, made)
-
-
-@dataclass(frozen=True, slots=True)
-class _ToPrepare:
-    """A video to transcode, or only to analyse if its prepared file exists and lacks no plane."""
-
-    video: VideoEntry
-    window: PixelRect
-    standing: PreparedVideo | None
-    lacks_planes: bool
+        yield job, result
+    yield from failed
 
 
 def _window(video: VideoEntry, rows: Rows) -> PixelRect:
@@ -293,7 +266,7 @@ def _window(video: VideoEntry, rows: Rows) -> PixelRect:
     return top, 0, bottom - top, video.width_px
 
 
-def _deadline_seconds(job: _ToPrepare) -> float:
+def _deadline_seconds(job: Transcoding) -> float:
     """Return the time limit for a video, seconds: some fifty times what a core takes to transcode and verify it. It
     ends jobs whose storage never answers.
     """
@@ -301,10 +274,10 @@ def _deadline_seconds(job: _ToPrepare) -> float:
     return 600 + video.frames * (0.5 + 5e-6 * video.width_px * video.height_px)
 
 
-def _attempt(job: tuple[_ToPrepare, Transcoding]) -> Made | Scene | str:
+def _attempt(job: Transcoding) -> Made | str:
     """Return the result of one job, or the reason why there is none."""
     try:
-        return transcode(job[1]) if job[0].standing is None or job[0].lacks_planes else look_again(job[1])
+        return transcode(job)
     except VideoError as error:
         return error.reason if error.frame is None else f"frame {error.frame}: {error.reason}"
     except OSError as error:
@@ -313,24 +286,201 @@ def _attempt(job: tuple[_ToPrepare, Transcoding]) -> Made | Scene | str:
         return f"preparing failed: {type(error).__name__}: {error}"
 
 
-def _record(video: VideoEntry, result: Made | str) -> PreparedVideo:
+def _record(video: VideoEntry, bytes: int = 0, scene: str = "", problem: str | None = None) -> PreparedVideo:
     rate = video.frames_per_second
     # A fingerprint begins with the size in bytes.
     size = int(video.fingerprint.partition("-")[0])
-    record = PreparedVideo(
+    return PreparedVideo(
         video.id, video.fingerprint, size, video.frames, None if math.isnan(rate) else rate, video.height_px,
-        video.width_px,
-        remark=video.remark,
+        video.width_px, bytes, problem, scene, video.remark,
     )  # fmt: skip
-    if isinstance(result, str):
-        return replace(record, problem=result)
-    return replace(
-        record,
-        fingerprint=result.fingerprint,
-        bytes=result.bytes,
-        scene="" if result.scene is None else _text(result.scene),
-    )
 
 
-def _text(scene: Scene) -> str:
-    return b64encode(scene.to_bytes()).decode()
+def _text(scene: Scene | None) -> str:
+    return "" if scene is None else b64encode(scene.to_bytes()).decode()
+
+
+def check_destination(target: Path, source: Path, single: bool = False, catalogue: Catalogue | None = None) -> None:
+    """Check a destination without reading a video of the source.
+
+    Args:
+        target: the destination, resolved.
+        source: the folder of the source, resolved.
+        single: the source is one video: other files of its folder are never used.
+        catalogue: the source, once it is probed: see :func:`refuse_links`.
+
+    Raises:
+        CorpusError: it is no folder, is write-protected, holds something else, overlaps with the source or lies in a
+            prepared folder, or the disk is nearly full.
+    """
+    try:
+        at = next(each for each in (target, *target.parents) if each.exists())
+        if not at.is_dir():
+            raise CorpusError(f"{target}: {at} is a file; give the name of a folder")
+        if not is_writable(at):
+            raise CorpusError(f"{target}: {at} is write-protected; choose another destination, or allow writing")
+        below = target != source and target.is_relative_to(source)
+        if source.is_relative_to(target) or (below and not single):
+            raise CorpusError(f"{target} and the source {source} overlap; choose a destination outside the source")
+        if catalogue is not None:
+            refuse_links(catalogue, target)
+        check_free_space(at)
+        if (target / MANIFEST_NAME).exists():
+            return
+        for folder in target.parents:
+            if (folder / MANIFEST_NAME).exists():
+                raise CorpusError(f"{target} lies in the prepared folder {folder}; choose another destination")
+        foreign = sorted(entry.name for entry in at.iterdir() if not entry.name.startswith(".")) if at == target else []
+        if foreign:
+            raise CorpusError(
+                f"{target}: holds {foreign[0]} ({len(foreign)} entries) and no manifest of v2v-prepare; choose an "
+                "empty or a new folder"
+            )
+    except OSError as error:
+        raise CorpusError(f"{target}: cannot be written to: {error.strerror or error}") from error
+
+
+def check_free_space(folder: Path) -> None:
+    """Check that the disk is not nearly full.
+
+    Raises:
+        CorpusError: it is.
+        OSError: the free space cannot be read.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < LEAST_FREE_BYTES:
+        raise CorpusError(
+            f"{folder}: the disk has {free / 1e9:.2f} GB free, of which {LEAST_FREE_BYTES / 1e9:.1f} must stay free; "
+            "finished files are kept; free disk space and run the same command to continue"
+        )
+
+
+def refuse_links(catalogue: Catalogue, target: Path) -> None:
+    """Check that no file of the source is a link into the destination.
+
+    Args:
+        catalogue: the source.
+        target: the destination, resolved.
+
+    Raises:
+        CorpusError: one is, or the source is a prepared folder itself.
+    """
+    root = catalogue.folder
+    if catalogue.prepared is not None:
+        raise CorpusError(f"{root} is a prepared folder itself; prepare its source instead")
+    # Resolving a path queries each of its parts, so do it once for every folder, and for files that are links.
+    inside: dict[str, bool] = {}
+    for video in catalogue.videos:
+        path = root / video.id
+        folder = os.path.dirname(video.id)
+        if folder not in inside:
+            inside[folder] = path.parent.resolve().is_relative_to(target)
+        if inside[folder] or (path.is_symlink() and path.resolve().is_relative_to(target)):
+            raise CorpusError(f"{target}: {video.id} of the source is a link into it; choose another destination")
+
+
+@contextlib.contextmanager
+def locked(target: Path) -> Iterator[None]:
+    """Lock the folder against other processes. The system releases the lock when this process ends in any way.
+
+    Raises:
+        CorpusError: another process works there.
+        OSError: the folder cannot be written to.
+    """
+    with (target / _LOCK_NAME).open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise CorpusError(f"{target}: another v2v-prepare works there; wait until it ends") from None
+        yield
+
+
+def known_records(target: Path, header: Header, videos: Sequence[VideoEntry]) -> dict[str, PreparedVideo]:
+    """Return the records of the run before, after removing unfinished files.
+
+    Args:
+        target: the destination.
+        header: settings of this run.
+        videos: videos of its source.
+
+    Raises:
+        CorpusError: the folder was prepared with other settings or from another source.
+        OSError: it cannot be read, or unfinished files cannot be removed.
+    """
+    if not (target / MANIFEST_NAME).exists():
+        return {}
+    manifest = read_manifest(target)
+    if manifest.header.settings != header.settings:
+        # One header describes all files of a folder, so it cannot hold two settings; and preparing all of them again
+        # without being asked may cost days.
+        made = sum(video.problem is None for video in manifest.videos.values())
+        raise CorpusError(
+            f"{target} holds {made} videos prepared with {manifest.header.settings}, but {header.settings} is "
+            "requested; choose another folder, or delete this one to prepare all of them again"
+        )
+    known, earlier, now = manifest.videos, manifest.header.source, header.source
+    # Another corpus would look like this one with every video changed or removed, and its files would replace those of
+    # the same names, which may have taken days. A source that keeps its name, or some video, is the same.
+    kept = (known[video.id].source_fingerprint == video.fingerprint for video in videos if video.id in known)
+    if earlier != now and known and not any(kept):
+        raise CorpusError(
+            f"{target} was prepared from a folder called {earlier}, and none of its {len(known)} videos is one of the "
+            f"{len(videos)} of {now}; choose another folder for another corpus. If it is the same one renamed, begin "
+            "with all of its videos, or use its old name"
+        )
+    for unfinished in target.rglob(f".*{PARTIAL_SUFFIX}"):
+        unfinished.unlink()
+    return known
+
+
+@dataclass(frozen=True, slots=True)
+class _Standing:
+    """A prepared file that stands: its planes and its size."""
+
+    planes: frozenset[str]
+    bytes: int
+
+
+def _standing_files(
+    target: Path, catalogue: Catalogue, size: str
+) -> Generator[tuple[VideoEntry, _Standing | None], None, None]:
+    """Yield each video, in order, with its prepared file, see :func:`find_standing`.
+
+    Many files are read at a time, because this waits for the disk.
+
+    Raises:
+        CorpusError: a file exists and cannot be read.
+    """
+    pool = ThreadPoolExecutor(_READERS)
+    find = partial(find_standing, target, catalogue.rows, size)
+    try:
+        for start in range(0, len(catalogue.videos), _AT_A_TIME):
+            some = catalogue.videos[start : start + _AT_A_TIME]
+            yield from zip(some, pool.map(find, some), strict=True)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def find_standing(target: Path, rows: Rows, size: str, video: VideoEntry) -> _Standing | None:
+    """Return the prepared file of a video if it is whole, and its head is what would be written; None if not.
+
+    Raises:
+        CorpusError: it exists and cannot be read.
+    """
+    path = target / prepared_name(video.id)
+    try:
+        wanted = video.fingerprint, video.height_px, _window(video, rows), 0, video.frames, SIZES[size].method
+        with StoreFile(path) as stored:
+            head = stored.head
+            usable = head.top, 0, head.rows, head.width_px
+            found = head.fingerprint, head.height_px, usable, head.first, head.count, head.packing
+            return _Standing(stored.planes, path.stat().st_size) if found == wanted and stored.is_whole else None
+    except UsageError:
+        return None
+    except VideoError as error:
+        if isinstance(error.__cause__, OSError) and error.__cause__.errno not in _NOT_THERE:
+            raise CorpusError(
+                f"{path} {error.reason}, so it cannot be checked, and nothing was changed; make it readable, or "
+                "delete it to prepare it again"
+            ) from error
+        return None

@@ -18,23 +18,21 @@ import fcntl
 import hashlib
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
 from v2v_protocol.errors import CorpusError, VideoError, VideoUnreadable
-from v2v_server.store.format import PIECE_FRAMES, Head
+from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.store.packing import QUICK, RAW, Packing
 from v2v_server.store.pixels import Pixels
 from v2v_server.store.planes import OPTIONAL, PLANES, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
-from v2v_server.store.reader import StoreFile, has_planes, read_clips
-from v2v_server.store.writer import StoreWriter, head_of, planes_of, write_pictures
-from v2v_server.system.process import make_private
+from v2v_server.store.reader import StoreFile, read_clips
+from v2v_server.store.writer import write_store
 from v2v_server.system.status_fields import GIB
-from v2v_server.video.collect import ClipRequest, DecodedPicture
+from v2v_server.video.collect import ClipRequest
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.orientation import PixelRect
 
@@ -115,11 +113,12 @@ class Cache:
             for number in range(start // size, last // size + 1)
         ]
         planes = [name for name in OPTIONAL if PLANES[name].is_worth_storing(request)]
-        lacking = [piece for piece in pieces if not has_planes(piece.path, planes)]
+        held = {piece: _planes_in(piece.path) for piece in pieces} if planes else {}
+        lacking = {piece: names for piece, names in held.items() if not names.issuperset(planes)}
         needed = [name for name in planes if PLANES[name].remedy]
-        is_readable = all(has_planes(piece.path, needed) for piece in lacking)
+        is_readable = all(names.issuperset(needed) for names in lacking.values())
         # Keep what other streams stored; otherwise two streams would replace each other's pieces.
-        kept = [name for name in OPTIONAL if any(has_planes(piece.path, (name,)) for piece in lacking)]
+        kept = [name for name in OPTIONAL if any(name in names for names in lacking.values())]
         made = self._read(pieces, fingerprint, request) if is_readable else None
         if made is not None and not lacking:
             return made
@@ -135,15 +134,10 @@ class Cache:
                 break
             except VideoError:
                 break  # the damage may lie beyond the frames that this sample needs
-            made, lacking = made or self._read(pieces, fingerprint, request), []
+            made, lacking = made or self._read(pieces, fingerprint, request), {}
             if made is not None:
                 return tuple(replace(clip, origin="") for clip in made)
         return made
-
-    @property
-    def used_bytes(self) -> int:
-        """Bytes stored in the folder by all processes that share it; 0 if unknown."""
-        return self._quota.used_bytes
 
     def _read(self, pieces: Sequence[_Piece], fingerprint: str, request: ClipRequest) -> tuple[DecodedClip, ...] | None:
         """Read the cuts if all pieces are present and sound. Damaged pieces are removed."""
@@ -178,8 +172,9 @@ class Cache:
             self._rest(f"is gone: {error.strerror or error}")
             return False
         expected = pixels * _EXPECTED_BITS[self._packing] // 8
-        if self.used_bytes + expected > self._quota.most_bytes:
-            self.trouble = f"full: {self.used_bytes / GIB:.2f} of {self._quota.most_bytes / GIB:g} GiB"
+        used = self._quota.used_bytes
+        if used + expected > self._quota.most_bytes:
+            self.trouble = f"full: {used / GIB:.2f} of {self._quota.most_bytes / GIB:g} GiB"
             return False
         if free - expected < self._quota.least_free_bytes:
             self._rest(f"disk full: {free / GIB:.2f} GiB free")
@@ -195,7 +190,7 @@ class Cache:
         missing: Sequence[_Piece],
         planes: Sequence[str],
     ) -> None:
-        """Decode the missing pieces in one pass, and store each.
+        """Decode the missing pieces in one pass, and store each that fits the limit.
 
         Raises:
             VideoError: they cannot be decoded.
@@ -205,34 +200,22 @@ class Cache:
         begin, end = missing[0].first, missing[-1].end
         cut = whole_cut(end - begin, usable, planes)
         frames = pixels.pictures(ClipRequest(index, begin, (cut,), most_bits=request.most_bits))
+        partial = self.folder / PARTIAL / secrets.token_hex(8)
+        partial.parent.mkdir(exist_ok=True)
         for piece in missing:
             for _ in range(begin, piece.first):  # frames of a piece that exists
                 next(frames)
-            begin, count = piece.end, piece.end - piece.first
-            picture = next(frames)
-            head = head_of(
-                picture, index, usable, video=video, fingerprint=fingerprint, first=piece.first, count=count,
-                packing=self._packing,
-            )  # fmt: skip
-            self._keep(piece.path, head, chain((picture,), islice(frames, count - 1)), planes_of(head, planes))
-
-    def _keep(self, path: Path, head: Head, pictures: Iterable[DecodedPicture], planes: Sequence[str]) -> None:
-        """Write a piece, and rename it into place if it fits the limit."""
-        partial = self.folder / PARTIAL / secrets.token_hex(8)
-        try:
-            partial.parent.mkdir(exist_ok=True)
-            make_private(partial)
-            with StoreWriter(partial, head, self._packing, planes) as writer:
-                # Held for the life of this process: see _remove_abandoned.
-                fcntl.flock(writer.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-                for _ in write_pictures(writer, head, pictures, planes):
-                    pass
-                writer.close()
-            with self._waiting():
-                self._quota.add(partial, path)
-        finally:
-            with contextlib.suppress(OSError):
-                partial.unlink()
+            begin = piece.end
+            try:
+                write_store(
+                    partial, frames, index, usable, piece.first, piece.end - piece.first, video=video,
+                    fingerprint=fingerprint, packing=self._packing, planes=planes, is_private=True,
+                )  # fmt: skip
+                with self._waiting():
+                    self._quota.add(partial, piece.path)
+            finally:
+                with contextlib.suppress(OSError):
+                    partial.unlink()
 
     def _remove(self, path: Path, why: str) -> None:
         """Remove an unreadable piece, so that it is decoded again."""
@@ -266,7 +249,7 @@ class Cached:
 
     def __init__(self, pixels: Pixels, cache: Cache, video: str, fingerprint: str) -> None:
         self._pixels, self._cache, self._name = pixels, cache, (video, fingerprint)
-        self.facts, self.pictures, self.signal = pixels.facts, pixels.pictures, pixels.signal
+        self.facts, self.pictures = pixels.facts, pixels.pictures
 
     def check(self, fingerprint: str) -> None:
         """Do nothing: a piece states what it was made from, and the video is checked before it is decoded."""
@@ -287,6 +270,15 @@ class _Piece:
     path: Path
     first: int
     end: int
+
+
+def _planes_in(path: Path) -> frozenset[str]:
+    """Return the planes of a piece; all of one that cannot be read, since whatever reads it says why."""
+    try:
+        with StoreFile(path) as stored:
+            return stored.planes
+    except VideoError:
+        return frozenset(PLANES)
 
 
 def make_cache(folder: Path) -> None:

@@ -26,7 +26,7 @@ import numpy.typing as npt
 import xxhash
 
 from v2v_protocol.errors import ProtocolError, VideoError
-from v2v_server.store.packing import PACK_METHODS
+from v2v_server.store.packing import PACK_METHODS, UnpackingError
 from v2v_server.video.colour.chroma import DEFAULT_MATRIX
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR, TRANSFERS, Signal
@@ -41,6 +41,8 @@ LARGEST_BLOCK_BYTES = 2 * GROUP_FRAMES * BLOCK_ROWS * BLOCK_COLUMNS
 _LARGEST_GROUP_BYTES = 64 << 20
 _PREFIX = struct.Struct("<8sIQ")
 _LARGEST_HEAD_BYTES = 64 << 20
+_LONGEST_FINGERPRINT = 200
+"""An index keeps it for every video."""
 _BLOCK = np.dtype([("bytes", "<u4"), ("check", "<u8")])
 
 
@@ -98,6 +100,7 @@ class Head:
             and 0 <= self.first < self.first + self.count <= self.frames <= LARGEST_FRAMES
             and 1 <= self.group <= GROUP_FRAMES
             and self.packing in PACK_METHODS
+            and len(self.fingerprint) <= _LONGEST_FINGERPRINT
             and SDR.bits <= self.bits <= MOST_BITS
             and self.transfer in (SDR.transfer, MIXED, *TRANSFERS.values())
         )
@@ -105,7 +108,7 @@ class Head:
             raise ProtocolError(
                 f"{self.count} frames from {self.first} of {self.frames}, rows {self.top} + {self.rows} of "
                 f"{self.width_px}x{self.height_px} px, groups of {self.group}, packed by {self.packing!r:.20}, "
-                f"{self.bits} bits, transfer {self.transfer!r:.20}"
+                f"{self.bits} bits, transfer {self.transfer!r:.20}, fingerprint {self.fingerprint!r:.100}"
             )
 
     @property
@@ -204,22 +207,27 @@ class BlockRecord:
     checks: list[int]
 
 
-def unpack_record(group: int, data: bytes) -> BlockRecord | None:
-    """Decode the record of a group; None if it is damaged."""
-    if len(data) < 16 or check(data[:-8], group + 1) != struct.unpack("<Q", data[-8:])[0]:
-        return None
-    if struct.unpack("<Q", data[:8])[0] >= 1 << 62:  # longer than any file; offsets are signed
-        return None
+def unpack_record(group: int, data: bytes) -> BlockRecord:
+    """Decode the record of a group.
+
+    Raises:
+        UnpackingError: it is damaged, or a block is larger than any that is written.
+    """
+    start = int.from_bytes(data[:8], "little")
+    is_sound = len(data) >= 16 and check(data[:-8], group + 1) == int.from_bytes(data[-8:], "little")
+    if not is_sound or start >= 1 << 62:  # longer than any file; offsets are signed
+        raise UnpackingError("its record in the table is damaged")
     blocks: npt.NDArray[np.void] = np.frombuffer(data[8:-8], _BLOCK)
-    starts = np.cumsum(np.concatenate([[struct.unpack("<Q", data[:8])[0]], blocks["bytes"].astype(np.int64)]))
-    return BlockRecord(starts.tolist(), blocks["check"].tolist())
-
-
-def block_check(block: bytes | memoryview, group: int, number: int) -> int:
-    """Return the hash of a block at its position."""
-    return check(block, group << 32 | number)
+    sizes = blocks["bytes"].astype(np.int64)
+    # Check before a reader allocates: the author of a hostile file also wrote its checksums.
+    if sizes.max(initial=0) > LARGEST_BLOCK_BYTES:
+        number = int(sizes.argmax())
+        raise UnpackingError(f"block {number} has {sizes[number]} bytes, the limit is {LARGEST_BLOCK_BYTES}")
+    return BlockRecord(np.cumsum(np.concatenate([[start], sizes])).tolist(), blocks["check"].tolist())
 
 
 def check(data: bytes | memoryview, place: int) -> int:
-    """Return the hash of data at a place."""
+    """Return the hash of data at a place: 0 for the head, ``group + 1`` for a record, ``group << 32 | number`` for a
+    block.
+    """
     return xxhash.xxh3_64_intdigest(data, place)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import os
 import posixpath
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -96,7 +96,7 @@ class PictureSequence(VideoFile):
             remark=looks[0].partition("; ")[2],
         )
 
-    def _frames(self, stack: Stack) -> Iterator[VideoFrame]:
+    def _frames(self, stack: Stack) -> Generator[VideoFrame, None, None]:
         """Decode the pictures of a request, and no other."""
         wanted, index = stack.wanted, stack.wanted.index
         with self._opened() as (files, read):

@@ -14,6 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from v2v_protocol.errors import UsageError
+from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
+from v2v_server.video.decode import DecodedClip
+from v2v_server.video.frame_index import FrameIndex
+from v2v_server.video.luma import MOST_BITS, Signal
+from v2v_server.video.probe import VideoFacts
 
 if TYPE_CHECKING:  # a server's command line, which names the kinds, starts without the decoder
     from v2v_server.video.collect import ClipRequest, DecodedPicture
@@ -99,8 +104,13 @@ class Pixels(Protocol):
     def pictures(self, request: ClipRequest) -> Iterator[DecodedPicture]:
         """Yield the pictures of the only cut of a request, in the memory of a few."""
 
-    def signal(self, index: FrameIndex) -> Signal:
-        """Return what the levels mean, by the first frame."""
+
+def signal_of(pixels: Pixels, index: FrameIndex) -> Signal:
+    """Return what the levels of a video mean, by its first frame, whatever the sample."""
+    from v2v_server.video.collect import ClipRequest
+
+    cut = Cut(1, (0, 0, 1, 1))
+    return pixels.clips(ClipRequest(index, index.first, (cut,), most_bits=MOST_BITS, samples=((0, 0, 0),)))[0].signal
 
 
 def kind_of(id: str) -> str:

@@ -138,17 +138,6 @@ class QuotaFolder:
         return True
 
     def remove(self, path: Path) -> None:
-        """Remove a file.
-
-        Raises:
-            OSError: it cannot be removed; BlockingIOError: see :meth:`locked`.
-        """
-        with self.locked() as used:
-            size = path.stat().st_size
-            path.unlink()
-            used.add(-size)
-
-    def discard(self, path: Path) -> None:
         """Remove a file unless it has a reader.
 
         Raises:

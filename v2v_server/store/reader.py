@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NoReturn
@@ -19,12 +19,10 @@ from v2v_protocol.errors import ProtocolError, UsageError, VideoChanged, VideoEr
 from v2v_server.store.format import (
     BLOCK_COLUMNS,
     BLOCK_ROWS,
-    GROUP_FRAMES,
-    LARGEST_BLOCK_BYTES,
     MAGIC,
     BlockRecord,
     Head,
-    block_check,
+    check,
     read_head,
     unpack_record,
 )
@@ -38,7 +36,7 @@ from v2v_server.video.luma import MIXED, SDR, Signal
 from v2v_server.video.orientation import PixelRect
 from v2v_server.video.probe import VideoFacts
 
-STORE_FORMAT = "v2v store"
+STORE_FORMAT = "v2v store file"
 """Name of the store file format, which only a prepared folder can serve."""
 _REMEDY = "re-create it with v2v-prepare"
 _ZEROS = np.empty(0, np.uint8)
@@ -131,14 +129,10 @@ class BlockReader:
 
     def _record(self, group: int) -> BlockRecord:
         size = self.head.record_bytes
-        record = unpack_record(group, self._pread(size, self._table + group * size, group))
-        if record is None:
-            self._refuse(group, "its record in the table is damaged")
-        # Check before allocating: the author of a hostile file also wrote its checksums.
-        for number, (start, end) in enumerate(pairwise(record.starts)):
-            if end - start > LARGEST_BLOCK_BYTES:
-                self._refuse(group, f"block {number} has {end - start} bytes, the limit is {LARGEST_BLOCK_BYTES}")
-        return record
+        try:
+            return unpack_record(group, self._pread(size, self._table + group * size, group))
+        except UnpackingError as error:
+            self._refuse(group, str(error))
 
     def _blocks(
         self, group: int, record: BlockRecord, before: int, columns: range, column_bytes: int
@@ -154,7 +148,7 @@ class BlockReader:
         for column in columns:
             number = before + column
             packed = data[record.starts[number] - start : record.starts[number + 1] - start]
-            if block_check(packed, group, number) != record.checks[number]:
+            if check(packed, group << 32 | number) != record.checks[number]:
                 self._refuse(group, f"block {number} is damaged or truncated")
             if self._is_sparse and not packed:
                 yield _ZEROS
@@ -180,7 +174,7 @@ class BlockReader:
         )
 
 
-class StoreFile(BlockReader):
+class StoreFile(BlockReader, AbstractContextManager["StoreFile"]):
     """An open store file: :class:`v2v_server.store.pixels.Pixels` of the video that it was made from.
 
     Args:
@@ -231,6 +225,7 @@ class StoreFile(BlockReader):
             rotation_degrees=0,
             full_range=True,
             index=index,
+            made_of=head.fingerprint,
         )
 
     def check(self, fingerprint: str) -> None:
@@ -254,6 +249,16 @@ class StoreFile(BlockReader):
         if not is_there or usable != (head.top, 0, head.rows, head.width_px):
             raise VideoError(self._path, None, f"holds other frames or rows than its name says: {head}"[:200])
 
+    @property
+    def is_whole(self) -> bool:
+        """Return whether the file ends behind its last block, or behind a list of planes.
+
+        Raises:
+            VideoUnreadable, VideoError: see :meth:`plane`.
+        """
+        end, size = self._record(self.head.groups - 1).starts[-1], os.fstat(self._file).st_size
+        return end == size or (end < size and bool(self._places))
+
     def clips(self, request: ClipRequest) -> tuple[DecodedClip, ...]:
         """Read the cuts of a request, see :func:`read_clips`."""
         return read_clips([self], request, "store")
@@ -261,18 +266,11 @@ class StoreFile(BlockReader):
     def pictures(self, request: ClipRequest) -> Iterator[DecodedPicture]:
         """Yield the frames of the only cut of a request in 8 bits, in the memory of a few."""
         (cut,) = request.cuts
-        for done in range(0, cut.count, GROUP_FRAMES):
-            grey = np.empty((min(GROUP_FRAMES, cut.count - done), *request.window(cut)[2:]), np.uint8)
+        for done in range(0, cut.count, self.head.group):
+            grey = np.empty((min(self.head.group, cut.count - done), *request.window(cut)[2:]), np.uint8)
             self.read(request.start + done * request.stride, request.stride, request.window(cut), grey)
             for picture in grey:
                 yield DecodedPicture(picture, picture, SDR, self.head.codec, self.head.bit_exact)
-
-    def signal(self, index: FrameIndex) -> Signal:
-        """Return what the levels of the source mean."""
-        return self.head.signal
-
-    def __enter__(self) -> StoreFile:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -286,7 +284,8 @@ class StoreFile(BlockReader):
         Raises:
             VideoUnreadable, VideoError: see :meth:`plane`.
         """
-        return frozenset(name for name, place in self._places.items() if place.version == PLANES[name].version)
+        places = self._places
+        return frozenset(name for name in PLANES if name in places and places[name].version == PLANES[name].version)
 
     def plane(
         self, name: str, start: int, count: int, cells: PixelRect, wanted: npt.NDArray[np.int64] | None = None
@@ -329,10 +328,9 @@ class StoreFile(BlockReader):
     @cached_property
     def _places(self) -> Mapping[str, PlanePlace]:
         try:
-            places = read_footer(self._path, self._file)
+            return read_footer(self._path, self._file)
         except OSError as error:
             raise VideoUnreadable(self._path, None, f"cannot be read: {error.strerror or error}") from error
-        return {name: place for name, place in places.items() if name in PLANES}
 
 
 def read_clips(files: Sequence[StoreFile], request: ClipRequest, origin: str) -> tuple[DecodedClip, ...]:
@@ -392,14 +390,3 @@ def is_store_file(path: str | os.PathLike[str]) -> bool:
             return file.read(len(MAGIC)) == MAGIC
     except OSError:
         return False
-
-
-def has_planes(path: Path, planes: Collection[str]) -> bool:
-    """Return whether a store file has planes; True if it cannot be read, since whatever reads it says why."""
-    if not planes:
-        return True
-    try:
-        with StoreFile(path) as stored:
-            return stored.planes.issuperset(planes)
-    except VideoError:
-        return True

@@ -8,11 +8,9 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 from v2v_server.store.planes.motion import by_cut, watch_motion
-from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
+from v2v_server.video.collect import ClipRequest, DecodedPicture
 from v2v_server.video.decode import DecodedClip, Way, decode_cuts, stream_pictures
 from v2v_server.video.fingerprint import check_fingerprint
-from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import MOST_BITS, Signal
 from v2v_server.video.probe import VideoFacts, probe
 
 VIDEO_SUFFIXES = frozenset({
@@ -53,11 +51,6 @@ class VideoFile:
     def pictures(self, request: ClipRequest) -> Iterator[DecodedPicture]:
         """Decode one by one, see :func:`v2v_server.video.decode.stream_pictures`."""
         return stream_pictures(self._path, request, self.ways)
-
-    def signal(self, index: FrameIndex) -> Signal:
-        """Decode the first frame."""
-        request = ClipRequest(index, index.first, (Cut(1, (0, 0, 1, 1)),), most_bits=MOST_BITS)
-        return decode_cuts(self._path, request, ways=self.ways)[0].signal
 
 
 def id_of(path: str) -> str:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack
+from itertools import chain, islice
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, BinaryIO
@@ -15,13 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.store.format import BLOCK_COLUMNS, BLOCK_ROWS, Head, block_check, group_frames_for, pack_record
+from v2v_server.store.format import BLOCK_COLUMNS, BLOCK_ROWS, Head, check, group_frames_for, pack_record
 from v2v_server.store.packing import Packing
 from v2v_server.store.planes import PLANES
 from v2v_server.store.planes.plane import PlanePlace, pack_footer
+from v2v_server.system.process import make_private
 from v2v_server.video.collect import DecodedPicture
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.orientation import PixelRect
+
+Arrays = Mapping[str, npt.NDArray[Any]]
 
 
 class _BlockWriter:
@@ -75,7 +80,7 @@ class _BlockWriter:
                 block = view[left * column : (left + BLOCK_COLUMNS) * column]
                 is_empty = self._is_sparse and not np.frombuffer(block, np.uint8).any()
                 blocks.append(b"" if is_empty else self._pack(block))
-        checks = [block_check(block, group, number) for number, block in enumerate(blocks)]
+        checks = [check(block, group << 32 | number) for number, block in enumerate(blocks)]
         self._table.append(pack_record(head, group, self.end, [len(block) for block in blocks], checks))
         self._file.seek(self.end)
         self._file.write(b"".join(blocks))
@@ -100,7 +105,7 @@ class _BlockWriter:
         self._file.flush()
 
 
-class StoreWriter:
+class StoreWriter(AbstractContextManager["StoreWriter"]):
     """Write the frames that a head announces. The file is a store file once it is closed without an error.
 
     Memory: one group of frames, twice (see :func:`v2v_server.store.format.group_frames_for`), and the compressed blocks
@@ -119,6 +124,8 @@ class StoreWriter:
     def __init__(self, path: str | os.PathLike[str], head: Head, packing: Packing, planes: Iterable[str] = ()) -> None:
         self._files = ExitStack()
         self._file: BinaryIO = self._files.enter_context(open(path, "wb"))  # noqa: SIM115 - closed by close()
+        # Held while this writes: a file without it is abandoned (v2v_server.store.cache).
+        fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._luma = _BlockWriter(self._file, head, packing)
         self._planes: dict[str, tuple[BinaryIO, _BlockWriter]] = {}
         for name in planes:
@@ -130,13 +137,7 @@ class StoreWriter:
         """Size of the file so far without its planes, bytes."""
         return self._luma.end
 
-    def fileno(self) -> int:
-        """Return the file descriptor."""
-        return self._file.fileno()
-
-    def add(
-        self, picture: npt.NDArray[np.uint8], planes: Mapping[str, npt.NDArray[Any]] = MappingProxyType({})
-    ) -> None:
+    def add(self, picture: npt.NDArray[np.uint8], planes: Arrays = MappingProxyType({})) -> None:
         """Add the next frame: [rows, width] uint8, and the array of each plane.
 
         Raises:
@@ -176,60 +177,57 @@ class StoreWriter:
             shutil.copyfileobj(file, self._file)
         self._file.write(pack_footer(places))
 
-    def __enter__(self) -> StoreWriter:
-        return self
-
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._files.close()
 
 
-def planes_of(head: Head, planes: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return the names of the planes of a file: the given ones, and those that every file of its signal has."""
-    own = (name for name, plane in PLANES.items() if plane.is_part_of(head.signal))
-    return tuple(dict.fromkeys((*planes, *own)))
-
-
-def write_pictures(
-    writer: StoreWriter, head: Head, pictures: Iterable[DecodedPicture], planes: Iterable[str]
-) -> Iterator[tuple[npt.NDArray[np.uint8], dict[str, npt.NDArray[Any]]]]:
-    """Write pictures and their planes; yield what was written of each.
-
-    Raises:
-        VideoError: a picture states another transfer than the head.
-        UsageError, OSError: see :class:`StoreWriter`.
-    """
-    makers = {name: PLANES[name].maker() for name in planes}
-    for picture in pictures:
-        if picture.signal.transfer != head.transfer:
-            why = f"its transfer changes from {head.transfer or 'SDR'}: re-encode it with one transfer"
-            raise VideoError(head.video, None, why)
-        arrays = {name: make(picture) for name, make in makers.items()}
-        writer.add(picture.grey, arrays)
-        yield picture.grey, arrays
-
-
-def head_of(
-    picture: DecodedPicture, index: FrameIndex, usable: PixelRect, *, video: str, fingerprint: str, first: int,
-    count: int, packing: Packing, frames_per_second: float = 0.0, stored_index: bytes = b"",
-) -> Head:  # fmt: skip
-    """Return the head of a file.
+def write_store(
+    path: Path, pictures: Iterator[DecodedPicture], index: FrameIndex, usable: PixelRect, first: int,
+    count: int, *, video: str, fingerprint: str, packing: Packing, planes: Iterable[str],
+    frames_per_second: float = 0.0, stored_index: bytes = b"", lasting: bool = False, is_private: bool = False,
+    see: Callable[[Arrays], object] = lambda arrays: None,
+) -> None:  # fmt: skip
+    """Write a store file of the next pictures of a video, with the planes that every file of their signal has.
 
     Args:
-        picture: its first one.
+        path: the file; overwritten.
+        pictures: they begin at frame ``first``.
         index: of the video, or the part of it that is known.
         usable: the part of the pictures to store, all columns.
-        video, fingerprint: of the source.
         first, count: the frames to store.
-        packing: of the file.
+        video, fingerprint: of the source.
+        packing: compression.
+        planes: names of further planes to write.
         frames_per_second: of the video; 0 if unknown.
         stored_index: the encoded index; empty in a piece of a video.
+        lasting: wait until the data is on disk.
+        is_private: let no other user open it.
+        see: called with the arrays of each frame by the names of their planes; "" names the luma.
+
+    Raises:
+        VideoError: the pictures cannot be decoded, or one states another transfer than the first.
+        UsageError, OSError: see :class:`StoreWriter`.
     """
+    beginning = next(pictures)
     top, _, rows, width = usable
-    return Head(
+    head = Head(
         video=video, fingerprint=fingerprint, height_px=index.height_px, width_px=width, top=top, rows=rows,
-        first=first, count=count, frames=first + count, frames_per_second=frames_per_second, codec=picture.codec,
-        bit_exact=picture.bit_exact, group=group_frames_for(rows, width), packing=packing.method,
-        index=stored_index, bits=picture.signal.bits, transfer=picture.signal.transfer, matrix=picture.matrix,
+        first=first, count=count, frames=first + count, frames_per_second=frames_per_second, codec=beginning.codec,
+        bit_exact=beginning.bit_exact, group=group_frames_for(rows, width), packing=packing.method,
+        index=stored_index, bits=beginning.signal.bits, transfer=beginning.signal.transfer, matrix=beginning.matrix,
     )  # fmt: skip
+    own = (name for name, plane in PLANES.items() if plane.is_part_of(head.signal))
+    makers = {name: PLANES[name].maker() for name in (*planes, *own)}
+    if is_private:
+        make_private(path)
+    with StoreWriter(path, head, packing, makers) as writer:
+        for picture in chain((beginning,), islice(pictures, count - 1)):
+            if picture.signal.transfer != head.transfer:
+                why = f"its transfer changes from {head.transfer or 'SDR'}: re-encode it with one transfer"
+                raise VideoError(video, None, why)
+            arrays = {name: make(picture) for name, make in makers.items()}
+            writer.add(picture.grey, arrays)
+            see({"": picture.grey} | arrays)
+        writer.close(lasting=lasting)

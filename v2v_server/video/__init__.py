@@ -1,11 +1,8 @@
 """One video file: from its bytes to luma.
 
-source       opening it, for sequential reading
-container    what its container states beyond that
-probe        what it holds
+source       opening it, for sequential reading, and what its container states beyond that
+probe        what it holds, and which frames decode
 packets      what a packet says without being decoded
-signs        signs that a file's packets are not its frames
-listing      which frames decode
 frame_index  which frames it has, and where decoding may begin
 decode       a range of frames, exactly
 collect      the asked frames of one pass of a decoder

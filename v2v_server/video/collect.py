@@ -17,6 +17,13 @@ from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import MIXED, SDR, TRANSFERS, BeyondBits, LumaFormat, Signal, copy_luma, luma_plane, stretch
 from v2v_server.video.orientation import Orientation, PixelRect
 
+BIT_EXACT_CODECS = frozenset({
+    "h264", "hevc", "vp8", "vp9", "av1", "ffv1", "huffyuv", "ffvhuff", "png", "utvideo",
+    "tiff", "webp", "bmp",
+})  # fmt: skip
+"""Codecs whose standard fixes every bit of the decoded picture, or that are lossless, so that all hosts agree. Not so
+MPEG-1, 2, 4 and MJPEG: their standards leave the precision of the inverse transform open."""
+
 
 @dataclass(frozen=True, slots=True)
 class Cut:
@@ -129,6 +136,7 @@ class DecodedFrame(NamedTuple):
         samples, luma: see :func:`v2v_server.video.luma.luma_plane`.
         orientation, height_px, width_px: of the upright picture.
         signal: what the levels mean that were asked for.
+        codec: FFmpeg's name of the format.
     """
 
     frame: VideoFrame
@@ -138,6 +146,7 @@ class DecodedFrame(NamedTuple):
     height_px: int
     width_px: int
     signal: Signal
+    codec: str
 
     def raw(self, window: PixelRect) -> npt.NDArray[np.unsignedinteger]:
         """Return a window of the upright picture as the decoder stores it, without a copy."""
@@ -153,14 +162,15 @@ class DecodedFrame(NamedTuple):
         upright: npt.NDArray[Any] = self.orientation.upright(part)[0]
         return upright
 
-    def picture(self, window: PixelRect, chroma: ChromaCut | None, codec: str, bit_exact: bool) -> DecodedPicture:
+    def picture(self, window: PixelRect, chroma: ChromaCut | None) -> DecodedPicture:
         """Return a window of the picture, with the colour of a cut."""
         luma = self.part(window, self.signal)
         grey = self.part(window) if self.signal.bits > SDR.bits else luma
+        is_exact = self.codec in BIT_EXACT_CODECS
         if chroma is None:
-            return DecodedPicture(luma, grey, self.signal, codec, bit_exact)
+            return DecodedPicture(luma, grey, self.signal, self.codec, is_exact)
         stack = ChromaStack(chroma, self.orientation, self.height_px, self.width_px)
-        return DecodedPicture(luma, grey, self.signal, codec, bit_exact, *stack.cells_of(self.frame))
+        return DecodedPicture(luma, grey, self.signal, self.codec, is_exact, *stack.cells_of(self.frame))
 
 
 Watch = Callable[[], Callable[[DecodedFrame], object]]
@@ -245,15 +255,11 @@ class Stack:
             return True
         if frame.pts > expected:
             self.refuse(f"is missing: the decoder delivers time stamp {frame.pts} where {expected} should come")
-        if self.taken and not self._is_passed_over(frame.pts):
+        if self.taken and not (self._stride > 1 and frame.pts in self._pts):  # not one that the stride skips
             self.refuse(
                 f"the decoder delivers time stamp {frame.pts}, which the index does not have, before {expected}"
             )
         return False
-
-    def _is_passed_over(self, pts: int) -> bool:
-        """Return whether a frame before the next one to take is one that the stride skips."""
-        return self._stride > 1 and pts in self._pts
 
     def _copy(self, frame: VideoFrame) -> None:
         if self._luma is None:
@@ -277,7 +283,7 @@ class Stack:
                 copy_luma(samples, self._luma, stored, raw[self.taken], self.signal)
         if self._show is not None:
             size = self.index.height_px, self.index.width_px
-            self._show(DecodedFrame(frame, samples, self._luma, self._orientation, *size, self.signal))
+            self._show(DecodedFrame(frame, samples, self._luma, self._orientation, *size, self.signal, self.codec))
 
     def _part(self, cut: Cut) -> tuple[PixelRect, npt.NDArray[np.unsignedinteger]]:
         window = self.wanted.window(cut)

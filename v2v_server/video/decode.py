@@ -29,20 +29,12 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError
-from v2v_server.video.collect import ClipRequest, Cut, DecodedFrame, DecodedPicture, Stack, Watch
+from v2v_server.video.collect import BIT_EXACT_CODECS, ClipRequest, Cut, DecodedFrame, DecodedPicture, Stack, Watch
 from v2v_server.video.colour.chroma import Chroma
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.luma import SDR, Signal
-from v2v_server.video.orientation import PixelRect
 from v2v_server.video.packets import is_unreferenced, length_bytes
 from v2v_server.video.source import opened, packets, reason
-
-BIT_EXACT_CODECS = frozenset({
-    "h264", "hevc", "vp8", "vp9", "av1", "ffv1", "huffyuv", "ffvhuff", "png", "utvideo",
-    "tiff", "webp", "bmp",
-})  # fmt: skip
-"""Codecs whose standard fixes every bit of the decoded picture, or that are lossless, so that all hosts agree. Not so
-MPEG-1, 2, 4 and MJPEG: their standards leave the precision of the inverse transform open."""
 
 _VERSIONED_CODECS = frozenset({"h264", "mpeg4"})
 
@@ -76,19 +68,12 @@ class DecodedClip:
     arrays: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
 
 
-Way = Callable[[Stack], Iterator[VideoFrame]]
+Way = Callable[[Stack], Generator[VideoFrame, None, None]]
 """Yields the decoded frames for a stack."""
 
 
 class _SeekFailed(Exception):
     """Decoding did not begin at the keyframe that the index names."""
-
-
-def decode_luma(
-    path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: PixelRect | None = None
-) -> DecodedClip:
-    """Decode frames start .. start + count - 1 of a video, or a window of them: :func:`decode_cuts` of one cut."""
-    return decode_cuts(path, ClipRequest(index, start, (Cut(count, window),)))[0]
 
 
 def decode_cuts(
@@ -113,43 +98,14 @@ def decode_cuts(
             picture's size or format changes. Its ``frame`` is the ordinal of the first frame that was not delivered.
     """
     request.check()
-    stack = _filled(os.fspath(path), request, watch, ways)
+    for stack in _passes(path, request, watch, ways):  # noqa: B007 - the last one is complete
+        pass
     return tuple(
         DecodedClip(
             grey, request.seconds(cut), stack.codec, stack.codec in BIT_EXACT_CODECS, signal=stack.signal, chroma=chroma
         )
         for grey, chroma, cut in zip(stack.grey(), stack.chroma(), request.cuts, strict=True)
     )
-
-
-def _filled(path: str, wanted: ClipRequest, watch: Watch | None = None, ways: Sequence[Way] = ()) -> Stack:
-    for frames_of in ways or _WAYS:
-        stack = Stack(path, wanted, watch)
-        try:
-            for _ in _fill(stack, frames_of(stack)):
-                pass
-            return stack
-        except _SeekFailed:
-            continue
-        except VideoError:
-            if frames_of is (ways or _WAYS)[-1]:
-                raise
-    raise AssertionError("the last way has the last word")
-
-
-def stream_luma(
-    path: str | os.PathLike[str], index: FrameIndex, start: int, count: int, window: PixelRect | None = None
-) -> Iterator[npt.NDArray[np.uint8]]:
-    """Yield the frames of :func:`decode_luma` one by one, in the memory of one.
-
-    Yields:
-        [h, w] uint8, C-contiguous, full-range luma.
-
-    Raises:
-        UsageError, VideoError: see :func:`decode_cuts`.
-    """
-    for picture in stream_pictures(path, ClipRequest(index, start, (Cut(count, window),))):
-        yield picture.grey
 
 
 def stream_pictures(
@@ -161,21 +117,12 @@ def stream_pictures(
     shown: list[DecodedPicture] = []
 
     def see(frame: DecodedFrame) -> None:
-        shown[:] = [frame.picture(request.window(cut), cut.chroma, stack.codec, stack.codec in BIT_EXACT_CODECS)]
+        shown[:] = [frame.picture(request.window(cut), cut.chroma)]
 
-    for frames_of in ways or _WAYS:
-        stack = Stack(os.fspath(path), request, lambda: see, collects=False)
-        try:
-            for _ in _fill(stack, frames_of(stack)):
-                if stack.taken > done:
-                    done += 1
-                    yield shown[0]
-            return
-        except _SeekFailed:
-            continue
-        except VideoError:
-            if frames_of is (ways or _WAYS)[-1]:
-                raise
+    for stack in _passes(path, request, lambda: see, ways, collects=False):
+        if stack.taken > done:
+            done += 1
+            yield shown[0]
 
 
 def decodes_as_listed(path: str, index: FrameIndex, start: int, count: int) -> bool:
@@ -186,13 +133,40 @@ def decodes_as_listed(path: str, index: FrameIndex, start: int, count: int) -> b
     """
     index.position(start, count)
     try:
-        _filled(path, ClipRequest(index, start, (Cut(count, (0, 0, 1, 1)),)))
+        for _ in _passes(path, ClipRequest(index, start, (Cut(count, (0, 0, 1, 1)),))):
+            pass
     except VideoError:
         return False
     return True
 
 
-def _from_keyframe_on(stack: Stack) -> Iterator[VideoFrame]:
+def _passes(
+    path: str | os.PathLike[str],
+    wanted: ClipRequest,
+    watch: Watch | None = None,
+    ways: Sequence[Way] = (),
+    *,
+    collects: bool = True,
+) -> Generator[Stack, None, None]:
+    """Decode in one way after the other, until one does not fail; yield the stack of the pass after each frame."""
+    for frames_of in ways or _WAYS:
+        stack = Stack(os.fspath(path), wanted, watch, collects=collects)
+        try:
+            with closing(frames_of(stack)) as frames:
+                for frame in frames:
+                    complete = stack.take(frame)
+                    yield stack
+                    if complete:
+                        return
+            stack.refuse("the file ends before it")
+        except _SeekFailed:
+            continue
+        except VideoError:
+            if frames_of is (ways or _WAYS)[-1]:
+                raise
+
+
+def _from_keyframe_on(stack: Stack) -> Generator[VideoFrame, None, None]:
     """Yield the frames from the last keyframe at or before the range, without unreferenced ones.
 
     Raises:
@@ -222,7 +196,7 @@ def _from_keyframe_on(stack: Stack) -> Iterator[VideoFrame]:
             raise _SeekFailed from error
 
 
-def _from_beginning(stack: Stack) -> Iterator[VideoFrame]:
+def _from_beginning(stack: Stack) -> Generator[VideoFrame, None, None]:
     """Every frame of the file."""
     with opened(stack.path) as (container, stream):
         stack.codec = stream.codec_context.codec.canonical_name
@@ -239,17 +213,6 @@ def _from_beginning(stack: Stack) -> Iterator[VideoFrame]:
 
 
 _WAYS: Sequence[Way] = (_from_keyframe_on, _from_beginning)
-
-
-def _fill(stack: Stack, frames: Iterator[VideoFrame]) -> Iterator[None]:
-    """Pass frame after frame to a stack until it is complete, and yield after each."""
-    with closing(frames):  # type: ignore[type-var]  # a generator
-        for frame in frames:
-            complete = stack.take(frame)
-            yield
-            if complete:
-                return
-    stack.refuse("the file ends before it")
 
 
 def _decoded(stream: VideoStream, source: Iterator[Packet[VideoStream]]) -> Iterator[VideoFrame]:

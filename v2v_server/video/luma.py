@@ -99,7 +99,8 @@ class LumaFormat:
         name = frame.format.name
         if not _LUMA_PLANE.fullmatch(name) or frame.planes[0].line_size <= 0:  # negative: stored bottom-up
             return cls(name, int(frame.color_range), 8, full_range=True, has_plane=False)
-        full_range = _is_full_range(name, frame.color_range)
+        is_stated = frame.color_range != ColorRange.UNSPECIFIED
+        full_range = frame.color_range == ColorRange.JPEG if is_stated else name.startswith(("yuvj", "gray"))
         return cls(name, int(frame.color_range), frame.format.components[0].bits, full_range, has_plane=True)
 
     def describes(self, frame: VideoFrame) -> bool:
@@ -119,13 +120,6 @@ class LumaFormat:
         if self.bits == 8:
             return _BYTE
         return np.dtype(">u2" if self.pixel_format.endswith("be") else "<u2")
-
-
-def _is_full_range(pixel_format: str, color_range: int) -> bool:
-    """Return whether samples span 0 .. 2**b - 1: as stated, or by the rule above where nothing is stated."""
-    if color_range == ColorRange.UNSPECIFIED:
-        return pixel_format.startswith(("yuvj", "gray"))
-    return color_range == ColorRange.JPEG
 
 
 @cache

@@ -24,8 +24,8 @@ from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
 from v2v_server.labels.formats import READERS
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.pixels import VideosKind
-from v2v_server.video.container import clean_aperture
 from v2v_server.video.rows import Rows
+from v2v_server.video.source import clean_aperture
 from v2v_tools.doctor.motion import look_at_motion
 from v2v_tools.remake import Remaker, open_shown
 

@@ -31,7 +31,7 @@ from v2v_server.corpus.scenes.picture_check import defects_of_video
 from v2v_server.motion.prediction import Prediction
 from v2v_server.schedule.sequences import SequenceTable, VideoSequence
 from v2v_server.simulation.intensity import tone_table
-from v2v_server.store.pixels import VIDEOS, VideosKind
+from v2v_server.store.pixels import VIDEOS, VideosKind, signal_of
 from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.luma import SDR
 from v2v_server.video.probe import DOLBY_VISION
@@ -217,7 +217,7 @@ def _signal_note(catalogue: Catalogue, provenance: Provenance, recipe: Recipe) -
     """Return what the video states about its levels, and whether the recipe uses it; "" for 8 bits of SDR."""
     id = provenance.video
     with catalogue.source.open_pixels(id, provenance.fingerprint) as pixels:
-        signal = pixels.signal(catalogue.frame_index(id))
+        signal = signal_of(pixels, catalogue.frame_index(id))
     if DOLBY_VISION in provenance.remark:
         return ""  # the stated transfer does not hold for IPT-PQ
     if signal == SDR or recipe.light == "declared":

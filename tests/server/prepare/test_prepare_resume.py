@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import shutil
@@ -13,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -26,9 +28,9 @@ from v2v_protocol.errors import CorpusError, VideoError
 from v2v_server.commands.prepare import main, summary
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.manifest import MANIFEST_NAME, read_manifest
-from v2v_server.prepare.prepare import prepare
-from v2v_server.prepare.resume import refuse_links
+from v2v_server.prepare.prepare import find_standing, prepare, refuse_links
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX, Transcoding
+from v2v_server.store.reader import StoreFile
 from v2v_server.video.fingerprint import fingerprint
 
 _KILLED_SECONDS = 60.0
@@ -47,6 +49,11 @@ def source(tmp_path: Path) -> Path:
 def _no_process_left() -> Iterator[None]:
     yield
     assert not psutil.wait_procs(children(), timeout=60)[1]
+
+
+def is_whole(path: Path) -> bool:
+    with StoreFile(path) as stored:
+        return stored.is_whole
 
 
 def inodes(folder: Path) -> dict[str, int]:
@@ -69,26 +76,24 @@ def test_a_run_on_a_part_forgets_nothing(source: Path, tmp_path: Path) -> None:
     before, digest = inodes(out), opened(out).digest
     (tmp_path / "part.txt").write_text("1.mp4\nsub/4.mp4\n")
     part = run(source, out, list_file=tmp_path / "part.txt")
-    assert (part.kept, part.aside, len(part.videos)) == (2, 3, 2)
+    assert (part.kept, len(part.videos)) == (2, 2)
     served = opened(out)  # finished, and exactly what was asked for last
     assert [video.id for video in served.videos] == ["1.mp4", "sub/4.mp4"]
-    assert "3 prepared videos are set aside" in served.notes[0]
-    assert "3 others that were prepared earlier are set aside" in summary(part, "dense", 0.0)[1]
     (tmp_path / "other.txt").write_text("0.mp4\n1.mp4\n")
     assert "last v2v-prepare was not asked for it" in opened(out, list_file=tmp_path / "other.txt").refusals[0].reason
     (source / "sub").rename(tmp_path / "away")
     away = run(source, out)
-    assert (away.kept, away.aside) == (4, 1)
+    assert (away.kept, len(away.videos)) == (4, 4)
     (tmp_path / "away").rename(source / "sub")
     whole_again = run(source, out)
-    assert (whole_again.kept, whole_again.aside) == (5, 0)
+    assert whole_again.kept == 5
     assert whole_again.videos == first.videos
     assert inodes(out) == before
     assert opened(out).digest == digest
 
 
 def test_another_corpus_is_not_taken_for_a_changed_source(source: Path, tmp_path: Path) -> None:
-    """Every video of the same name would be replaced, and every other set aside."""
+    """Every video of the same name would be replaced."""
     out = tmp_path / "out"
     run(source, out)
     before = inodes(out)
@@ -116,14 +121,14 @@ def test_finished_files_are_looked_at_together_and_told_of(
     run(source, out)
     inside, several = [], threading.Event()
 
-    def among_others(path: Path) -> str:
-        inside.append(path)
+    def among_others(*file: Any) -> object:
+        inside.append(file)
         if len(inside) > 1:
             several.set()
         assert several.wait(60.0), "the files are read one after the other"
-        return fingerprint(path)
+        return find_standing(*file)
 
-    monkeypatch.setattr("v2v_server.prepare.resume.fingerprint", among_others)
+    monkeypatch.setattr("v2v_server.prepare.prepare.find_standing", among_others)
     steps: list[tuple[int, int]] = []
     assert run(source, out, progress=lambda *step: steps.append(step[:2])).kept == 5
     assert steps == [(0, 126), (24, 126), (48, 126), (72, 126), (96, 126), (126, 126)]
@@ -157,12 +162,12 @@ def test_a_prepared_file_that_cannot_be_read_is_not_given_up(
     run(source, out)
     manifest, before = (out / MANIFEST_NAME).read_bytes(), inodes(out)
 
-    def refuse(path: Path) -> str:
+    def refuse(path: Path) -> StoreFile:
         if path.name == "3.mp4":
             raise VideoError(str(path), None, "cannot be read: Permission denied") from PermissionError(13, "denied")
-        return fingerprint(path)
+        return StoreFile(path)
 
-    monkeypatch.setattr("v2v_server.prepare.resume.fingerprint", refuse)
+    monkeypatch.setattr("v2v_server.prepare.prepare.StoreFile", refuse)
     with pytest.raises(CorpusError, match=r"3\.mp4 cannot be read: Permission denied, .* nothing was changed"):
         run(source, out)
     assert (out / MANIFEST_NAME).read_bytes() == manifest
@@ -223,7 +228,7 @@ def test_a_look_that_fails_costs_no_prepared_file(
     def refuse(job: Transcoding) -> None:
         raise VideoError(str(job.source), 3, "is damaged")
 
-    monkeypatch.setattr("v2v_server.prepare.prepare.look_again", refuse)
+    monkeypatch.setattr("v2v_server.prepare.prepare.transcode", refuse)
     report = run(source, out, scene=True)
     assert report.videos == first.videos == tuple(video for _, video in sorted(read_manifest(out).videos.items()))
     assert [refusal.reason for refusal in report.not_looked_at] == ["frame 3: is damaged"] * 5
@@ -262,6 +267,41 @@ def test_a_json_file_that_cannot_be_written_does_not_cost_the_summary(
     said = capsys.readouterr()
     assert said.out == ""
     assert "it is a folder; give the name of a file" in said.err
+
+
+def test_a_file_that_is_cut_short_or_of_other_settings_is_written_again(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run(source, out)
+    whole_file = (out / "0.mp4").read_bytes()
+    (out / "0.mp4").write_bytes(whole_file[:-1])
+    run(source, tmp_path / "raw", size="raw")
+    shutil.copy(tmp_path / "raw" / "1.mp4", out / "1.mp4")
+    run(source, tmp_path / "rows", rows="top:0.5")
+    shutil.copy(tmp_path / "rows" / "2.mp4", out / "2.mp4")
+    shutil.copy(out / "sub" / "4.mp4", out / "3.mp4")
+    assert run(source, out).kept == 1
+    assert (out / "0.mp4").read_bytes() == whole_file
+    assert run(source, out).kept == 5
+    run(source, tmp_path / "colour", planes=("chroma",))
+    with (tmp_path / "colour" / "0.mp4").open("r+b") as file:
+        file.truncate(file.seek(0, os.SEEK_END) - 1)
+    assert run(source, tmp_path / "colour").kept == 4
+
+
+def test_a_folder_of_an_earlier_release_goes_on(source: Path, tmp_path: Path) -> None:
+    """Its lines also had the fingerprint of the prepared file, and those of videos that were set aside."""
+    out = tmp_path / "out"
+    report, before = run(source, out), inodes(out)
+    header, *lines = map(json.loads, (out / MANIFEST_NAME).read_text().splitlines())
+    lines = [line | {"fingerprint": fingerprint(out / line["id"])} for line in lines]
+    (aside,) = (line for line in lines if line["id"] == "0.mp4")
+    aside |= {"aside": True}
+    header["videos"] = 4
+    (out / MANIFEST_NAME).write_text("".join(json.dumps(each) + "\n" for each in (header, *lines)))
+    assert [video.id for video in opened(out).videos] == ["1.mp4", "2.mp4", "3.mp4", "sub/4.mp4"]
+    again = run(source, out)
+    assert (again.kept, again.videos) == (5, report.videos)
+    assert inodes(out) == before
 
 
 def test_only_what_changed_is_done_again(source: Path, tmp_path: Path) -> None:
@@ -349,13 +389,13 @@ def test_killed_at_a_random_moment(source: Path, tmp_path: Path, turn: int) -> N
     for _ in range(1 + turn % 2):
         if _killed_in_the_middle(command, tmp_path / "cache", out, rng.randrange(3)):
             records = read_manifest(out).videos
-            assert all(fingerprint(out / id) == record.fingerprint for id, record in records.items())
+            assert all(is_whole(out / id) for id in records)
     last = run(source, out)
     assert last.complete
     assert not list(out.rglob(f"*{PARTIAL_SUFFIX}"))
     # Whole and right, whichever process made them.
     for video in last.videos:
-        assert fingerprint(out / video.id) == video.fingerprint
+        assert is_whole(out / video.id)
         np.testing.assert_array_equal(stored_whole(out / video.id), whole(source / video.id))
 
 
@@ -366,7 +406,7 @@ def test_an_unfinished_line_counts_as_not_written(source: Path, tmp_path: Path) 
     (out / MANIFEST_NAME).write_bytes(manifest[:-25])
     with pytest.raises(CorpusError, match="4 of 5 videos are prepared; run v2v-prepare again"):
         opened(out)
-    assert run(source, out).kept == 4
+    assert run(source, out).kept == 5  # its file says what it is
     assert len(opened(out).videos) == 5
 
 

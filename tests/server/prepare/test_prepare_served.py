@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -17,10 +18,10 @@ from v2v_protocol.errors import CorpusError, VideoError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
 from v2v_server.corpus.manifest import MANIFEST_NAME
 from v2v_server.schedule.sequences import SequenceTable
-from v2v_server.video.fingerprint import check_fingerprint
+from v2v_server.video.fingerprint import check_fingerprint, fingerprint
 from v2v_server.video.rows import Rows
 from v2v_tools.remake import remake
 
@@ -157,6 +158,20 @@ def test_a_missing_or_changed_file_keeps_its_place(copied: Path) -> None:
             path.unlink()
     with pytest.raises(CorpusError, match="none of 5 prepared files"):
         opened(copied)
+
+
+def test_an_index_of_an_earlier_release_is_read_again(copied: Path) -> None:
+    """It named a prepared file by its own bytes, not by its source."""
+    whole = opened(copied)
+    index = index_path(copied, copied.parent / "cache")
+    with closing(sqlite3.connect(index)) as database, database:
+        for video in whole.videos:
+            if video.id != CORRUPT:
+                named = fingerprint(copied / video.id), "v2v store", video.id
+                database.execute("UPDATE video SET fingerprint = ?, codec = ? WHERE id = ?", named)
+    again = opened(copied)
+    assert (again.digest, again.notes) == (whole.digest, whole.notes)
+    assert again.videos == whole.videos
 
 
 def test_files_that_the_manifest_does_not_know(copied: Path) -> None:

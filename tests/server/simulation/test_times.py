@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.oracles.decoded import decode_luma
 from tests.oracles.in_time import ages_of, bilinear_of, counts_of, stacked_histogram, watch
 from tests.oracles.noise import standard_normals, start_uniforms
 from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
@@ -24,7 +25,6 @@ from v2v_server.simulation.kernels import Voxels, fill, list_events
 from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, bin_edges, rounding_tolerance, timeline
-from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
 
 FPS = 25.0

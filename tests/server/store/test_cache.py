@@ -164,7 +164,7 @@ def test_a_folder_that_cannot_be_written_to(source: Path, folder: Path) -> None:
 
 
 def test_a_write_that_fails(source: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("v2v_server.store.writer.StoreWriter.close", full)
@@ -235,9 +235,10 @@ def test_what_a_killed_worker_leaves_is_not_used_and_removed(source: Path, folde
     """Killed in the middle of a piece: the file is there, under a name that is never read."""
     program = (
         "import os, signal, sys\nfrom pathlib import Path\nimport v2v_server.store.cache as cache\n"
+        "from v2v_server.store.writer import StoreWriter\n"
         "from tests.server.store.test_cache import leases_of, Clips, Folder\n"
         "cache.piece_frames = lambda rows, width: 16\n"
-        "cache.StoreWriter.close = lambda self: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "StoreWriter.close = lambda self, **more: os.kill(os.getpid(), signal.SIGKILL)\n"
         "(root, lease), = leases_of(Path(sys.argv[1]), 1)\n"
         "Clips(Folder(root), cache.Cache(Path(sys.argv[2]), 1 << 30, 0)).take(lease)\n"
     )

@@ -64,9 +64,6 @@ class Raw:
         for grey in clip.frames:
             yield DecodedPicture(grey, grey, SDR, "toy raw", True)
 
-    def signal(self, index):
-        return SDR
-
 
 def open_pixels(path):
     with path.open("rb") as file:
@@ -121,9 +118,6 @@ class World:
         for _ in range(request.count):
             grey = np.zeros(request.window(request.cuts[0])[2:], np.uint8)
             yield DecodedPicture(grey, grey, SDR, "toy world", True)
-
-    def signal(self, index):
-        return SDR
 
 
 def open_pixels(path):
@@ -189,8 +183,10 @@ from tests.digests.rows import Row, samples_of
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.prepare.prepare import prepare
 from v2v_server.store.cache import Cache, make_cache
+from v2v_server.store.pixels import signal_of
 from v2v_server.store.reader import StoreFile
 from v2v_server.store.toy_world import drawn
+from v2v_server.video.luma import SDR
 
 root = Path(sys.argv[1])
 row = Row("paper", count=4)
@@ -240,6 +236,8 @@ with opened("world") as catalogue:
         level, speed = drawn((world.seed, 0, index))
         assert (sample.arrays["flow"] == np.float16(speed)).all()
         assert (sample.arrays["frames"] >= level).all() and (sample.arrays["frames"] < level + 30).all()
+    with catalogue.source.open_pixels("a.mkv", "") as pixels:
+        assert signal_of(pixels, catalogue.frame_index("a.mkv")) == SDR
     alone = samples_of(catalogue, replace(world, spec={}, count=1))
     require_equal([alone[0].arrays], [together[0].arrays])
 """

@@ -13,8 +13,7 @@ from av.video.reformatter import ColorRange, Colorspace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v2v_server.video.collect import ChromaCut
-from v2v_server.video.colour.chroma import ChromaStack, stated_matrix
+from v2v_server.video.colour.chroma import ChromaCut, ChromaStack, stated_matrix
 from v2v_server.video.colour.rgb import add_colour, differences_of
 from v2v_server.video.luma import LumaFormat, luma_plane, range_table
 from v2v_server.video.orientation import Orientation

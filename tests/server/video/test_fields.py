@@ -10,7 +10,7 @@ import pytest
 
 from tests.clips import panned_luma, write_clip
 from tests.field_coded import write_field_coded
-from v2v_server.video.decode import decode_luma
+from tests.oracles.decoded import decode_luma
 from v2v_server.video.luma import range_table
 from v2v_server.video.packets import Fields
 from v2v_server.video.probe import probe

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from tests.clips import panned_luma, truncated, write_clip
+from tests.oracles.decoded import decode_luma
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.video.container import describe_cut, dolby_vision_profile
-from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
+from v2v_server.video.source import describe_cut, dolby_vision_profile
 from v2v_tools.remake import Remaker
 
 CODECS = {

@@ -12,13 +12,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import v2v_server.video.probe as probing
 from tests.clips import panned_luma, write_clip
-from v2v_server.video import listing
-from v2v_server.video.decode import decode_luma, decodes_as_listed
+from tests.oracles.decoded import decode_luma
+from v2v_server.video.decode import decodes_as_listed
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import range_table
+from v2v_server.video.packets import is_scaled, may_be_not_coded, times_are_doubtful
 from v2v_server.video.probe import VideoFacts, probe
-from v2v_server.video.signs import is_scaled, may_be_not_coded, times_are_doubtful
 
 Change = Callable[[av.Packet, int], av.Packet]
 """(packet, its number in stored order) -> what is stored instead."""
@@ -179,8 +180,8 @@ def test_only_the_frames_around_a_gap_are_decoded(tmp_path: Path, monkeypatch: p
         places.append((start, count))
         return decodes_as_listed(path, index, start, count)
 
-    monkeypatch.setattr(listing, "decodes_as_listed", seen)
-    monkeypatch.setattr(listing.Delivered, "of", lambda *more: pytest.fail("the whole file was decoded"))
+    monkeypatch.setattr(probing, "decodes_as_listed", seen)
+    monkeypatch.setattr(probing.Delivered, "of", lambda *more: pytest.fail("the whole file was decoded"))
     assert probe(path).frames == 120
     assert places == [(0, 8), (49, 2), (100, 20)]
 

@@ -10,8 +10,8 @@ import pytest
 from av.stream import Disposition
 
 from tests.clips import damaged, panned_luma, write_clip
+from tests.oracles.decoded import decode_luma
 from v2v_protocol.errors import VideoError
-from v2v_server.video.decode import decode_luma
 from v2v_server.video.packets import is_hidden
 from v2v_server.video.probe import probe
 

@@ -11,8 +11,8 @@ import av
 import numpy as np
 import pytest
 
+from tests.oracles.decoded import decode_luma
 from v2v_protocol.errors import VideoError
-from v2v_server.video.decode import decode_luma
 from v2v_server.video.luma import LumaFormat, range_table
 from v2v_server.video.orientation import Orientation
 from v2v_server.video.probe import probe

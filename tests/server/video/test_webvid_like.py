@@ -10,7 +10,7 @@ import pytest
 from bench.__main__ import main
 from bench.corpus import webvid_like
 from tests.clips import panned_luma, write_clip
-from v2v_server.video.decode import decode_luma
+from tests.oracles.decoded import decode_luma
 from v2v_server.video.probe import probe
 
 

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 
 from tests.bench.small import FLAGS, clips, records
 from tests.clips import panned_luma, write_clip
+from tests.oracles.decoded import decode_luma
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.video.decode import decode_luma
 from v2v_server.video.probe import probe
 from v2v_tools.tradeoff import command as tradeoff
 from v2v_tools.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, Places

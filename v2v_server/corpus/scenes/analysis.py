@@ -17,9 +17,9 @@ is at least 2 grey levels, the next frame does not go back, and what of m_t is n
 is at least 0.35^2 var m_t and 3^2 times that of each of the eight steps before and after. In a shot that stands still
 (median of d below 0.2 grey levels) that is something which appears, not a jump.
 
-All of this is exact arithmetic, the same everywhere. Repeats are found in ``steps``, the other stretches in
-``stretches``; dissolves are not found. Motion is that of dense inverse search on pictures of a quarter of the size,
-over the first four of every eight frames, rounded to 1/64 px a frame.
+All of this is exact arithmetic, the same everywhere. Repeats and the other stretches are found in ``stretches``;
+dissolves are not found. Motion is that of dense inverse search on pictures of a quarter of the size, over the first
+four of every eight frames, rounded to 1/64 px a frame.
 """
 
 from __future__ import annotations

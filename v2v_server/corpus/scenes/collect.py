@@ -41,23 +41,15 @@ class SceneCollection:
     """How the videos of a corpus are analysed.
 
     Attributes:
-        rows: of the corpus; all of a prepared one.
-        manifest: of a prepared folder, whose statistics are those of its source's frames where it has them.
+        rows: of the corpus.
     """
 
     rows: Rows
-    manifest: Manifest | None
 
     @property
     def kind(self) -> FigureKind:
         """Distinguish analyses of one file."""
-        made = "part of prepared, " if self.manifest is not None and not self._is_stated else ""
-        return FigureKind("scene", f"{made}{self.rows}{_ENDING}")
-
-    @property
-    def _is_stated(self) -> bool:
-        """Whether the manifest's scenes are of the rows of the corpus."""
-        return self.manifest is not None and Rows.parse(self.manifest.header.rows) == self.rows
+        return FigureKind("scene", f"{self.rows}{_ENDING}")
 
     def collect(
         self,
@@ -129,7 +121,7 @@ class SceneCollection:
         left = []
         for place in missing:
             record = table.row(place)
-            if (data := self._prepared(record)) is None:
+            if (data := self._stated(source.manifest, record)) is None:
                 left.append(place)
             else:
                 yield record, Scene.from_bytes(data)
@@ -152,13 +144,13 @@ class SceneCollection:
                 yield job, found
             # Otherwise the video counts as unknown, and the next start tries again.
 
-    def _prepared(self, record: IndexRow) -> bytes | None:
-        """Return the encoded scene that the manifest states."""
-        if self.manifest is None or not self._is_stated or not self.manifest.videos[record.id].scene:
+    def _stated(self, manifest: Manifest | None, record: IndexRow) -> bytes | None:
+        """Return the encoded scene that a prepared folder's manifest states, if it is of the rows of the corpus."""
+        if manifest is None or Rows.parse(manifest.header.rows) != self.rows:
             return None
-        if not self.manifest.describes(record):
-            return None
-        return b64decode(self.manifest.videos[record.id].scene)
+        video = manifest.videos[record.id]
+        is_there = video.scene and record.fingerprint == video.source_fingerprint
+        return b64decode(video.scene) if is_there else None
 
     def _window(self, record: IndexRow) -> PixelRect | None:
         try:

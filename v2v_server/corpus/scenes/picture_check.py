@@ -33,6 +33,7 @@ from v2v_server.corpus.scenes.findings import (
 )  # fmt: skip
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.corpus.videos import VideoEntry
+from v2v_server.store.pixels import signal_of
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.system.process import usable_cores
@@ -285,7 +286,7 @@ def _look_at(source: VideoSource, excerpt: Excerpt) -> tuple[int, tuple[Defect, 
     try:
         with source.open_pixels(excerpt.id, "") as pixels:
             scene = analyse(picture.grey for picture in pixels.pictures(excerpt.request))
-            signal = pixels.signal(excerpt.index)
+            signal = signal_of(pixels, excerpt.index)
     except V2VError as error:
         return 0, (), SDR, getattr(error, "reason", str(error))
     return scene.end, defects_of(scene), signal, ""

@@ -256,7 +256,7 @@ class Copies(VideoSource):
             slot.unlink(missing_ok=True)
             try:
                 slot.hardlink_to(self._path(id, found))
-                self._quota.discard(self._path(id, found))
+                self._quota.remove(self._path(id, found))
                 self._quota.add(slot, self._path(id, fingerprint), evicts=True)
             finally:
                 slot.unlink(missing_ok=True)

@@ -27,16 +27,43 @@ class Prepared(Folder):
 
     def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
         """List the videos of the manifest; other files are passed over."""
-        listed = None if self.listed is None else [entry.id for entry in self.listed]
-        return iter(self.manifest.wanted(listed, refused))
+        known = self.manifest.videos
+        for id in sorted(known) if self.listed is None else [entry.id for entry in self.listed]:
+            if id in known:
+                yield id
+            else:
+                refused[id] = (
+                    "is not in the prepared folder's manifest: the source had no such usable video, or the last "
+                    "v2v-prepare was not asked for it; run it once for all of them"
+                )
 
     def file_of(self, id: str) -> str:
         """Return the path of the prepared file."""
         return prepared_name(id)
 
     def rows(self, asked: Rows | None) -> Rows:
-        """Return which rows of the pictures may be used, see :meth:`Manifest.served_rows`."""
-        return self.manifest.served_rows(asked)
+        """Return which rows of the pictures may be used.
+
+        A folder that stores all rows may be served with any rows, another one only with its stored rows.
+
+        Raises:
+            CorpusError: the folder is not finished, or lacks requested rows.
+        """
+        header, done = self.manifest.header, len(self.manifest.videos)
+        if done != header.videos:
+            raise CorpusError(
+                f"{self}: {done} of {header.videos} videos are prepared; run v2v-prepare again to finish (what is done "
+                "is kept)"
+            )
+        kept = Rows.parse(header.rows)
+        if asked is None or asked == Rows():
+            return kept
+        if kept not in (Rows(), asked):
+            raise CorpusError(
+                f"{self}: rows {asked} asked for, but this prepared folder holds rows {header.rows} of its source "
+                "only; leave --rows out, or serve the source"
+            )
+        return asked
 
 
 def open_source(name: str, options: SourceOptions) -> Prepared | None:

@@ -5,13 +5,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from v2v_server.store.planes.plane import Files, Plane
 from v2v_server.video.collect import ClipRequest, Cut, DecodedFrame, DecodedPicture, Watch
@@ -22,9 +21,6 @@ from v2v_server.video.orientation import PixelRect
 if TYPE_CHECKING:
     from v2v_server.motion import Cells, MotionOfCuts, Vectors
     from v2v_server.store.reader import StoreFile
-
-_PICTURES = 16
-"""Whole pictures that are read at a time."""
 
 
 class Motion(Plane):
@@ -53,8 +49,8 @@ class Motion(Plane):
             return [None if cut.cells is None else _read(files, request, cut) for cut in request.cuts]
         found = MotionOfCuts(request.cuts)
         for stored, frames in files:
-            for each in _pictures_in(stored, frames, request.start, request.stride, request.usable):
-                found.add(Pyramid.of(each))
+            for picture in stored.pictures(_whole(request, frames)):
+                found.add(Pyramid.of(picture.grey))
         return by_cut(request, found)
 
     def narrowed(self, cut: Cut, value: Vectors | None) -> Cut:
@@ -114,26 +110,22 @@ def _read(files: Files, request: ClipRequest, cut: Cut) -> Vectors:
     vectors[0] = 0
     for (before, _), (after, frames) in pairwise(files):
         if frames.start < cut.count:  # the first frame of a file has no motion in it
-            vectors[frames.start] = _motion_across(before, after, start + frames.start, cells, request.usable)
+            vectors[frames.start] = _motion_across(before, after, request, frames.start, cells)
     return vectors
 
 
-def _pictures_in(
-    stored: StoreFile, frames: range, start: int, stride: int, picture: PixelRect
-) -> Iterator[npt.NDArray[np.uint8]]:
-    """Yield frames of a clip that begins at ``start``, in the memory of a few."""
-    for first in range(frames.start, frames.stop, _PICTURES):
-        some = np.empty((min(_PICTURES, frames.stop - first), *picture[2:]), np.uint8)
-        stored.read(start + first * stride, stride, picture, some)
-        yield from some
+def _whole(request: ClipRequest, frames: range) -> ClipRequest:
+    """Return a request of some frames of a clip, whole usable pictures."""
+    cut = Cut(len(frames), request.usable)
+    return replace(request, start=request.start + frames.start * request.stride, cuts=(cut,))
 
 
-def _motion_across(before: StoreFile, after: StoreFile, at: int, cells: Cells, picture: PixelRect) -> Vectors:
-    """Return the motion to the first frame of a file, ``at``, from the last frame of the one before."""
+def _motion_across(before: StoreFile, after: StoreFile, request: ClipRequest, number: int, cells: Cells) -> Vectors:
+    """Return the motion to frame ``number`` of a clip, the first of a file, from the last of the file before."""
     from v2v_server.motion import Pyramid, motion
 
     first, second = (
-        Pyramid.of(next(_pictures_in(stored, range(1), number, 1, picture)))
-        for stored, number in ((before, at - 1), (after, at))
+        Pyramid.of(next(stored.pictures(_whole(request, range(at, at + 1)))).grey)
+        for stored, at in ((before, number - 1), (after, number))
     )
     return motion(first, second, cells)

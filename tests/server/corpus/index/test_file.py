@@ -21,7 +21,7 @@ from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, COLUMNS, Scene
 from v2v_server.corpus.videos import VideoTable, joined
 from v2v_server.video.rows import Rows
 
-KIND = SceneCollection(Rows(), None).kind
+KIND = SceneCollection(Rows()).kind
 
 
 class Corpus:

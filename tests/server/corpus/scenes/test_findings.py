@@ -14,6 +14,7 @@ import pytest
 from skimage import data
 
 from tests.clips import write_clip
+from tests.oracles.decoded import stream_luma
 from v2v_protocol.errors import VideoError
 from v2v_server.corpus.scenes.analysis import analyse
 from v2v_server.corpus.scenes.findings import (
@@ -30,7 +31,6 @@ from v2v_server.corpus.scenes.findings import (
     defects_of,
 )  # fmt: skip
 from v2v_server.corpus.scenes.scene import Sides
-from v2v_server.video.decode import stream_luma
 from v2v_server.video.probe import probe
 
 HEIGHT, WIDTH, FRAMES = 144, 208, 96
