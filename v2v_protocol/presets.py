@@ -56,8 +56,8 @@ PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
         "hot_pixel_share": (0.0, 5e-4),
         "hot_pixel_sigma": (0.0, 20.0),
     },
-    # A DAVIS346 that has run for a while, its successor. Sources: docs/effects.md. Chosen before it was compared with a
-    # sensor. `gamma` is that of the videos; for frames that are linear in intensity, as a DAVIS stores them, set it to 1.
+    # Its successor, a DAVIS346 that has run for a while. Each number is from its source, not from a fit: docs/effects.md.
+    # `gamma` stays that of the videos; for frames that are linear in intensity, as a DAVIS stores them, set it to 1.
     "davis346-running": {
         "start": "triangular",  # a residual that moves as a Brownian motion: where it stands in the long run
         # v2e's logarithm becomes linear below 20 of 255, with the slope of an epsilon of 0.026; half and twice of it.
