@@ -56,7 +56,7 @@ PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
         "hot_pixel_share": (0.0, 5e-4),
         "hot_pixel_sigma": (0.0, 20.0),
     },
-    # Its successor, a DAVIS346 that has run for a while. Each number is from its source, not from a fit: docs/effects.md.
+    # Its successor, a DAVIS346 that has run for a while. Numbers are from sources, no fit (docs/effects.md).
     # `gamma` stays that of the videos; for frames that are linear in intensity, as a DAVIS stores them, set it to 1.
     "davis346-running": {
         "start": "triangular",  # a residual that moves as a Brownian motion: where it stands in the long run

@@ -38,10 +38,10 @@ from tests.oracles.cameras import (
 from tests.oracles.other_cameras import OTHERS, record_other
 from v2v_protocol.command import Parser
 from v2v_protocol.recipe import PRESETS, Recipe
+from v2v_recordings.items import Light
 from v2v_server.fit.fit import fit
 from v2v_server.fit.interval import Doubles
 from v2v_server.fit.recording import Recorded, recorded
-from v2v_server.fit.regression import light_of
 from v2v_server.fit.statistics import panels_of, simulate_recording
 from v2v_server.simulation.draw import draw
 
@@ -149,7 +149,7 @@ def _drawn(recipe: Recipe, seed: int) -> dict[str, float]:
 def _apart(recording: Recorded, camera: Mapping[str, float]) -> tuple[float, ...]:
     begin, end = int(recording.frame_us[0]), int(recording.frame_us[-1])
     both = [
-        panels_of(each, light_of(np.arange(256.0)), begin, end)
+        panels_of(each, each.known_light.of(np.arange(256.0)), begin, end)
         for each in (recording, simulate_recording(recording, camera))
     ]
     off, on = (np.array([panels["rates"][part].sum() for panels in both]) for part in HALVES)
@@ -168,7 +168,9 @@ def _distance(mine: Doubles, other: Doubles) -> float:
 
 def _recorded(made: Mapping[str, Any]) -> Recorded:
     place = made["y"].astype(np.int64) * WIDTH_PX + made["x"]
-    return recorded(HEIGHT_PX, WIDTH_PX, made["t"], place, made["p"], made["frames"], made["frame_us"])
+    return recorded(
+        HEIGHT_PX, WIDTH_PX, made["t"], place, made["p"], made["frames"], made["frame_us"], light=Light.parse("2.2")
+    )
 
 
 def one(camera: TrueCamera, film: Film, seed: int, scene: str) -> Iterator[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,8 @@ def report_lines(fitted: FittedCamera, source: str) -> list[str]:
         f"({100 * facts['on_share']:.0f} % brighter), {facts['frames']:.0f} frames, {facts['seconds']:.1f} s; "
         f"{facts['pixels']:.0f} pixels in use",
         *fitted.notes,
-        "Fitted (90 % intervals; thresholds are for frames of gamma 2.2):",
+        *_of_frames(fitted),
+        "Fitted (90 % intervals; thresholds and log_eps are those of linear intensity):",
     ]
     for name, made in fitted.estimates.items():
         if name not in fitted.left_out:
@@ -85,6 +87,26 @@ def report_lines(fitted: FittedCamera, source: str) -> list[str]:
     if {"threshold_pos", "threshold_neg"} <= fitted.camera.keys():
         lines.append("A recipe draws which polarity has the larger threshold: it keeps the ratio, not its direction.")
     return lines
+
+
+def _of_frames(fitted: FittedCamera) -> list[str]:
+    """Return what was assumed of the frames: their light and their times."""
+    if not fitted.facts["frames"]:
+        return []
+    light, offset = fitted.light.name, fitted.offset
+    told = (
+        f"they fit the events best {1e3 * offset.value:.1f} ms later [{1e3 * offset.low:.1f}, {1e3 * offset.high:.1f}]"
+    )
+    times = told if math.isfinite(offset.value) else f"their offset cannot be told: {offset.note}"
+    applied = (
+        f"{1e3 * fitted.applied_seconds:.1f} ms were added"
+        if fitted.applied_seconds
+        else "nothing was added (--shift-frames adds it)"
+    )
+    return [
+        f"Light of the frames: {light}. The recipe is valid for it; its gamma is that of the videos it is used on",
+        f"Times of the frames: {times}; {applied}",
+    ]
 
 
 def draw_fit(fitted: FittedCamera, source: str) -> Image:
