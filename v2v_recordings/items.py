@@ -19,7 +19,6 @@ from v2v_protocol.errors import UsageError
 
 MOST_SENSOR_PIXELS = 1 << 24
 """Limit of a stated sensor's size: 4096 x 4096. Some arrays have an entry for each pixel."""
-LEAST_GAMMA, MOST_GAMMA = 0.05, 20.0
 Progress = Callable[[int, int | None], None]
 """Progress callback: called with the amount read so far (bytes or messages), and the total if it is known."""
 
@@ -148,10 +147,8 @@ class Light:
             gamma = known[text] if text in known else float(text)
         except ValueError:
             gamma = math.nan
-        if text not in known and not LEAST_GAMMA <= gamma <= MOST_GAMMA:
-            raise UsageError(
-                f"light {text!r}: give linear, srgb or an exponent from {LEAST_GAMMA:g} to {MOST_GAMMA:g}, such as 2.2"
-            )
+        if text not in known and not 0.05 <= gamma <= 20.0:
+            raise UsageError(f"light {text!r}: give linear, srgb or an exponent from 0.05 to 20, such as 2.2")
         return cls("linear" if gamma == 1.0 else text, gamma)
 
     def of(self, grey: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:

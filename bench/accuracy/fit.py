@@ -26,7 +26,6 @@ import numpy as np
 
 from bench.frame import Column, Report, add_whole, beyond, progress
 from tests.oracles.cameras import (
-    FRAMES_PER_SECOND,
     SCENES,
     Film,
     TrueCamera,
@@ -36,14 +35,14 @@ from tests.oracles.cameras import (
     rendered_film,
 )
 from tests.oracles.other_cameras import OTHERS, record_other
+from tests.oracles.simulators import drawn
 from v2v_protocol.command import Parser
-from v2v_protocol.recipe import PRESETS, Recipe
+from v2v_protocol.recipe import PRESETS
 from v2v_recordings.items import Light
 from v2v_server.fit.fit import fit
 from v2v_server.fit.interval import Doubles
 from v2v_server.fit.recording import Recorded, recorded
 from v2v_server.fit.statistics import panels_of, simulate_recording
-from v2v_server.simulation.draw import draw
 
 HEIGHT_PX, WIDTH_PX = 96, 128
 FIRST_SEED = 100
@@ -122,7 +121,7 @@ def _outside() -> Report:
         progress(f"{name}: told {', '.join(fitted.camera)}")
         other = given.part(~is_even)
         cameras = {"fitted": [{"threshold_pos": 0.2, "threshold_neg": 0.2, **fitted.camera}]}
-        cameras |= {preset: [_drawn(recipe, seed) for seed in range(DRAWS)] for preset, recipe in PRESETS.items()}
+        cameras |= {preset: [drawn(recipe, seed) for seed in range(DRAWS)] for preset, recipe in PRESETS.items()}
         found = {who: np.median([_apart(other, each) for each in some], axis=0) for who, some in cameras.items()}
         for place, statistic in enumerate(("rate", "on/off", "pixels", "intervals")):
             values = {who: float(distances[place]) for who, distances in found.items()}
@@ -132,18 +131,6 @@ def _outside() -> Report:
     columns: list[Column] = [("camera", "camera", "{}", 1), ("statistic", "statistic", "{}", 1)]
     columns += [(who, who, "{:.3f}", 1) for who in ("fitted", *PRESETS)]
     return Report(records, [(records, columns)], [], missed)
-
-
-def _drawn(recipe: Recipe, seed: int) -> dict[str, float]:
-    """Draw a camera; noise and drift of a frame are converted to those of a second."""
-    made = draw(recipe, seed=seed, epoch=0, index=0, picture_height_px=512, picture_width_px=512, video_id="")
-    hz = float(FRAMES_PER_SECOND) if recipe.noise_unit == "frame" else 1.0
-    return {
-        "threshold_pos": made.threshold_pos, "threshold_neg": made.threshold_neg, **made.effects,
-        "log_eps": recipe.log_eps[0] if made.log_eps is None else made.log_eps,
-        "noise_sigma": made.noise_sigma * hz**0.5, "hot_pixel_sigma": made.hot_pixel_sigma * hz,
-        "hot_pixel_share": made.hot_pixel_count / (recipe.crop_height_px * recipe.crop_width_px),
-    }  # fmt: skip
 
 
 def _apart(recording: Recorded, camera: Mapping[str, float]) -> tuple[float, ...]:

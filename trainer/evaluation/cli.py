@@ -158,8 +158,6 @@ def _evaluate(arguments: argparse.Namespace, data: Path, config: EvaluationConfi
     if run.network.task == "flow":
         return _run_flow(arguments, data, config, run, model)
     lights = set[str]().union(*(check_data_set(run, data, data_set) for data_set in config.data_sets))
-    if run.metrics:
-        print(_of_light(run, lights))
     scores: dict[str, list[SequenceScore]] = {}
     try:
         with Progress("evaluating", "windows") as progress:
@@ -175,6 +173,8 @@ def _evaluate(arguments: argparse.Namespace, data: Path, config: EvaluationConfi
         wanted = ", ".join(f"{data_set.folder}/*.h5 ({data_set.name})" for data_set in config.data_sets)
         raise UsageError(f"--data {data} holds no sequence of {wanted}; create the files with v2v-convert")
     _print(config, scores)
+    if run.metrics:
+        print(_of_light(run, lights))
     if arguments.per_frame is not None:
         write_frames(arguments.per_frame, scores)
     if arguments.json is not None:

@@ -225,9 +225,7 @@ def frame_offset(recording: Recorded) -> Estimate:
     steps = np.flatnonzero((frame_us[:-1] - reach >= t.min()) & (frame_us[1:] + reach <= t.max()))
     if not len(steps):
         return unknown(f"no two frames have events for {reach / 1000:g} ms before and after them")
-    in_time = np.sort(t)
-    events = np.diff(np.searchsorted(in_time, frame_us))[steps]
-    steps = steps[np.argsort(-events, kind="stable")[:_MOST_STEPS]]
+    steps = steps[:: -(-len(steps) // _MOST_STEPS)]
     owner, blocks = np.repeat(np.arange(len(recording.pixels)), np.diff(recording.first)), recording.blocks()
     level = np.log(_DARK + recording.known_light.of(np.arange(256.0)))
     sums = np.zeros((64, len(OFFSETS_US), 2))

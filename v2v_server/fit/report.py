@@ -93,19 +93,16 @@ def _of_frames(fitted: FittedCamera) -> list[str]:
     """Return what was assumed of the frames: their light and their times."""
     if not fitted.facts["frames"]:
         return []
-    light, offset = fitted.light.name, fitted.offset
-    told = (
-        f"they fit the events best {1e3 * offset.value:.1f} ms later [{1e3 * offset.low:.1f}, {1e3 * offset.high:.1f}]"
-    )
-    times = told if math.isfinite(offset.value) else f"their offset cannot be told: {offset.note}"
-    applied = (
-        f"{1e3 * fitted.applied_seconds:.1f} ms were added"
-        if fitted.applied_seconds
-        else "nothing was added (--shift-frames adds it)"
-    )
+    offset, times = fitted.offset, f"their offset cannot be told: {fitted.offset.note}"
+    if math.isfinite(offset.value):
+        times = (
+            f"they fit the events best {1e3 * offset.value:.1f} ms later "
+            f"[{1e3 * offset.low:.1f}, {1e3 * offset.high:.1f}]"
+        )
+    added = f"{1e3 * fitted.applied_seconds:.1f} ms" if fitted.applied_seconds else "nothing (see --shift-frames)"
     return [
-        f"Light of the frames: {light}. The recipe is valid for it; its gamma is that of the videos it is used on",
-        f"Times of the frames: {times}; {applied}",
+        f"Light of the frames: {fitted.light.name}. The recipe is valid for it; its gamma is that of its videos",
+        f"Times of the frames: {times}; added: {added}",
     ]
 
 

@@ -33,11 +33,14 @@ intervals: between events of a pixel, of one polarity, then of opposite ones: 44
 """
 
 
-def simulate_recording(recording: Recorded, camera: Mapping[str, float], seed: int = 0) -> Recorded:
+def simulate_recording(
+    recording: Recorded, camera: Mapping[str, float], seed: int = 0, start: str = "uniform"
+) -> Recorded:
     """Simulate the frames of a recording with the product's own kernel: the same pixels, frames and times.
 
     Args:
         camera: parameters by the recipe's names, and ``threshold_pos`` and ``threshold_neg``; noise is per second.
+        start: how residuals start (field of the recipe).
 
     Returns:
         the events between the first and the last frame; ``counts`` stay those of the recording.
@@ -47,9 +50,9 @@ def simulate_recording(recording: Recorded, camera: Mapping[str, float], seed: i
     ranges = {name: (value, value) for name, value in effects.items()}
     ranges["log_eps"] = (camera.get("log_eps", 1e-3),) * 2
     frames, light, signal = recording.frames[:, None, :], recording.known_light, SDR
-    given: dict[str, Any] = {"gamma": light.gamma}
+    given: dict[str, Any] = {"gamma": light.gamma, "start": start}
     if not light.gamma:  # the kernel has no curve of sRGB
-        signal, given = Signal(12, "linear"), {"light": "declared"}
+        signal, given = Signal(12, "linear"), {"light": "declared", "start": start}
         frames = np.rint(signal.white * light.of(np.arange(256.0))).astype(signal.dtype)[frames]
     recipe = Recipe(voxels_per_clip=steps, bins=1, noise_unit="second", pause_probability=0.0).replace(
         **ranges, **given

@@ -23,6 +23,7 @@ from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
 from v2v_server.labels.formats import READERS
 from v2v_server.offline.doctor_motion import look_at_motion
 from v2v_server.offline.doctor_pictures import look_at_pictures, name_all
+from v2v_server.offline.motion import describe_start, start_events
 from v2v_server.offline.remake import Remaker, open_shown
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.video.container import clean_aperture
@@ -93,7 +94,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
         return
     remaker = Remaker(catalogue, spec, DEFAULT_ARRAYS)
     try:
-        remaker.sample(0, 0, 0)  # with compiling
+        starts = sum(start_events(remaker.made(0, 0, at)) for at in range(min(4, remaker.count)))  # with compiling
         began = time.perf_counter()
         remaker.sample(0, 0, min(1, remaker.count - 1))
     except V2VError as error:
@@ -101,6 +102,10 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
         return
     text = f"{table.count} samples an epoch; one took {time.perf_counter() - began:.2f} s on one core"
     yield "ok", "corpus", text, ""
+    yield (
+        "ok", "start", f"{describe_start(np.asarray(starts))}; {min(4, remaker.count)} samples",
+        "" if spec.recipe.start == "triangular" else "start: triangular begins as a running camera does",
+    )  # fmt: skip
 
 
 def _rates(rates: npt.NDArray[np.float64], recipe: Recipe) -> Iterator[Line]:
