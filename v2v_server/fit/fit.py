@@ -108,7 +108,7 @@ def fit(
     simulated = None
     if len(given.frames) >= LEAST_FRAMES and ("threshold_pos" in _values(estimates) or static):
         used = _values({name: made for name, made in estimates.items() if name not in left_out})
-        simulated = panels_of(simulate_recording(given, _complete(used), 2), light, begin, end)
+        simulated = panels_of(simulate_recording(given, _complete(used), 2, "triangular"), light, begin, end)
     facts = {
         "events": float(given.counts.sum()), "pixels": float(len(given.pixels)), "seconds": given.seconds,
         "frames": float(len(given.frames) if has_frames else 0),

@@ -25,10 +25,10 @@ _DIGITS = 4
 def recipe_fields(fitted: FittedCamera) -> dict[str, Any]:
     """Return the fields of the recipe that differ from the preset ``paper``; ranges are the intervals.
 
-    A parameter that the recording cannot tell is off; thresholds that it cannot tell stay those of ``paper``.
+    A clip starts as in a running camera. A parameter that the recording cannot tell is off; thresholds that it cannot tell stay those of ``paper``.
     """
     fields: dict[str, Any] = {
-        "preset": "paper", "noise_sigma": [0.0, 0.0], "noise_unit": "second",
+        "preset": "paper", "start": "triangular", "noise_sigma": [0.0, 0.0], "noise_unit": "second",
         "hot_pixel_share": [0.0, 0.0], "hot_pixel_sigma": [0.0, 0.0],
     }  # fmt: skip
     used = {name: made for name, made in fitted.estimates.items() if name in fitted.camera}
