@@ -268,7 +268,9 @@ def speed_preset(name: object, base: StreamSpec) -> StreamSpec:
     if not isinstance(name, str) or name not in STREAM_PRESETS:
         near, known = nearest(name, STREAM_PRESETS), ", ".join(STREAM_PRESETS)
         raise UsageError(f"unknown preset {format_value(name)}{near}; known: {known}")
-    fields = {key: preset(value) if key == "recipe" else value for key, value in STREAM_PRESETS[name].items()}
+    fields: dict[str, Any] = {
+        key: preset(value) if key == "recipe" else value for key, value in STREAM_PRESETS[name].items()
+    }
     return dataclasses.replace(base, sibling_spacing=0, **fields)
 
 

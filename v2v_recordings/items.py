@@ -151,7 +151,7 @@ class Light:
             raise UsageError(f"light {text!r}: give linear, srgb or an exponent from 0.05 to 20, such as 2.2")
         return cls("linear" if gamma == 1.0 else text, gamma)
 
-    def of(self, grey: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
+    def of(self, grey: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
         """Return light, 0 (black) to 1 (white), of grey levels 0 .. 255."""
         share = np.asarray(grey, np.float64) / 255.0
         if self.gamma:

@@ -25,7 +25,8 @@ _DIGITS = 4
 def recipe_fields(fitted: FittedCamera) -> dict[str, Any]:
     """Return the fields of the recipe that differ from the preset ``paper``; ranges are the intervals.
 
-    A clip starts as in a running camera. A parameter that the recording cannot tell is off; thresholds that it cannot tell stay those of ``paper``.
+    A clip starts as in a running camera. A parameter that the recording cannot tell is off; thresholds that it cannot
+    tell stay those of ``paper``.
     """
     fields: dict[str, Any] = {
         "preset": "paper", "start": "triangular", "noise_sigma": [0.0, 0.0], "noise_unit": "second",
