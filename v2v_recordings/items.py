@@ -149,7 +149,7 @@ class Light:
             gamma = math.nan
         if text not in known and not 0.05 <= gamma <= 20.0:
             raise UsageError(f"light {text!r}: give linear, srgb or an exponent from 0.05 to 20, such as 2.2")
-        return cls("linear" if gamma == 1.0 else text, gamma)
+        return cls("linear" if gamma == 1.0 else f"{gamma:g}" if gamma else "srgb", gamma)
 
     def of(self, grey: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
         """Return light, 0 (black) to 1 (white), of grey levels 0 .. 255."""

@@ -30,6 +30,7 @@ from trainer.models import NETWORKS
 from trainer.weights import SHIPPED, load_network
 from v2v_protocol.command import JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
+from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
 from v2v_protocol.write_aside import write_json
 from v2v_recordings.items import ConvertOptions, Light, SensorSize
@@ -174,7 +175,7 @@ def _evaluate(arguments: argparse.Namespace, data: Path, config: EvaluationConfi
         raise UsageError(f"--data {data} holds no sequence of {wanted}; create the files with v2v-convert")
     _print(config, scores)
     if run.metrics:
-        print(_of_light(run, lights))
+        show(_of_light(run, lights))
     if arguments.per_frame is not None:
         write_frames(arguments.per_frame, scores)
     if arguments.json is not None:

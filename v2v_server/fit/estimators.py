@@ -245,6 +245,6 @@ def frame_offset(recording: Recorded) -> Estimate:
         sums, lambda s: np.array([summit(seconds, s[:, 0] / np.sqrt(np.maximum(s[:, 1], 1e-9)))])
     )
     note = f"{len(steps)} steps between frames"
-    if high[0] - low[0] > _WIDEST_OFFSET_SECONDS or abs(value[0]) > seconds[-2]:
+    if high[0] - low[0] > _WIDEST_OFFSET_SECONDS or abs(value[0]) > seconds[-3]:
         return unknown(f"the events fit no offset much better than others, by {note}")
     return Estimate(float(value[0]), float(low[0]), float(high[0]), 0.0, note)

@@ -82,9 +82,8 @@ def fit(
     given = recording if isinstance(recording, Recorded) else read_recording(recording, options, progress)
     has_frames = len(given.frames) >= LEAST_FRAMES
     if not has_frames:
-        given = dataclasses.replace(
-            given, light=given.light or Light.parse("2.2")
-        )  # of frames that are made up, if any
+        # That of frames that are made up.
+        given = dataclasses.replace(given, light=given.light or Light.parse("2.2"))
     offset = estimators.frame_offset(given) if has_frames else unknown("there are no frames")
     applied_seconds = (options or ConvertOptions()).frame_offset_ns * 1e-9
     if shift:
@@ -93,7 +92,7 @@ def fit(
                 f"the recording cannot tell the offset of its frames: {offset.note}; leave --shift-frames out"
             )
         given = dataclasses.replace(given, frame_us=given.frame_us + round(1e6 * offset.value))
-        applied_seconds = offset.value
+        applied_seconds += offset.value
     if static and not has_frames:
         given = _with_constant_frames(given)
     estimates = _estimates(given, static and not has_frames, static)

@@ -264,6 +264,8 @@ def test_noise_tells_no_offset() -> None:
         20, 20, t, rng.integers(0, 400, 4000), rng.random(4000) < 0.5, frames, np.arange(20_000, 480_000, 50_000),
         light=LIGHT,
     )  # fmt: skip
+    still = dataclasses.replace(made, frames=0 * made.frames + 90)
+    assert np.isnan(estimators.frame_offset(still).value)
     found = estimators.frame_offset(made)
     assert np.isnan(found.value)
     assert "no offset much better" in found.note
@@ -307,6 +309,7 @@ def test_a_light_is_a_name_or_an_exponent(text: str) -> None:
     with pytest.raises(UsageError, match="give linear, srgb or an exponent from"):
         Light.parse(text)
     assert Light.parse("1.0") == Light.parse("linear")
+    assert Light.parse("2.2\n").name == "2.2"
 
 
 def test_a_recording_without_events_is_refused() -> None:
