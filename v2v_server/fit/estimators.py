@@ -240,7 +240,7 @@ def frame_offset(recording: Recorded) -> Estimate:
             count = np.bincount(pixel[inside], sign[inside], len(change))
             count = np.clip(count, -_MOST_COUNT, _MOST_COUNT) * seen
             sums[:, number] += sums_by_block(blocks, np.stack([change * count, count**2], axis=1), 64)
-    seconds: Doubles = OFFSETS_US * 1e-6
+    seconds = np.asarray(OFFSETS_US * 1e-6, np.float64)
     value, low, high = bootstrap(
         sums, lambda s: np.array([summit(seconds, s[:, 0] / np.sqrt(np.maximum(s[:, 1], 1e-9)))])
     )
