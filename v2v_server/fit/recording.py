@@ -227,12 +227,12 @@ class _Kept:
             self._halve()
 
     def recorded(self) -> Recorded:
-        """Return the recording, its time from 0 on, without frames a millisecond after the last event and later."""
+        """Return the recording, its time from 0 on, without frames 50 us after the last event and later."""
         t_us, place, p = (np.concatenate(column) for column in zip(*self._events, strict=True))
         self._events.clear()
         begun = int(t_us.min())
         shown = np.array(self._frame_us, np.int64) - begun
-        within = shown <= int(t_us.max()) - begun + 1000
+        within = shown <= int(t_us.max()) - begun + 50  # a recording that ends with a frame has no event after it
         frames = np.stack(self._frames) if self._frames else np.empty((0, len(self._pixels)), np.uint8)
         return recorded(
             self._size.height, self._size.width, t_us - begun, place.astype(np.int64), p, frames[within], shown[within],
