@@ -213,7 +213,10 @@ class TrainConfig:
         for name, remedy in _SET_ELSEWHERE.items():
             if name in self.stream.spec:
                 raise UsageError(f"stream.spec.{name}: {remedy}")
-        StreamSpec.from_dict(self.stream.spec)
+        named = StreamSpec.from_dict(self.stream.spec).recipe
+        if named != Recipe():
+            preset = self.stream.spec["preset"]
+            raise UsageError(f"stream.spec.preset {preset} names a recipe: set stream.recipe, and preset natural")
         if "bins" in self.network.options:
             raise UsageError("network.options.bins: set stream.recipe.bins instead, the network follows it")
         if self.run.validate_config and not self.run.validate:

@@ -81,7 +81,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
             and loader workers inherit; "" uses no key.
         timeout_seconds: silence after which the server counts as lost.
         patience: the other timeouts; None for the defaults. Its ``timeout_seconds`` is not used.
-        options: ``preset`` ("exact", "balanced", "fast" or "natural", see
+        options: ``preset`` ("exact", "balanced", "fast", "natural" or "natural-davis346", see
             :data:`v2v_protocol.presets.STREAM_PRESETS`) and fields of :class:`v2v_protocol.spec.StreamSpec`, which
             override the preset; None takes the server's.
 

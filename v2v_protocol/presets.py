@@ -56,6 +56,25 @@ PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
         "hot_pixel_share": (0.0, 5e-4),
         "hot_pixel_sigma": (0.0, 20.0),
     },
+    # Its successor, a DAVIS346 that has run for a while. Numbers are from sources, no fit (docs/effects.md).
+    # `gamma` stays that of the videos; for frames that are linear in intensity, as a DAVIS stores them, set it to 1.
+    "davis346-running": {
+        "start": "triangular",  # a residual that moves as a Brownian motion: where it stands in the long run
+        # v2e's logarithm becomes linear below 20 of 255, with the slope of an epsilon of 0.026; half and twice of it.
+        "log_eps": (0.013, 0.052),
+        "threshold": (0.134, 0.405),  # as davis346
+        "threshold_mismatch_sigma": (0.05, 0.16),  # 2.1 % of contrast (Lichtsteiner et al. 2008) at these thresholds
+        "rate_draw": "log",  # still scenes of two DAVIS cameras differ by 9 in their rate of noise
+        "shot_noise_hz": (0.1, 10.0),  # around those two, 0.44 and 4.06 a pixel, halved by grey light; v2e's `noisy`: 5
+        "leak_hz": (0.05, 0.2),  # around v2e's 0.1
+        "refractory_seconds": (1e-4, 1e-3),  # as davis346
+        "photoreceptor_hz": (300.0, 3000.0),  # v2e's default; the bandwidth in bright light of Lichtsteiner et al. 2008
+        "dead_pixel_share": (0.0, 1e-4),  # a guess, as davis346
+        "noise_sigma": (0.0, 0.0),
+        "noise_unit": "second",
+        "hot_pixel_share": (0.0, 5e-4),  # a guess, as davis346
+        "hot_pixel_sigma": (0.0, 20.0),
+    },
 }
 
 STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
@@ -63,7 +82,11 @@ STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
     "balanced": {"samples_per_decode": 2},
     "fast": {"samples_per_decode": 4},
     "natural": {"samples_per_decode": 1, "scene": "auto", "moving_share": 0.75},
-}
-"""Spec fields that each preset sets. The first three trade accuracy for speed (`docs/accuracy.md`); "natural" is for
-videos as they are: what spoils events is left out, and most crops show something that moves (`docs/scene.md`).
+    "natural-davis346": {
+        "samples_per_decode": 1, "scene": "auto", "moving_share": 0.75, "recipe": "davis346-running",
+    },
+}  # fmt: skip
+"""Spec fields that each preset sets; a recipe by its name. The first three trade accuracy for speed
+(`docs/accuracy.md`); "natural" is for videos as they are: what spoils events is left out, and most crops show something
+that moves (`docs/scene.md`); "natural-davis346" shows them to a running camera (`docs/effects.md`).
 """

@@ -32,7 +32,7 @@ OnBadVideo = Literal["substitute", "raise"]
 FlowMethod = Literal["auto", "zero", "dis-ultrafast", "dis-fast", "dis-fast-lean", "dis-fast-1"]
 FlowDirection = Literal["forward", "backward"]
 SceneChoice = Literal["off", "auto"]
-SpeedPreset = Literal["exact", "balanced", "fast", "natural"]
+SpeedPreset = Literal["exact", "balanced", "fast", "natural", "natural-davis346"]
 VOXEL_DTYPES: tuple[VoxelDtype, ...] = get_args(VoxelDtype)
 SCENES: tuple[SceneChoice, ...] = get_args(SceneChoice)
 DEFECTS = ("bars", "black", "combed", "cuts", "duplicates", "fades", "white")
@@ -267,7 +267,10 @@ def speed_preset(name: object, base: StreamSpec) -> StreamSpec:
     if not isinstance(name, str) or name not in STREAM_PRESETS:
         near, known = nearest(name, STREAM_PRESETS), ", ".join(STREAM_PRESETS)
         raise UsageError(f"unknown preset {format_value(name)}{near}; known: {known}")
-    return dataclasses.replace(base, sibling_spacing=0, **STREAM_PRESETS[name])
+    fields: dict[str, Any] = {
+        key: preset(value) if key == "recipe" else value for key, value in STREAM_PRESETS[name].items()
+    }
+    return dataclasses.replace(base, sibling_spacing=0, **fields)
 
 
 def _recipe(value: object, base: Recipe) -> Recipe:

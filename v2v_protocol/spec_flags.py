@@ -39,7 +39,8 @@ def add_spec(parser: Parser) -> None:
         type=_stream_preset,
         metavar="NAME",
         help=f"a choice of stream settings: {', '.join(STREAM_PRESETS)} (default exact). The first three trade "
-        "accuracy for speed; natural cleans videos as they are",
+        "accuracy for speed; natural cleans videos as they are; natural-davis346 also shows them to a camera that has "
+        "run for a while",
     )
     add_recipe(parser)
     parser.add_settings(StreamSpec)
@@ -51,6 +52,12 @@ def _stream_preset(name: str) -> str:
         hint = f", or give --recipe {name}" if is_recipe else nearest(name, STREAM_PRESETS)
         raise argparse.ArgumentTypeError(f"{name!r}: choose one of {', '.join(STREAM_PRESETS)}{hint}")
     return name
+
+
+def asked_recipe(arguments: argparse.Namespace) -> str | None:
+    """Return the value of ``--recipe``, else the recipe of ``--preset``; None if neither names one."""
+    recipe: str | None = arguments.recipe or STREAM_PRESETS.get(arguments.preset or "", {}).get("recipe")
+    return recipe
 
 
 def spec_fields(arguments: argparse.Namespace) -> dict[str, Any]:

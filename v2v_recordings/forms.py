@@ -19,6 +19,7 @@ class RawForm:
         title: description for the help text.
         recognises: returns whether a path has this form, judged by the name and the first bytes only.
         read: yields the items of a recording.
+        light: how the pictures of this camera follow light; "" if the form does not tell.
         published_shift: how many events earlier the published conversion of this form pairs a picture.
     """
 
@@ -26,11 +27,16 @@ class RawForm:
     recognises: Callable[[Path], bool]
     read: Callable[[Path, ConvertOptions, ReadProgress], Iterator[Item]]
     published_shift: int = 0
+    light: str = ""
 
 
+# IJRR, MVSEC and aedat4 are of DAVIS cameras, whose frames are linear in intensity.
 FORMS = {
     "ijrr": RawForm(
-        "IJRR: events.txt, images.txt, PNGs in a zip or folder; or one .txt or .csv", ijrr.recognises, ijrr.read
+        "IJRR: events.txt, images.txt, PNGs in a zip or folder; or one .txt or .csv",
+        ijrr.recognises,
+        ijrr.read,
+        light="linear",
     ),
     "evaid": RawForm("EVAID-R: event/*.txt, gt/, timestamps.txt in a zip or folder", evaid.recognises, evaid.read),
     "dsec": RawForm(
@@ -44,9 +50,9 @@ FORMS = {
         npy_columns.read,
     ),
     "h5": RawForm("the layout that v2v-convert writes", layout_h5.recognises, layout_h5.read),
-    "mvsec": RawForm("MVSEC: *_data.hdf5", mvsec.recognises, mvsec.read),
+    "mvsec": RawForm("MVSEC: *_data.hdf5", mvsec.recognises, mvsec.read, light="linear"),
     "bag": RawForm("ROS 1 bag (HQF, IJRR, MVSEC)", bag.recognises, bag.read, published_shift=1),
-    "aedat4": RawForm("aedat4 of a DAVIS", faery_reader.recognises_aedat4, faery_reader.read_aedat4),
+    "aedat4": RawForm("aedat4 of a DAVIS", faery_reader.recognises_aedat4, faery_reader.read_aedat4, light="linear"),
     "es": RawForm("Event Stream (.es)", faery_reader.recognises_es, faery_reader.read_es),
     "prophesee": RawForm("EVT 2, 3 (.raw), DAT", faery_reader.recognises_prophesee, faery_reader.read_prophesee),
 }

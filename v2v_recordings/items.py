@@ -6,6 +6,8 @@ seconds since 1970 in float64 are 0.24 us apart.
 
 from __future__ import annotations
 
+import argparse
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -121,7 +123,43 @@ class Note:
     text: str
 
 
-Item = EventChunk | Picture | SensorSize | FlowField | Note
+@dataclass(frozen=True)
+class Light:
+    """Say how the grey levels of pictures follow light.
+
+    Attributes:
+        name: "linear", "srgb", or the exponent.
+        gamma: light is a grey level to this power; 0: the curve of sRGB.
+    """
+
+    name: str
+    gamma: float
+
+    @classmethod
+    def parse(cls, text: str) -> Light:
+        """Read a name or an exponent.
+
+        Raises:
+            UsageError: it is neither.
+        """
+        known = {"linear": 1.0, "srgb": 0.0}
+        try:
+            gamma = known[text] if text in known else float(text)
+        except ValueError:
+            gamma = math.nan
+        if text not in known and not 0.05 <= gamma <= 20.0:
+            raise UsageError(f"light {text!r}: give linear, srgb or an exponent from 0.05 to 20, such as 2.2")
+        return cls("linear" if gamma == 1.0 else f"{gamma:g}" if gamma else "srgb", gamma)
+
+    def of(self, grey: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+        """Return light, 0 (black) to 1 (white), of grey levels 0 .. 255."""
+        share = np.asarray(grey, np.float64) / 255.0
+        if self.gamma:
+            return np.asarray(share**self.gamma)
+        return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+
+
+Item = EventChunk | Picture | SensorSize | FlowField | Note | Light
 
 
 @dataclass(frozen=True)
@@ -134,6 +172,8 @@ class ConvertOptions:
             us.
         camera: "left" or "right" of a stereo recording (MVSEC).
         events_topic, images_topic: topics to read from a bag that has several.
+        light: of the pictures; None takes what the form or the file states.
+        frame_offset_ns: added to the times of the pictures.
     """
 
     size: SensorSize | None = None
@@ -141,6 +181,52 @@ class ConvertOptions:
     camera: str = "left"
     events_topic: str | None = None
     images_topic: str | None = None
+    light: Light | None = None
+    frame_offset_ns: int = 0
+
+
+def add_options(group: argparse._ArgumentGroup) -> None:
+    """Add the flags of :class:`ConvertOptions`."""
+    group.add_argument("--size", metavar="WxH", help="size of the sensor in px, if a recording does not state it")
+    group.add_argument(
+        "--time-unit", choices=tuple(NS_PER_UNIT),
+        help="unit of times in text files (default: s if they have a decimal point, else us)",
+    )  # fmt: skip
+    group.add_argument(
+        "--camera", choices=("left", "right"), default="left",
+        help="camera of a stereo recording (MVSEC; default left)",
+    )  # fmt: skip
+    group.add_argument("--events-topic", metavar="TOPIC", help="topic of events, for a bag with several")
+    group.add_argument("--images-topic", metavar="TOPIC", help="topic of pictures, for a bag with several")
+    group.add_argument(
+        "--light", metavar="CURVE",
+        help="light of the pictures: linear, srgb, or the exponent of their light, such as 2.2 (default: that of the "
+        "camera or file, if it is known)",
+    )  # fmt: skip
+    group.add_argument(
+        "--frame-offset", default="0", metavar="MS", help="milliseconds to add to the times of the pictures"
+    )
+
+
+def options_of(arguments: argparse.Namespace) -> ConvertOptions:
+    """Return the options that the flags of :func:`add_options` state.
+
+    Raises:
+        UsageError: a flag has a wrong value.
+    """
+    try:
+        offset_ns = round(1e6 * float(arguments.frame_offset))
+    except (ValueError, OverflowError):
+        raise UsageError(f"--frame-offset {arguments.frame_offset}: give milliseconds, such as 7 or -2.5") from None
+    return ConvertOptions(
+        size=None if arguments.size is None else SensorSize.parse(arguments.size),
+        time_unit=arguments.time_unit,
+        camera=arguments.camera,
+        events_topic=arguments.events_topic,
+        images_topic=arguments.images_topic,
+        light=None if arguments.light is None else Light.parse(arguments.light),
+        frame_offset_ns=offset_ns,
+    )
 
 
 LARGEST_NS = 2.0**63

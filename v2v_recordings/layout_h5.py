@@ -6,6 +6,7 @@
 | ``images/*`` | uint8 [H, W]; attribute ``timestamp``, s, or ``event_idx`` |
 | ``flow/*`` | float32 [2, H, W]; attribute ``timestamp``, s |
 | attributes ``sensor_resolution``, ``start_ns`` | height and width; time 0 in the clock of the raw recording |
+| attribute ``light`` | of the pictures, if it is known (``Light.parse``) |
 """
 
 from __future__ import annotations
@@ -17,7 +18,16 @@ import numpy as np
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings import hdf5
-from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, FlowField, Item, Picture, ReadProgress, to_ns
+from v2v_recordings.items import (
+    NS_PER_UNIT,
+    ConvertOptions,
+    FlowField,
+    Item,
+    Light,
+    Picture,
+    ReadProgress,
+    to_ns,
+)
 
 
 def recognises(path: Path) -> bool:
@@ -33,6 +43,8 @@ def read(path: Path, _options: ConvertOptions, progress: ReadProgress) -> Iterat
     """
     with hdf5.open_hdf5(path) as file:
         origin_ns = int(file.attrs.get("start_ns", 0))
+        if "light" in file.attrs:
+            yield Light.parse(str(file.attrs["light"]))
         stated = file.attrs.get("sensor_resolution", file.get("sensor_resolution"))
         if stated is not None:
             yield hdf5.sensor_size(stated, path)

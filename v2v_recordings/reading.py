@@ -16,7 +16,17 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings.forms import FORMS, recognise
-from v2v_recordings.items import ConvertOptions, EventChunk, FlowField, Item, Note, Picture, ReadProgress, SensorSize
+from v2v_recordings.items import (
+    ConvertOptions,
+    EventChunk,
+    FlowField,
+    Item,
+    Light,
+    Note,
+    Picture,
+    ReadProgress,
+    SensorSize,
+)
 
 LATE_NS = 10_000_000
 """Events that are earlier than others before them by at most this are late in any case."""
@@ -31,7 +41,7 @@ GAP_NS = 1000
 def read_items(
     path: Path, form: str | None, options: ConvertOptions, progress: ReadProgress = lambda _done, _total: None
 ) -> Iterator[Item]:
-    """Yield the items of a recording.
+    """Yield the items of a recording; its light, if it is known, first.
 
     Args:
         path: file or folder.
@@ -41,8 +51,12 @@ def read_items(
         UsageError: the recording is missing, damaged or of an unknown form; its sensor is too large; its clock is reset
             and it has pictures.
     """
-    clock = _Clock(path)
-    for item in FORMS[form or recognise(path)].read(path, options, progress):
+    clock, chosen = _Clock(path), FORMS[form or recognise(path)]
+    if options.light or chosen.light:
+        yield options.light or Light.parse(chosen.light)
+    for item in chosen.read(path, options, progress):
+        if isinstance(item, Light) and options.light:
+            continue
         if isinstance(item, EventChunk):
             yield from clock.pass_on(item)
             continue
@@ -50,6 +64,7 @@ def read_items(
             item.require_usable(str(path))
         elif isinstance(item, Picture):
             SensorSize(*item.pixels.shape[::-1]).require_usable(str(path))
+            item = dataclasses.replace(item, t_ns=item.t_ns + options.frame_offset_ns)
         clock.check(isinstance(item, (Picture, FlowField)))
         yield item
     yield from clock.pass_on(None)

@@ -213,7 +213,8 @@ class ServeConfig:
         values |= {name: value for name, value in flags.items() if value is not None}
         values |= {"recipe": read_recipe(values["recipe"])} if "recipe" in values else {}
         if settings:
-            values["recipe"] = recipe_setting(None, settings, values.get("recipe"))
+            named = {**STREAM_PRESETS.get(values.get("preset") or "", {}), **values}
+            values["recipe"] = recipe_setting(None, settings, named.get("recipe"))
         fields = {name: values.pop(name) for name in SPEC_KEYS if name in values}
         return cls(**values, spec=StreamSpec.from_dict(fields))
 

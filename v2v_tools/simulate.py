@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
-from v2v_protocol.spec_flags import add_spec, recipe_setting, spec_fields
+from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting, spec_fields
 from v2v_server.config import ServeConfig
 from v2v_server.store.pixels import VideosKind
 from v2v_tools.event_files import EVENT_WRITERS
@@ -68,7 +68,7 @@ def _run(arguments: argparse.Namespace) -> None:
         events=arguments.events,
         list_file=arguments.list,
         rows=arguments.rows or "full",
-        spec=spec_fields(arguments) | {"recipe": recipe_setting(arguments.recipe, arguments.set)},
+        spec=spec_fields(arguments) | {"recipe": recipe_setting(asked_recipe(arguments), arguments.set)},
         arrays=tuple(arguments.arrays.split(",")),
         seed=arguments.seed,
         epoch=arguments.epoch,

@@ -26,7 +26,6 @@ import numpy as np
 
 from bench.frame import Column, Report, add_whole, beyond, progress
 from tests.oracles.cameras import (
-    FRAMES_PER_SECOND,
     SCENES,
     Film,
     TrueCamera,
@@ -36,13 +35,13 @@ from tests.oracles.cameras import (
     rendered_film,
 )
 from tests.oracles.other_cameras import OTHERS, record_other
+from tests.oracles.simulators import drawn
 from v2v_protocol.command import Parser
-from v2v_protocol.recipe import PRESETS, Recipe
-from v2v_server.simulation.draw import draw
+from v2v_protocol.recipe import PRESETS
+from v2v_recordings.items import Light
 from v2v_tools.fit.fit import fit
 from v2v_tools.fit.interval import Doubles
 from v2v_tools.fit.recording import Recorded, recorded
-from v2v_tools.fit.regression import light_of
 from v2v_tools.fit.statistics import panels_of, simulate_recording
 
 HEIGHT_PX, WIDTH_PX = 96, 128
@@ -122,7 +121,7 @@ def _outside() -> Report:
         progress(f"{name}: told {', '.join(fitted.camera)}")
         other = given.part(~is_even)
         cameras = {"fitted": [{"threshold_pos": 0.2, "threshold_neg": 0.2, **fitted.camera}]}
-        cameras |= {preset: [_drawn(recipe, seed) for seed in range(DRAWS)] for preset, recipe in PRESETS.items()}
+        cameras |= {preset: [drawn(recipe, seed) for seed in range(DRAWS)] for preset, recipe in PRESETS.items()}
         found = {who: np.median([_apart(other, each) for each in some], axis=0) for who, some in cameras.items()}
         for place, statistic in enumerate(("rate", "on/off", "pixels", "intervals")):
             values = {who: float(distances[place]) for who, distances in found.items()}
@@ -134,22 +133,10 @@ def _outside() -> Report:
     return Report(records, [(records, columns)], [], missed)
 
 
-def _drawn(recipe: Recipe, seed: int) -> dict[str, float]:
-    """Draw a camera; noise and drift of a frame are converted to those of a second."""
-    made = draw(recipe, seed=seed, epoch=0, index=0, picture_height_px=512, picture_width_px=512, video_id="")
-    hz = float(FRAMES_PER_SECOND) if recipe.noise_unit == "frame" else 1.0
-    return {
-        "threshold_pos": made.threshold_pos, "threshold_neg": made.threshold_neg, **made.effects,
-        "log_eps": recipe.log_eps[0] if made.log_eps is None else made.log_eps,
-        "noise_sigma": made.noise_sigma * hz**0.5, "hot_pixel_sigma": made.hot_pixel_sigma * hz,
-        "hot_pixel_share": made.hot_pixel_count / (recipe.crop_height_px * recipe.crop_width_px),
-    }  # fmt: skip
-
-
 def _apart(recording: Recorded, camera: Mapping[str, float]) -> tuple[float, ...]:
     begin, end = int(recording.frame_us[0]), int(recording.frame_us[-1])
     both = [
-        panels_of(each, light_of(np.arange(256.0)), begin, end)
+        panels_of(each, each.known_light.of(np.arange(256.0)), begin, end)
         for each in (recording, simulate_recording(recording, camera))
     ]
     off, on = (np.array([panels["rates"][part].sum() for panels in both]) for part in HALVES)
@@ -168,7 +155,9 @@ def _distance(mine: Doubles, other: Doubles) -> float:
 
 def _recorded(made: Mapping[str, Any]) -> Recorded:
     place = made["y"].astype(np.int64) * WIDTH_PX + made["x"]
-    return recorded(HEIGHT_PX, WIDTH_PX, made["t"], place, made["p"], made["frames"], made["frame_us"])
+    return recorded(
+        HEIGHT_PX, WIDTH_PX, made["t"], place, made["p"], made["frames"], made["frame_us"], light=Light.parse("2.2")
+    )
 
 
 def one(camera: TrueCamera, film: Film, seed: int, scene: str) -> Iterator[dict[str, Any]]:

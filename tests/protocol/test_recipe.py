@@ -98,7 +98,7 @@ def test_the_paper_preset_holds_the_released_values() -> None:
 
 def test_presets_differ_from_paper_only_where_they_say() -> None:
     def changed(name: str) -> set[str]:
-        return {key for key, value in preset(name).to_dict().items() if value != preset("paper").to_dict()[key]}
+        return {key for key, value in preset(name).to_dict().items() if value != preset("paper").to_dict().get(key)}
 
     assert changed("paper-fixed-thresholds") == {"threshold_source"}
     assert changed("paper-contrast") == {"contrast_probability"}
@@ -107,7 +107,9 @@ def test_presets_differ_from_paper_only_where_they_say() -> None:
     noise = {"noise_sigma", "hot_pixel_share", "hot_pixel_sigma"}
     assert changed("noise-free") == noise | {"pause_probability"}
     assert changed("clean") == noise | {"threshold", "threshold_ratio", "threshold_mismatch_sigma"}
-    assert changed("davis346") == noise | {"threshold", "noise_unit", *EFFECTS}
+    of_davis = noise | {"threshold", "noise_unit", *EFFECTS}
+    assert changed("davis346") == of_davis
+    assert changed("davis346-running") == of_davis | {"log_eps"} | {"start", "rate_draw"}
 
 
 @pytest.mark.parametrize("name", ["papers", "", None, 7, ["paper"]])

@@ -125,6 +125,15 @@ def test_the_options_of_a_dataset_are_the_fields_of_a_spec() -> None:
         assert setting.words == get_args(fields[name])
 
 
+def test_a_stream_preset_may_name_a_recipe_which_other_fields_change() -> None:
+    stream = StreamSpec.from_dict({"preset": "natural-davis346"})
+    assert stream.recipe == preset("davis346-running")
+    assert stream == StreamSpec.from_dict({"preset": "natural", "recipe": "davis346-running"})
+    changed = StreamSpec.from_dict({"preset": "natural-davis346", "recipe": {"bins": 3}})
+    assert changed.recipe == preset("davis346-running").replace(bins=3)
+    assert StreamSpec.from_dict({"preset": "natural-davis346", "recipe": "clean"}).recipe == preset("clean")
+
+
 def test_every_field_changes_the_digest() -> None:
     digests = {StreamSpec().digest}
     for name, value in OTHER_RECIPE_VALUES.items():

@@ -91,6 +91,9 @@ def test_keys_may_be_written_as_the_flags_are(tmp_path: Path) -> None:
         ("--set gamma=2 --set bins=3", "clean gamma=2 bins=3"),
         ("--recipe davis346", "davis346"),
         ("--recipe davis346 --set bins=3", "davis346 bins=3"),
+        ("--preset natural-davis346", "davis346-running"),
+        ("--preset natural-davis346 --set bins=3", "davis346-running bins=3"),
+        ("--preset natural-davis346 --recipe clean", "clean"),
     ],
 )
 def test_single_fields_are_changed_in_the_recipe_of_the_file(
@@ -103,6 +106,14 @@ def test_single_fields_are_changed_in_the_recipe_of_the_file(
     serve(["--config", str(file), *flags.split()])
     name, *changes = recipe.split()
     assert served[0].spec.recipe == recipe_setting(name, changes)
+
+
+def test_settings_change_the_recipe_of_a_stream_preset_in_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "serve.yaml"
+    file.write_text("videos: a\npreset: natural-davis346\n")
+    config = ServeConfig.load(str(file), {}, ["bins=3"])
+    assert config.spec.recipe == preset("davis346-running").replace(bins=3)
+    assert config.spec.scene == "auto"
 
 
 def test_a_named_recipe_of_the_file_is_changed_too_and_without_one_the_papers(tmp_path: Path) -> None:

@@ -121,6 +121,7 @@ def test_numbers_without_a_point_are_numbers(tmp_path):
         ("stream.recipe.gama=2", r"unknown recipe key 'gama'.*gamma"),
         ("stream.recipe.lead_frames=1", r"stream\.recipe\.lead_frames: leave it out"),
         ("stream.spec.flow_from=3", r"stream\.spec\.flow_from: section loss decides"),
+        ("stream.spec.preset=natural-davis346", r"natural-davis346 names a recipe: set stream\.recipe"),
         ("stream.spec.voxel_dtype=int4", r"voxel_dtype = 'int4'"),
         ("loss.l1_weight=0", r"l1_weight, lpips_weight and temporal_weight are all 0"),
         ("loss.l1_weight=-1", r"loss\.l1_weight = -1: give a number from 0"),

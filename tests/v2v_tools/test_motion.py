@@ -20,7 +20,7 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.simulation import simulate
 from v2v_server.video.rows import Rows
 from v2v_tools import motion
-from v2v_tools.motion import WholePictures, moving_seeds, noise_rate, quiet_voxels
+from v2v_tools.motion import WholePictures, describe_start, moving_seeds, noise_rate, quiet_voxels, start_events
 from v2v_tools.preview import command
 from v2v_tools.remake import Remaker
 
@@ -130,3 +130,21 @@ def test_a_seed_that_is_given_is_kept(corpus: Catalogue, tmp_path: Path, monkeyp
     assert whole.voxels.shape[2:] == (96, 160)
     chosen, _ = _drawn(clip, tmp_path, monkeypatch, "--seeds=2", "--set=threshold=[0.1,0.2]")
     assert all(provenance.params.crop_left_px > 60 for provenance in chosen)
+
+
+def test_the_start_makes_the_events_of_a_still_clip_and_none_if_it_is_zero(tmp_path: Path) -> None:
+    """Where levels waver by one, only residuals near a threshold cross it: those that a start puts there."""
+    frames = np.full((12, 64, 64), 60, np.uint8)
+    frames[1::2] = 61
+    write_clip(tmp_path / "still.mkv", frames, codec="ffv1", pixel_format="gray")
+    catalogue = open_catalogue(tmp_path, rows=Rows.parse("full"), cache_dir=tmp_path / "cache")
+    size = {"voxels_per_clip": 2, "bins": 2, "crop_height_px": 32, "crop_width_px": 32, "threshold": 0.2}
+    shares = {}
+    for start in ("uniform", "triangular", "zero"):
+        spec = StreamSpec.from_dict({"recipe": {**size, "start": start}})
+        shares[start] = start_events(Remaker(catalogue, spec).made(0, 0, 0))
+    catalogue.close()
+    assert shares["uniform"][0] > 3 * shares["triangular"][0] > 0
+    assert all(events[1] == 0 for events in shares.values())
+    assert "makes 100% of its events" in describe_start(shares["uniform"])
+    assert "makes 0% of its events" in describe_start(shares["zero"])

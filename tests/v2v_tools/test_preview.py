@@ -111,7 +111,8 @@ def test_the_command_compares_recipes_on_one_clip(
     )
     assert seen == [("paper", 0), ("noise-free", 0), ("own", 0)]
     assert np.asarray(Pictures.open(out)).ndim == 3
-    chosen, _, said = capsys.readouterr().out.splitlines()
+    chosen, started, _, said = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"the start of a clip makes \d+% of its events without noise \(recipe field start\)", started)
     assert re.fullmatch(r"seed \d+: chosen because their crops show motion; --seed 0 takes what chance gives", chosen)
     assert said == f"{out}: 3 cameras"
 

@@ -18,7 +18,6 @@ from v2v_protocol.progress import Progress
 from v2v_protocol.write_aside import write_json
 from v2v_recordings import items
 from v2v_recordings.forms import FORMS
-from v2v_recordings.items import NS_PER_UNIT
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,17 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--out", required=True, metavar="PATH", help="folder for the new files, or (one SRC) a file ending in .h5"
     )
     recordings.add_argument("--form", choices=tuple(FORMS), help="form of the recordings (default: detected)")
-    recordings.add_argument("--size", metavar="WxH", help="size of the sensor in px, if a recording does not state it")
-    recordings.add_argument(
-        "--time-unit", choices=tuple(NS_PER_UNIT),
-        help="unit of times in text files (default: s if they have a decimal point, else us)",
-    )  # fmt: skip
-    recordings.add_argument(
-        "--camera", choices=("left", "right"), default="left",
-        help="camera of a stereo recording (MVSEC; default left)",
-    )  # fmt: skip
-    recordings.add_argument("--events-topic", metavar="TOPIC", help="topic of events, for a bag with several")
-    recordings.add_argument("--images-topic", metavar="TOPIC", help="topic of pictures, for a bag with several")
+    items.add_options(recordings)
     out.add_argument("--overwrite", action="store_true", help="replace files that exist")
     parser.add_output("Output", "--json", JSON, "also write a record of each recording to this file")
     interrupted = "interrupted; no incomplete file is left"
@@ -53,13 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    options = items.ConvertOptions(
-        size=None if arguments.size is None else items.SensorSize.parse(arguments.size),
-        time_unit=arguments.time_unit,
-        camera=arguments.camera,
-        events_topic=arguments.events_topic,
-        images_topic=arguments.images_topic,
-    )
+    options = items.options_of(arguments)
     out = Path(arguments.out)
     to_file = out.suffix.lower() in layout.SUFFIXES
     if to_file and len(arguments.sources) > 1:
@@ -106,6 +89,10 @@ def summary(done: Converted) -> str:
         text += (
             f"\n  {written.backward_images} images are not later than the previous one; v2v-eval repairs their times"
         )
+    if written.images and written.light:
+        text += f"\n  light of the images: {written.light}"
+    elif written.images:
+        text += "\n  light of the images: not known; v2v-fit and v2v-eval need it: give --light if you know it"
     if not written.images:
         text += "\n  no images: v2v-eval can reconstruct it (--fps), but not score it"
     return text
@@ -124,6 +111,7 @@ def _record(done: Converted) -> dict[str, str | int | float]:
         "backward_images": written.backward_images,
         "width_px": written.size.width,
         "height_px": written.size.height,
+        "light": written.light,
         "notes": "; ".join(written.notes),
     }
 

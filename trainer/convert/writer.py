@@ -24,7 +24,7 @@ import numpy.typing as npt
 from trainer.evaluation import layout
 from v2v_protocol.errors import UsageError
 from v2v_protocol.write_aside import write_aside_and_rename
-from v2v_recordings.items import EventChunk, FlowField, Item, Note, Picture, SensorSize
+from v2v_recordings.items import EventChunk, FlowField, Item, Light, Note, Picture, SensorSize
 
 FLUSH_EVENTS = 1 << 19
 REORDER_EVENTS = 1 << 17
@@ -45,6 +45,7 @@ class Written:
         size_is_guessed: True if the recording does not state the size, so that it is the smallest one that holds all
             events.
         notes: sentences of the reader for the user.
+        light: of the pictures, by its name; "": not known.
     """
 
     events: int
@@ -55,6 +56,7 @@ class Written:
     size: SensorSize
     size_is_guessed: bool
     notes: tuple[str, ...]
+    light: str = ""
 
 
 class RecordingWriter:
@@ -81,6 +83,7 @@ class RecordingWriter:
         self._last_ns: int | None = None
         self._largest = SensorSize(0, 0)
         self._notes: list[str] = []
+        self._light: Light | None = None
         self._picture_size: SensorSize | None = None
         self._picture_times: list[int] = []
         self._events = self._reordered = self._flow_fields = 0
@@ -126,6 +129,8 @@ class RecordingWriter:
             self._size = item
         elif isinstance(item, Note):
             self._notes.append(item.text)
+        elif isinstance(item, Light):
+            self._light = item
         elif isinstance(item, Picture):
             self._add_picture(item)
         elif isinstance(item, FlowField):
@@ -231,6 +236,8 @@ class RecordingWriter:
             data_source=self._source,
             start_ns=self._origin_ns,
         )
+        if self._light is not None and self._picture_times:
+            self._file.attrs["light"] = self._light.name
         return Written(
             events=self._events,
             images=len(self._picture_times),
@@ -240,6 +247,7 @@ class RecordingWriter:
             size=size,
             size_is_guessed=self._size is None and self._picture_size is None,
             notes=tuple(self._notes),
+            light="" if self._light is None else self._light.name,
         )
 
     def _pair_pictures(self) -> None:

@@ -21,6 +21,7 @@ from trainer.evaluation.config import EvaluationConfig, folder_config, read_conf
 from trainer.evaluation.evaluate import Advance, Drawing, Run, check_data_set, evaluate_data_set, find_recordings
 from trainer.evaluation.flow import FlowRun, evaluate_flow, flow_records, flow_table
 from trainer.evaluation.metrics import METRICS, make_metrics
+from trainer.evaluation.readers import VIDEO_GAMMA
 from trainer.evaluation.reconstruct import Stretch
 from trainer.evaluation.score import SequenceScore
 from trainer.evaluation.tables import records, table, write_frames
@@ -29,9 +30,10 @@ from trainer.models import NETWORKS
 from trainer.weights import SHIPPED, load_network
 from v2v_protocol.command import JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
+from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
 from v2v_protocol.write_aside import write_json
-from v2v_recordings.items import ConvertOptions, SensorSize
+from v2v_recordings.items import ConvertOptions, Light, SensorSize
 
 OF_PICTURES = (
     "metrics",
@@ -42,6 +44,7 @@ OF_PICTURES = (
     "window_pictures",
     "fps",
     "rows",
+    "light",
     "video",
     "per_frame",
 )
@@ -124,6 +127,11 @@ def _parser() -> Parser:
         "--fps", type=float, metavar="N", help="reconstruct N pictures per second of the recording, without scores"
     )
     how.add_argument("--size", metavar="WxH", help="size of the sensor in px, for recordings without pictures")
+    how.add_argument(
+        "--light", metavar="CURVE",
+        help="light of the pictures: linear (DAVIS), srgb, or the exponent of their light, such as 2.2: score them as "
+        "videos code them, with gamma 2.2 (default: score them as stored)",
+    )  # fmt: skip
     how.add_argument("--device", metavar="D", help="PyTorch device (default: cuda if available, else cpu)")
     out.add_argument("--out", metavar="DIR", help="folder to write a picture of each sequence to")
     out.add_argument("--rows", type=int, default=6, metavar="N", help="rows of each picture (default 6)")
@@ -150,8 +158,7 @@ def _evaluate(arguments: argparse.Namespace, data: Path, config: EvaluationConfi
     run, model = _prepare(arguments, config)
     if run.network.task == "flow":
         return _run_flow(arguments, data, config, run, model)
-    for data_set in config.data_sets:
-        check_data_set(run, data, data_set)
+    lights = set[str]().union(*(check_data_set(run, data, data_set) for data_set in config.data_sets))
     scores: dict[str, list[SequenceScore]] = {}
     try:
         with Progress("evaluating", "windows") as progress:
@@ -167,6 +174,8 @@ def _evaluate(arguments: argparse.Namespace, data: Path, config: EvaluationConfi
         wanted = ", ".join(f"{data_set.folder}/*.h5 ({data_set.name})" for data_set in config.data_sets)
         raise UsageError(f"--data {data} holds no sequence of {wanted}; create the files with v2v-convert")
     _print(config, scores)
+    if run.metrics:
+        show(_of_light(run, lights))
     if arguments.per_frame is not None:
         write_frames(arguments.per_frame, scores)
     if arguments.json is not None:
@@ -182,9 +191,18 @@ def _evaluate(arguments: argparse.Namespace, data: Path, config: EvaluationConfi
             "window_seconds": run.window_seconds,
             "window_events": run.window_events,
             "stretch": run.stretch,
+            "light": "as stored" if run.light is None else run.light.name,
         }
         write_json(arguments.json, records(scores, settings))
     return 0
+
+
+def _of_light(run: Run, lights: set[str]) -> str:
+    """Say in which light pictures are scored: networks trained on videos draw what a video codes."""
+    if run.light is not None:
+        return f"pictures: taken as {run.light.name}, and scored as videos code them, with gamma {VIDEO_GAMMA}"
+    stated = ", ".join(sorted(name or "light not stated" for name in lights))
+    return f"pictures: scored as stored ({stated}); --light scores them as videos code them"
 
 
 def _run_flow(arguments: argparse.Namespace, data: Path, config: EvaluationConfig, run: Run, model: str) -> int:
@@ -254,6 +272,7 @@ def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[R
         window_events=arguments.window_events,
         size=_size(arguments.size),
         stretch=arguments.stretch,
+        light=None if arguments.light is None else Light.parse(arguments.light),
         drawing=Drawing(None if arguments.out is None else Path(arguments.out), arguments.rows, arguments.video),
     )
     return run, model

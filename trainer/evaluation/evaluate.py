@@ -20,6 +20,7 @@ from trainer.evaluation.windows import picture_windows, regular_windows, windows
 from trainer.models import VoxelNetwork
 from trainer.precision import ieee_products
 from v2v_protocol.errors import UsageError
+from v2v_recordings.items import Light
 
 Advance = Callable[[str, int, int], None]
 """Progress callback: called with the sequence, the windows done, and the total number of windows."""
@@ -66,6 +67,7 @@ class Run:
         size: height and width of the sensor, see :class:`Recording`.
         drawing: pictures and videos to write.
         stretch: see :func:`reconstruct`.
+        light: see :class:`Recording`.
         score_blank: also score a blank picture in the mean grey of each target.
     """
 
@@ -82,6 +84,7 @@ class Run:
     size: tuple[int, int] | None = None
     drawing: Drawing = field(default_factory=Drawing)
     stretch: Stretch = "none"
+    light: Light | None = None
     score_blank: bool = True
 
 
@@ -100,20 +103,23 @@ def find_recordings(data: Path, data_set: DataSet) -> dict[str, Path]:
     return found
 
 
-def check_data_set(run: Run, data: Path, data_set: DataSet) -> None:
+def check_data_set(run: Run, data: Path, data_set: DataSet) -> set[str]:
     """Check all existing recordings, so that a bad one is reported before the others are evaluated.
+
+    Returns:
+        the lights of pictures that they state; "" of one that states none.
 
     Raises:
         UsageError: see :class:`Recording`.
     """
-    for path in find_recordings(data, data_set).values():
-        check_recording(run, path, data_set)
+    return {check_recording(run, path, data_set) for path in find_recordings(data, data_set).values()}
 
 
-def check_recording(run: Run, path: Path, data_set: DataSet) -> None:
-    """Check that a recording can be evaluated; raises as :func:`check_data_set`."""
+def check_recording(run: Run, path: Path, data_set: DataSet) -> str:
+    """Check that a recording can be evaluated; return the light that it states, raise as :func:`check_data_set`."""
     with Recording(path, as_published=run.as_published, size=run.size) as recording:
         _windows(run, recording, data_set)
+        return recording.stated_light
 
 
 def _windows(run: Run, recording: Recording, data_set: DataSet) -> list[EventWindow]:
@@ -144,7 +150,7 @@ def evaluate_sequence(
     run: Run, path: Path, data_set: DataSet, advance: Advance = lambda _sequence, _done, _total: None
 ) -> SequenceScore:
     """Score one recording, and draw it if requested."""
-    with Recording(path, as_published=run.as_published, size=run.size) as recording, ieee_products():
+    with Recording(path, as_published=run.as_published, size=run.size, light=run.light) as recording, ieee_products():
         windows = _windows(run, recording, data_set)
         scorer = SequenceScorer(run.metrics, run.score_blank)
         rows = []

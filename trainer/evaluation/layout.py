@@ -11,6 +11,7 @@
 | ... attribute ``event_idx_published`` | integer, optional | ``event_idx`` as the published conversion writes it |
 | ``flow/<key>`` | float32 [2, H, W], optional | flow (x, y), px, until the next field; NaN: not known |
 | ... attribute ``timestamp`` | float | seconds, the clock of ``ts`` |
+| root attribute ``light`` | text, optional | of the pictures: linear, srgb or the exponent of their light |
 | root attribute ``sensor_resolution`` | 2 integers | height, width |
 """
 

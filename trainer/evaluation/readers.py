@@ -23,11 +23,12 @@ from trainer.evaluation import layout
 from trainer.evaluation.voxelise import Events
 from v2v_protocol.errors import UsageError
 from v2v_recordings.hdf5 import require_self_contained
-from v2v_recordings.items import SensorSize
+from v2v_recordings.items import Light, SensorSize
 
 BLOCK_EVENTS = 1 << 16
 CACHED_BLOCKS = 64
 CLOCK_SLACK_SECONDS = 1.0
+VIDEO_GAMMA = 2.2
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,7 @@ class Recording:
         path: file, opened for reading.
         as_published: see the module.
         size: height and width of the sensor, used if the file has no pictures; None takes those that the file states.
+        light: of the pictures, which are then read as a video codes them (VIDEO_GAMMA); None reads them as stored.
 
     Attributes:
         name: name of the sequence, the file's name without its ending.
@@ -100,9 +102,19 @@ class Recording:
         UsageError: there is no such file, it has another layout, or its clocks disagree.
     """
 
-    def __init__(self, path: str | Path, *, as_published: bool = False, size: tuple[int, int] | None = None) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        as_published: bool = False,
+        size: tuple[int, int] | None = None,
+        light: Light | None = None,
+    ) -> None:
         self.path = Path(path)
         self._given_size = size
+        self._table = None
+        if light is not None:
+            self._table = np.rint(255.0 * light.of(np.arange(256.0)) ** (1 / VIDEO_GAMMA)).astype(np.uint8)
         self.name = self.path.stem
         if not self.path.is_file():
             raise UsageError(f"no file {self.path}")
@@ -291,7 +303,12 @@ class Recording:
             raise UsageError(
                 f"{self.path}: {image.key} is {pixels.dtype} {list(pixels.shape)}, not uint8 {list(self.size)}"
             )
-        return np.asarray(pixels)
+        return np.asarray(pixels if self._table is None else self._table[pixels])
+
+    @property
+    def stated_light(self) -> str:
+        """Return the light of the pictures that the file states; "" if it states none."""
+        return str(self._file.attrs.get("light", ""))
 
 
 def _in_order(events: Events, window: EventWindow, path: Path) -> Events:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
-from v2v_protocol.spec_flags import add_spec, recipe_setting
+from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting
 from v2v_protocol.write_aside import check_output
 from v2v_server.config import SERVE_KEYS, ServeConfig
 from v2v_server.supervise.local_host import start_ahead
@@ -37,9 +37,10 @@ def _run(arguments: argparse.Namespace) -> None:
     times = StartTimes(is_logged=arguments.debug)
     flags = {name: getattr(arguments, name) for name in SERVE_KEYS}
     # Without --recipe, --set changes fields of the file's recipe.
-    settings = arguments.set if arguments.recipe is None else []
-    if arguments.recipe is not None:
-        flags["recipe"] = recipe_setting(arguments.recipe, arguments.set)
+    recipe = asked_recipe(arguments)
+    settings = arguments.set if recipe is None else []
+    if recipe is not None:
+        flags["recipe"] = recipe_setting(recipe, arguments.set)
     with report_errors(lambda: arguments.log_format):
         config = ServeConfig.load(arguments.config, flags, settings)
         arguments.log_format = config.log_format  # the file may ask for JSON

@@ -27,6 +27,7 @@ from v2v_server.store.pixels import VideosKind
 from v2v_server.video.rows import Rows
 from v2v_server.video.source import clean_aperture
 from v2v_tools.doctor.motion import look_at_motion
+from v2v_tools.motion import describe_start, start_events
 from v2v_tools.remake import Remaker, open_shown
 
 Line = tuple[str, str, str, str]
@@ -94,7 +95,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
         return
     remaker = Remaker(catalogue, spec, DEFAULT_ARRAYS)
     try:
-        remaker.sample(0, 0, 0)  # with compiling
+        starts = sum(start_events(remaker.made(0, 0, at)) for at in range(min(4, remaker.count)))  # with compiling
         began = time.perf_counter()
         remaker.sample(0, 0, min(1, remaker.count - 1))
     except V2VError as error:
@@ -102,6 +103,10 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
         return
     text = f"{table.count} samples an epoch; one took {time.perf_counter() - began:.2f} s on one core"
     yield "ok", "corpus", text, ""
+    yield (
+        "ok", "start", f"{describe_start(np.asarray(starts))}; {min(4, remaker.count)} samples",
+        "" if spec.recipe.start == "triangular" else "start: triangular begins as a running camera does",
+    )  # fmt: skip
 
 
 def _rates(rates: npt.NDArray[np.float64], recipe: Recipe) -> Iterator[Line]:

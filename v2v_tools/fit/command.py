@@ -14,7 +14,7 @@ from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec_flags import read_yaml_mapping, recipe_setting
 from v2v_recordings.forms import FORMS
-from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, SensorSize
+from v2v_recordings.items import add_options, options_of
 from v2v_tools.fit.fit import FittedCamera, fit
 from v2v_tools.fit.lab import camera_of, measure, table
 from v2v_tools.fit.report import draw_fit, report_lines, write_recipe
@@ -35,15 +35,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     recording = parser.group("Recording")
     recording.add_argument("recording", nargs="?", metavar="RECORDING", help="file or folder with events; frames help")
     recording.add_argument("--static", action="store_true", help="nothing moved: all events are noise")
-    recording.add_argument("--size", metavar="WxH", help="size of the sensor in px, if the recording does not state it")
+    add_options(recording)
     recording.add_argument(
-        "--time-unit",
-        choices=tuple(NS_PER_UNIT),
-        help="unit of times in text files (default: s if they have a decimal point, else us)",
+        "--shift-frames", action="store_true", help="add the estimated offset to the times of the frames"
     )
-    recording.add_argument("--camera", choices=("left", "right"), default="left", help="camera of a stereo recording")
-    recording.add_argument("--events-topic", metavar="TOPIC", help="topic of events, for a bag with several")
-    recording.add_argument("--images-topic", metavar="TOPIC", help="topic of pictures, for a bag with several")
     parser.add_output(
         "Output", "--out", (".yaml", ".yml"), "recipe to write (.yaml); --recipe of the other commands reads it"
     )
@@ -65,7 +60,7 @@ def _run(arguments: argparse.Namespace) -> None:
     for flag, value in (("--sheet", arguments.sheet), ("--set", arguments.set)):
         if value and arguments.check is None:
             raise UsageError(f"{flag} needs --check")
-    for flag in ("--static", "--size", "--time-unit", "--picture"):
+    for flag in ("--static", "--size", "--time-unit", "--picture", "--light", "--shift-frames"):
         if arguments.recording is None and getattr(arguments, flag[2:].replace("-", "_")):
             raise UsageError(f"{flag} needs a RECORDING")
     fitted = None if arguments.recording is None else _fit(arguments)
@@ -80,16 +75,10 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _fit(arguments: argparse.Namespace) -> FittedCamera:
-    options = ConvertOptions(
-        size=None if arguments.size is None else SensorSize.parse(arguments.size),
-        time_unit=arguments.time_unit,
-        camera=arguments.camera,
-        events_topic=arguments.events_topic,
-        images_topic=arguments.images_topic,
-    )
+    options = options_of(arguments)
     source, out = Path(arguments.recording), arguments.out
     with Progress(source.name, "%") as progress:
-        fitted = fit(source, static=arguments.static, options=options, progress=progress)
+        fitted = fit(source, static=arguments.static, shift=arguments.shift_frames, options=options, progress=progress)
     show("\n".join(report_lines(fitted, source.name)))
     write_recipe(out, fitted, source.name)
     if arguments.picture is not None:

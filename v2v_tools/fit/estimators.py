@@ -4,6 +4,7 @@ mismatch               products of residuals of different increments of one pixe
 shot noise, leak       events of pixels that see no change
 refractory period      end of the distribution of the shortest intervals, by profile likelihood
 hot and dead pixels    pixels of a far higher rate than others; silent pixels among active ones
+times of the frames    the offset at which their changes correlate best with the events
 """
 
 from __future__ import annotations
@@ -13,13 +14,16 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from v2v_tools.fit.increments import Increments, Still
+from v2v_tools.fit.increments import BRIGHTEST_GREY, Increments, Still
 from v2v_tools.fit.interval import Doubles, Estimate, bootstrap, sums_by_block, unknown
 from v2v_tools.fit.recording import Recorded
-from v2v_tools.fit.regression import LEAST_INCREMENTS, SYSTEMATIC, Regression
+from v2v_tools.fit.regression import LEAST_INCREMENTS, SYSTEMATIC, Regression, summit
 
 LEAST_SECONDS = 200.0
 """Pixel-seconds without a change that rates of noise need."""
+OFFSETS_US = np.arange(-15_000, 15_001, 1000)
+_WIDEST_OFFSET_SECONDS = 0.004
+_MOST_STEPS, _MOST_COUNT, _DARK = 32, 5, 0.03
 _GLITCHES = 3e-5
 _MANY_SHORT, _EDGE = 100, 0.01
 
@@ -210,3 +214,37 @@ def dead_pixels(recording: Recorded, blocks: npt.NDArray[np.int64]) -> Estimate:
     most = float(silent.sum() + 2.5 + 1.645 * math.sqrt(silent.sum())) / float(active.sum())
     note = f"{silent.sum()} of {active.sum()} pixels with active neighbours are silent"
     return Estimate(float(value[0]), float(low[0]), max(float(high[0]), most), 1e-3, note)
+
+
+def frame_offset(recording: Recorded) -> Estimate:
+    """Estimate how much later than its time a frame was seen, s: where the correlation of changes of log intensity with
+    signed events is largest. Clipped levels are left out, and counts limited: lamps that flicker have many events, and
+    no frame shows them.
+    """
+    t, frame_us, reach = recording.t_us, recording.frame_us, OFFSETS_US[-1]
+    steps = np.flatnonzero((frame_us[:-1] - reach >= t.min()) & (frame_us[1:] + reach <= t.max()))
+    if not len(steps):
+        return unknown(f"no two frames have events for {reach / 1000:g} ms before and after them")
+    steps = steps[:: -(-len(steps) // _MOST_STEPS)]
+    owner, blocks = np.repeat(np.arange(len(recording.pixels)), np.diff(recording.first)), recording.blocks()
+    level = np.log(_DARK + recording.known_light.of(np.arange(256.0)))
+    sums = np.zeros((64, len(OFFSETS_US), 2))
+    for step in steps:
+        before, after = recording.frames[step : step + 2]
+        seen = np.maximum(before, after) <= BRIGHTEST_GREY
+        change = np.where(seen, level[after] - level[before], 0.0)
+        near = (t >= frame_us[step] - reach) & (t < frame_us[step + 1] + reach)
+        at, pixel, sign = t[near], owner[near], np.where(recording.p[near], 1.0, -1.0)
+        for number, offset in enumerate(OFFSETS_US):
+            inside = (at >= frame_us[step] + offset) & (at < frame_us[step + 1] + offset)
+            count = np.bincount(pixel[inside], sign[inside], len(change))
+            count = np.clip(count, -_MOST_COUNT, _MOST_COUNT) * seen
+            sums[:, number] += sums_by_block(blocks, np.stack([change * count, count**2], axis=1), 64)
+    seconds = np.asarray(OFFSETS_US * 1e-6, np.float64)
+    value, low, high = bootstrap(
+        sums, lambda s: np.array([summit(seconds, s[:, 0] / np.sqrt(np.maximum(s[:, 1], 1e-9)))])
+    )
+    note = f"{len(steps)} steps between frames"
+    if high[0] - low[0] > _WIDEST_OFFSET_SECONDS or abs(value[0]) > seconds[-3]:
+        return unknown(f"the events fit no offset much better than others, by {note}")
+    return Estimate(float(value[0]), float(low[0]), float(high[0]), 0.0, note)

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from v2v_recordings.items import ConvertOptions, ReadProgress
+from v2v_protocol.errors import UsageError
+from v2v_recordings.items import ConvertOptions, Light, ReadProgress
 from v2v_tools.fit import estimators, regression
 from v2v_tools.fit.increments import Still, increments_of, intervals_us, still_time
 from v2v_tools.fit.interval import Doubles, Estimate, unknown
@@ -37,6 +38,9 @@ class FittedCamera:
         left_out: why an effect is not in the recipe, by name.
         measured, simulated: statistics of the recording and of its simulation; None without frames.
         facts: what was read: events, pixels, seconds, frames, and the shares of brighter events.
+        light: of the frames.
+        offset: how much later than their times the frames were seen, s.
+        applied_seconds: what was added to their times.
         notes: what the reader says about the recording.
     """
 
@@ -45,6 +49,9 @@ class FittedCamera:
     measured: Panels
     simulated: Panels | None
     facts: Mapping[str, float]
+    light: Light
+    offset: Estimate
+    applied_seconds: float = 0.0
     notes: tuple[str, ...] = ()
 
     @property
@@ -57,6 +64,7 @@ def fit(
     recording: str | Path | Recorded,
     *,
     static: bool = False,
+    shift: bool = False,
     options: ConvertOptions | None = None,
     progress: ReadProgress = lambda _done, _total: None,
 ) -> FittedCamera:
@@ -65,6 +73,7 @@ def fit(
     Args:
         recording: a file or folder of any form that ``v2v-convert`` reads; or what was read already.
         static: neither the scene nor the camera moved, so all events are noise.
+        shift: add the estimated offset to the times of the frames.
         options: what the recording lacks, such as the size of its sensor.
 
     Raises:
@@ -72,10 +81,22 @@ def fit(
     """
     given = recording if isinstance(recording, Recorded) else read_recording(recording, options, progress)
     has_frames = len(given.frames) >= LEAST_FRAMES
+    if not has_frames:
+        # That of frames that are made up.
+        given = dataclasses.replace(given, light=given.light or Light.parse("2.2"))
+    offset = estimators.frame_offset(given) if has_frames else unknown("there are no frames")
+    applied_seconds = (options or ConvertOptions()).frame_offset_ns * 1e-9
+    if shift:
+        if not math.isfinite(offset.value):
+            raise UsageError(
+                f"the recording cannot tell the offset of its frames: {offset.note}; leave --shift-frames out"
+            )
+        given = dataclasses.replace(given, frame_us=given.frame_us + round(1e6 * offset.value))
+        applied_seconds += offset.value
     if static and not has_frames:
         given = _with_constant_frames(given)
     estimates = _estimates(given, static and not has_frames, static)
-    light = regression.light_of(np.arange(256.0))
+    light = given.known_light.of(np.arange(256.0))
     begin, end = _span(given)
     measured = panels_of(given, light, begin, end)
     left_out = {
@@ -86,18 +107,20 @@ def fit(
     simulated = None
     if len(given.frames) >= LEAST_FRAMES and ("threshold_pos" in _values(estimates) or static):
         used = _values({name: made for name, made in estimates.items() if name not in left_out})
-        simulated = panels_of(simulate_recording(given, _complete(used), 2), light, begin, end)
+        simulated = panels_of(simulate_recording(given, _complete(used), 2, "triangular"), light, begin, end)
     facts = {
         "events": float(given.counts.sum()), "pixels": float(len(given.pixels)), "seconds": given.seconds,
         "frames": float(len(given.frames) if has_frames else 0),
         "on_share": float(given.counts[1].sum() / max(given.counts.sum(), 1)),
     }  # fmt: skip
-    return FittedCamera(estimates, left_out, measured, simulated, facts, given.notes)
+    return FittedCamera(
+        estimates, left_out, measured, simulated, facts, given.known_light, offset, applied_seconds, given.notes
+    )
 
 
 def _estimates(given: Recorded, is_blank: bool, static: bool = False) -> dict[str, Estimate]:
     """Estimate all parameters. ``is_blank``: the frames are made up, of one grey level. ``static``: see :func:`fit`."""
-    blocks, light = given.blocks(_BLOCKS_SIDE), regression.light_of(np.arange(256.0))
+    blocks, light = given.blocks(_BLOCKS_SIDE), given.known_light.of(np.arange(256.0))
     period = estimators.refractory(intervals_us(given))
     has_frames = len(given.frames) >= LEAST_FRAMES
     longest_us = float(np.median(np.diff(given.frame_us))) if has_frames else 0.0

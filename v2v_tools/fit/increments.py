@@ -38,7 +38,7 @@ class Increments(NamedTuple):
         pixel: index of the pixel.
         block: part of the time, 0 .. 3, of its first frame.
         seconds: duration.
-        grey: [2, M] grey level at both ends.
+        grey: [2, M] grey level at both ends; light, slope: its light, 0 .. 1, and the change of light with the level.
         on, off: events, with fractions.
         speed: [2, M] signed events a second at both ends.
     """
@@ -50,6 +50,8 @@ class Increments(NamedTuple):
     on: Doubles
     off: Doubles
     speed: Doubles
+    light: Doubles
+    slope: Doubles
 
     def take(self, which: npt.NDArray[Any]) -> Increments:
         """Return some of the increments, by a mask or by places."""
@@ -86,10 +88,10 @@ def increments_of(recording: Recorded, refractory_seconds: float, longest_us: fl
         1e6 * refractory_seconds, 1e6 * _LONGEST_SECONDS, table,
     )  # fmt: skip
     pixel, begin, end, grey_1, grey_2, on, off, speed_1, speed_2 = table[:, :count]
-    quarter = _quarter(recording, begin)
+    quarter, grey, light_of = _quarter(recording, begin), np.stack([grey_1, grey_2]), recording.known_light.of
     return Increments(
-        pixel.astype(np.int64), quarter, (end - begin) * 1e-6, np.stack([grey_1, grey_2]), on, off,
-        np.stack([speed_1, speed_2]),
+        pixel.astype(np.int64), quarter, (end - begin) * 1e-6, grey, on, off, np.stack([speed_1, speed_2]),
+        light_of(grey), light_of(grey + 0.5) - light_of(grey - 0.5),
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.items import ConvertOptions, EventChunk, Note, Picture, ReadProgress, SensorSize
+from v2v_recordings.items import ConvertOptions, EventChunk, Light, Note, Picture, ReadProgress, SensorSize
 from v2v_recordings.reading import read_items
 
 MOST_PIXELS = 1 << 15
@@ -37,6 +37,7 @@ class Recorded:
         counts: [2, H, W] int64, darker and brighter events of the whole sensor.
         seconds: time from the first to the last event or frame.
         notes: sentences of the reader for the user.
+        light: of the frames; None: not known.
     """
 
     height_px: int
@@ -50,6 +51,21 @@ class Recorded:
     counts: Longs
     seconds: float
     notes: tuple[str, ...] = ()
+    light: Light | None = None
+
+    @property
+    def known_light(self) -> Light:
+        """Return the light of the frames.
+
+        Raises:
+            UsageError: it is not known.
+        """
+        if self.light is None:
+            raise UsageError(
+                "the recording does not state the light of its frames, and a fit depends on it: give --light linear "
+                "(as a DAVIS stores them), srgb, or the exponent of their light, such as 2.2"
+            )
+        return self.light
 
     @property
     def begin_us(self) -> int:
@@ -95,6 +111,7 @@ def recorded(
     frame_us: Longs,
     counts: Longs | None = None,
     pixels: Longs | None = None,
+    light: Light | None = None,
 ) -> Recorded:
     """Build a recording from events in any order.
 
@@ -103,6 +120,7 @@ def recorded(
         frames: [n, P] of ``pixels``, or [n, H, W].
         counts: see :class:`Recorded`; None counts the events given.
         pixels: [P] pixels to keep, in row order; None: :func:`chosen_pixels`.
+        light: of the frames, if it is known.
 
     Raises:
         UsageError: there are no events.
@@ -125,7 +143,7 @@ def recorded(
     return Recorded(
         height_px, width_px, pixels, np.searchsorted(of_pixel[order], np.arange(len(pixels) + 1)), t_us[order],
         p[order], np.ascontiguousarray(frames[in_time]), frame_us[in_time], counts,
-        float(times.max() - times.min()) * 1e-6,
+        float(times.max() - times.min()) * 1e-6, light=light,
     )  # fmt: skip
 
 
@@ -138,10 +156,13 @@ def read_recording(
         UsageError: the form is not known, the file is damaged or has no events, or its sensor's size is not known.
     """
     path, options = Path(path), options or ConvertOptions()
-    size, kept, notes = options.size, None, []
+    size, light, kept, notes = options.size, options.light, None, []
     for item in read_items(path, None, options, progress):
         if isinstance(item, Note):
             notes.append(item.text)
+            continue
+        if isinstance(item, Light):
+            light = item
             continue
         if isinstance(item, Picture):
             size = size or SensorSize(*item.pixels.shape[::-1])
@@ -156,7 +177,7 @@ def read_recording(
             kept.add_events(item, path)
     if kept is None or not kept.event_count:
         raise UsageError(f"{path} has no events")
-    return dataclasses.replace(kept.recorded(), notes=tuple(notes))
+    return dataclasses.replace(kept.recorded(), notes=tuple(notes), light=light)
 
 
 class _Kept:
@@ -206,12 +227,12 @@ class _Kept:
             self._halve()
 
     def recorded(self) -> Recorded:
-        """Return the recording, its time from 0 on, without frames after the last event."""
+        """Return the recording, its time from 0 on, without frames 50 us after the last event and later."""
         t_us, place, p = (np.concatenate(column) for column in zip(*self._events, strict=True))
         self._events.clear()
         begun = int(t_us.min())
         shown = np.array(self._frame_us, np.int64) - begun
-        within = shown <= int(t_us.max()) - begun
+        within = shown <= int(t_us.max()) - begun + 50  # a recording that ends with a frame has no event after it
         frames = np.stack(self._frames) if self._frames else np.empty((0, len(self._pixels)), np.uint8)
         return recorded(
             self._size.height, self._size.width, t_us - begun, place.astype(np.int64), p, frames[within], shown[within],

@@ -18,7 +18,6 @@ from v2v_tools.fit.increments import Increments, increments_of
 from v2v_tools.fit.interval import Doubles, Estimate, bootstrap, sums_by_block, unknown
 from v2v_tools.fit.recording import Recorded
 
-GAMMA = 2.2
 SYSTEMATIC = {
     "threshold_pos": 0.09,
     "threshold_neg": 0.09,
@@ -38,11 +37,6 @@ _CLOCK_SECONDS = 2e-5
 _LEAST_EVENTS = 2.0
 _MOST_FOR_LOG_EPS = 40_000
 _LEAST_LOG_EPS = 5e-4
-
-
-def light_of(grey: Doubles) -> Doubles:
-    """Return light, 0 (black) to 1 (white), of grey levels."""
-    return np.asarray((grey / 255.0) ** GAMMA)
 
 
 def is_large(increments: Increments) -> npt.NDArray[np.bool_]:
@@ -106,9 +100,9 @@ class _Fit(NamedTuple):
 
 def _rows(given: Increments, log_eps: float, solved: Doubles) -> tuple[Doubles, Doubles, Doubles]:
     """Return columns [M, 4], change [M] and variance [M] of increments, for thresholds known from a turn before."""
-    light = light_of(given.grey)
+    light = given.light
     change = np.log(log_eps + light[1]) - np.log(log_eps + light[0])
-    sensitivity = GAMMA * light / (light + log_eps) / given.grey
+    sensitivity = given.slope / (light + log_eps)
     positive, negative = np.maximum(solved[:2], 1e-4)
     lag = given.speed * (1.0 + _DARKEST) / (2.0 * math.pi * (light + _DARKEST))
     lag = lag * np.where(given.speed > 0, positive, negative)
@@ -138,7 +132,7 @@ def _likelihood(given: Increments, log_eps: float) -> Doubles:
     A larger epsilon makes all changes smaller, residuals included. So the likelihood is that of grey levels, not of log
     intensity: it has the derivative dL / dF as a factor.
     """
-    fit, light = _least_squares(given, log_eps, turns=5), light_of(given.grey)
+    fit, light = _least_squares(given, log_eps, turns=5), given.light
     scale = 1.4826 * float(np.median(np.abs(fit.residual) / np.sqrt(fit.variance)))
     derivative = np.log(light / (light + log_eps)).mean(axis=0)
     tails = np.log1p(fit.residual**2 / fit.variance / scale**2 / 4)
@@ -156,7 +150,7 @@ def _sample(given: Increments, count: int) -> Increments:
     return given.take(chosen)
 
 
-def _summit(grid: Doubles, total: Doubles) -> float:
+def summit(grid: Doubles, total: Doubles) -> float:
     """Return the place of the maximum of a function on a grid of even steps, between its points by a parabola."""
     k = int(np.clip(np.argmax(total), 1, len(grid) - 2))
     left, middle, right = total[k - 1 : k + 2]
@@ -173,7 +167,7 @@ def _fit_log_eps(given: Increments, blocks: npt.NDArray[np.int64]) -> Estimate:
     grid = best + np.linspace(-1.25, 1.25, 11) * (coarse[1] - coarse[0])
     values = np.stack([_likelihood(given, math.exp(x)) for x in grid], axis=1)
     sums = sums_by_block(block, values, int(block.max()) + 1)
-    value, low, high = bootstrap(sums, lambda total: np.exp([_summit(grid, total)]))
+    value, low, high = bootstrap(sums, lambda total: np.exp([summit(grid, total)]))
     note = f"{len(given.on)} changes between frames"
     if value[0] < _LEAST_LOG_EPS:
         return Estimate(float(value[0]), 0.0, math.inf, 0.0, f"too little in the dark: {note}")
@@ -202,6 +196,6 @@ def refractory_by_change(
         columns.append(np.bincount(blocks[given.pixel], best, size))
         counts.append(np.bincount(blocks[given.pixel], minlength=size))
     sums = np.stack([np.stack(columns, axis=1), np.stack(counts, axis=1)], axis=1)
-    value, low, high = bootstrap(sums, lambda s: np.clip([_summit(grid, s[0] / np.maximum(s[1], 1))], 0.0, bound.high))
+    value, low, high = bootstrap(sums, lambda s: np.clip([summit(grid, s[0] / np.maximum(s[1], 1))], 0.0, bound.high))
     made = Estimate(float(value[0]), float(low[0]), float(high[0]), 1e-4, f"change lost between events; {bound.note}")
     return made.moved(made.value, SYSTEMATIC["refractory_seconds"] * made.value + _CLOCK_SECONDS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,11 @@ _DIGITS = 4
 def recipe_fields(fitted: FittedCamera) -> dict[str, Any]:
     """Return the fields of the recipe that differ from the preset ``paper``; ranges are the intervals.
 
-    A parameter that the recording cannot tell is off; thresholds that it cannot tell stay those of ``paper``.
+    A clip starts as in a running camera. A parameter that the recording cannot tell is off; thresholds that it cannot
+    tell stay those of ``paper``.
     """
     fields: dict[str, Any] = {
-        "preset": "paper", "noise_sigma": [0.0, 0.0], "noise_unit": "second",
+        "preset": "paper", "start": "triangular", "noise_sigma": [0.0, 0.0], "noise_unit": "second",
         "hot_pixel_share": [0.0, 0.0], "hot_pixel_sigma": [0.0, 0.0],
     }  # fmt: skip
     used = {name: made for name, made in fitted.estimates.items() if name in fitted.camera}
@@ -70,7 +72,8 @@ def report_lines(fitted: FittedCamera, source: str) -> list[str]:
         f"({100 * facts['on_share']:.0f} % brighter), {facts['frames']:.0f} frames, {facts['seconds']:.1f} s; "
         f"{facts['pixels']:.0f} pixels in use",
         *fitted.notes,
-        "Fitted (90 % intervals; thresholds are for frames of gamma 2.2):",
+        *_of_frames(fitted),
+        "Fitted (90 % intervals; thresholds and log_eps are those of linear intensity):",
     ]
     for name, made in fitted.estimates.items():
         if name not in fitted.left_out:
@@ -86,6 +89,23 @@ def report_lines(fitted: FittedCamera, source: str) -> list[str]:
     if {"threshold_pos", "threshold_neg"} <= fitted.camera.keys():
         lines.append("A recipe draws which polarity has the larger threshold: it keeps the ratio, not its direction.")
     return lines
+
+
+def _of_frames(fitted: FittedCamera) -> list[str]:
+    """Return what was assumed of the frames: their light and their times."""
+    if not fitted.facts["frames"]:
+        return []
+    offset, times = fitted.offset, f"their offset cannot be told: {fitted.offset.note}"
+    if math.isfinite(offset.value):
+        times = (
+            f"they fit the events best {1e3 * offset.value:.1f} ms later "
+            f"[{1e3 * offset.low:.1f}, {1e3 * offset.high:.1f}]"
+        )
+    added = f"{1e3 * fitted.applied_seconds:.1f} ms" if fitted.applied_seconds else "nothing (see --shift-frames)"
+    return [
+        f"Light of the frames: {fitted.light.name}. The recipe is valid for it; its gamma is that of its videos",
+        f"Times of the frames: {times}; added: {added}",
+    ]
 
 
 def draw_fit(fitted: FittedCamera, source: str) -> Image:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from v2v_protocol.sample import SampleParams
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.kernels import list_events
+from v2v_server.video.luma import SDR, Signal
 from v2v_tools.fit.increments import intervals_us, still_time
 from v2v_tools.fit.interval import Doubles
 from v2v_tools.fit.recording import Recorded
@@ -31,11 +33,14 @@ intervals: between events of a pixel, of one polarity, then of opposite ones: 44
 """
 
 
-def simulate_recording(recording: Recorded, camera: Mapping[str, float], seed: int = 0) -> Recorded:
+def simulate_recording(
+    recording: Recorded, camera: Mapping[str, float], seed: int = 0, start: str = "uniform"
+) -> Recorded:
     """Simulate the frames of a recording with the product's own kernel: the same pixels, frames and times.
 
     Args:
         camera: parameters by the recipe's names, and ``threshold_pos`` and ``threshold_neg``; noise is per second.
+        start: how residuals start (field of the recipe).
 
     Returns:
         the events between the first and the last frame; ``counts`` stay those of the recording.
@@ -44,15 +49,22 @@ def simulate_recording(recording: Recorded, camera: Mapping[str, float], seed: i
     effects = {name: camera[name] for name in effect_settings() if camera.get(name, 0.0) > 0.0}
     ranges = {name: (value, value) for name, value in effects.items()}
     ranges["log_eps"] = (camera.get("log_eps", 1e-3),) * 2
-    recipe = Recipe(voxels_per_clip=steps, bins=1, noise_unit="second", pause_probability=0.0).replace(**ranges)
+    frames, light, signal = recording.frames[:, None, :], recording.known_light, SDR
+    given: dict[str, Any] = {"gamma": light.gamma, "start": start}
+    if not light.gamma:  # the kernel has no curve of sRGB
+        signal, given = Signal(12, "linear"), {"light": "declared", "start": start}
+        frames = np.rint(signal.white * light.of(np.arange(256.0))).astype(signal.dtype)[frames]
+    recipe = Recipe(voxels_per_clip=steps, bins=1, noise_unit="second", pause_probability=0.0).replace(
+        **ranges, **given
+    )
     params = SampleParams(
         camera["threshold_pos"], camera["threshold_neg"], camera.get("noise_sigma", 0.0),
         round(camera.get("hot_pixel_share", 0.0) * pixels), camera.get("hot_pixel_sigma", 0.0), (), 1.0, 0, 0, False,
         0.0, noise_key_of_seed(seed), effects,
     )  # fmt: skip
     step_us = np.diff(recording.frame_us).astype(np.float64)
-    frames = np.ascontiguousarray(recording.frames[:, None, :])
-    voxels = simulate_clip(frames, params, recipe, "int8", step_us * 1e-6, out={})
+    frames = np.ascontiguousarray(frames)
+    voxels = simulate_clip(frames, params, recipe, "int8", step_us * 1e-6, out={}, signal=signal)
     events = list_events(voxels.given, voxels.real, step_us)
     order = np.argsort(events.x, kind="stable") if pixels <= 1 << 16 else np.lexsort((events.t, events.x))
     first = np.searchsorted(events.x[order], np.arange(pixels + 1))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_protocol.spec_flags import add_spec, recipe_setting, spec_fields
+from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting, spec_fields
 from v2v_server.config import ServeConfig
 from v2v_server.store.pixels import VideosKind
 from v2v_tools.preview.preview import PICTURE_SUFFIXES, Shot, preview
@@ -68,9 +68,10 @@ def _run(arguments: argparse.Namespace) -> None:
         looks = [Shot(Path(name).stem, recipe_setting(name, arguments.set), first) for name in arguments.compare]
         what = "the same clip under " + ", ".join(look.title for look in looks)
     else:
-        recipe = recipe_setting(arguments.recipe or "paper", arguments.set)
+        name = asked_recipe(arguments) or "paper"
+        recipe = recipe_setting(name, arguments.set)
         looks = [Shot("", recipe, seed) for seed in range(first, first + count)]
-        what = f'virtual cameras drawn from the recipe "{Path(arguments.recipe or "paper").stem}"'
+        what = f'virtual cameras drawn from the recipe "{Path(name).stem}"'
     if arguments.seed is None:
         what += ", chosen where something moves"
     stem, names = arguments.out.stem, [Path(source).stem for source in arguments.sources]

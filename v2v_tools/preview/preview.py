@@ -35,7 +35,15 @@ from v2v_server.store.pixels import VIDEOS, VideosKind, signal_of
 from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.luma import SDR
 from v2v_server.video.probe import DOLBY_VISION
-from v2v_tools.motion import WholePictures, describe_loss, moving_seeds, predicted_loss, quiet_voxels
+from v2v_tools.motion import (
+    WholePictures,
+    describe_loss,
+    describe_start,
+    moving_seeds,
+    predicted_loss,
+    quiet_voxels,
+    start_events,
+)
 from v2v_tools.remake import Remaker, open_shown
 
 LABELS = ("boxes", "masks")
@@ -100,7 +108,7 @@ def preview(
     scene = StreamSpec.from_dict({**spec, "recipe": shots[0].recipe}).scene != "off"
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir, kind=kind)
     cameras: list[Camera] = []
-    loss, notes = Prediction(), dict[str, list[str]]()
+    loss, started, notes = Prediction(), np.zeros(2), dict[str, list[str]]()
     try:
         first = _fitted_stream(catalogue, spec, shots[0].recipe)
         wholes = WholePictures(catalogue, first)
@@ -109,9 +117,10 @@ def preview(
             say(note)
         with Progress("simulating", "cameras") as progress:
             for shot in shots:
-                camera, lost = _camera(catalogue, shot, spec, with_flow, notes)
+                camera, lost, events = _camera(catalogue, shot, spec, with_flow, notes)
                 cameras.append(camera)
                 loss += lost
+                started = started + events
                 progress(len(cameras), len(shots))  # the first may include compiling; the estimate begins after it
         whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
         shown = sorted({camera.provenance.video for camera in cameras}) if first.scene == "off" else ()
@@ -121,6 +130,7 @@ def preview(
     _check_sizes(cameras, out.suffix.lower())
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
+    say(f"{describe_start(started)} (recipe field start)")
     say(describe_loss(loss, defects))
     write_file(out, _content(out.suffix.lower(), whole, cameras, title, moments))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
@@ -181,8 +191,8 @@ def _content(kind: str, whole: Camera, cameras: Sequence[Camera], title: str, mo
 
 def _camera(
     catalogue: Catalogue, shot: Shot, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
-) -> tuple[Camera, Prediction]:
-    """Make one camera's clip and predict what it loses between frames.
+) -> tuple[Camera, Prediction, npt.NDArray[np.float64]]:
+    """Make one camera's clip; predict what it loses between frames, and count what its start makes.
 
     Adds the titles of the cameras that a note is about to ``notes``, by its text.
     """
@@ -210,7 +220,7 @@ def _camera(
     quiet = dataclasses.replace(camera, voxels=quiet_grids[camera.lead_voxels :])
     rate = _sequence_of(catalogue, provenance).video.frames_per_second
     timed = dataclasses.replace(camera, quiet=quiet.rates, step_seconds=stream.recipe.frame_stride / rate)
-    return timed, predicted_loss(made)
+    return timed, predicted_loss(made), start_events(made)
 
 
 def _signal_note(catalogue: Catalogue, provenance: Provenance, recipe: Recipe) -> str:

@@ -24,6 +24,8 @@ from trainer.evaluation import evaluate as evaluate_module
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.reconstruct import Step
 from trainer.models import FireNet
+from v2v_recordings.items import ConvertOptions, Light, Picture
+from v2v_recordings.reading import read_items
 
 DAVIS = WEIGHTS.parent / "events" / "davis346_aestream.aedat4"
 TOP_PX, LEFT_PX = 82, 44
@@ -111,6 +113,33 @@ def test_windows_need_not_end_at_pictures(tmp_path: Path, weights: Path, flag: s
     assert sequence["frames"] == frames
     assert sequence[flag.removeprefix("--").replace("-", "_")] == value
     assert 0 < sequence["mse"] < 1
+
+
+def test_the_light_of_the_pictures_is_said_and_scored_as_asked(
+    tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    raw_forms.write_folder(tmp_path / "slider", raw_forms.ijrr_members(scene()))
+    convert_cli.main([str(tmp_path / "slider"), "--out", str(tmp_path / "h5")])
+    assert "light of the images: linear" in capsys.readouterr().out
+    images = []
+    for light in (None, Light.parse("linear")):
+        with Recording(tmp_path / "h5" / "slider.h5", light=light) as recording:
+            assert recording.stated_light == "linear"
+            images.append(recording.image(recording.images[0]))
+    np.testing.assert_array_equal(images[1], np.rint(255 * (images[0] / 255) ** (1 / 2.2)).astype(np.uint8))
+    moved = ConvertOptions(frame_offset_ns=-1_500_000)
+    times = [
+        [item.t_ns for item in read_items(tmp_path / "slider", None, options) if isinstance(item, Picture)]
+        for options in (ConvertOptions(), moved)
+    ]
+    assert [late - early for late, early in zip(*times, strict=True)] == [1_500_000] * len(times[0])
+    given = ("--weights", weights, "--data", tmp_path / "h5")
+    ours = evaluate(*given)
+    assert "scored as stored (linear)" in capsys.readouterr().out
+    other = evaluate(*given, "--light", "linear")
+    assert "taken as linear, and scored as videos code them" in capsys.readouterr().out
+    assert (ours[0]["light"], other[0]["light"]) == ("as stored", "linear")
+    assert ours[0]["mse"] != other[0]["mse"]
 
 
 def test_published_event_indices_change_the_scores(tmp_path: Path, weights: Path) -> None:

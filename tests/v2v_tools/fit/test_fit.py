@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 
 from tests.oracles.cameras import Film, TrueCamera, record, rendered_film
 from v2v_protocol.errors import UsageError
-from v2v_recordings.items import ConvertOptions, SensorSize
+from v2v_recordings.items import ConvertOptions, Light, SensorSize
 from v2v_server.config import recipe_setting
 from v2v_tools.fit import estimators
 from v2v_tools.fit import recording as recording_module
@@ -26,7 +27,9 @@ from v2v_tools.fit.interval import Estimate
 from v2v_tools.fit.recording import Recorded, chosen_pixels, read_recording, recorded
 from v2v_tools.fit.regression import Regression
 from v2v_tools.fit.report import draw_fit, recipe_fields, report_lines, write_recipe
+from v2v_tools.fit.statistics import simulate_recording
 
+LIGHT = Light.parse("2.2")
 FAST = TrueCamera(0.2, 0.26, shot_noise_hz=3.0, leak_hz=0.0, refractory_seconds=5e-4, log_eps=0.01)
 SLOW = TrueCamera(0.25, 0.21, 0.12, 0.4, 0.6, 0.0, 60.0, log_eps=0.01)
 
@@ -40,7 +43,7 @@ def recording_of(camera: TrueCamera, film_seen: Film | None = None) -> Recorded:
     made = record(film_seen or film(), camera, 1)
     height, width = made["frames"].shape[1:]
     place = made["y"].astype(np.int64) * width + made["x"]
-    return recorded(height, width, made["t"], place, made["p"], made["frames"], made["frame_us"])
+    return recorded(height, width, made["t"], place, made["p"], made["frames"], made["frame_us"], light=LIGHT)
 
 
 @lru_cache(maxsize=2)
@@ -142,7 +145,7 @@ def test_events_of_a_steady_ramp_count_its_change(threshold: float, rises: bool)
     crossings = np.arange(1, int(2.0 / threshold) + 1) * threshold
     t = np.round(crossings / 2.0 * frames_us[-1]).astype(np.int64)
     grey = np.full((11, 1, 1), 100, np.uint8)
-    made = recorded(1, 1, t, np.zeros(len(t), np.int64), np.full(len(t), rises), grey, frames_us)
+    made = recorded(1, 1, t, np.zeros(len(t), np.int64), np.full(len(t), rises), grey, frames_us, light=LIGHT)
     increments = increments_of(made, 0.0, 1e6)
     count = increments.on if rises else increments.off
     change = np.round(increments.seconds * 1e6) / frames_us[-1] * level[-1]
@@ -226,6 +229,87 @@ def test_tiles_of_a_large_sensor_stay_within_the_limit(height: int, width: int) 
     assert len(pixels) == min(height * width, 4096)
     assert (np.diff(pixels) > 0).all()
     assert np.isin(chosen_pixels(height, width, len(pixels) // 2), pixels).all()
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(-9, 9), st.sampled_from(["linear", "2.2", "srgb"]))
+def test_the_offset_of_the_frames_is_found(offset_ms: int, name: str) -> None:
+    """Gratings of any speed: the events have exact times, and the frames are seen later than they say."""
+    rng, light = np.random.default_rng(offset_ms + 20), Light.parse(name)
+    curve = light.of(np.arange(256.0))
+    speed, phase = rng.uniform(3.0, 6.0, 1600), rng.uniform(0.0, 2 * np.pi, 1600)
+
+    def levels(seconds: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        return np.asarray(np.exp(0.5 * np.sin(speed * 2 * np.pi * seconds[:, None] + phase) - 1.2))
+
+    fine = np.arange(0.0, 0.5, 2e-4)
+    steps = np.floor(np.log(0.03 + levels(fine)) / 0.15)
+    at, pixel = np.nonzero(np.diff(steps, axis=0))
+    frame_us = np.arange(20_000, 480_000, 33_000)
+    frames = np.abs(curve[:, None, None] - levels(frame_us * 1e-6 + offset_ms * 1e-3)).argmin(axis=0).astype(np.uint8)
+    made = recorded(
+        40, 40, (1e6 * fine[at + 1]).astype(np.int64), pixel, np.diff(steps, axis=0)[at, pixel] > 0,
+        frames.reshape(-1, 40, 40), frame_us, light=light,
+    )  # fmt: skip
+    found = estimators.frame_offset(made)
+    assert found.value == pytest.approx(offset_ms * 1e-3, abs=1e-3)
+    assert found.low <= found.value <= found.high
+
+
+def test_noise_tells_no_offset() -> None:
+    rng = np.random.default_rng(1)
+    t = np.sort(rng.integers(0, 500_000, 4000))
+    frames = rng.integers(90, 110, (10, 20, 20)).astype(np.uint8)
+    made = recorded(
+        20, 20, t, rng.integers(0, 400, 4000), rng.random(4000) < 0.5, frames, np.arange(20_000, 480_000, 50_000),
+        light=LIGHT,
+    )  # fmt: skip
+    still = dataclasses.replace(made, frames=0 * made.frames + 90)
+    assert np.isnan(estimators.frame_offset(still).value)
+    found = estimators.frame_offset(made)
+    assert np.isnan(found.value)
+    assert "no offset much better" in found.note
+
+
+def test_frames_of_unknown_light_are_refused(tmp_path: Path) -> None:
+    made = recording_of(FAST, rendered_film("coins", 20, 24, 60.0, moving=0.2))
+    with pytest.raises(UsageError, match=r"does not state the light of its frames.*--light linear"):
+        fit(dataclasses.replace(made, light=None))
+    write_ijrr(tmp_path, record(rendered_film("coins", 20, 24, 60.0, moving=0.2), FAST, 1))
+    assert read_recording(tmp_path).light == Light.parse("linear")  # IJRR is of a DAVIS
+    assert read_recording(tmp_path, ConvertOptions(light=LIGHT)).light == LIGHT
+
+
+def test_a_camera_of_linear_frames_has_the_thresholds_of_the_same_light() -> None:
+    """The same scene, once gamma-coded and once linear: the fit takes each for what it is."""
+    coded = recording_of(FAST, rendered_film("camera", 48, 64, 70.0, moving=0.8, still=0.0))
+    linear = np.rint(255.0 * LIGHT.of(np.arange(256.0))).astype(np.uint8)[coded.frames]
+    others = [coded, dataclasses.replace(coded, frames=linear, light=Light.parse("linear"))]
+    found = [Regression(increments_of(each, 5e-4, 33_333.0), each.blocks()) for each in others]
+    assert found[1].positive.value == pytest.approx(found[0].positive.value, rel=0.15)
+    wrong = dataclasses.replace(coded, light=Light.parse("linear"))
+    assert (
+        Regression(increments_of(wrong, 5e-4, 33_333.0), wrong.blocks()).positive.value < 0.7 * found[0].positive.value
+    )
+
+
+def test_srgb_is_simulated_as_its_own_curve() -> None:
+    made = recording_of(FAST, rendered_film("camera", 24, 32, 70.0, moving=0.3, still=0.0))
+    camera = {"threshold_pos": 0.2, "threshold_neg": 0.2, "log_eps": 0.02}
+    counts = {
+        name: len(simulate_recording(dataclasses.replace(made, light=Light.parse(name)), camera).t_us)
+        for name in ("srgb", "2.2", "linear")
+    }
+    assert counts["srgb"] == pytest.approx(counts["2.2"], rel=0.06)
+    assert counts["linear"] > 1.3 * counts["2.2"]  # the dark of this picture is lifted
+
+
+@pytest.mark.parametrize("text", ["", "gamma", "0", "-1", "nan", "1e9"])
+def test_a_light_is_a_name_or_an_exponent(text: str) -> None:
+    with pytest.raises(UsageError, match="give linear, srgb or an exponent from"):
+        Light.parse(text)
+    assert Light.parse("1.0") == Light.parse("linear")
+    assert Light.parse("2.2\n").name == "2.2"
 
 
 def test_a_recording_without_events_is_refused() -> None:

@@ -1,0 +1,161 @@
+"""Simulators of event cameras beside the product's own, as functions over recordings, and how alike two recordings are.
+
+The paper's equations are simulated event by event in float64. A peer is the published package of its authors: its
+source has to be importable.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from tests.oracles.cameras import FRAMES_PER_SECOND
+from tests.oracles.dense import dense_events
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.spec_flags import recipe_setting
+from v2v_recordings.items import Light
+from v2v_server.simulation.draw import draw
+from v2v_tools.fit.increments import intervals_us
+from v2v_tools.fit.interval import Doubles
+from v2v_tools.fit.recording import Recorded, recorded
+from v2v_tools.fit.statistics import INTERVAL_EDGES_US, simulate_recording
+
+ROWS = 16
+"""Peers get the pixels as pictures of this height: the number of pixels is a multiple of it."""
+Simulator = Callable[[Recorded, float, int], Recorded]
+"""From a recording, a threshold (0: the camera's own) and a seed to its simulation."""
+
+
+def drawn(recipe: Recipe, seed: int) -> dict[str, float]:
+    """Draw a camera; noise and drift of a frame are converted to those of a second."""
+    made = draw(recipe, seed=seed, epoch=0, index=0, picture_height_px=512, picture_width_px=512, video_id="")
+    hz = float(FRAMES_PER_SECOND) if recipe.noise_unit == "frame" else 1.0
+    return {
+        "threshold_pos": made.threshold_pos, "threshold_neg": made.threshold_neg, **made.effects,
+        "log_eps": recipe.log_eps[0] if made.log_eps is None else made.log_eps,
+        "noise_sigma": made.noise_sigma * hz**0.5, "hot_pixel_sigma": made.hot_pixel_sigma * hz,
+        "hot_pixel_share": made.hot_pixel_count / (recipe.crop_height_px * recipe.crop_width_px),
+    }  # fmt: skip
+
+
+def of_recipe(name: str) -> Simulator:
+    """Return the product's own simulation of a recipe."""
+    recipe = recipe_setting(name, [])
+
+    def simulated(given: Recorded, threshold: float, seed: int) -> Recorded:
+        mine = recipe.replace(threshold=(threshold,) * 2, threshold_ratio=(1.0, 1.0)) if threshold else recipe
+        return simulate_recording(given, drawn(mine, seed), seed, mine.start)
+
+    return simulated
+
+
+def equations(given: Recorded, threshold: float, seed: int) -> Recorded:
+    """Simulate the paper's equations: no noise, residuals uniform, events linear in time between frames."""
+    random = np.random.default_rng(seed)
+    own = random.uniform(0.05, 2.0) * np.array([1.0, random.uniform(1.0, 1.5)])[:: random.choice((-1, 1))]
+    positive, negative = (threshold, threshold) if threshold else own
+    levels = np.log(1e-3 + given.known_light.of(given.frames))
+    start = random.uniform(-negative, positive, levels.shape[1])
+    events = dense_events(levels, given.frame_us.astype(np.float64), start, positive, negative)
+    return of_events(given, events.seconds, events.pixel, events.polarity > 0)
+
+
+def v2e(given: Recorded, threshold: float, seed: int) -> Recorded:
+    """Simulate with v2e's EventEmulator; without a threshold its defaults."""
+    emulator_class: Any = import_module("v2ecore.emulator").EventEmulator
+    asked: dict[str, Any] = {"pos_thres": threshold, "neg_thres": threshold} if threshold else {}
+    emulator, found = emulator_class(seed=seed + 1, output_folder=None, **asked), []
+    for light, us in zip(given.known_light.of(given.frames), given.frame_us, strict=True):
+        made = emulator.generate_events(255.0 * light.reshape(ROWS, -1), us * 1e-6)
+        found += [] if made is None else [np.asarray(made, np.float64)]
+    t, x, y, p = np.concatenate(found).T if found else np.empty((4, 0))
+    return of_events(given, 1e6 * t, y * (len(given.pixels) // ROWS) + x, p > 0)
+
+
+def openeb(given: Recorded, threshold: float, seed: int) -> Recorded:
+    """Simulate with OpenEB's EventSimulator, which takes grey levels as light; without a threshold those of its
+    sample.
+    """
+    width, positive = len(given.pixels) // ROWS, threshold or 0.11
+    simulator_class: Any = import_module("metavision_core_ml.video_to_event.simulator").EventSimulator
+    made = simulator_class(ROWS, width, positive, threshold or 0.1, 1)
+    for light, us in zip(given.known_light.of(given.frames), given.frame_us, strict=True):
+        made.image_callback(np.rint(255 * light.reshape(ROWS, width)).astype(np.uint8), int(us))
+    events = made.get_events()
+    return of_events(given, events["t"], events["y"] * width + events["x"], events["p"] > 0)
+
+
+def eventcv(given: Recorded, threshold: float, seed: int) -> Recorded:
+    """Simulate with eventcv, which takes frames as sRGB and at one rate."""
+    curve, width = Light.parse("srgb").of(np.linspace(0.0, 255.0, 4096)), len(given.pixels) // ROWS
+    coded = np.interp(given.known_light.of(given.frames), curve, np.linspace(0.0, 1.0, 4096)).astype(np.float32)
+    asked = {"pos_thres": threshold, "neg_thres": threshold} if threshold else {}
+    step_us = float(np.diff(given.frame_us).mean())
+    frames, simulate = coded.reshape(-1, ROWS, width), import_module("eventcv").simulate
+    made: Any = simulate(frames, fps=1e6 / step_us, seed=seed, **asked)
+    x, y, t, p = made.numpy().astype(np.int64).T
+    us = np.interp(t, step_us * np.arange(len(frames)), given.frame_us)
+    return of_events(given, us, y * width + x, p > 0)
+
+
+PEERS: dict[str, Simulator] = {"v2e": v2e, "openeb": openeb, "eventcv": eventcv}
+
+
+def of_events(given: Recorded, t_us: Any, pixel: Any, p: Any) -> Recorded:
+    """Return a recording with other events, of pixels by their number among those kept."""
+    t_us, place = np.asarray(t_us).astype(np.int64), given.pixels[np.asarray(pixel).astype(np.int64)]
+    if not len(t_us):
+        return dataclasses.replace(given, first=0 * given.first, t_us=given.t_us[:0], p=given.p[:0])
+    size = given.height_px, given.width_px
+    return recorded(*size, t_us, place, p, given.frames, given.frame_us, pixels=given.pixels, light=given.light)
+
+
+def counts_of(given: Recorded) -> Doubles:
+    """Return the darker and brighter events of each step: [2, steps, pixels]."""
+    owner = np.repeat(np.arange(len(given.pixels)), np.diff(given.first))
+    steps, pixels = len(given.frames) - 1, len(given.pixels)
+    step = np.searchsorted(given.frame_us, given.t_us, side="right") - 1
+    inside = (step >= 0) & (step < steps)
+    at = (given.p[inside] * steps + step[inside]) * pixels + owner[inside]
+    return np.bincount(at, minlength=2 * steps * pixels).reshape(2, steps, pixels).astype(np.float64)
+
+
+def correlation(one: Doubles, other: Doubles) -> float:
+    """Return the correlation of two maps; 0 where one is constant."""
+    return float(np.corrcoef(one, other)[0, 1]) if one.std() and other.std() else 0.0
+
+
+def compared(given: Recorded, true: Doubles, made: Recorded) -> dict[str, float]:
+    """Return the figures of one simulation."""
+    found, steps = counts_of(made), range(true.shape[1])
+    signed, real = found[1] - found[0], true[1] - true[0]
+    row, column = np.divmod(given.pixels, given.width_px)
+    place = row * given.width_px + given.width_px - 1 - column
+    mirror = np.minimum(np.searchsorted(given.pixels, place), len(place) - 1)
+    kept = given.pixels[mirror] == place
+    total, wanted = found.sum(axis=(0, 2)) + 0.5, true.sum(axis=(0, 2)) + 0.5
+    gaps = [np.histogram(intervals_us(each)[0], INTERVAL_EDGES_US)[0] for each in (made, given)]
+    shares = [each / max(each.sum(), 1) for each in gaps]
+    active, seen_active = found.sum(axis=0) > 0, true.sum(axis=0) > 0
+    return {
+        "correlation": float(np.mean([correlation(signed[k], real[k]) for k in steps])),
+        **{name: float(np.mean([correlation(found[p][k], true[p][k]) for k in steps]))
+           for p, name in enumerate(("darker", "brighter"))},
+        "mirrored": float(np.mean([correlation(signed[k][mirror][kept], real[k][kept]) for k in steps])),
+        "log_ratio": float(np.abs(np.log(total / wanted)).mean()), "ratio": float(np.log(total / wanted).mean()),
+        "intervals": float(np.abs(shares[0] - shares[1]).sum() / 2),
+        "missed": float((seen_active & ~active).sum() / max(seen_active.sum(), 1)),
+        "invented": float((active & ~seen_active).sum() / max(active.sum(), 1)),
+        "events": float(total.sum()),
+    }  # fmt: skip
+
+
+def within(given: Recorded) -> Recorded:
+    """Return a recording with the events between its first and last frame."""
+    inside = (given.t_us >= given.frame_us[0]) & (given.t_us < given.frame_us[-1])
+    first = np.concatenate([[0], np.cumsum(inside)])[given.first]
+    return dataclasses.replace(given, first=first, t_us=given.t_us[inside], p=given.p[inside])
