@@ -8,16 +8,18 @@ send which message when.
     any peer -> server     GetStatus
     server -> any peer     Status
 
-Field types are those that the wire checks: int (0 .. 2**64 - 1), float, bool, str, bytes, int | None, tuples of int,
-float or str, and Mapping (plain values, checked by the code that uses them).
+A message is checked by the types of its fields (:mod:`v2v_protocol.persisted`); the plain values of a Mapping are
+checked by the code that uses them. Fields that are ``later`` were added within a protocol version.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
+
+from v2v_protocol.persisted import Persisted, later
 
 
 class ErrorCode(StrEnum):
@@ -36,7 +38,7 @@ class ErrorCode(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Hello:
+class Hello(Persisted):
     """Open a consumer's session, or open it again after a server restart.
 
     Attributes:
@@ -67,7 +69,7 @@ class Hello:
 
 
 @dataclass(frozen=True, slots=True)
-class Want:
+class Want(Persisted):
     """Ask for samples of one epoch; each index uses one unit of credit until it is answered.
 
     An index that is requested again while it is in work is not made twice.
@@ -87,12 +89,12 @@ class Want:
 
 
 @dataclass(frozen=True, slots=True)
-class Ping:
+class Ping(Persisted):
     """Ask for a sign of life. It is sent only after a silence, because any message counts as a sign of life."""
 
 
 @dataclass(frozen=True, slots=True)
-class Goodbye:
+class Goodbye(Persisted):
     """The sender leaves in an orderly way: forget its session, or give its leases to other workers.
 
     Attributes:
@@ -103,7 +105,7 @@ class Goodbye:
 
 
 @dataclass(frozen=True, slots=True)
-class GetStatus:
+class GetStatus(Persisted):
     """Ask for the state of the service. It needs no session, and workers' ports accept it too. The answer is the next
     state that is built, a few times a second; several requests before it get one answer.
     """
@@ -113,7 +115,7 @@ class GetStatus:
 
 
 @dataclass(frozen=True, slots=True)
-class Welcome:
+class Welcome(Persisted):
     """Answer to Hello.
 
     Attributes:
@@ -132,11 +134,11 @@ class Welcome:
     sequences: int
     credit: int
     quarantine: int = 0
-    sidecars: str = ""
+    sidecars: str = later("")
 
 
 @dataclass(frozen=True, slots=True)
-class SampleHeader:
+class SampleHeader(Persisted):
     """One sample; the raw bytes of each array follow as frames of their own, C order, little endian.
 
     If ``slot`` is set and no frames follow, the arrays lie in that slot, one after the other. If ``arena`` is set as
@@ -172,11 +174,11 @@ class SampleHeader:
     slot: int = 0
     quarantine: int = 0
     packed: bool = False
-    arena: str = ""
+    arena: str = later("")
 
 
 @dataclass(frozen=True, slots=True)
-class Unavailable:
+class Unavailable(Persisted):
     """A requested sample cannot be made from any of its candidates; ``text`` lists the reason of each."""
 
     epoch: int
@@ -185,7 +187,7 @@ class Unavailable:
 
 
 @dataclass(frozen=True, slots=True)
-class Denied:
+class Denied(Persisted):
     """A request cannot be granted. ``code`` is an ErrorCode; ``text`` says what to do about it."""
 
     code: str
@@ -193,7 +195,7 @@ class Denied:
 
 
 @dataclass(frozen=True, slots=True)
-class Pong:
+class Pong(Persisted):
     """Answer to Ping.
 
     Attributes:
@@ -204,7 +206,7 @@ class Pong:
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class Status(Persisted):
     """Answer to GetStatus.
 
     Attributes:
@@ -218,7 +220,7 @@ class Status:
 
 
 @dataclass(frozen=True, slots=True)
-class WorkerHello:
+class WorkerHello(Persisted):
     """Offer a worker that accepts ``credit`` leases at a time.
 
     Attributes:
@@ -238,14 +240,14 @@ class WorkerHello:
 
 
 @dataclass(frozen=True, slots=True)
-class Begun:
+class Begun(Persisted):
     """The worker starts on this lease now. Only a lease that was begun can be blamed for what happens next."""
 
     lease: int
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class Result(Persisted):
     """A lease's sample is done; the frames of its SampleHeader message follow, and are passed on unchanged.
 
     Attributes:
@@ -268,7 +270,7 @@ class Result:
 
 
 @dataclass(frozen=True, slots=True)
-class LeaseFailed:
+class LeaseFailed(Persisted):
     """The lease's video could not be used. ``frame`` and ``reason`` are those of VideoError.
 
     Attributes:
@@ -280,14 +282,14 @@ class LeaseFailed:
     frame: int | None
     reason: str
     here: bool = False
-    sidecar: str = ""
+    sidecar: str = later("")
 
 
 # --- server -> worker -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class Lease:
+class Lease(Persisted):
     """One clip of one video, and the sample to make from it.
 
     Attributes:
@@ -342,12 +344,12 @@ class Lease:
     arena: str = ""
     slot: int = 0
     packed: bool = False
-    sidecars: Mapping[str, Any] = field(default_factory=dict)
-    remark: str = ""
+    sidecars: Mapping[str, Any] = later(default_factory=dict)
+    remark: str = later("")
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
+class Stop(Persisted):
     """Finish what was begun, say Goodbye and exit."""
 
 

@@ -27,6 +27,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ import numpy.typing as npt
 
 from v2v_protocol.bounds import LARGEST_EVENTS, most_events, pixel_thresholds
 from v2v_protocol.errors import RecipeError
+from v2v_protocol.persisted import Persisted
 from v2v_protocol.presets import DEFAULT_PRESET, PRESET_FIELDS, STREAM_PRESETS
 from v2v_protocol.settings import (
     Setting,
@@ -61,8 +63,6 @@ TIME_UNITS = ("Hz", "s")
 STARTS = ("uniform", "triangular", "zero")
 """How the residual of a pixel is drawn at the start of a clip (``v2v_server/simulation/pixel.py``)."""
 _LARGEST_FRAMES = 1_000_001
-LATER_FIELDS = ("grids_per_frame", "max_boxes", "light", "voxel_seconds", "start", "rate_draw")
-"""Fields that the plain form leaves out at their defaults, so that older digests hold."""
 MOST_STEPS_PER_GRID = 1024
 """Largest number of steps between video frames that a grid of ``voxel_seconds`` may span."""
 BRIGHTEST = 50.0
@@ -70,7 +70,7 @@ BRIGHTEST = 50.0
 
 
 @dataclass(frozen=True, slots=True)
-class Recipe:
+class Recipe(Persisted):
     """Ranges of one virtual camera. Frozen, hashable, validated on construction.
 
     Raises:
@@ -83,20 +83,22 @@ class Recipe:
     bins: int = whole(5, 1, 1024, "B, bins of one voxel grid")
     frames_per_bin: int = whole(1, 1, 1024, "steps between video frames in one bin")
     grids_per_frame: int = whole(
-        0, 0, 1024, "n voxel grids in each step between video frames; 0: a grid spans bins x frames_per_bin steps"
-    )
+        0, 0, 1024, "n voxel grids in each step between video frames; 0: a grid spans bins x frames_per_bin steps",
+        is_later=True,
+    )  # fmt: skip
     voxel_seconds: Range = span(
         (0.0, 0.0), 1e-6, 100.0,
         "duration of a voxel grid: it spans the number of steps between video frames that comes nearest, and its bins "
         "are equal parts of its time",
-        unit="s", off=True,
+        unit="s", off=True, is_later=True,
     )  # fmt: skip
     lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
     lead_voxels: int = whole(0, 0, 1, "1 adds one voxel grid before the first (ERAFT)")
     frame_stride: int = whole(1, 1, 1000, "use every n-th frame, as if the video had 1/n of its frame rate")
     max_boxes: int = whole(
-        64, 1, 4096, "most boxes of a frame, if boxes are requested; the smallest ones beyond it are left out"
-    )
+        64, 1, 4096, "most boxes of a frame, if boxes are requested; the smallest ones beyond it are left out",
+        is_later=True,
+    )  # fmt: skip
 
     crop_height_px: int = whole(128, 1, LARGEST_SIDE_PX, "height of the random crop", unit="px", group="View")
     crop_width_px: int = whole(128, 1, LARGEST_SIDE_PX, "width of the random crop", unit="px")
@@ -124,6 +126,7 @@ class Recipe:
         "sdr", ("sdr", "declared"),
         "sdr: read 8 bits and apply gamma; declared: read up to 12 bits and apply the transfer that the video states "
         "(PQ, HLG, log, linear), else gamma",
+        is_later=True,
     )  # fmt: skip
 
     threshold: Range = span(
@@ -141,6 +144,7 @@ class Recipe:
         "uniform", STARTS,
         "residual of each pixel at the start of a clip, between its thresholds: uniform, as in the paper's code; "
         "triangular, as in a camera that has run for a long time; zero, as if each pixel had just fired",
+        is_later=True,
     )  # fmt: skip
     noise_sigma: Range = span(
         (0.0, 0.1), 0.0, 1e6, "standard deviation of the noise, per frame, or per square root of a second",
@@ -158,6 +162,7 @@ class Recipe:
         "uniform", ("uniform", "log"),
         "draw effects in Hz uniformly from their range, or uniformly in its logarithm: from 0.1 to 10, half of the "
         "draws are below 1",
+        is_later=True,
     )  # fmt: skip
     threshold_mismatch_sigma: Range = span(
         (0.0, 0.0), 0.0, 1.0, "standard deviation of each pixel's thresholds, as a share of the nominal ones",
@@ -367,18 +372,15 @@ class Recipe:
         return most_events(segments, ends, (smallest, largest), steps * (sigma * math.sqrt(unit) + hot * unit + leak))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all fields as plain values (ranges as lists), in a stable order."""
-        values = {
-            field.name: list(value) if isinstance(value := getattr(self, field.name), tuple) else value
-            for field in dataclasses.fields(self)
+        """Return all fields as plain values: ranges as lists, without those of later releases that are at their
+        defaults.
+        """
+        plain = {
+            name: list(value) if isinstance(value, tuple) else value for name, value in Persisted.to_dict(self).items()
         }
         # A fixed value is written as a number: older digests depend on this form.
         low, high = self.log_eps
-        if low == high:
-            values["log_eps"] = low
-        defaults = {name: settings_of(Recipe)[name].default for name in LATER_FIELDS}
-        plain = {name: list(value) if isinstance(value, tuple) else value for name, value in defaults.items()}
-        return {name: value for name, value in values.items() if name not in plain or value != plain[name]}
+        return plain | {"log_eps": low} if low == high else plain
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:
@@ -404,7 +406,8 @@ class Recipe:
         return dataclasses.replace(self, **changes)
 
 
-def effect_settings() -> dict[str, Setting]:
+@cache
+def effect_settings() -> Mapping[str, Setting]:
     """Return the fields of a recipe that switch on an effect beyond the paper's model."""
     return {name: setting for name, setting in settings_of(Recipe).items() if setting.group == EFFECTS}
 

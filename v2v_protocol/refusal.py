@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
+
+from v2v_protocol.persisted import Persisted, later
 
 
-class RefusalKind(StrEnum):
+class RefusalKind:
     """Which part refuses a video.
 
     UNUSABLE: the catalogue; the file cannot be opened, or is not a video.
@@ -22,7 +23,7 @@ class RefusalKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
+class Refusal(Persisted):
     """A video that cannot be used for a request.
 
     Attributes:
@@ -30,7 +31,6 @@ class Refusal:
         frame: the first unavailable frame, presentation order; None if no single frame is to blame.
         reason: one line of text.
         kind: which part refuses it.
-        time: when, ISO 8601, UTC; empty if the reason depends only on the file's bytes.
         remedy: which setting would admit it, in words; empty if no setting would.
     """
 
@@ -38,14 +38,9 @@ class Refusal:
     frame: int | None
     reason: str
     kind: str = RefusalKind.FAILED
-    time: str = ""
-    remedy: str = ""
+    remedy: str = later("")
 
     def __str__(self) -> str:
         where = "" if self.frame is None else f" at frame {self.frame}"
         remedy = f"; would admit it: {self.remedy}" if self.remedy else ""
         return f"{self.video}{where}: {self.reason}{remedy}"
-
-    def to_dict(self) -> dict[str, str | int | None]:
-        """Return plain values for a provenance, without the time."""
-        return {"video": self.video, "frame": self.frame, "reason": self.reason, "kind": str(self.kind)}

@@ -10,7 +10,6 @@ message or raises a :class:`v2v_protocol.errors.ProtocolError`.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
@@ -42,6 +41,7 @@ from v2v_protocol.messages import (
     Welcome,
     WorkerHello,
 )
+from v2v_protocol.persisted import add_fields, reader, shown
 
 LARGEST_HEADER_BYTES = 1 << 20
 """Frame 0. The largest in use is a Lease: a frame index of a few thousand frames is a few kilobytes."""
@@ -52,20 +52,17 @@ MOST_CONTAINERS = 4096
 LARGEST_ARRAY_BYTES = 1 << 31
 MOST_IN_FLIGHT_BYTES = 512 << 20
 """Bytes on their way to all peers of a socket above which one that takes nothing is disconnected."""
-LARGEST_TUPLE = 65_536
 ARRAY_DTYPES = ("int8", "uint8", "int16", "uint16", "float16", "float32")
 _DTYPE_NAMES = {np.dtype(name): name for name in ARRAY_DTYPES}
 _ENCRYPTION_BYTES = 64
 """Bytes added to a frame by encryption; CURVE adds 33."""
 _MOST_ARRAYS = 16
 _MOST_DIMENSIONS = 8
-_DEEPEST_NESTING = 16
-"""Containers within containers. Deeper ones could not even be shown in an error message (RecursionError)."""
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
 Frames: TypeAlias = list[Buffer]
 
-_TYPES: dict[str, type[Any]] = {
+_TYPES: dict[str, type[Message]] = {
     "hello": Hello,
     "want": Want,
     "ping": Ping,
@@ -85,13 +82,7 @@ _TYPES: dict[str, type[Any]] = {
     "seen": Status,
 }
 _NAMES = {cls: name for name, cls in _TYPES.items()}
-_LATER: dict[type[Any], dict[str, Any]] = {
-    Welcome: {"sidecars": ""},
-    LeaseFailed: {"sidecar": ""},
-    SampleHeader: {"arena": ""},
-    Lease: {"sidecars": {}, "remark": ""},
-}
-"""Fields that were added within a protocol version, with their defaults: a header leaves them out at the default."""
+_plain_map = reader(Mapping[str, Any])
 
 
 def encode(message: Message) -> Frames:
@@ -100,16 +91,10 @@ def encode(message: Message) -> Frames:
     Raises:
         LimitExceeded: the header is larger than any peer accepts.
     """
-    cls = type(message)
-    fields: dict[str, Any] = {"v": PROTOCOL_VERSION, "t": _NAMES[cls]}
-    for name in _CHECKS[cls]:
-        fields[name] = getattr(message, name)
-    for name, default in _LATER.get(cls, {}).items():
-        if fields[name] == default:
-            del fields[name]
-    header = msgpack.packb(fields, use_bin_type=True)
+    name = _NAMES[type(message)]
+    header = msgpack.packb(add_fields({"v": PROTOCOL_VERSION, "t": name}, message), use_bin_type=True)
     if len(header) > LARGEST_HEADER_BYTES:
-        raise LimitExceeded(f"a {_NAMES[cls]} header of {len(header)} bytes; the limit is {LARGEST_HEADER_BYTES}")
+        raise LimitExceeded(f"a {name} header of {len(header)} bytes; the limit is {LARGEST_HEADER_BYTES}")
     return [header]
 
 
@@ -180,10 +165,9 @@ def decode_map(packed: bytes) -> dict[str, Any]:
     """Decode the result of :func:`encode_map`.
 
     Raises:
-        LimitExceeded: it is nested too deeply.
-        ProtocolError: it is not a map.
+        ProtocolError: it is not a map, or is nested too deeply.
     """
-    return _mapping(_unpacked(packed, "a map"))
+    return _plain_map(_unpacked(packed, "a map"))
 
 
 def decode(header: Buffer, most_bytes: int = LARGEST_HEADER_BYTES) -> Message:
@@ -206,24 +190,13 @@ def decode(header: Buffer, most_bytes: int = LARGEST_HEADER_BYTES) -> Message:
     version = fields.pop("v")
     if version != PROTOCOL_VERSION or type(version) is not int:
         raise VersionMismatch(
-            f"the peer speaks protocol version {_shown(version)}, this side version {PROTOCOL_VERSION}"
+            f"the peer speaks protocol version {shown(version)}, this side version {PROTOCOL_VERSION}"
         )
     name = fields.pop("t")
     cls = _TYPES.get(name) if type(name) is str else None
     if cls is None:
-        raise ProtocolError(f"unknown message type {_shown(name)}")
-    checks = _CHECKS[cls]
-    if fields.keys() != checks.keys():
-        fields = _LATER.get(cls, {}) | fields
-    if fields.keys() != checks.keys():
-        raise ProtocolError(f"{name}: fields {sorted(map(str, fields))[:40]!r:.400}, expected {sorted(checks)}")
-    key = ""
-    try:
-        for key, check in checks.items():
-            fields[key] = check(fields[key])
-    except ProtocolError as error:
-        raise type(error)(f"{name}.{key}: {error}") from None
-    message: Message = cls(**fields)
+        raise ProtocolError(f"unknown message type {shown(name)}")
+    message: Message = cls.from_dict(fields)
     return message
 
 
@@ -321,84 +294,3 @@ def _unpacked(packed: Buffer, what: str) -> Any:
     except (ValueError, msgpack.exceptions.UnpackException) as error:
         # msgpack's own errors quote raw bytes; the kind of damage is enough.
         raise ProtocolError(f"not {what}: {type(error).__name__}") from error
-
-
-# --- field checks -----------------------------------------------------------------------------------------------------
-# A server decodes two headers per sample, so texts for errors are built only when there is one.
-
-Check: TypeAlias = Callable[[Any], Any]
-
-
-def _shown(value: Any) -> str:
-    """Format a value for an error message. Containers, whose nesting is not checked yet, show only their type."""
-    return f"{value!r:.40}" if type(value) in (int, float, bool, str, bytes) else f"of {type(value).__name__}"
-
-
-def _exactly(kind: type[Any]) -> Check:
-    def check(value: Any) -> Any:
-        if type(value) is not kind:
-            raise ProtocolError(f"expected {kind.__name__}, got {type(value).__name__}")
-        return value
-
-    return check
-
-
-def _int(value: Any) -> int:
-    if type(value) is not int or not 0 <= value < 2**64:
-        raise ProtocolError(f"expected a whole number from 0 to 2**64 - 1, got {_shown(value)}")
-    return value
-
-
-def _float(value: Any) -> float:
-    if type(value) not in (float, int) or not math.isfinite(value):
-        raise ProtocolError(f"expected a finite number, got {_shown(value)}")
-    return float(value)
-
-
-def _int_or_none(value: Any) -> int | None:
-    return None if value is None else _int(value)
-
-
-def _tuple_of(check: Check) -> Check:
-    def check_all(value: Any) -> tuple[Any, ...]:
-        if type(value) is not list:
-            raise ProtocolError(f"expected a list, got {type(value).__name__}")
-        if len(value) > LARGEST_TUPLE:
-            raise LimitExceeded(f"{len(value)} entries; the limit is {LARGEST_TUPLE}")
-        return tuple(map(check, value))
-
-    return check_all
-
-
-def _mapping(value: Any) -> dict[str, Any]:
-    if type(value) is not dict:
-        raise ProtocolError(f"expected dict, got {type(value).__name__}")
-    level: list[Any] = [value]
-    for _ in range(_DEEPEST_NESTING):
-        inner: list[Any] = []
-        for outer in level:
-            inner.extend(outer.values() if type(outer) is dict else outer)
-        level = [item for item in inner if type(item) is dict or type(item) is list]
-        if not level:
-            return value
-    raise LimitExceeded(f"nested more than {_DEEPEST_NESTING} deep")
-
-
-_BY_ANNOTATION: dict[str, Check] = {
-    "int": _int,
-    "float": _float,
-    "bool": _exactly(bool),
-    "str": _exactly(str),
-    "bytes": _exactly(bytes),
-    "int | None": _int_or_none,
-    "tuple[int, ...]": _tuple_of(_int),
-    "tuple[float, ...]": _tuple_of(_float),
-    "tuple[str, ...]": _tuple_of(_exactly(str)),
-    "Mapping[str, Any]": _mapping,
-}
-_CHECKS: dict[type[Any], dict[str, Check]] = {
-    # Annotations are strings here (postponed evaluation), which makes them keys of a closed vocabulary: a message
-    # with a field type the wire does not check fails at import.
-    cls: {field.name: _BY_ANNOTATION[str(field.type)] for field in dataclasses.fields(cls)}
-    for cls in _TYPES.values()
-}

@@ -125,9 +125,7 @@ class Candidates:
         self._sessions.put_back(replace(request, deaths=0))
         return []
 
-    def refuse(
-        self, request: Request, frame: int | None, reason: str, kind: RefusalKind = RefusalKind.FAILED
-    ) -> list[Action]:
+    def refuse(self, request: Request, frame: int | None, reason: str, kind: str = RefusalKind.FAILED) -> list[Action]:
         """Move the request to its next candidate, or tell the consumer that the sample is unavailable and list all
         refusals.
         """

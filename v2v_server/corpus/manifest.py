@@ -11,14 +11,15 @@ that a later run can use them without preparing them again.
 
 from __future__ import annotations
 
-import math
+import sys
 from base64 import b64decode
-from collections.abc import Callable, Iterable
-from dataclasses import MISSING, dataclass, field, fields, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeAlias
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
+from v2v_protocol.persisted import Limits, Persisted, later
 from v2v_protocol.programs import printable
 from v2v_protocol.safe_json import parse_json
 from v2v_server.corpus.index.file import IndexRow
@@ -31,14 +32,15 @@ from v2v_server.video.rows import Rows
 
 MANIFEST_NAME = "v2v-prepared.jsonl"
 MANIFEST_VERSION = 2
-_OF_LOSSY = frozenset({"codec", "quality", "gop", "psnr_db", "worst_psnr_db"})
+_OF_LOSSY = frozenset({"quality", "gop", "psnr_db", "worst_psnr_db"})
 """Fields of releases that could also prepare lossy files."""
 NO_LOSSY = "which this release does not serve: re-encode the videos with ffmpeg, and serve them as videos"
-_Record = TypeVar("_Record", "Header", "PreparedVideo")
+_Bytes: TypeAlias = Annotated[int, Limits(0, 2**63 - 1)]
+_Side: TypeAlias = Annotated[int, Limits(0, LARGEST_SIDE_PX)]
 
 
 @dataclass(frozen=True, slots=True)
-class Header:
+class Header(Persisted):
     """What holds for the whole folder.
 
     Attributes:
@@ -53,10 +55,15 @@ class Header:
 
     rows: str
     size: str
-    videos: int
+    videos: Annotated[int, Limits(1, 2**63 - 1)]
     source: str
     source_digest: str
     version: int = MANIFEST_VERSION
+
+    def __post_init__(self) -> None:
+        if self.size not in SIZES:
+            raise UsageError(f"size {self.size!r:.80}: this program reads {', '.join(SIZES)}")
+        Rows.parse(self.rows)
 
     @property
     def settings(self) -> str:
@@ -65,7 +72,7 @@ class Header:
 
 
 @dataclass(frozen=True, slots=True)
-class PreparedVideo:
+class PreparedVideo(Persisted):
     """What was made of one video.
 
     Attributes:
@@ -81,16 +88,16 @@ class PreparedVideo:
 
     id: str
     source_fingerprint: str
-    source_bytes: int
-    frames: int
-    frames_per_second: float | None
-    height_px: int
-    width_px: int
+    source_bytes: _Bytes
+    frames: Annotated[int, Limits(1, LARGEST_FRAMES)]
+    frames_per_second: Annotated[float, Limits(0, sys.float_info.max)] | None
+    height_px: _Side
+    width_px: _Side
     fingerprint: str = ""
-    bytes: int = 0
+    bytes: _Bytes = 0
     problem: str | None = None
     scene: str = ""
-    remark: str = ""
+    remark: str = later("")
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +212,7 @@ def read_manifest(root: Path) -> Manifest:
                 for records in (videos, aside):
                     records.pop(video.id, None)
                 (aside if is_aside else videos)[video.id] = video
-        except (ValueError, TypeError, UsageError) as error:
+        except (ValueError, ProtocolError, UsageError) as error:
             remedy = "" if NO_LOSSY in str(error) else "; prepare another folder"
             raise CorpusError(f"{path}, line {number}: {error}{remedy}") from error
     return Manifest(root, header, videos, aside)
@@ -215,83 +222,31 @@ def _header(line: bytes) -> Header:
     data = _object(line)
     if data.get("version") != MANIFEST_VERSION:
         raise ValueError(f"format version {data.get('version')!r}; this program reads {MANIFEST_VERSION}")
-    if data.get("codec", "lossless") != "lossless":
-        raise ValueError(f"the folder was prepared with --codec {data['codec']!r:.80}, {NO_LOSSY}")
-    header = _record(Header, data)
-    if header.size not in SIZES:
-        raise ValueError(f"size {header.size!r:.80}: this program reads {', '.join(SIZES)}")
-    Rows.parse(header.rows)
-    if not _whole(header.videos, 1, math.inf):
-        raise ValueError(f"{header.videos!r} videos")
-    return header
+    if (codec := data.pop("codec", "lossless")) != "lossless":
+        raise ValueError(f"the folder was prepared with --codec {codec!r:.80}, {NO_LOSSY}")
+    return Header.from_dict(data)
 
 
 def _video(line: bytes) -> tuple[PreparedVideo, bool]:
     """Read the line of a video: return its record, and whether the video is set aside."""
     data = _object(line)
     aside = data.pop("aside", False) is True
-    video = _record(PreparedVideo, data)
+    video = PreparedVideo.from_dict(data)
     path = PurePosixPath(video.id)
     if printable(video.id) != video.id:
         raise ValueError(f"id {printable(video.id)}: {UNPRINTABLE}")
     if path.is_absolute() or ".." in path.parts:
         raise ValueError(f"id {video.id!r} leads out of the folder")
-    sizes = (video.height_px, video.width_px)
-    if not _whole(video.frames, 1, LARGEST_FRAMES) or not all(_whole(size, 0, LARGEST_SIDE_PX) for size in sizes):
-        raise ValueError(f"{video.id}: {video.frames!r} frames of {video.width_px!r}x{video.height_px!r} px")
     if video.scene:
         scene = b64decode(video.scene, validate=True)
         if not Scene.is_encoding(scene):  # of another release: it counts as not asked for
             return replace(video, scene=""), aside
-        try:
-            Scene.from_bytes(scene)
-        except ProtocolError as error:
-            raise ValueError(f"{video.id}: {error}") from error
+        Scene.from_bytes(scene)
     return video, aside
-
-
-def _record(kind: type[_Record], data: dict[str, Any]) -> _Record:
-    """Return the record with these fields.
-
-    Raises:
-        ValueError: a field is unknown, missing or of another type.
-    """
-    known = {each.name: each for each in fields(kind)}
-    data = {name: value for name, value in data.items() if name not in _OF_LOSSY}
-    if unknown := data.keys() - known.keys():
-        raise ValueError(f"unknown fields {', '.join(sorted(unknown))}")
-    for name, each in known.items():
-        if name not in data:
-            if each.default is MISSING:
-                raise ValueError(f"field {name!r} is missing")
-        elif not _FIELD_CHECKS[str(each.type)](data[name]):
-            raise ValueError(f"{name} = {data[name]!r:.80}: expected {each.type}")
-    return kind(**data)
 
 
 def _object(line: bytes) -> dict[str, Any]:
     data = parse_json(line)
     if not isinstance(data, dict):
         raise ValueError("is not a JSON object")
-    return data
-
-
-def _whole(value: object, least: float, most: float) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
-
-
-def _is_text(value: object) -> bool:
-    return isinstance(value, str)
-
-
-def _is_rate(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf
-
-
-_FIELD_CHECKS: dict[str, Callable[[object], bool]] = {
-    # Annotations are text here, as in the wire's checks.
-    "int": lambda value: _whole(value, 0, 2**63 - 1),
-    "str": _is_text,
-    "str | None": lambda value: value is None or _is_text(value),
-    "float | None": lambda value: value is None or _is_rate(value),
-}
+    return {name: value for name, value in data.items() if name not in _OF_LOSSY}

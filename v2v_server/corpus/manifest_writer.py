@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 
@@ -53,7 +52,5 @@ class ManifestWriter:
 
 
 def _line(item: Header | PreparedVideo, aside: bool = False) -> bytes:
-    values: dict[str, object] = {name: value for name, value in asdict(item).items() if name != "remark" or value}
-    if aside:
-        values["aside"] = True
+    values = item.to_dict() | ({"aside": True} if aside else {})
     return json.dumps(values, allow_nan=False).encode() + b"\n"

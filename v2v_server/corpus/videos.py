@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import overload
 
 from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.persisted import FloatOrNaN, Persisted
 from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_server.corpus.index.columns import CHUNK, NO_STRINGS, VideoTable
 from v2v_server.corpus.scenes.pieces import SplitVideos
@@ -24,7 +25,7 @@ NO_THRESHOLDS: Thresholds = (None, None)
 
 
 @dataclass(frozen=True, slots=True)
-class VideoEntry:
+class VideoEntry(Persisted):
     """A video that can be used.
 
     Attributes:
@@ -45,7 +46,7 @@ class VideoEntry:
     frames: int
     width_px: int
     height_px: int
-    frames_per_second: float
+    frames_per_second: FloatOrNaN
     codec: str
     threshold_pos: float | None = None
     threshold_neg: float | None = None

@@ -7,6 +7,7 @@ from dataclasses import astuple, dataclass
 from functools import partial
 
 from v2v_protocol.errors import V2VError
+from v2v_protocol.persisted import Persisted
 from v2v_protocol.progress import Progress
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.probe import LARGEST_MEMORY_BYTES
@@ -32,7 +33,7 @@ _Fields = tuple[tuple[float, ...], float, float, float, float, float, float, flo
 
 
 @dataclass(frozen=True, slots=True)
-class _Middle:
+class _Middle(Persisted):
     """Frames in the middle of a video, and the part of the picture that is looked at."""
 
     id: str

@@ -23,6 +23,7 @@ from itertools import chain
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
+from v2v_protocol.persisted import Persisted
 from v2v_protocol.refusal import Refusal
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.manifest import Header, PreparedVideo
@@ -288,7 +289,7 @@ def _outcomes(
 
 
 @dataclass(frozen=True, slots=True)
-class _ToPrepare:
+class _ToPrepare(Persisted):
     """A video to transcode, or only to analyse if its prepared file exists and lacks no plane."""
 
     video: VideoEntry

@@ -17,6 +17,7 @@ import numpy as np
 import xxhash
 
 from v2v_protocol.errors import VideoError
+from v2v_protocol.persisted import FloatOrNaN, Persisted
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.scenes.analysis import SceneAnalysis
 from v2v_server.corpus.scenes.scene import MOST_FRAMES, Scene
@@ -35,7 +36,7 @@ PARTIAL_SUFFIX = ".v2v-partial"
 
 
 @dataclass(frozen=True, slots=True)
-class Transcoding:
+class Transcoding(Persisted):
     """One video to prepare.
 
     Attributes:
@@ -56,7 +57,7 @@ class Transcoding:
     source: Path
     fingerprint: str
     index: bytes
-    frames_per_second: float
+    frames_per_second: FloatOrNaN
     window: Window
     size: str
     root: Path
@@ -66,7 +67,7 @@ class Transcoding:
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class Made(Persisted):
     """A prepared and verified file.
 
     Attributes:

@@ -18,6 +18,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from v2v_protocol.errors import CorpusError
+from v2v_protocol.persisted import Persisted
 from v2v_server.system.status_fields import gauge, short, text
 
 VERDICTS_PER_VIDEO = 2
@@ -25,7 +26,7 @@ _MOST_VERDICTS = 20
 
 
 @dataclass(frozen=True, slots=True)
-class QuarantineEntry:
+class QuarantineEntry(Persisted):
     """One line of the quarantine.
 
     Attributes:

@@ -15,7 +15,7 @@ import msgpack
 import pytest
 from hypothesis import given, settings
 
-from tests.protocol.wire_messages import messages
+from tests.protocol.persisted_values import messages
 from tests.server.named_corpus import SMALL, SMALL_SPEC, corpus, video
 from tests.server.peers import CREDIT, DEADLINE, IDLE, Peers, frames_of, peers, sample_frames
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION

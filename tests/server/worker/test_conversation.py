@@ -7,7 +7,7 @@ from dataclasses import replace
 import msgpack
 import pytest
 
-from tests.protocol.wire_messages import example
+from tests.protocol.persisted_values import example
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.errors import RemoteError, VersionMismatch, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import (

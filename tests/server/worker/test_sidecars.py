@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.protocol.wire_messages import example
+from tests.protocol.persisted_values import example
 from v2v_protocol import sample
 from v2v_protocol.errors import ProtocolError, SidecarError, VideoError
 from v2v_protocol.messages import Lease, LeaseFailed, WorkerHello

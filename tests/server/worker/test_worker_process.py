@@ -16,7 +16,7 @@ import pytest
 import zmq
 
 from tests.oracles.dealers import wait
-from tests.protocol.wire_messages import example
+from tests.protocol.persisted_values import example
 from v2v_protocol.errors import SidecarError, UsageError, VideoError
 from v2v_protocol.messages import Begun, Goodbye, Lease, LeaseFailed, Message, Ping, Pong, Result, Stop, WorkerHello
 from v2v_protocol.sample import Layout, new_arrays

@@ -17,6 +17,7 @@ from pathlib import Path
 from threading import Timer
 from typing import Any
 
+from v2v_protocol.persisted import Int64, Persisted
 from v2v_server.corpus.sources.asking import Notice
 from v2v_server.system.private import make_private
 
@@ -87,7 +88,7 @@ class Figures:
 
 
 @dataclass(frozen=True, slots=True)
-class IndexRow:
+class IndexRow(Persisted):
     """What is known of one file.
 
     Attributes:
@@ -102,13 +103,13 @@ class IndexRow:
     """
 
     id: str
-    size_bytes: int
-    mtime_ns: int = 0
-    ctime_ns: int = 0
+    size_bytes: Int64
+    mtime_ns: Int64 = 0
+    ctime_ns: Int64 = 0
     fingerprint: str = ""
-    frames: int = 0
-    width_px: int = 0
-    height_px: int = 0
+    frames: Int64 = 0
+    width_px: Int64 = 0
+    height_px: Int64 = 0
     frames_per_second: float | None = None
     codec: str = ""
     interlaced: bool = False

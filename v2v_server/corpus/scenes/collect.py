@@ -18,6 +18,7 @@ import numpy as np
 import xxhash
 
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
+from v2v_protocol.persisted import Persisted
 from v2v_server.corpus.index.columns import VideoTable, joined
 from v2v_server.corpus.index.file import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.manifest import Manifest
@@ -178,7 +179,7 @@ def figures(video: IndexRow | _Job, scene: Scene) -> Figures:
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
+class _Job(Persisted):
     id: str
     fingerprint: str
     frames: int

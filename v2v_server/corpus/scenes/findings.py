@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2v_protocol.persisted import Persisted
 from v2v_server.corpus.scenes.scene import (
     NOISE,
     SEGMENT_FRAMES,
@@ -32,7 +33,7 @@ _NOISY_LEVELS = 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class Defect:
+class Defect(Persisted):
     """A defect of the frames that were analysed.
 
     Attributes:
