@@ -177,7 +177,7 @@ def test_imports_are_absolute() -> None:
 @pytest.mark.parametrize(
     ("module", "without"),
     [
-        ("v2v_protocol.wire", ("torch", "zmq", "av", "numba", "cv2", "yaml")),
+        ("v2v_protocol.messages", ("torch", "zmq", "av", "numba", "cv2", "yaml")),
         ("v2v_server.simulation.draw", ("torch", "zmq", "av", "numba", "cv2")),
         ("v2v_server.broker.dispatcher", ("torch", "zmq", "numba", "cv2")),
         ("v2v_server.serve", ("torch", "numba", "cv2")),

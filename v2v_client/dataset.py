@@ -86,7 +86,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         timeout_seconds: silence after which the server counts as lost.
         patience: the other timeouts; None for the defaults. Its ``timeout_seconds`` is not used.
         options: ``preset`` ("exact", "balanced", "fast" or "natural", see
-            :data:`v2v_protocol.presets.STREAM_PRESETS`) and fields of :class:`v2v_protocol.spec.StreamSpec`, which
+            :data:`v2v_protocol.recipe.STREAM_PRESETS`) and fields of :class:`v2v_protocol.spec.StreamSpec`, which
             override the preset; None takes the server's.
 
     Each sample is requested for its position in the order; samples that a crash or disconnect loses are requested

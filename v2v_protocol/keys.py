@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import IO
 
 from v2v_protocol.errors import KeyRefused, ProtocolError
-from v2v_protocol.persisted import Persisted
-from v2v_protocol.safe_json import parse_json
+from v2v_protocol.persisted import Persisted, parse_json
 
 SIDES = ("consumer", "worker")
 VARIABLE = "V2V_KEYS"

@@ -27,6 +27,7 @@ default, so records, and the digests of them, keep the bytes that they had befor
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import os
 import sys
@@ -278,3 +279,19 @@ def _is_shallow(value: dict[str, Any]) -> bool:
         if not level:
             return True
     return False
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the value of a JSON text.
+
+    Raises:
+        ValueError: it is not JSON, is nested too deeply, or holds half of a surrogate pair, which is not Unicode text.
+    """
+    try:
+        value = json.loads(text)
+        json.dumps(value, ensure_ascii=False).encode()
+    except RecursionError:
+        raise ValueError("is nested too deeply") from None
+    except UnicodeEncodeError:
+        raise ValueError("holds half of a surrogate pair, which is not Unicode text") from None
+    return value

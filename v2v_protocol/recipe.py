@@ -33,10 +33,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.bounds import LARGEST_EVENTS, most_events, pixel_thresholds
 from v2v_protocol.errors import RecipeError
 from v2v_protocol.persisted import Persisted
-from v2v_protocol.presets import DEFAULT_PRESET, PRESET_FIELDS, STREAM_PRESETS
 from v2v_protocol.settings import (
     Setting,
     check_settings,
@@ -50,6 +48,98 @@ from v2v_protocol.settings import (
     whole,
     word,
 )
+
+SMALLEST_THRESHOLD_SHARE = 0.25
+"""Lower limit of a pixel's threshold under mismatch, as a share of the nominal threshold."""
+LARGEST_NORMAL = 6.56
+"""No noise deviates by more standard deviations (``v2v_server.simulation.noise``)."""
+LARGEST_EVENTS = 2.0**49
+"""Largest number of events of a pixel in a clip. With more, float64 no longer resolves a threshold."""
+
+
+def pixel_thresholds(smallest: float, largest: float, mismatch_sigma: float) -> tuple[float, float]:
+    """Return the limits of any pixel's threshold, for nominal thresholds between two values."""
+    spread = LARGEST_NORMAL * mismatch_sigma
+    return smallest * max(1.0 - spread, SMALLEST_THRESHOLD_SHARE), largest * (1.0 + spread)
+
+
+def most_events(steps: int, log_ends: tuple[float, float], thresholds: tuple[float, float], noise_sum: float) -> float:
+    """Return an upper bound of the events that one pixel can fire in a clip; it determines the arithmetic that is
+    needed.
+
+    ((steps + 1) (largest threshold + range of L) + largest noise and hot drift of all steps + largest |L|), in units of
+    the smallest threshold: no step changes dL by more, and the start and the rounding of L count as one step more.
+
+    Args:
+        steps: differences between frames, or segments of them.
+        log_ends: smallest and largest log intensity L.
+        thresholds: smallest and largest contrast threshold, log units.
+        noise_sum: standard deviations of noise and of hot drift, and the leak, summed over the steps, log units.
+    """
+    low, high = log_ends
+    change = (steps + 1) * (max(thresholds) + (high - low)) + LARGEST_NORMAL * noise_sum
+    return (change + max(abs(low), abs(high))) / min(thresholds)
+
+
+DEFAULT_PRESET = "paper"
+
+PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
+    "paper": {},
+    # Ablation "-F": one draw of the thresholds per video, the same in every epoch.
+    "paper-fixed-thresholds": {"threshold_source": "video"},
+    # Ablation "LDR": contrast raised, then clipped.
+    "paper-contrast": {"contrast_probability": 0.8},
+    # EVFlowNet: the frame before the first target frame, for pseudo flow.
+    "paper-flow": {"lead_frames": 1},
+    # ERAFT: that frame, and one more voxel grid before the first.
+    "paper-eraft": {"lead_frames": 1, "lead_voxels": 1},
+    # The paper's pixel without noise, hot pixels or pauses: for tests and for viewing.
+    "noise-free": {
+        "noise_sigma": (0.0, 0.0),
+        "hot_pixel_share": (0.0, 0.0),
+        "hot_pixel_sigma": (0.0, 0.0),
+        "pause_probability": 0.0,
+    },
+    # What v2e (Hu et al. 2021) calls `clean`: thresholds 0.2 with a deviation of 0.02, nothing else.
+    "clean": {
+        "threshold": (0.2, 0.2),
+        "threshold_ratio": (1.0, 1.0),
+        "threshold_mismatch_sigma": (0.1, 0.1),
+        "noise_sigma": (0.0, 0.0),
+        "hot_pixel_share": (0.0, 0.0),
+        "hot_pixel_sigma": (0.0, 0.0),
+    },
+    # The paper's pixel with a higher dark floor, drawn (docs/effects.md).
+    "sensor": {"log_eps": (0.01, 0.2)},
+    # A DAVIS346 in ordinary light; docs/effects.md gives the source of each value.
+    "davis346": {
+        # ln 1.143, its least contrast, to ln 1.5, as far as such cameras are usually set (Gallego et al. 2022).
+        "threshold": (0.134, 0.405),
+        # 2.1 % of contrast (Lichtsteiner et al. 2008); 0.05 of 0.2 (v2e `noisy`)
+        "threshold_mismatch_sigma": (0.1, 0.25),
+        "shot_noise_hz": (0.0, 5.0),  # up to v2e's `noisy`
+        "leak_hz": (0.05, 0.2),  # around v2e's 0.1; the width is a guess
+        "refractory_seconds": (1e-4, 1e-3),  # ESIM's examples 1e-4, v2e's default 5e-4; the upper end is a guess
+        "photoreceptor_hz": (30.0, 300.0),  # v2e's `noisy` and its default
+        "dead_pixel_share": (0.0, 1e-4),  # a guess
+        # Shot noise takes the place of the paper's noise; hot pixels of up to about a hundred events a second: a guess.
+        "noise_sigma": (0.0, 0.0),
+        "noise_unit": "second",
+        "hot_pixel_share": (0.0, 5e-4),
+        "hot_pixel_sigma": (0.0, 20.0),
+    },
+}
+
+STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "exact": {"samples_per_decode": 1},
+    "balanced": {"samples_per_decode": 2},
+    "fast": {"samples_per_decode": 4},
+    "natural": {"samples_per_decode": 1, "scene": "auto", "moving_share": 0.75},
+}
+"""Spec fields that each preset sets. The first three trade accuracy for speed (`docs/accuracy.md`); "natural" is for
+videos as they are: what spoils events is left out, and most crops show something that moves (`docs/scene.md`).
+"""
+
 
 Range = tuple[float, float]
 """Lowest and highest value of a uniform draw; equal ends fix the value."""

@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal, TypedDict, get_args
 
-from v2v_protocol.bounds import LARGEST_EVENTS
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.persisted import Persisted, always_written
-from v2v_protocol.presets import STREAM_PRESETS
-from v2v_protocol.recipe import LARGEST_SIDE_PX, Recipe, preset
+from v2v_protocol.recipe import LARGEST_EVENTS, LARGEST_SIDE_PX, STREAM_PRESETS, Recipe, preset
 from v2v_protocol.settings import (
     check_settings,
     format_value,

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, IndexUnreadable, V2VError, VideoChanged, VideoError, VideoGone
-from v2v_protocol.wire import encode
+from v2v_protocol.messages import encode
 from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, SendLease, ToWorker
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.worker_registry import REST_SECONDS, clean_name

@@ -40,10 +40,12 @@ from v2v_protocol.messages import (
     Result,
     Stop,
     WorkerHello,
+    decode,
+    encode,
+    encode_sample,
 )
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, SampleId, SampleParams
-from v2v_protocol.wire import decode, encode, encode_sample
 from v2v_server.system.process import die_with_parent, keep_freed_memory
 from v2v_server.worker.output_buffer import open_output_buffer, pack, sample_message
 from v2v_server.worker.produce import sample_layout

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from tests.oracles.dense import Trace, trace
 from tests.oracles.noise import standard_normals, start_uniforms
-from v2v_protocol.bounds import most_events
+from v2v_protocol.recipe import most_events
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.intensity import log_table, log_table_float64

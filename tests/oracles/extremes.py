@@ -22,9 +22,8 @@ from tests.oracles import extremes_in_time as in_time
 from tests.oracles.balance import Camera, balance, imbalance, trace_of
 from tests.oracles.dense import trace
 from tests.oracles.noise import standard_normals
-from v2v_protocol.bounds import most_events
 from v2v_protocol.errors import RecipeError, UsageError
-from v2v_protocol.recipe import Recipe, preset
+from v2v_protocol.recipe import Recipe, most_events, preset
 from v2v_protocol.spec import StreamSpec
 from v2v_server.simulation import noise, simulate, simulate_log
 from v2v_server.simulation.draw import draw, noise_key_of_seed

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.bounds import most_events
-from v2v_protocol.recipe import Recipe
+from v2v_protocol.recipe import Recipe, most_events
 from v2v_protocol.spec import MOST_SUBSTEPS
 from v2v_server.motion import levels_between
 from v2v_server.motion.matching import UNITS_PER_PX

@@ -7,9 +7,8 @@ from typing import Any, get_args
 
 from hypothesis import strategies as st
 
-from v2v_protocol.bounds import LARGEST_EVENTS
 from v2v_protocol.errors import RecipeError
-from v2v_protocol.recipe import Recipe
+from v2v_protocol.recipe import LARGEST_EVENTS, Recipe
 from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, MOST_SUBSTEPS, VOXEL_DTYPES, OnBadVideo, StreamSpec
 
 

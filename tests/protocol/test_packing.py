@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from v2v_client.session.packing import unpack
 from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import ProtocolError
-from v2v_protocol.messages import SampleHeader
-from v2v_protocol.wire import decode, decode_sample, encode_sample
+from v2v_protocol.messages import SampleHeader, decode, decode_sample, encode_sample
 
 
 def pack(raw: object) -> bytes:

@@ -15,13 +15,18 @@ from hypothesis import strategies as st
 from tests.protocol.persisted_values import MESSAGES, example, messages
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.errors import LimitExceeded, ProtocolError, VersionMismatch
-from v2v_protocol.messages import Denied, Goodbye, Hello, Lease, Ping, SampleHeader, Want
-from v2v_protocol.persisted import LARGEST_LIST
-from v2v_protocol.wire import (
+from v2v_protocol.messages import (
     ARRAY_DTYPES,
     LARGEST_ARRAY_BYTES,
     LARGEST_HEADER_BYTES,
     MOST_CONTAINERS,
+    Denied,
+    Goodbye,
+    Hello,
+    Lease,
+    Ping,
+    SampleHeader,
+    Want,
     decode,
     decode_map,
     decode_sample,
@@ -29,6 +34,7 @@ from v2v_protocol.wire import (
     encode_map,
     encode_sample,
 )
+from v2v_protocol.persisted import LARGEST_LIST
 
 V = b"\x82\xa1v" + bytes([PROTOCOL_VERSION])
 """A message of two fields begins, with its version."""

@@ -14,6 +14,7 @@ from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.errors import IndexUnreadable, V2VError
 from v2v_protocol.messages import (
     Begun,
+    Buffer,
     Denied,
     Hello,
     Lease,
@@ -25,11 +26,12 @@ from v2v_protocol.messages import (
     Want,
     Welcome,
     WorkerHello,
+    decode,
+    encode,
+    encode_map,
 )
-from v2v_protocol.refusal import Refusal
-from v2v_protocol.sample import array_layout, layout_bytes
+from v2v_protocol.sample import Refusal, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import Buffer, decode, encode, encode_map
 from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,

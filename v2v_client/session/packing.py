@@ -5,7 +5,7 @@ from __future__ import annotations
 import zstandard
 
 from v2v_protocol.errors import ProtocolError
-from v2v_protocol.wire import Buffer
+from v2v_protocol.messages import Buffer
 
 
 def unpack(frame: Buffer, size: int) -> Buffer:

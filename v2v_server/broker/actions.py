@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from v2v_protocol.errors import ProtocolError, VersionMismatch
-from v2v_protocol.messages import Denied, ErrorCode, Lease
-from v2v_protocol.refusal import Refusal
+from v2v_protocol.messages import Denied, ErrorCode, Frames, Lease, encode
+from v2v_protocol.sample import Refusal
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import Frames, encode
 from v2v_server.broker.leases import Request
 from v2v_server.quarantine.snapshots import QuarantineEntry
 

@@ -10,9 +10,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from v2v_protocol.messages import Unavailable
-from v2v_protocol.refusal import Refusal, RefusalKind
-from v2v_protocol.wire import encode
+from v2v_protocol.messages import Unavailable, encode
+from v2v_protocol.sample import Refusal, RefusalKind
 from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, ReportRefusal, ToConsumer
 from v2v_server.broker.counters import Counters
 from v2v_server.broker.leases import Request

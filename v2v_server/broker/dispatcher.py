@@ -19,9 +19,12 @@ from v2v_protocol.errors import (
     UsageError,
 )
 from v2v_protocol.messages import (
+    LARGEST_REQUEST_BYTES,
     Begun,
+    Buffer,
     Denied,
     ErrorCode,
+    Frames,
     GetStatus,
     Goodbye,
     Hello,
@@ -34,10 +37,11 @@ from v2v_protocol.messages import (
     Stop,
     Want,
     WorkerHello,
+    decode,
+    encode,
 )
 from v2v_protocol.sample import SampleId
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import LARGEST_REQUEST_BYTES, Buffer, Frames, decode, encode
 from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,

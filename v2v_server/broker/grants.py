@@ -18,11 +18,9 @@ from typing import Any
 
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.errors import ProtocolError
-from v2v_protocol.messages import Lease, SampleHeader
-from v2v_protocol.refusal import RefusalKind
-from v2v_protocol.sample import Form
+from v2v_protocol.messages import Lease, SampleHeader, decode, largest_packed_bytes
+from v2v_protocol.sample import Form, RefusalKind
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import decode, largest_packed_bytes
 from v2v_server.broker.actions import Action, SendLease, ToConsumer
 from v2v_server.broker.candidates import Candidates
 from v2v_server.broker.counters import Counters

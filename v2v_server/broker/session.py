@@ -23,11 +23,10 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import CorpusError, LimitExceeded, UsageError
 from v2v_protocol.liveness import Liveness
-from v2v_protocol.messages import Hello, Welcome
+from v2v_protocol.messages import LARGEST_ARRAY_BYTES, MOST_IN_FLIGHT_BYTES, Hello, Welcome
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Form, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import LARGEST_ARRAY_BYTES, MOST_IN_FLIGHT_BYTES
 from v2v_server.broker.fair_queue import FairQueue
 from v2v_server.broker.leases import LeaseBook, Request, runs_alone
 from v2v_server.broker.worker_registry import clean_name

@@ -14,8 +14,7 @@ import numpy as np
 
 from v2v_protocol.errors import CorpusError, IndexUnreadable, VideoChanged
 from v2v_protocol.messages import Lease
-from v2v_protocol.refusal import Refusal, RefusalKind
-from v2v_protocol.sample import ARRAYS, sidecar_endings
+from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.corpus import Corpus, format_problems, list_corpus
 from v2v_server.corpus.index.columns import VideoTable

@@ -19,9 +19,8 @@ from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, TypeAlias
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
-from v2v_protocol.persisted import Limits, Persisted, later
+from v2v_protocol.persisted import Limits, Persisted, later, parse_json
 from v2v_protocol.programs import printable
-from v2v_protocol.safe_json import parse_json
 from v2v_server.corpus.index.file import IndexRow
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.names import UNPRINTABLE

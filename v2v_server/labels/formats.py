@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from v2v_protocol.safe_json import parse_json
+from v2v_protocol.persisted import parse_json
 from v2v_server.labels.boxes import NO_TRACK, Box, BoxTable, checked
 from v2v_server.labels.masks import read_mask
 

@@ -24,7 +24,7 @@ from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_protocol.persisted import Persisted
-from v2v_protocol.refusal import Refusal
+from v2v_protocol.sample import Refusal
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.manifest import Header, PreparedVideo
 from v2v_server.corpus.manifest_writer import ManifestWriter

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from v2v_protocol.refusal import Refusal
+from v2v_protocol.sample import Refusal
 from v2v_server.corpus.manifest import PreparedVideo
 
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, ProtocolError
-from v2v_protocol.safe_json import parse_json
+from v2v_protocol.persisted import parse_json
 from v2v_server.corpus.refresh import index_path
 from v2v_server.quarantine.snapshots import Quarantine, QuarantineEntry
 from v2v_server.system.locks import lock

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.refusal import Refusal
+from v2v_protocol.sample import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.scene import MOST_FRAMES

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.bounds import most_events, pixel_thresholds
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import STARTS, TIME_UNITS, Recipe, effect_settings
+from v2v_protocol.recipe import STARTS, TIME_UNITS, Recipe, effect_settings, most_events, pixel_thresholds
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.settings import nearest, require_known
 from v2v_server.simulation.draw import noise_key_of_seed

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.bounds import pixel_thresholds
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList, check_duration, whole_edges
+from v2v_protocol.recipe import pixel_thresholds
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import noise

@@ -37,8 +37,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.bounds import LARGEST_EVENTS
 from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import LARGEST_EVENTS
 
 AUTO = "auto"
 Real = type[np.floating[Any]]

@@ -23,9 +23,8 @@ import zstandard
 
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot, array_offsets, find_memory, open_memory
 from v2v_protocol.errors import ProtocolError
-from v2v_protocol.messages import Lease
+from v2v_protocol.messages import Buffer, Frames, Lease, encode_sample
 from v2v_protocol.sample import Form, Layout, new_arrays
-from v2v_protocol.wire import Buffer, Frames, encode_sample
 
 Find: TypeAlias = Callable[[ArenaName, bool], int]
 

@@ -25,8 +25,7 @@ from v2v_protocol.arena import find_memory
 from v2v_protocol.errors import SidecarError, UsageError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.keys import key_for
 from v2v_protocol.link.dealer import Dealer
-from v2v_protocol.messages import Lease, Result, WorkerHello
-from v2v_protocol.wire import Frames
+from v2v_protocol.messages import Frames, Lease, Result, WorkerHello
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.schedule.sequences import MOST_LEASE_BYTES
 from v2v_server.simulation.variants import USUAL

@@ -21,11 +21,11 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
 from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
-from v2v_protocol.refusal import Refusal
-from v2v_protocol.safe_json import parse_json
+from v2v_protocol.persisted import parse_json
 from v2v_protocol.sample import (
     Layout,
     Provenance,
+    Refusal,
     Sample,
     SampleId,
     SampleParams,

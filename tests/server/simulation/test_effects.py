@@ -19,9 +19,8 @@ from tests.server.simulation import effect_oracle, reference
 from tests.server.simulation.effect_oracle import Camera, Chance
 from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from tests.server.simulation.test_pixel import moving_frames
-from v2v_protocol.bounds import LARGEST_NORMAL
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe, preset
+from v2v_protocol.recipe import LARGEST_NORMAL, Recipe, preset
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation import noise, simulate, simulate_clip
 from v2v_server.simulation.draw import noise_key_of_seed

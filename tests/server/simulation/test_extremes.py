@@ -14,9 +14,8 @@ from tests.oracles.balance import Camera, arithmetic, balance, imbalance, trace_
 from tests.oracles.extremes import Finding, Row, record_of, refused, rows, texture
 from tests.oracles.noise import standard_normals, start_uniforms
 from tests.server.simulation import oracle, reference
-from v2v_protocol.bounds import LARGEST_EVENTS, LARGEST_NORMAL, most_events
 from v2v_protocol.errors import RecipeError, UsageError
-from v2v_protocol.recipe import PRESETS, Recipe
+from v2v_protocol.recipe import LARGEST_EVENTS, LARGEST_NORMAL, PRESETS, Recipe, most_events
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation import noise, simulate, simulate_clip
 from v2v_server.simulation.draw import noise_key_of_seed

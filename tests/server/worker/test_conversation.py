@@ -14,6 +14,7 @@ from v2v_protocol.messages import (
     Begun,
     Denied,
     ErrorCode,
+    Frames,
     Goodbye,
     Lease,
     LeaseFailed,
@@ -23,8 +24,9 @@ from v2v_protocol.messages import (
     Result,
     Stop,
     WorkerHello,
+    decode,
+    encode,
 )
-from v2v_protocol.wire import Frames, decode, encode
 from v2v_server.worker.conversation import (
     Action,
     Inspect,

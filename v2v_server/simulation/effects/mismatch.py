@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from v2v_protocol.bounds import SMALLEST_THRESHOLD_SHARE
+from v2v_protocol.recipe import SMALLEST_THRESHOLD_SHARE
 from v2v_server.simulation import noise
 from v2v_server.simulation.effects.state import Clip, hook
 from v2v_server.simulation.pixel import BLOCK_PX, folds_of, two_normals, word
