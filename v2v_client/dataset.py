@@ -27,8 +27,8 @@ from v2v_client.ranks import distributed_rank
 from v2v_client.session.brokers import addresses
 from v2v_client.session.connector import Connector, ConsumerId
 from v2v_client.session.liveness import Patience
-from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import RepeatedSamplesWarning, StateMismatch, UsageError
+from v2v_protocol.keys import leaves_host
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, html_table
 from v2v_protocol.settings import require_whole

@@ -410,7 +410,7 @@ _TYPES: dict[str, type[Message]] = {
     "seen": Status,
 }
 _NAMES = {cls: name for name, cls in _TYPES.items()}
-_plain_map = reader(Mapping[str, Any])
+_plain_map: Callable[[Any], dict[str, Any]] = reader(Mapping[str, Any])
 
 
 def encode(message: Message) -> Frames:

@@ -87,7 +87,7 @@ class Persisted:
         return read_fields(cls, values)
 
 
-def add_fields(plain: dict[str, Any], item: Persisted) -> dict[str, Any]:
+def add_fields(plain: dict[str, Any], item: Any) -> dict[str, Any]:
     """Add what ``item.to_dict()`` returns to plain values, and return them."""
     names, nested, defaults = _written(type(item))
     # dataclasses.asdict copies every value, which takes a quarter of a millisecond for a provenance.
@@ -119,11 +119,12 @@ def read_fields(kind: Callable[..., T], values: Any) -> T:
     except (ProtocolError, UsageError) as error:
         raise ProtocolError(f"{kind.__name__}: {error}") from error
     except TypeError as error:
-        lacking = [each.name for each in dataclasses.fields(kind) if each.name not in read and _is_needed(each)]
+        fields: Any = dataclasses.fields(kind)  # type: ignore[arg-type]
+        lacking = [each.name for each in fields if each.name not in read and each.default is each.default_factory]
         raise ProtocolError(f"{kind.__name__} lacks {', '.join(lacking)}") from error
 
 
-def always_written(kind: type[Persisted]) -> Set[str]:
+def always_written(kind: Any) -> Set[str]:
     """Return the names of the fields that every record has, whichever release wrote it."""
     names, _, defaults = _written(kind)
     return {name: None for name in names if name not in defaults}.keys()
@@ -139,7 +140,7 @@ def to_plain(value: Any) -> Any:
 @cache
 def _written(kind: Any) -> tuple[list[str], list[str], Mapping[str, Any]]:
     """Return the names of all fields, those of fields that hold a Persisted, and the defaults of later ones."""
-    fields = {each.name: each for each in dataclasses.fields(kind)}
+    fields: Mapping[str, Any] = {each.name: each for each in dataclasses.fields(kind)}
     parts = {name: (hint, *typing.get_args(hint)) for name, hint in typing.get_type_hints(kind).items()}
     defaults = {
         name: each.default_factory() if each.default is MISSING else each.default
@@ -153,10 +154,6 @@ def _written(kind: Any) -> tuple[list[str], list[str], Mapping[str, Any]]:
 def _readers(kind: Any) -> Mapping[str, Read]:
     hints = typing.get_type_hints(kind, include_extras=True)
     return {each.name: reader(hints[each.name]) for each in dataclasses.fields(kind)}
-
-
-def _is_needed(field: Any) -> bool:
-    return field.default is field.default_factory is MISSING
 
 
 def _is_persisted(kind: Any) -> bool:

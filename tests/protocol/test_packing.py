@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from v2v_client.session.packing import unpack
-from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import ProtocolError
+from v2v_protocol.keys import leaves_host
 from v2v_protocol.messages import SampleHeader, decode, decode_sample, encode_sample
 
 

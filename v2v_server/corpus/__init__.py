@@ -10,5 +10,4 @@ index            what probing found, on disk and in memory
 refresh          bring the index up to date
 scenes           what the videos show, and what is wrong with it
 manifest         what a prepared folder states about itself
-manifest_writer  writing a manifest
 """

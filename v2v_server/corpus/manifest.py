@@ -11,16 +11,20 @@ that a later run can use them without preparing them again.
 
 from __future__ import annotations
 
+import json
+import os
 import sys
 from base64 import b64decode
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
+from types import TracebackType
 from typing import Annotated, Any, TypeAlias
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_protocol.persisted import Limits, Persisted, later, parse_json
 from v2v_protocol.programs import printable
+from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.index.file import IndexRow
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.names import UNPRINTABLE
@@ -31,7 +35,7 @@ from v2v_server.video.rows import Rows
 
 MANIFEST_NAME = "v2v-prepared.jsonl"
 MANIFEST_VERSION = 2
-_OF_LOSSY = frozenset({"quality", "gop", "psnr_db", "worst_psnr_db"})
+_OF_LOSSY = frozenset({"codec", "quality", "gop", "psnr_db", "worst_psnr_db"})
 """Fields of releases that could also prepare lossy files."""
 NO_LOSSY = "which this release does not serve: re-encode the videos with ffmpeg, and serve them as videos"
 _Bytes: TypeAlias = Annotated[int, Limits(0, 2**63 - 1)]
@@ -221,16 +225,16 @@ def _header(line: bytes) -> Header:
     data = _object(line)
     if data.get("version") != MANIFEST_VERSION:
         raise ValueError(f"format version {data.get('version')!r}; this program reads {MANIFEST_VERSION}")
-    if (codec := data.pop("codec", "lossless")) != "lossless":
+    if (codec := data.get("codec", "lossless")) != "lossless":
         raise ValueError(f"the folder was prepared with --codec {codec!r:.80}, {NO_LOSSY}")
-    return Header.from_dict(data)
+    return Header.from_dict(_without_lossy(data))
 
 
 def _video(line: bytes) -> tuple[PreparedVideo, bool]:
     """Read the line of a video: return its record, and whether the video is set aside."""
     data = _object(line)
     aside = data.pop("aside", False) is True
-    video = PreparedVideo.from_dict(data)
+    video = PreparedVideo.from_dict(_without_lossy(data))
     path = PurePosixPath(video.id)
     if printable(video.id) != video.id:
         raise ValueError(f"id {printable(video.id)}: {UNPRINTABLE}")
@@ -248,4 +252,52 @@ def _object(line: bytes) -> dict[str, Any]:
     data = parse_json(line)
     if not isinstance(data, dict):
         raise ValueError("is not a JSON object")
+    return data
+
+
+def _without_lossy(data: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in data.items() if name not in _OF_LOSSY}
+
+
+class ManifestWriter:
+    """Writes a manifest: first afresh and in one piece, then line by line.
+
+    Args:
+        root: the prepared folder.
+        header: its first line.
+        videos: what is known already.
+        aside: what is known of videos that the corpus does not have.
+
+    Raises:
+        OSError: the folder cannot be written to.
+    """
+
+    def __init__(
+        self, root: Path, header: Header, videos: Iterable[PreparedVideo], aside: Iterable[PreparedVideo] = ()
+    ) -> None:
+        path = root / MANIFEST_NAME
+        aside_path = path.with_name(f".{MANIFEST_NAME}.new")  # one name, so that killed runs leave one file at most
+        with write_aside_and_rename(path, partial=aside_path, durable=True) as fresh, fresh.open("wb") as file:
+            file.write(_line(header))
+            file.writelines(map(_line, videos))
+            file.writelines(_line(video, aside=True) for video in aside)
+        self._file = path.open("ab")
+
+    def add(self, video: PreparedVideo) -> None:
+        """Append one record, and make sure that it stays."""
+        self._file.write(_line(video))
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def __enter__(self) -> ManifestWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+
+def _line(item: Header | PreparedVideo, aside: bool = False) -> bytes:
+    values = item.to_dict() | ({"aside": True} if aside else {})
+    return json.dumps(values, allow_nan=False).encode() + b"\n"

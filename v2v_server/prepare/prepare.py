@@ -26,8 +26,7 @@ from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_protocol.persisted import Persisted
 from v2v_protocol.sample import Refusal
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.manifest import Header, PreparedVideo
-from v2v_server.corpus.manifest_writer import ManifestWriter
+from v2v_server.corpus.manifest import Header, ManifestWriter, PreparedVideo
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.report import Report

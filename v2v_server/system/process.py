@@ -26,7 +26,7 @@ _SCHED_ATTR_CALLS = {"x86_64": (315, 314), "aarch64": (275, 274)}  # numbers of 
 
 
 def keep_freed_memory() -> bool:
-    """Call :func:`v2v_protocol.allocator.keep_freed_memory` for blocks of the size of a sample; a server or worker
+    """Call :func:`v2v_protocol.arena.keep_freed_memory` for blocks of the size of a sample; a server or worker
     returns larger free memory.
     """
     return allocator.keep_freed_memory(most_bytes=allocator.LARGEST_SAMPLE_BYTES)

@@ -20,10 +20,9 @@ from functools import partial
 from importlib.resources.abc import Traversable
 
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.addresses import leaves_host
 from v2v_protocol.arena import find_memory
 from v2v_protocol.errors import SidecarError, UsageError, VideoChanged, VideoError, VideoUnreadable
-from v2v_protocol.keys import key_for
+from v2v_protocol.keys import key_for, leaves_host
 from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Frames, Lease, Result, WorkerHello
 from v2v_server.corpus.sources.source import VideoSource

@@ -426,7 +426,7 @@ def _pair(thresholds: tuple[float, ...]) -> tuple[float, float] | None:
 
 
 def _refusals(lease: Lease) -> tuple[Refusal, ...]:
-    return tuple(Refusal(**item) for item in lease.refusals["refusals"])
+    return tuple(map(Refusal.from_dict, lease.refusals["refusals"]))
 
 
 def _refuse_outside(video: str) -> None:
