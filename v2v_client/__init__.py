@@ -21,7 +21,7 @@ from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.in_process import V2VDataset
 from v2v_client.options import Patience
-from v2v_protocol.allocator import keep_freed_memory
+from v2v_protocol.arena import keep_freed_memory
 from v2v_protocol.errors import (
     NoWorkers,
     ProtocolError,

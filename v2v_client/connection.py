@@ -32,9 +32,8 @@ from v2v_client.position import ResumeState, StreamIdentity
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.link.dealer import Dealer, diagnose
-from v2v_protocol.messages import Hello, SampleHeader
+from v2v_protocol.messages import LARGEST_HEADER_BYTES, Hello, SampleHeader, decode, encode, largest_frame_bytes
 from v2v_protocol.sample import Layout, Provenance
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, decode, encode, largest_frame_bytes
 
 _GOODBYE_LINGER_MS = 250
 """Time that closing may spend on sending the Goodbye. Without it the server would go on making requested samples."""

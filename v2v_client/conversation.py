@@ -36,6 +36,7 @@ from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.errors import NoWorkers, ProtocolError, RemoteError, SampleUnavailable, ServerLost
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import (
+    Buffer,
     Denied,
     ErrorCode,
     Goodbye,
@@ -47,9 +48,11 @@ from v2v_protocol.messages import (
     Unavailable,
     Want,
     Welcome,
+    decode_map,
+    decode_sample,
+    layout_of,
 )
 from v2v_protocol.sample import Form, Layout, Provenance, SampleId, array_layout
-from v2v_protocol.wire import Buffer, decode_map, decode_sample, layout_of
 
 WAIT_REPORT_SECONDS = 1.0
 """Interval at which the server is told how long this consumer has waited for samples."""

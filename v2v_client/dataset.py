@@ -23,8 +23,8 @@ from v2v_client.memory import BatchBuffers
 from v2v_client.options import Labels, Options, Patience, check_labels, require_arguments, require_labels
 from v2v_client.passes import Iteration, Position
 from v2v_client.position import Consumer, EpochPlan, ResumeState, StreamIdentity
-from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import RepeatedSamplesWarning, StateMismatch, UsageError
+from v2v_protocol.keys import leaves_host
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, html_table
 from v2v_protocol.settings import require_whole
@@ -82,7 +82,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         timeout_seconds: silence after which the server counts as lost.
         patience: the other timeouts; None for the defaults. Its ``timeout_seconds`` is not used.
         options: ``preset`` ("exact", "balanced", "fast", "natural" or "natural-davis346", see
-            :data:`v2v_protocol.presets.STREAM_PRESETS`) and fields of :class:`v2v_protocol.spec.StreamSpec`, which
+            :data:`v2v_protocol.recipe.STREAM_PRESETS`) and fields of :class:`v2v_protocol.spec.StreamSpec`, which
             override the preset; None takes the server's.
 
     Each sample is requested for its position in the order; samples that a crash or disconnect loses are requested

@@ -22,19 +22,21 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 from v2v_protocol.errors import ProtocolError, StateMismatch, UsageError
 from v2v_protocol.messages import Welcome
+from v2v_protocol.persisted import Limits, Persisted, always_written, later, read_fields
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_INDEX, LARGEST_SEED
-from v2v_protocol.settings import format_value, require_whole
+from v2v_protocol.settings import format_value
 from v2v_protocol.spec import StreamSpec
 
 STATE_VERSION = 1
+Count: TypeAlias = Annotated[int, Limits(0, LARGEST_INDEX)]
 
 
 @dataclass(frozen=True, slots=True)
-class StreamIdentity:
+class StreamIdentity(Persisted):
     """Hold the server's half of every sample's identity.
 
     Attributes:
@@ -47,9 +49,9 @@ class StreamIdentity:
     spec: Mapping[str, Any]
     spec_digest: str
     catalogue_digest: str
-    numerics_version: int
-    sequences: int
-    sidecars: str = ""
+    numerics_version: Count
+    sequences: Count
+    sidecars: str = later("")
 
     @classmethod
     def of(cls, welcome: Welcome) -> StreamIdentity:
@@ -67,14 +69,7 @@ class StreamIdentity:
                 f"the server names its resolved spec {welcome.spec_digest}, but it is {digest}: client and server are "
                 "of different releases"
             )
-        return cls(
-            spec=welcome.spec,
-            spec_digest=welcome.spec_digest,
-            catalogue_digest=welcome.catalogue_digest,
-            numerics_version=welcome.numerics_version,
-            sequences=welcome.sequences,
-            sidecars=welcome.sidecars,
-        )
+        return cls(**{name: getattr(welcome, name) for name in _OF_STREAM})
 
     @property
     def resolved(self) -> StreamSpec:
@@ -108,6 +103,9 @@ class StreamIdentity:
                 raise StateMismatch(f"{f'{ours} / {theirs}: {changed}' if changed else digests}; {remedy}")
 
 
+_OF_STREAM = tuple(StreamIdentity.__slots__)
+
+
 def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
     """Return the fields in which two resolved specs differ, as text: ``recipe.gamma 2.2 / 1.8``."""
 
@@ -126,7 +124,7 @@ def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class LoaderShare:
+class LoaderShare(Persisted):
     """Hold the progress of one loader worker, for a loader that saves the state of each worker.
 
     Attributes:
@@ -135,14 +133,14 @@ class LoaderShare:
         batches: batches that it has delivered since the position in the state.
     """
 
-    worker: int
-    workers: int
-    batch_size: int
-    batches: int
+    worker: Count
+    workers: Count
+    batch_size: Count
+    batches: Count
 
 
 @dataclass(frozen=True, slots=True)
-class ResumeState:
+class ResumeState(Persisted):
     """Hold where a rank, or one of its loader workers, stands.
 
     Attributes:
@@ -155,13 +153,13 @@ class ResumeState:
     """
 
     stream: StreamIdentity | None
-    seed: int
-    epoch: int
-    origin: int
-    position: int
-    world_size: int
+    seed: Annotated[int, Limits(0, LARGEST_SEED)]
+    epoch: Annotated[int, Limits(0, LARGEST_EPOCH)]
+    origin: Count
+    position: Count
+    world_size: Annotated[int, Limits(1, LARGEST_INDEX)]
     share: LoaderShare | None = None
-    quarantine: int | None = None
+    quarantine: Count | None = None
 
     @property
     def place(self) -> tuple[int, int, int]:
@@ -178,28 +176,17 @@ class ResumeState:
         return dataclasses.replace(self, epoch=epoch, origin=0, position=0, share=None, quarantine=None)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values."""
-        pinned = {field.name: getattr(self.stream, field.name, None) for field in dataclasses.fields(StreamIdentity)}
-        if not pinned["sidecars"]:
-            del pinned["sidecars"]  # as in states of earlier releases
-        return {
-            "version": STATE_VERSION,
-            **pinned,
-            "seed": self.seed,
-            "epoch": self.epoch,
-            "origin": self.origin,
-            "position": self.position,
-            "world_size": self.world_size,
-            "quarantine": self.quarantine,
-            "loader_worker": None if self.share is None else dataclasses.asdict(self.share),
-        }
+        """Return plain values, those of the stream beside the others."""
+        plain = Persisted.to_dict(self)
+        stream, share = plain.pop("stream") or dict.fromkeys(always_written(StreamIdentity)), plain.pop("share")
+        return {"version": STATE_VERSION, **stream, **plain, "loader_worker": share}
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> ResumeState:
+    def from_dict(cls, values: Any) -> ResumeState:
         """Return the state that :meth:`to_dict` wrote.
 
         Raises:
-            UsageError: the values are not a state of this release.
+            UsageError: the values are not a state of this release; the message names field, value and limit.
         """
         if not isinstance(values, Mapping) or values.get("version") != STATE_VERSION:
             found = f"version {values.get('version')!r}" if isinstance(values, Mapping) else format_value(values)
@@ -207,52 +194,14 @@ class ResumeState:
                 f"not a state of V2VStreamDataset: {found}, expected version {STATE_VERSION}. Give the saved "
                 "Batch.resume_state itself, for instance torch.load('last.pt')['stream']"
             )
-        known = {"version", "seed", "epoch", "origin", "position", "world_size", "quarantine", "loader_worker"}
-        known |= {field.name for field in dataclasses.fields(StreamIdentity)}
-        if values.keys() | {"sidecars"} != known:
-            raise UsageError(
-                f"not a state of V2VStreamDataset: keys {sorted(map(str, values))!r:.400}, expected {sorted(known)}"
-            )
-        share, quarantine = values["loader_worker"], values["quarantine"]
-        return cls(
-            stream=_stream(values),
-            seed=_whole(values, "seed", 0, LARGEST_SEED),
-            epoch=_whole(values, "epoch", 0, LARGEST_EPOCH),
-            origin=_whole(values, "origin", 0, LARGEST_INDEX),
-            position=_whole(values, "position", 0, LARGEST_INDEX),
-            world_size=_whole(values, "world_size", 1, LARGEST_INDEX),
-            share=None if share is None else _share(share),
-            quarantine=None if quarantine is None else _whole(values, "quarantine", 0, LARGEST_INDEX),
-        )
-
-
-def _stream(values: Mapping[str, Any]) -> StreamIdentity | None:
-    if values["spec"] is None:
-        return None
-    if not isinstance(values["spec"], Mapping):
-        raise UsageError("state: spec is not a mapping")
-    for name in ("spec_digest", "catalogue_digest", "sidecars"):
-        if not isinstance(values.get(name, ""), str):
-            raise UsageError(f"state: {name} = {values[name]!r} is not text")
-    return StreamIdentity(
-        spec=values["spec"],
-        spec_digest=values["spec_digest"],
-        catalogue_digest=values["catalogue_digest"],
-        numerics_version=_whole(values, "numerics_version", 0, LARGEST_INDEX),
-        sequences=_whole(values, "sequences", 0, LARGEST_INDEX),
-        sidecars=values.get("sidecars", ""),
-    )
-
-
-def _share(values: Any) -> LoaderShare:
-    names = [field.name for field in dataclasses.fields(LoaderShare)]
-    if not isinstance(values, Mapping) or values.keys() != set(names):
-        raise UsageError(f"state: loader_worker = {values!r:.200}, expected {', '.join(names)}")
-    return LoaderShare(**{name: _whole(values, name, 0, LARGEST_INDEX) for name in names})
-
-
-def _whole(values: Mapping[str, Any], name: str, low: int, high: int) -> int:
-    return require_whole(f"state: {name}", values[name], low, high)
+        plain = {name: value for name, value in values.items() if name not in ("version", *_OF_STREAM)}
+        stream = {name: values[name] for name in _OF_STREAM if name in values}
+        plain["stream"] = None if values.get("spec", "") is None else stream
+        plain["share"] = plain.pop("loader_worker", None)
+        try:
+            return read_fields(cls, plain)
+        except ProtocolError as error:
+            raise UsageError(f"not a state of V2VStreamDataset: {error}") from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,16 +7,17 @@ only our own user can connect to them.
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import os
 import stat
 import tempfile
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
-from v2v_protocol.errors import KeyRefused
-from v2v_protocol.safe_json import parse_json
+from v2v_protocol.errors import KeyRefused, ProtocolError
+from v2v_protocol.persisted import Persisted, parse_json
 
 SIDES = ("consumer", "worker")
 VARIABLE = "V2V_KEYS"
@@ -26,7 +27,7 @@ _Z85 = "0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ.-:+=^!/*?
 
 
 @dataclass(frozen=True, slots=True)
-class PeerKey:
+class PeerKey(Persisted):
     """Content of a key file. Its secret is excluded from ``repr``."""
 
     side: str
@@ -68,8 +69,8 @@ def read_key(file: Path) -> PeerKey:
         KeyRefused: it cannot be read, other users can read it, or it is not a key file.
     """
     try:
-        key = PeerKey(**parse_json(read_private(file)))
-    except (ValueError, TypeError):
+        key = PeerKey.from_dict(parse_json(read_private(file)))
+    except (ValueError, ProtocolError):
         raise KeyRefused(f"{file} is not a key file: give one that `v2v-keys new` made") from None
     if key.side not in SIDES or not all(map(is_key, (key.server, key.public, key.secret))):
         raise KeyRefused(f"{file} is not a key file: give one that `v2v-keys new` made")
@@ -108,7 +109,7 @@ def write_key(file: Path, key: PeerKey) -> None:
     Raises:
         FileExistsError: the file exists.
     """
-    write_private(file, json.dumps(asdict(key), indent=1) + "\n")
+    write_private(file, json.dumps(key.to_dict(), indent=1) + "\n")
 
 
 def write_private(file: Path, content: str) -> None:
@@ -128,6 +129,20 @@ def nameless_key(key: PeerKey) -> IO[bytes]:
     in_memory = hasattr(os, "memfd_create")
     file = os.fdopen(os.memfd_create("v2v-key"), "w+b") if in_memory else tempfile.TemporaryFile()  # noqa: SIM115
     os.fchmod(file.fileno(), 0o600)
-    file.write(json.dumps(asdict(key)).encode())
+    file.write(json.dumps(key.to_dict()).encode())
     file.flush()
     return file
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host name, or an IP address in digits, is certainly this machine."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def leaves_host(address: str) -> bool:
+    """Return whether data sent to a ZeroMQ address may travel over a network: all but ``ipc://`` and loopback."""
+    scheme, _, rest = address.partition("://")
+    return scheme == "tcp" and not is_loopback(rest.rpartition(":")[0].strip("[]"))

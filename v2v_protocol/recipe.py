@@ -27,13 +27,14 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import RecipeError
-from v2v_protocol.presets import DEFAULT_PRESET, PRESET_FIELDS, STREAM_PRESETS
+from v2v_protocol.persisted import Persisted
 from v2v_protocol.settings import (
     Setting,
     check_settings,
@@ -48,6 +49,121 @@ from v2v_protocol.settings import (
     word,
 )
 
+SMALLEST_THRESHOLD_SHARE = 0.25
+"""Lower limit of a pixel's threshold under mismatch, as a share of the nominal threshold."""
+LARGEST_NORMAL = 6.56
+"""No noise deviates by more standard deviations (``v2v_server.simulation.noise``)."""
+LARGEST_EVENTS = 2.0**49
+"""Largest number of events of a pixel in a clip. With more, float64 no longer resolves a threshold."""
+
+
+def pixel_thresholds(smallest: float, largest: float, mismatch_sigma: float) -> tuple[float, float]:
+    """Return the limits of any pixel's threshold, for nominal thresholds between two values."""
+    spread = LARGEST_NORMAL * mismatch_sigma
+    return smallest * max(1.0 - spread, SMALLEST_THRESHOLD_SHARE), largest * (1.0 + spread)
+
+
+def most_events(steps: int, log_ends: tuple[float, float], thresholds: tuple[float, float], noise_sum: float) -> float:
+    """Return an upper bound of the events that one pixel can fire in a clip; it determines the arithmetic that is
+    needed.
+
+    ((steps + 1) (largest threshold + range of L) + largest noise and hot drift of all steps + largest |L|), in units of
+    the smallest threshold: no step changes dL by more, and the start and the rounding of L count as one step more.
+
+    Args:
+        steps: differences between frames, or segments of them.
+        log_ends: smallest and largest log intensity L.
+        thresholds: smallest and largest contrast threshold, log units.
+        noise_sum: standard deviations of noise and of hot drift, and the leak, summed over the steps, log units.
+    """
+    low, high = log_ends
+    change = (steps + 1) * (max(thresholds) + (high - low)) + LARGEST_NORMAL * noise_sum
+    return (change + max(abs(low), abs(high))) / min(thresholds)
+
+
+DEFAULT_PRESET = "paper"
+
+PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
+    "paper": {},
+    # Ablation "-F": one draw of the thresholds per video, the same in every epoch.
+    "paper-fixed-thresholds": {"threshold_source": "video"},
+    # Ablation "LDR": contrast raised, then clipped.
+    "paper-contrast": {"contrast_probability": 0.8},
+    # EVFlowNet: the frame before the first target frame, for pseudo flow.
+    "paper-flow": {"lead_frames": 1},
+    # ERAFT: that frame, and one more voxel grid before the first.
+    "paper-eraft": {"lead_frames": 1, "lead_voxels": 1},
+    # The paper's pixel without noise, hot pixels or pauses: for tests and for viewing.
+    "noise-free": {
+        "noise_sigma": (0.0, 0.0),
+        "hot_pixel_share": (0.0, 0.0),
+        "hot_pixel_sigma": (0.0, 0.0),
+        "pause_probability": 0.0,
+    },
+    # What v2e (Hu et al. 2021) calls `clean`: thresholds 0.2 with a deviation of 0.02, nothing else.
+    "clean": {
+        "threshold": (0.2, 0.2),
+        "threshold_ratio": (1.0, 1.0),
+        "threshold_mismatch_sigma": (0.1, 0.1),
+        "noise_sigma": (0.0, 0.0),
+        "hot_pixel_share": (0.0, 0.0),
+        "hot_pixel_sigma": (0.0, 0.0),
+    },
+    # The paper's pixel with a higher dark floor, drawn (docs/effects.md).
+    "sensor": {"log_eps": (0.01, 0.2)},
+    # A DAVIS346 in ordinary light; docs/effects.md gives the source of each value.
+    "davis346": {
+        # ln 1.143, its least contrast, to ln 1.5, as far as such cameras are usually set (Gallego et al. 2022).
+        "threshold": (0.134, 0.405),
+        # 2.1 % of contrast (Lichtsteiner et al. 2008); 0.05 of 0.2 (v2e `noisy`)
+        "threshold_mismatch_sigma": (0.1, 0.25),
+        "shot_noise_hz": (0.0, 5.0),  # up to v2e's `noisy`
+        "leak_hz": (0.05, 0.2),  # around v2e's 0.1; the width is a guess
+        "refractory_seconds": (1e-4, 1e-3),  # ESIM's examples 1e-4, v2e's default 5e-4; the upper end is a guess
+        "photoreceptor_hz": (30.0, 300.0),  # v2e's `noisy` and its default
+        "dead_pixel_share": (0.0, 1e-4),  # a guess
+        # Shot noise takes the place of the paper's noise; hot pixels of up to about a hundred events a second: a guess.
+        "noise_sigma": (0.0, 0.0),
+        "noise_unit": "second",
+        "hot_pixel_share": (0.0, 5e-4),
+        "hot_pixel_sigma": (0.0, 20.0),
+    },
+    # Its successor, a DAVIS346 that has run for a while. Numbers are from sources, no fit (docs/effects.md).
+    # `gamma` stays that of the videos; for frames that are linear in intensity, as a DAVIS stores them, set it to 1.
+    "davis346-running": {
+        "start": "triangular",  # a residual that moves as a Brownian motion: where it stands in the long run
+        # v2e's logarithm becomes linear below 20 of 255, with the slope of an epsilon of 0.026; half and twice of it.
+        "log_eps": (0.013, 0.052),
+        "threshold": (0.134, 0.405),  # as davis346
+        "threshold_mismatch_sigma": (0.05, 0.16),  # 2.1 % of contrast (Lichtsteiner et al. 2008) at these thresholds
+        "rate_draw": "log",  # still scenes of two DAVIS cameras differ by 9 in their rate of noise
+        "shot_noise_hz": (0.1, 10.0),  # around those two, 0.44 and 4.06 a pixel, halved by grey light; v2e's `noisy`: 5
+        "leak_hz": (0.05, 0.2),  # around v2e's 0.1
+        "refractory_seconds": (1e-4, 1e-3),  # as davis346
+        "photoreceptor_hz": (300.0, 3000.0),  # v2e's default; the bandwidth in bright light of Lichtsteiner et al. 2008
+        "dead_pixel_share": (0.0, 1e-4),  # a guess, as davis346
+        "noise_sigma": (0.0, 0.0),
+        "noise_unit": "second",
+        "hot_pixel_share": (0.0, 5e-4),  # a guess, as davis346
+        "hot_pixel_sigma": (0.0, 20.0),
+    },
+}
+
+STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "exact": {"samples_per_decode": 1},
+    "balanced": {"samples_per_decode": 2},
+    "fast": {"samples_per_decode": 4},
+    "natural": {"samples_per_decode": 1, "scene": "auto", "moving_share": 0.75},
+    "natural-davis346": {
+        "samples_per_decode": 1, "scene": "auto", "moving_share": 0.75, "recipe": "davis346-running",
+    },
+}  # fmt: skip
+"""Spec fields that each preset sets; a recipe by its name. The first three trade accuracy for speed
+(`docs/accuracy.md`); "natural" is for videos as they are: what spoils events is left out, and most crops show something
+that moves (`docs/scene.md`); "natural-davis346" shows them to a running camera (`docs/effects.md`).
+"""
+
+
 Range = tuple[float, float]
 """Lowest and highest value of a uniform draw; equal ends fix the value."""
 
@@ -60,8 +176,6 @@ TIME_UNITS = ("Hz", "s")
 STARTS = ("uniform", "triangular", "zero")
 """How the residual of a pixel is drawn at the start of a clip (``v2v_server/simulation/pixel.py``)."""
 _LARGEST_FRAMES = 1_000_001
-LATER_FIELDS = ("grids_per_frame", "max_boxes", "light", "voxel_seconds", "start", "rate_draw")
-"""Fields that the plain form leaves out at their defaults, so that older digests hold."""
 MOST_STEPS_PER_GRID = 1024
 """Largest number of steps between video frames that a grid of ``voxel_seconds`` may span."""
 BRIGHTEST = 50.0
@@ -75,7 +189,7 @@ LARGEST_EVENTS = 2.0**49
 
 
 @dataclass(frozen=True, slots=True)
-class Recipe:
+class Recipe(Persisted):
     """Ranges of one virtual camera. Frozen, hashable, validated on construction.
 
     Raises:
@@ -88,20 +202,22 @@ class Recipe:
     bins: int = whole(5, 1, 1024, "B, bins of one voxel grid")
     frames_per_bin: int = whole(1, 1, 1024, "steps between video frames in one bin")
     grids_per_frame: int = whole(
-        0, 0, 1024, "n voxel grids in each step between video frames; 0: a grid spans bins x frames_per_bin steps"
-    )
+        0, 0, 1024, "n voxel grids in each step between video frames; 0: a grid spans bins x frames_per_bin steps",
+        is_later=True,
+    )  # fmt: skip
     voxel_seconds: Range = span(
         (0.0, 0.0), 1e-6, 100.0,
         "duration of a voxel grid: it spans the number of steps between video frames that comes nearest, and its bins "
         "are equal parts of its time",
-        unit="s", off=True,
+        unit="s", off=True, is_later=True,
     )  # fmt: skip
     lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
     lead_voxels: int = whole(0, 0, 1, "1 adds one voxel grid before the first (ERAFT)")
     frame_stride: int = whole(1, 1, 1000, "use every n-th frame, as if the video had 1/n of its frame rate")
     max_boxes: int = whole(
-        64, 1, 4096, "most boxes of a frame, if boxes are requested; the smallest ones beyond it are left out"
-    )
+        64, 1, 4096, "most boxes of a frame, if boxes are requested; the smallest ones beyond it are left out",
+        is_later=True,
+    )  # fmt: skip
 
     crop_height_px: int = whole(128, 1, LARGEST_SIDE_PX, "height of the random crop", unit="px", group="View")
     crop_width_px: int = whole(128, 1, LARGEST_SIDE_PX, "width of the random crop", unit="px")
@@ -129,6 +245,7 @@ class Recipe:
         "sdr", ("sdr", "declared"),
         "sdr: read 8 bits and apply gamma; declared: read up to 12 bits and apply the transfer that the video states "
         "(PQ, HLG, log, linear), else gamma",
+        is_later=True,
     )  # fmt: skip
 
     threshold: Range = span(
@@ -146,6 +263,7 @@ class Recipe:
         "uniform", STARTS,
         "residual of each pixel at the start of a clip, between its thresholds: uniform, as in the paper's code; "
         "triangular, as in a camera that has run for a long time; zero, as if each pixel had just fired",
+        is_later=True,
     )  # fmt: skip
     noise_sigma: Range = span(
         (0.0, 0.1), 0.0, 1e6, "standard deviation of the noise, per frame, or per square root of a second",
@@ -163,6 +281,7 @@ class Recipe:
         "uniform", ("uniform", "log"),
         "draw effects in Hz uniformly from their range, or uniformly in its logarithm: from 0.1 to 10, half of the "
         "draws are below 1",
+        is_later=True,
     )  # fmt: skip
     threshold_mismatch_sigma: Range = span(
         (0.0, 0.0), 0.0, 1.0, "standard deviation of each pixel's thresholds, as a share of the nominal ones",
@@ -374,18 +493,15 @@ class Recipe:
         return most_events(segments, ends, (smallest, largest), steps * (sigma * math.sqrt(unit) + hot * unit + leak))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all fields as plain values (ranges as lists), in a stable order."""
-        values = {
-            field.name: list(value) if isinstance(value := getattr(self, field.name), tuple) else value
-            for field in dataclasses.fields(self)
+        """Return all fields as plain values: ranges as lists, without those of later releases that are at their
+        defaults.
+        """
+        plain = {
+            name: list(value) if isinstance(value, tuple) else value for name, value in Persisted.to_dict(self).items()
         }
         # A fixed value is written as a number: older digests depend on this form.
         low, high = self.log_eps
-        if low == high:
-            values["log_eps"] = low
-        defaults = {name: settings_of(Recipe)[name].default for name in LATER_FIELDS}
-        plain = {name: list(value) if isinstance(value, tuple) else value for name, value in defaults.items()}
-        return {name: value for name, value in values.items() if name not in plain or value != plain[name]}
+        return plain | {"log_eps": low} if low == high else plain
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:
@@ -411,31 +527,8 @@ class Recipe:
         return dataclasses.replace(self, **changes)
 
 
-def pixel_thresholds(smallest: float, largest: float, mismatch_sigma: float) -> tuple[float, float]:
-    """Return the limits of any pixel's threshold, for nominal thresholds between two values."""
-    spread = LARGEST_NORMAL * mismatch_sigma
-    return smallest * max(1.0 - spread, SMALLEST_THRESHOLD_SHARE), largest * (1.0 + spread)
-
-
-def most_events(steps: int, log_ends: tuple[float, float], thresholds: tuple[float, float], noise_sum: float) -> float:
-    """Return an upper bound of the events that one pixel can fire in a clip; it determines the arithmetic that is
-    needed.
-
-    ((steps + 1) (largest threshold + range of L) + largest noise and hot drift of all steps + largest |L|), in units of
-    the smallest threshold: no step changes dL by more, and the start and the rounding of L count as one step more.
-
-    Args:
-        steps: differences between frames, or segments of them.
-        log_ends: smallest and largest log intensity L.
-        thresholds: smallest and largest contrast threshold, log units.
-        noise_sum: standard deviations of noise and of hot drift, and the leak, summed over the steps, log units.
-    """
-    low, high = log_ends
-    change = (steps + 1) * (max(thresholds) + (high - low)) + LARGEST_NORMAL * noise_sum
-    return (change + max(abs(low), abs(high))) / min(thresholds)
-
-
-def effect_settings() -> dict[str, Setting]:
+@cache
+def effect_settings() -> Mapping[str, Setting]:
     """Return the fields of a recipe that switch on an effect beyond the paper's model."""
     return {name: setting for name, setting in settings_of(Recipe).items() if setting.group == EFFECTS_SECTION}
 

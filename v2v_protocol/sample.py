@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import html
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -12,10 +11,50 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import ProtocolError, UsageError
+from v2v_protocol.errors import UsageError
+from v2v_protocol.persisted import Persisted, later
 from v2v_protocol.recipe import Recipe, effect_settings
-from v2v_protocol.refusal import Refusal
-from v2v_protocol.settings import require_whole
+from v2v_protocol.settings import require_known, require_whole
+
+
+class RefusalKind:
+    """Which part refuses a video.
+
+    UNUSABLE: the catalogue; the file cannot be opened, or is not a video.
+    UNSUITED: the schedule; it gives no sequence under the recipe.
+    FAILED: a worker; the file did not deliver what was catalogued, or the worker died over it.
+    QUARANTINED: the quarantine, which records the sequences that brought workers down.
+    """
+
+    UNUSABLE = "unusable"
+    UNSUITED = "unsuited"
+    FAILED = "failed"
+    QUARANTINED = "quarantined"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal(Persisted):
+    """A video that cannot be used for a request.
+
+    Attributes:
+        video: its catalogue id.
+        frame: the first unavailable frame, presentation order; None if no single frame is to blame.
+        reason: one line of text.
+        kind: which part refuses it.
+        remedy: which setting would admit it, in words; empty if no setting would.
+    """
+
+    video: str
+    frame: int | None
+    reason: str
+    kind: str = RefusalKind.FAILED
+    remedy: str = later("")
+
+    def __str__(self) -> str:
+        where = "" if self.frame is None else f" at frame {self.frame}"
+        remedy = f"; would admit it: {self.remedy}" if self.remedy else ""
+        return f"{self.video}{where}: {self.reason}{remedy}"
+
 
 LARGEST_SEED = 2**64 - 1
 LARGEST_EPOCH = 2**32 - 1
@@ -122,7 +161,7 @@ Layout: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
 
 
 @dataclass(frozen=True, slots=True)
-class SampleId:
+class SampleId(Persisted):
     """Identity of a sample. Equal identities mean equal bytes on any host, at any time.
 
     Attributes:
@@ -148,7 +187,7 @@ class SampleId:
 
 
 @dataclass(frozen=True, slots=True)
-class SampleParams:
+class SampleParams(Persisted):
     """One draw from a recipe.
 
     Attributes:
@@ -181,10 +220,16 @@ class SampleParams:
     flip: bool
     contrast: float
     noise_key: tuple[int, int, int, int]
-    effects: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    log_eps: float | None = None
-    voxel_seconds: float = 0.0
-    grid_steps: tuple[int, ...] = ()
+    effects: Mapping[str, float] = later(default_factory=dict)
+    log_eps: float | None = later(None)
+    voxel_seconds: float = later(0.0)
+    grid_steps: tuple[int, ...] = later(())
+
+    def __post_init__(self) -> None:
+        known = effect_settings()
+        require_known(self.effects, known, "effect")
+        for name, value in self.effects.items():
+            known[name].check(f"effect {name}", value)
 
     def ends(self, recipe: Recipe) -> npt.NDArray[np.int64]:
         """Return the positions in the clip (0 .. steps) between which its spans lie, from one delivered frame to the
@@ -210,15 +255,9 @@ class SampleParams:
             advance[first : first + length] = 0
         return np.cumsum(advance)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for the provenance; fields after ``noise_key`` are left out if they are empty."""
-        values = _fields(self)
-        optional = ("effects", "log_eps", "voxel_seconds", "grid_steps")
-        return {name: value for name, value in values.items() if value or name not in optional}
-
 
 @dataclass(frozen=True, slots=True)
-class Provenance:
+class Provenance(Persisted):
     """Origin of a sample: enough to make it again and to explain it. Deterministic: no clock, no host.
 
     Attributes:
@@ -258,16 +297,16 @@ class Provenance:
     irregular_timestamps: int
     decoder: str
     quarantine: int = 0
-    scene: str = ""
-    saturated: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    sidecars: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    unlabelled: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    boxes_dropped: int = 0
-    grid_seconds: tuple[float, ...] = ()
-    left_out: tuple[str, ...] = ()
-    substeps: int = 0
-    remark: str = ""
-    dropped: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    scene: str = later("")
+    saturated: Mapping[str, int] = later(default_factory=dict)
+    sidecars: Mapping[str, str] = later(default_factory=dict)
+    unlabelled: Mapping[str, str] = later(default_factory=dict)
+    boxes_dropped: int = later(0)
+    grid_seconds: tuple[float, ...] = later(())
+    left_out: tuple[str, ...] = later(())
+    substeps: int = later(0)
+    remark: str = later("")
+    dropped: Mapping[str, int] = later(default_factory=dict)
 
     @property
     def labelled(self) -> bool:
@@ -283,54 +322,6 @@ class Provenance:
         rows |= {f"id: {name}": value for name, value in rows.pop("id").items()}
         rows |= {f"drawn: {name}": value for name, value in rows.pop("params").items()}
         return html_table(f"{self.video}, from frame {self.start_frame}", rows)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, as they travel in the sample's header, without optional fields that are empty."""
-        values = _fields(self) | {
-            "id": _fields(self.id),
-            "refusals": tuple(refusal.to_dict() for refusal in self.refusals),
-            "params": self.params.to_dict(),
-        }
-        optional = (
-            "scene", "saturated", "sidecars", "unlabelled", "boxes_dropped", "grid_seconds", "left_out", "substeps",
-            "remark", "dropped",
-        )  # fmt: skip
-        return {name: value for name, value in values.items() if value or name not in optional}
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Provenance:
-        """Build a provenance from plain values.
-
-        Raises:
-            ProtocolError: a field is missing or unknown.
-        """
-        try:
-            rest = dict(values)
-            params = dict(rest.pop("params"))
-            params["pauses"] = tuple((int(first), int(length)) for first, length in params["pauses"])
-            params["noise_key"] = tuple(int(word) for word in params["noise_key"])
-            params["grid_steps"] = tuple(map(int, params.get("grid_steps", ())))
-            rest["grid_seconds"] = tuple(map(float, rest.get("grid_seconds", ())))
-            rest["left_out"] = tuple(map(str, rest.get("left_out", ())))
-            known = effect_settings()
-            params["effects"] = {
-                name: known[name].single.check(name, value) for name, value in params.get("effects", {}).items()
-            }
-            return cls(
-                id=SampleId(**rest.pop("id")),
-                refusals=tuple(Refusal(**item) for item in rest.pop("refusals")),
-                params=SampleParams(**params),
-                **rest,
-            )
-        except (AttributeError, KeyError, TypeError, ValueError, OverflowError, UsageError) as error:
-            raise ProtocolError(f"provenance of a sample does not fit its form: {error}") from error
-
-
-def _fields(item: Any) -> dict[str, Any]:
-    """Return a dataclass's fields. ``dataclasses.asdict`` copies every value in them, which takes a quarter of a
-    millisecond.
-    """
-    return {field.name: getattr(item, field.name) for field in dataclasses.fields(item)}
 
 
 def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> Layout:

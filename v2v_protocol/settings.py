@@ -22,6 +22,8 @@ from typing import Any, Literal
 from v2v_protocol.errors import UsageError
 
 _SETTING = "v2v setting"
+LATER = "v2v later"
+"""Key in the metadata of a field that is left out of its record at its default (:mod:`v2v_protocol.persisted`)."""
 _LONGEST_SHOWN = 200
 
 
@@ -42,6 +44,7 @@ class Setting:
         metavar: placeholder for the value in help.
         bare: value of a flag that is given without one; None: a value is required.
         is_hidden: internal to a program: left out of help and the reference page.
+        is_later: a later release added the field: a record leaves it out at its default, so older digests hold.
     """
 
     kind: Literal["whole", "bounds", "number", "range", "switch", "word", "text"]
@@ -56,6 +59,7 @@ class Setting:
     metavar: str = ""
     bare: Any = None
     is_hidden: bool = False
+    is_later: bool = False
 
     @property
     def expected(self) -> str:
@@ -191,7 +195,7 @@ def of_type(hint: Any) -> Setting | None:
 
 
 def _field(setting: Setting) -> Any:
-    return dataclasses.field(default=setting.default, metadata={_SETTING: setting})
+    return dataclasses.field(default=setting.default, metadata={_SETTING: setting, LATER: setting.is_later})
 
 
 @cache

@@ -11,9 +11,8 @@ from functools import lru_cache
 from typing import Any, Literal, TypedDict, get_args
 
 from v2v_protocol.errors import RecipeError, UsageError
-from v2v_protocol.presets import STREAM_PRESETS
-from v2v_protocol.recipe import LARGEST_EVENTS, LARGEST_SIDE_PX, Recipe, preset
-from v2v_protocol.recipe import LATER_FIELDS as LATER_RECIPE_FIELDS
+from v2v_protocol.persisted import Persisted, always_written
+from v2v_protocol.recipe import LARGEST_EVENTS, LARGEST_SIDE_PX, STREAM_PRESETS, Recipe, preset
 from v2v_protocol.settings import (
     check_settings,
     format_value,
@@ -42,14 +41,12 @@ MOST_SUBSTEPS = 16
 """Largest number of sub-steps of a step between video frames."""
 MARGIN_PX = 16
 """Margin around the crop that sub-steps are made from."""
-LATER_FIELDS = ("substep_px", "keep_defects", "still_share", "moving_share", "quiet_share", "tolerance")
-"""Fields that the plain form leaves out at their defaults, so that older digests hold."""
 _OF_SCENES = {"quiet_share": 1.0, "moving_share": 0.0}
 """Fields that scene "off" admits at these values only."""
 
 
 @dataclass(frozen=True, slots=True)
-class StreamSpec:
+class StreamSpec(Persisted):
     """Definition of a stream, apart from the videos and the seed.
 
     Two streams of equal digest over equal catalogues, seeds and numerics versions are equal byte for byte. Settings
@@ -110,13 +107,23 @@ class StreamSpec:
         "shows nothing, and skips flow where nothing moves (if flow_method is auto)",
         group="Scene",
     )  # fmt: skip
-    keep_defects: str = text("", f"what scene auto serves as it is, with commas between; of {', '.join(DEFECTS)}")
-    still_share: float = number(0.1, 0.0, 1.0, "share of the still sequences that scene auto serves")
+    keep_defects: str = text(
+        "", f"what scene auto serves as it is, with commas between; of {', '.join(DEFECTS)}", is_later=True
+    )
+    still_share: float = number(0.1, 0.0, 1.0, "share of the still sequences that scene auto serves", is_later=True)
     quiet_share: float = number(
-        1.0, 0.0, 1.0, "share of the quiet sequences, in which little of the picture changes, that scene auto serves"
+        1.0,
+        0.0,
+        1.0,
+        "share of the quiet sequences, in which little of the picture changes, that scene auto serves",
+        is_later=True,
     )
     moving_share: float = number(
-        0.0, 0.0, 1.0, "share of the samples whose crop is drawn with weight by how much changes there (scene auto)"
+        0.0,
+        0.0,
+        1.0,
+        "share of the samples whose crop is drawn with weight by how much changes there (scene auto)",
+        is_later=True,
     )
     substep_px: float = number(
         0.0, 0.0, 64.0,
@@ -124,11 +131,13 @@ class StreamSpec:
         f"most {MOST_SUBSTEPS} times, by pictures made along the motion; 0: light changes evenly between two frames",
         unit="px",
         group="Motion",
+        is_later=True,
     )  # fmt: skip
     tolerance: float = number(
         0.0, 0.0, 0.5,
         "largest share of a clip's events that the effects left out of it may change; 0: no effect is left out",
         group="Effects",
+        is_later=True,
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -174,13 +183,6 @@ class StreamSpec:
             return self
         return dataclasses.replace(self, sibling_spacing=stride)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return all fields as plain values, without LATER_FIELDS that are at their defaults."""
-        plain = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        defaults = {name: setting.default for name, setting in settings_of(StreamSpec).items()}
-        plain = {name: value for name, value in plain.items() if name not in LATER_FIELDS or value != defaults[name]}
-        return plain | {"recipe": self.recipe.to_dict()}
-
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], default: StreamSpec | None = None) -> StreamSpec:
         """Build a spec from requested values.
@@ -194,7 +196,7 @@ class StreamSpec:
         Raises:
             RecipeError, UsageError: an unknown key or a bad value.
         """
-        is_complete = settings_of(StreamSpec).keys() - set(LATER_FIELDS) <= values.keys()
+        is_complete = always_written(cls) - {"recipe"} <= values.keys()
         base = cls() if default is None or is_complete else default
         if values.get("preset") is not None:
             base = speed_preset(values["preset"], base)
@@ -284,6 +286,6 @@ def _recipe(value: object, base: Recipe) -> Recipe:
                 f"recipe key {key!r} is a setting of the stream: give {key}={format_value(named[key])} beside the "
                 f"recipe, or {flag} {named[key]} instead of --set on a command line"
             )
-        is_complete = settings_of(Recipe).keys() - set(LATER_RECIPE_FIELDS) <= named.keys()
+        is_complete = always_written(Recipe) <= named.keys()
         return Recipe.from_dict(named) if "preset" in named or is_complete else base.replace(**named)
     return preset(value)

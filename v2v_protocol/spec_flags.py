@@ -11,8 +11,7 @@ from typing import Any
 
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
-from v2v_protocol.presets import STREAM_PRESETS
-from v2v_protocol.recipe import PRESETS
+from v2v_protocol.recipe import PRESETS, STREAM_PRESETS
 from v2v_protocol.safe_yaml import YamlError, parse_yaml, read_yaml
 from v2v_protocol.settings import nearest, settings_of
 from v2v_protocol.spec import StreamSpec

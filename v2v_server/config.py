@@ -8,21 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from v2v_protocol.addresses import is_loopback
 from v2v_protocol.command import flag_of
 from v2v_protocol.errors import UsageError
-from v2v_protocol.presets import STREAM_PRESETS
-from v2v_protocol.settings import (
-    bounds,
-    check_settings,
-    number,
-    require_known,
-    settings_of,
-    switch,
-    text,
-    whole,
-    word,
-)
+from v2v_protocol.keys import is_loopback
+from v2v_protocol.recipe import STREAM_PRESETS
+from v2v_protocol.settings import bounds, check_settings, number, require_known, settings_of, switch, text, whole, word
 from v2v_protocol.spec import SPEC_KEYS, StreamSpec
 from v2v_protocol.spec_flags import read_recipe, read_yaml_mapping, recipe_setting
 from v2v_server.store.pixels import HIGHEST_RATE_HZ, PIXEL_KINDS

@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError
-from v2v_protocol.safe_json import parse_json
+from v2v_protocol.persisted import Persisted, parse_json
 from v2v_server.corpus.catalogue import index_path
 from v2v_server.system.process import lock, open_private
 from v2v_server.system.status_fields import gauge, short, text
@@ -38,7 +38,7 @@ _LOCK_SECONDS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class QuarantineEntry:
+class QuarantineEntry(Persisted):
     """One line of the quarantine.
 
     Attributes:

@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from v2v_protocol.allocator import give_back_freed_memory
+from v2v_protocol.arena import give_back_freed_memory
 from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoGone
 from v2v_protocol.link.user import OwnUser
 from v2v_protocol.progress import Progress

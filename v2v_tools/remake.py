@@ -18,8 +18,7 @@ from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
-from v2v_protocol.refusal import Refusal, RefusalKind
-from v2v_protocol.sample import DEFAULT_ARRAYS, Sample, SampleId, array_layout
+from v2v_protocol.sample import DEFAULT_ARRAYS, Refusal, RefusalKind, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.broker import grants

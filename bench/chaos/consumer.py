@@ -17,8 +17,8 @@ from pathlib import Path
 
 from tests.oracles.stream import Profile
 from tests.oracles.stream_log import BatchLine, LifeLine, LogWriter, sighting
-from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import V2VError
+from v2v_protocol.keys import leaves_host
 from v2v_protocol.write_aside import write_aside_and_rename
 
 _SMALL = {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}

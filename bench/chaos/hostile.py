@@ -43,8 +43,7 @@ from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
 from v2v_protocol.keys import PeerKey, key_for, read_key
 from v2v_protocol.link.curve import new_key_pair
 from v2v_protocol.link.dealer import Dealer
-from v2v_protocol.messages import GetStatus, Hello, Want
-from v2v_protocol.wire import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, encode
+from v2v_protocol.messages import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, GetStatus, Hello, Want, encode
 
 PEERS = 8
 IDLE_EACH = 125  # Connections of each idle peer: a thousand of all eight

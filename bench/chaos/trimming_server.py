@@ -15,7 +15,7 @@ from contextlib import suppress
 import psutil
 
 from bench.processes import rss_mib
-from v2v_protocol.allocator import give_back_freed_memory
+from v2v_protocol.arena import give_back_freed_memory
 from v2v_server.commands.serve import main
 
 MODULE = "bench.chaos.trimming_server"

@@ -29,10 +29,23 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import RemoteError, ServerLost
 from v2v_protocol.link.dealer import Dealer
-from v2v_protocol.messages import Begun, Denied, Goodbye, Lease, Message, Ping, Pong, Result, Stop, WorkerHello
+from v2v_protocol.messages import (
+    Begun,
+    Denied,
+    Goodbye,
+    Lease,
+    Message,
+    Ping,
+    Pong,
+    Result,
+    Stop,
+    WorkerHello,
+    decode,
+    encode,
+    encode_sample,
+)
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, SampleId, SampleParams
-from v2v_protocol.wire import decode, encode, encode_sample
 from v2v_server.system.process import die_with_parent, keep_freed_memory
 from v2v_server.worker.process import open_output_buffer, pack, sample_message
 from v2v_server.worker.produce import sample_layout

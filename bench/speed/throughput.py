@@ -9,7 +9,7 @@ the ratios within a turn, so that a drift of the machine cancels. Bars are on ra
                 on the source clips
     decode      decodes the frames that the stream's samples need (open, seek and crop included) and nothing else: the
                 limit of every loader that decodes each sample by itself; each corpus has its own
-    a preset    the stream under one of `v2v_protocol.presets.STREAM_PRESETS`, from server to batch
+    a preset    the stream under one of `v2v_protocol.recipe.STREAM_PRESETS`, from server to batch
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from tests.oracles.leases import open_leases
 from v2v_client import V2VStreamDataset, loadtest
 from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser
-from v2v_protocol.presets import STREAM_PRESETS
+from v2v_protocol.recipe import STREAM_PRESETS
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.system.process import usable_cores

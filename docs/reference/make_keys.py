@@ -8,8 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from v2v_protocol.presets import PRESET_FIELDS, STREAM_PRESETS
-from v2v_protocol.recipe import EFFECTS_SECTION, Recipe
+from v2v_protocol.recipe import EFFECTS_SECTION, PRESET_FIELDS, STREAM_PRESETS, Recipe
 from v2v_protocol.settings import Setting, settings_of
 from v2v_protocol.spec import StreamSpec
 from v2v_server.config import ServeConfig

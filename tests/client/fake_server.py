@@ -18,11 +18,24 @@ import zmq
 
 from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.errors import UsageError
-from v2v_protocol.messages import Denied, ErrorCode, Goodbye, Hello, Message, Ping, Pong, Unavailable, Want, Welcome
+from v2v_protocol.messages import (
+    Denied,
+    ErrorCode,
+    Goodbye,
+    Hello,
+    Message,
+    Ping,
+    Pong,
+    Unavailable,
+    Want,
+    Welcome,
+    decode,
+    encode,
+    encode_sample,
+)
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, SampleId, SampleParams, array_layout
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import decode, encode, encode_sample
 from v2v_server.worker.process import slot_arrays
 
 SPEC = StreamSpec(recipe=Recipe(voxels_per_clip=2, bins=2, crop_height_px=4, crop_width_px=6))

@@ -25,9 +25,8 @@ from v2v_client.conversation import Event
 from v2v_client.options import Patience
 from v2v_protocol.errors import ServerLost, StateMismatch, UsageError
 from v2v_protocol.link import dealer
-from v2v_protocol.messages import Hello
+from v2v_protocol.messages import Frames, Hello
 from v2v_protocol.sample import DEFAULT_ARRAYS
-from v2v_protocol.wire import Frames
 
 NEVER_BY_THE_CLOCK = Patience(timeout_seconds=60.0, ping_seconds=1000.0, rewant_seconds=1000.0)
 

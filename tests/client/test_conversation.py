@@ -18,9 +18,23 @@ from v2v_client.options import Patience
 from v2v_client.position import StreamIdentity
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import NoWorkers, ServerLost, UsageError
-from v2v_protocol.messages import Denied, ErrorCode, Goodbye, Hello, Message, Ping, Pong, SampleHeader, Want, Welcome
+from v2v_protocol.messages import (
+    Denied,
+    ErrorCode,
+    Frames,
+    Goodbye,
+    Hello,
+    Message,
+    Ping,
+    Pong,
+    SampleHeader,
+    Want,
+    Welcome,
+    decode,
+    encode,
+    encode_sample,
+)
 from v2v_protocol.sample import Provenance, SampleId, SampleParams
-from v2v_protocol.wire import Frames, decode, encode, encode_sample
 
 PATIENCE = Patience(timeout_seconds=60, ping_seconds=2, rewant_seconds=10)
 WELCOME = Welcome(SPEC.to_dict(), SPEC.digest, "catalogue", 1, sequences=20, credit=3)

@@ -29,10 +29,9 @@ from v2v_client import (
 )
 from v2v_client.options import Patience
 from v2v_protocol.arena import NO_SLOT
-from v2v_protocol.messages import Denied
+from v2v_protocol.messages import Denied, decode, decode_map, encode, encode_map
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import array_layout
-from v2v_protocol.wire import decode, decode_map, encode, encode_map
 from v2v_server.worker.process import slot_arrays
 
 SEED = 5

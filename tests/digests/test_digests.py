@@ -15,8 +15,7 @@ from tests.digests.clips import zooming
 from tests.digests.make import TABLE, Table
 from tests.digests.rows import OF_THIS_HOST, PORTABLE, Ways, compared
 from tests.oracles.decoded import decode_luma
-from v2v_protocol.presets import STREAM_PRESETS
-from v2v_protocol.recipe import PRESETS, Recipe
+from v2v_protocol.recipe import PRESETS, STREAM_PRESETS, Recipe
 from v2v_protocol.sample import ARRAYS
 from v2v_protocol.settings import settings_of
 from v2v_protocol.spec import StreamSpec

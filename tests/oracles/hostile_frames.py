@@ -25,8 +25,7 @@ import psutil
 
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.errors import ProtocolError
-from v2v_protocol.messages import Message, SampleHeader
-from v2v_protocol.wire import ARRAY_DTYPES, Frames, decode, decode_sample, encode
+from v2v_protocol.messages import ARRAY_DTYPES, Frames, Message, SampleHeader, decode, decode_sample, encode
 
 MOST_GROWTH_MIB = 16.0
 MOST_PEAK_GROWTH_MIB = 64.0

@@ -28,8 +28,22 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.keys import read_key
 from v2v_protocol.link.curve import secure
-from v2v_protocol.messages import Begun, Goodbye, Hello, Lease, Message, Ping, Pong, Result, Want, WorkerHello
-from v2v_protocol.wire import Buffer, decode, encode, encode_sample
+from v2v_protocol.messages import (
+    Begun,
+    Buffer,
+    Goodbye,
+    Hello,
+    Lease,
+    Message,
+    Ping,
+    Pong,
+    Result,
+    Want,
+    WorkerHello,
+    decode,
+    encode,
+    encode_sample,
+)
 
 _BURST = 100
 _SPEC = {"recipe": {"preset": "paper", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}}

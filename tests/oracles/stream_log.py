@@ -31,8 +31,7 @@ import numpy.typing as npt
 
 from v2v_client.loadtest import ScheduleCheck
 from v2v_protocol.errors import UsageError
-from v2v_protocol.refusal import Refusal
-from v2v_protocol.sample import Provenance
+from v2v_protocol.sample import Provenance, Refusal
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from bench.chaos.consumer import PROFILES
 from tests.clips import panned_luma, write_clip
 from tests.oracles.stream import Profile, StreamOracle, Verdict, check
 from tests.oracles.stream_log import BatchLine, LifeLine, Line, Sighting, sighting
-from v2v_protocol.refusal import Refusal
+from v2v_protocol.sample import Refusal
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_tools.remake import remake
 

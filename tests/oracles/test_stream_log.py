@@ -23,7 +23,7 @@ from tests.oracles.stream_log import (
     recovery_seconds,
 )
 from v2v_protocol.errors import UsageError
-from v2v_protocol.refusal import Refusal
+from v2v_protocol.sample import Refusal
 
 SEQUENCES, BATCH_SIZE = 11, 3
 PER_EPOCH = 3

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from v2v_protocol.allocator import keep_freed_memory
+from v2v_protocol.arena import keep_freed_memory
 
 glibc_only = pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="a setting of glibc")
 
@@ -29,7 +29,7 @@ def test_kept_memory_is_used_again_without_page_faults():
     # It is a setting of a whole process, so it is tried in another one.
     script = (
         "from tests.protocol.test_allocator import page_faults_of_fresh_blocks as faults\n"
-        "from v2v_protocol.allocator import keep_freed_memory\n"
+        "from v2v_protocol.arena import keep_freed_memory\n"
         "before = faults(4)\n"
         "assert keep_freed_memory()\n"
         "print(before, faults(4))\n"

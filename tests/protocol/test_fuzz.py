@@ -14,7 +14,7 @@ from tests.clips import panned_luma, write_clip
 from tests.oracles import hostile_frames
 from tests.oracles.hostile_frames import MESSAGE_TYPES, FrameFuzzer, failed, fuzz_decoder
 from v2v_protocol.errors import ProtocolError
-from v2v_protocol.wire import decode, decode_sample
+from v2v_protocol.messages import decode, decode_sample
 
 
 def test_twenty_thousand_frames() -> None:

@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from v2v_client.conversation import unpack
-from v2v_protocol.addresses import leaves_host
 from v2v_protocol.errors import ProtocolError
-from v2v_protocol.messages import SampleHeader
-from v2v_protocol.wire import decode, decode_sample, encode_sample
+from v2v_protocol.keys import leaves_host
+from v2v_protocol.messages import SampleHeader, decode, decode_sample, encode_sample
 
 
 def pack(raw: object) -> bytes:

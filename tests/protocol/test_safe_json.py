@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from v2v_protocol.safe_json import parse_json
+from v2v_protocol.persisted import parse_json
 
 
 @pytest.mark.parametrize(

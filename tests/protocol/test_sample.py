@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
 import msgpack
@@ -12,17 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v2v_protocol.errors import ProtocolError, UsageError
+from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe, preset
-from v2v_protocol.sample import (
-    Provenance,
-    Refusal,
-    Sample,
-    SampleId,
-    SampleParams,
-    array_layout,
-    layout_bytes,
-)
+from v2v_protocol.sample import Provenance, Refusal, Sample, SampleId, SampleParams, array_layout, layout_bytes
 
 PARAMS = SampleParams(
     threshold_pos=0.25,
@@ -110,7 +101,9 @@ def test_provenance_travels_unchanged() -> None:
     assert Provenance.from_dict(packed(PROVENANCE)) == PROVENANCE
 
 
-@given(st.floats(allow_nan=False), st.lists(st.tuples(st.integers(0, 2**40), st.integers(0, 2**40))))
+@given(
+    st.floats(allow_nan=False, allow_infinity=False), st.lists(st.tuples(st.integers(0, 2**40), st.integers(0, 2**40)))
+)
 def test_any_draw_travels_unchanged(number: float, pauses: list[tuple[int, int]]) -> None:
     params = SampleParams(number, number, number, 0, number, tuple(pauses), number, 0, 0, False, number, (0, 1, 2, 3))
     provenance = Provenance(PROVENANCE.id, "v", "f", 0, 0, (), params, 0, 0, "d")
@@ -125,59 +118,6 @@ def test_effects_travel_where_there_are_any() -> None:
     provenance = dataclasses.replace(PROVENANCE, params=dataclasses.replace(PARAMS, effects=effects))
     assert packed(provenance)["params"]["effects"] == effects
     assert Provenance.from_dict(packed(provenance)) == provenance
-
-
-def damage(path: tuple[str, ...], value: Any) -> dict[str, Any]:
-    """The plain provenance with one entry replaced, or removed where ``value`` is Ellipsis."""
-    values = packed(PROVENANCE)
-    place = values
-    for key in path[:-1]:
-        place = place[key]
-    if value is ...:
-        del place[path[-1]]
-    else:
-        place[path[-1]] = value
-    return values
-
-
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        (("video",), ...),
-        (("params",), ...),
-        (("id",), ...),
-        (("refusals",), ...),
-        (("params", "flip"), ...),
-        (("params", "pauses"), ...),
-        (("clock",), 1),
-        (("params", "clock"), 1),
-        (("id", "clock"), 1),
-        (("id", "seed"), -1),
-        (("id", "index"), 2**48),
-        (("id",), 5),
-        (("id",), ["seed"]),
-        (("params",), 5),
-        (("params",), "text"),
-        (("params", "pauses"), 5),
-        (("params", "pauses"), [5]),
-        (("params", "pauses"), [[1, 2, 3]]),
-        (("params", "pauses"), [["a", "b"]]),
-        (("params", "pauses"), [[math.inf, 1]]),
-        (("params", "noise_key"), [math.inf, 0, 0, 0]),
-        (("params", "noise_key"), [math.nan, 0, 0, 0]),
-        (("params", "noise_key"), None),
-        (("params", "effects"), 5),
-        (("params", "effects"), None),
-        (("params", "effects"), {"glow": 1.0}),
-        (("refusals",), 7),
-        (("refusals",), [7]),
-        (("refusals",), [{"video": ""}]),
-        (("refusals",), [{"video": "", "frame": None, "reason": "", "more": 1}]),
-    ],
-)
-def test_a_provenance_of_another_form_is_the_peers_fault(path: tuple[str, ...], value: Any) -> None:
-    with pytest.raises(ProtocolError, match="provenance of a sample does not fit its form"):
-        Provenance.from_dict(damage(path, value))
 
 
 def test_refusals_read_as_one_line() -> None:

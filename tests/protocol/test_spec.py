@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from tests.protocol.recipes import specs
 from v2v_protocol.errors import RecipeError, UsageError
-from v2v_protocol.presets import STREAM_PRESETS
-from v2v_protocol.recipe import PRESETS, Recipe, preset
+from v2v_protocol.recipe import PRESETS, STREAM_PRESETS, Recipe, preset
 from v2v_protocol.settings import settings_of
 from v2v_protocol.spec import SPEC_KEYS, SpecOptions, SpeedPreset, StreamSpec
 

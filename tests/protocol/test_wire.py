@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any
 
@@ -13,16 +12,21 @@ from hypothesis import example as with_example
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.protocol.wire_messages import MESSAGES, WRONG, example, messages
-from v2v_protocol import PROTOCOL_VERSION, wire
+from tests.protocol.persisted_values import MESSAGES, example, messages
+from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.errors import LimitExceeded, ProtocolError, VersionMismatch
-from v2v_protocol.messages import Denied, Goodbye, Hello, Lease, Ping, SampleHeader, Want
-from v2v_protocol.wire import (
+from v2v_protocol.messages import (
     ARRAY_DTYPES,
     LARGEST_ARRAY_BYTES,
     LARGEST_HEADER_BYTES,
-    LARGEST_TUPLE,
     MOST_CONTAINERS,
+    Denied,
+    Goodbye,
+    Hello,
+    Lease,
+    Ping,
+    SampleHeader,
+    Want,
     decode,
     decode_map,
     decode_sample,
@@ -30,6 +34,7 @@ from v2v_protocol.wire import (
     encode_map,
     encode_sample,
 )
+from v2v_protocol.persisted import LARGEST_LIST
 
 V = b"\x82\xa1v" + bytes([PROTOCOL_VERSION])
 """A message of two fields begins, with its version."""
@@ -142,7 +147,11 @@ def test_a_field_nested_too_deeply_is_refused_before_anybody_looks_at_it() -> No
     nested: Any = 1
     for _ in range(100):
         nested = {"recipe": nested}
-    refuse(plain(example(Hello)) | {"spec": nested}, LimitExceeded, "hello.spec: nested")
+    refuse(
+        plain(example(Hello)) | {"spec": nested},
+        LimitExceeded,
+        "Hello.spec = a dict of 1: expected a map nested at most 16 deep",
+    )
 
 
 @given(st.dictionaries(st.text(max_size=5), _values, max_size=4))
@@ -166,38 +175,6 @@ def test_a_map_nested_too_deeply_is_refused(opening: bytes, depth: int) -> None:
 
 
 # --- form -------------------------------------------------------------------------------------------------------------
-
-
-@by_name
-def test_no_field_may_be_missing(cls: type[Any]) -> None:
-    for field in dataclasses.fields(cls):
-        fields = plain(example(cls))
-        del fields[field.name]
-        if field.name in wire._LATER.get(cls, {}):
-            assert getattr(decode(msgpack.packb(fields)), field.name) == wire._LATER[cls][field.name]
-        else:
-            refuse(fields, match=f"expected .*{field.name}")
-
-
-def test_fields_of_a_later_release_are_left_out_at_their_default() -> None:
-    """An earlier release reads such a header, and writes one without them."""
-    for cls, defaults in wire._LATER.items():
-        message = dataclasses.replace(example(cls), **defaults)
-        assert plain(message).keys().isdisjoint(defaults)
-        assert decode(encode(message)[0]) == message
-
-
-@by_name
-def test_no_field_may_be_added(cls: type[Any]) -> None:
-    for key in ("more", "", "self", b"lease"):
-        refuse(plain(example(cls)) | {key: 1}, match="fields .*, expected ")
-
-
-@by_name
-def test_every_field_is_of_its_type(cls: type[Any]) -> None:
-    for field in dataclasses.fields(cls):
-        for value in WRONG[str(field.type)]:
-            refuse(plain(example(cls)) | {field.name: value}, match=rf"\.{field.name}: expected ")
 
 
 @by_name
@@ -227,7 +204,7 @@ def test_nothing_may_follow_a_message() -> None:
 
 def test_extension_types_and_bad_text_are_refused() -> None:
     for value in (msgpack.Timestamp(1, 2), msgpack.ExtType(5, b"x")):
-        refuse({"v": PROTOCOL_VERSION, "t": "denied", "code": value, "text": ""}, match="code: expected str")
+        refuse({"v": PROTOCOL_VERSION, "t": "denied", "code": value, "text": ""}, match="code = a .*: expected str")
         refuse({"v": value, "t": "ping"}, VersionMismatch)
     with pytest.raises(ProtocolError, match="UnicodeDecodeError"):
         decode(V + b"\xa1t\xa2\xff\xfe")
@@ -267,8 +244,8 @@ def test_the_largest_header_passes() -> None:
 
 
 def test_lists_are_limited() -> None:
-    assert decode(encode(Want(0, tuple(range(LARGEST_TUPLE))))[0]) == Want(0, tuple(range(LARGEST_TUPLE)))
-    refuse(plain(Want(0, (0,) * (LARGEST_TUPLE + 1))), LimitExceeded, f"the limit is {LARGEST_TUPLE}")
+    assert decode(encode(Want(0, tuple(range(LARGEST_LIST))))[0]) == Want(0, tuple(range(LARGEST_LIST)))
+    refuse(plain(Want(0, (0,) * (LARGEST_LIST + 1))), LimitExceeded, f"a list of at most {LARGEST_LIST}")
 
 
 def test_a_list_that_only_claims_to_be_huge_is_refused() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from v2v_protocol.errors import IndexUnreadable, ProtocolError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.refusal import Refusal
+from v2v_protocol.sample import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, CorpusPart
 from v2v_server.corpus.sidecars import Sidecars

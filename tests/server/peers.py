@@ -13,6 +13,7 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.messages import (
     Begun,
+    Buffer,
     Denied,
     Hello,
     Lease,
@@ -24,12 +25,21 @@ from v2v_protocol.messages import (
     Want,
     Welcome,
     WorkerHello,
+    decode,
+    encode,
+    encode_map,
 )
-from v2v_protocol.refusal import Refusal
-from v2v_protocol.sample import array_layout, layout_bytes
+from v2v_protocol.sample import Refusal, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import Buffer, decode, encode, encode_map
-from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, GiveUp, ReportRefusal, ToConsumer, ToWorker
+from v2v_server.broker.actions import (
+    Action,
+    AddToQuarantine,
+    CheckVideo,
+    GiveUp,
+    ReportRefusal,
+    ToConsumer,
+    ToWorker,
+)
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.corpus.catalogue import Catalogue, complete_lease

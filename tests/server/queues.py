@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from v2v_protocol.messages import Message
-from v2v_protocol.wire import decode, encode
+from v2v_protocol.messages import Message, decode, encode
 from v2v_server.broker.actions import ToConsumer, ToWorker
 from v2v_server.broker.leases import Cause, Loss, Stall
 from v2v_server.broker.transport import BrokerInput, FromConsumer, FromWorker

@@ -16,9 +16,8 @@ from tests.server.peers import peers
 from tests.server.queues import Queues, ToyPool
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import VideoChanged
-from v2v_protocol.messages import Pong, Stop, WorkerHello
-from v2v_protocol.refusal import Refusal
-from v2v_protocol.wire import encode
+from v2v_protocol.messages import Pong, Stop, WorkerHello, encode
+from v2v_protocol.sample import Refusal
 from v2v_server import serve as serve_module
 from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, GiveUp, ReportRefusal, ToConsumer, ToWorker
 from v2v_server.broker.dispatcher import Dispatcher

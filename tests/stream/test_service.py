@@ -20,8 +20,7 @@ from tests.stream.conftest import SMALL, SMALL_FLAGS, epoch_of, server_workers
 from tests.waiting import until
 from v2v_client.local_server import LocalServer
 from v2v_protocol import PROTOCOL_VERSION
-from v2v_protocol.messages import Denied, Hello, Ping, Pong, Want, Welcome
-from v2v_protocol.wire import decode, encode
+from v2v_protocol.messages import Denied, Hello, Ping, Pong, Want, Welcome, decode, encode
 from v2v_server.commands.serve import main as serve
 from v2v_server.worker.process import LARGEST_MEMORY_BYTES
 

@@ -19,9 +19,8 @@ from tests.stream.test_loaders import singles
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_protocol.messages import Hello, Want
+from v2v_protocol.messages import Hello, Want, encode
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.wire import encode
 from v2v_server.status.client import StatusClient
 
 Samples = list[tuple[int, str]]

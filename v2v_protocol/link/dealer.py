@@ -26,7 +26,7 @@ import zmq
 from v2v_protocol.errors import KeyRefused, ServerLost, UsageError
 from v2v_protocol.keys import VARIABLE, PeerKey, key_for
 from v2v_protocol.link.curve import secure
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, Frames
+from v2v_protocol.messages import LARGEST_HEADER_BYTES, Frames
 
 HANDSHAKE_EVENTS = 0x0800 | 0x1000 | 0x2000 | 0x4000
 """Handshake events of a socket monitor: failed without detail, succeeded, protocol error, authentication failed."""

@@ -27,7 +27,7 @@ import zmq
 from v2v_protocol.errors import UsageError
 from v2v_protocol.link.curve import Gate, KeyStore
 from v2v_protocol.link.guard import ConnectionGuard
-from v2v_protocol.wire import MOST_IN_FLIGHT_BYTES
+from v2v_protocol.messages import MOST_IN_FLIGHT_BYTES
 
 MOST_QUEUED = 512
 """Messages queued for one peer at which it is disconnected."""

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from v2v_protocol.errors import ProtocolError, VersionMismatch
-from v2v_protocol.messages import Denied, ErrorCode
-from v2v_protocol.refusal import Refusal
-from v2v_protocol.wire import Frames, encode
+from v2v_protocol.messages import Denied, ErrorCode, Frames, encode
+from v2v_protocol.sample import Refusal
 from v2v_server.broker.leases import Request
 from v2v_server.quarantine import QuarantineEntry
 

@@ -15,9 +15,13 @@ from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
 from v2v_protocol.errors import CorpusError, LimitExceeded, ProtocolError, UsageError
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import (
+    LARGEST_ARRAY_BYTES,
+    LARGEST_REQUEST_BYTES,
     Begun,
+    Buffer,
     Denied,
     ErrorCode,
+    Frames,
     GetStatus,
     Goodbye,
     Hello,
@@ -30,11 +34,12 @@ from v2v_protocol.messages import (
     Want,
     Welcome,
     WorkerHello,
+    decode,
+    encode,
 )
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleId, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_REQUEST_BYTES, Buffer, Frames, decode, encode
 from v2v_server.broker.actions import (
     Action,
     AddToQuarantine,

@@ -22,12 +22,17 @@ from typing import Any
 
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.errors import IndexUnreadable, ProtocolError, V2VError
-from v2v_protocol.messages import Lease, SampleHeader, Unavailable
-from v2v_protocol.refusal import Refusal, RefusalKind
-from v2v_protocol.sample import Form
+from v2v_protocol.messages import Lease, SampleHeader, Unavailable, decode, encode, largest_packed_bytes
+from v2v_protocol.sample import Form, Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import decode, encode, largest_packed_bytes
-from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, ReportRefusal, ToConsumer, ToWorker
+from v2v_server.broker.actions import (
+    Action,
+    AddToQuarantine,
+    CheckVideo,
+    ReportRefusal,
+    ToConsumer,
+    ToWorker,
+)
 from v2v_server.broker.leases import Request, runs_alone
 from v2v_server.broker.session import Session
 from v2v_server.broker.state import Broker, RefusalPart
@@ -90,7 +95,7 @@ def refuse_quarantined(broker: Broker, request: Request, reason: str) -> list[Ac
 
 
 def refuse(
-    broker: Broker, request: Request, frame: int | None, reason: str, kind: RefusalKind = RefusalKind.FAILED
+    broker: Broker, request: Request, frame: int | None, reason: str, kind: str = RefusalKind.FAILED
 ) -> list[Action]:
     """Move the request to its next candidate, or tell the consumer that the sample is unavailable and list all
     refusals.
@@ -103,7 +108,7 @@ def refuse(
     last = passed_over.refusals[-1]
     broker.refusals.append(RefusalPart.of(last, broker.wall_clock()))
     # The operator was told when the candidate was quarantined.
-    actions: list[Action] = [] if kind is RefusalKind.QUARANTINED else [ReportRefusal(last, request)]
+    actions: list[Action] = [] if kind == RefusalKind.QUARANTINED else [ReportRefusal(last, request)]
     if passed_over.candidate < MOST_CANDIDATES and session.spec.on_bad_video == "substitute":
         broker.sessions.put_back(replace(passed_over, deaths=0))
         return actions

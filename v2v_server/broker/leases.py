@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from v2v_protocol.arena import Slot
-from v2v_protocol.refusal import Refusal
+from v2v_protocol.sample import Refusal
 
 ALONE_AFTER = 2
 """Number of unexplained losses after which a sample runs alone."""

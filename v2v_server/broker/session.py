@@ -24,9 +24,9 @@ from typing import TypeAlias
 from v2v_protocol.arena import Slot
 from v2v_protocol.errors import LimitExceeded
 from v2v_protocol.liveness import Liveness
+from v2v_protocol.messages import MOST_IN_FLIGHT_BYTES
 from v2v_protocol.sample import Form, array_layout
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import MOST_IN_FLIGHT_BYTES
 from v2v_server.broker.leases import LeaseBook, Request, runs_alone
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import VideoSequence

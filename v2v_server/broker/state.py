@@ -11,8 +11,7 @@ from dataclasses import KW_ONLY, dataclass, field
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.messages import Lease
-from v2v_protocol.refusal import Refusal
-from v2v_protocol.sample import SampleId
+from v2v_protocol.sample import Refusal, SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import LeaseBook, Request
 from v2v_server.broker.session import Sessions

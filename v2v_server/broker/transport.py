@@ -21,7 +21,7 @@ from typing import Protocol, TypeAlias
 
 from v2v_protocol.link.curve import KeyStore
 from v2v_protocol.link.router import Received, Routers
-from v2v_protocol.wire import LARGEST_ARRAY_BYTES, LARGEST_REQUEST_BYTES
+from v2v_protocol.messages import LARGEST_ARRAY_BYTES, LARGEST_REQUEST_BYTES
 from v2v_server.broker.actions import ToConsumer, ToWorker
 from v2v_server.system.process import MOST_CONNECTIONS
 

@@ -22,8 +22,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError, IndexUnreadable, VideoChanged
 from v2v_protocol.messages import Lease
-from v2v_protocol.refusal import Refusal, RefusalKind
-from v2v_protocol.sample import ARRAYS, sidecar_endings
+from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
 from v2v_server.corpus.manifest import ABSENT, Header

@@ -24,6 +24,7 @@ from typing import Any
 import xxhash
 
 from v2v_protocol.errors import CorpusError, UsageError
+from v2v_protocol.persisted import Int64, Persisted
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.sources.source import Notice
 from v2v_server.system.process import make_private
@@ -97,7 +98,7 @@ class Figures:
 
 
 @dataclass(frozen=True, slots=True)
-class IndexRow:
+class IndexRow(Persisted):
     """What is known of one file.
 
     Attributes:
@@ -112,13 +113,13 @@ class IndexRow:
     """
 
     id: str
-    size_bytes: int
-    mtime_ns: int = 0
-    ctime_ns: int = 0
+    size_bytes: Int64
+    mtime_ns: Int64 = 0
+    ctime_ns: Int64 = 0
     fingerprint: str = ""
-    frames: int = 0
-    width_px: int = 0
-    height_px: int = 0
+    frames: Int64 = 0
+    width_px: Int64 = 0
+    height_px: Int64 = 0
     frames_per_second: float | None = None
     codec: str = ""
     interlaced: bool = False

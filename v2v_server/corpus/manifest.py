@@ -11,18 +11,18 @@ lacks (a list left them out, or their folder could not be read) are not served; 
 from __future__ import annotations
 
 import json
-import math
 import os
+import sys
 from base64 import b64decode
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import MISSING, asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeAlias
 
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
+from v2v_protocol.persisted import Limits, Persisted, later, parse_json
 from v2v_protocol.programs import printable
-from v2v_protocol.safe_json import parse_json
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import Scene
@@ -38,11 +38,12 @@ ABSENT = "no prepared file"
 _OF_EARLIER = frozenset({"codec", "quality", "gop", "psnr_db", "worst_psnr_db", "fingerprint"})
 """Fields of earlier releases, whose files say the same themselves, or could be lossy."""
 NO_LOSSY = "which this release does not serve: re-encode the videos with ffmpeg, and serve them as videos"
-_Record = TypeVar("_Record", "Header", "PreparedVideo")
+_Bytes: TypeAlias = Annotated[int, Limits(0, 2**63 - 1)]
+_Side: TypeAlias = Annotated[int, Limits(0, LARGEST_INDEXED_SIDE_PX)]
 
 
 @dataclass(frozen=True, slots=True)
-class Header:
+class Header(Persisted):
     """What holds for the whole folder.
 
     Attributes:
@@ -56,10 +57,15 @@ class Header:
 
     rows: str
     size: str
-    videos: int
+    videos: Annotated[int, Limits(1, 2**63 - 1)]
     source: str
     source_digest: str
     version: int = MANIFEST_VERSION
+
+    def __post_init__(self) -> None:
+        if self.size not in SIZES:
+            raise UsageError(f"size {self.size!r:.80}: this program reads {', '.join(SIZES)}")
+        Rows.parse(self.rows)
 
     @property
     def settings(self) -> str:
@@ -68,7 +74,7 @@ class Header:
 
 
 @dataclass(frozen=True, slots=True)
-class PreparedVideo:
+class PreparedVideo(Persisted):
     """What was made of one video.
 
     Attributes:
@@ -84,15 +90,15 @@ class PreparedVideo:
 
     id: str
     source_fingerprint: str
-    source_bytes: int
-    frames: int
-    frames_per_second: float | None
-    height_px: int
-    width_px: int
-    bytes: int = 0
+    source_bytes: _Bytes
+    frames: Annotated[int, Limits(1, LARGEST_FRAMES)]
+    frames_per_second: Annotated[float, Limits(0, sys.float_info.max)] | None
+    height_px: _Side
+    width_px: _Side
+    bytes: _Bytes = 0
     problem: str | None = None
     scene: str = ""
-    remark: str = ""
+    remark: str = later("")
 
 
 def prepared_name(id: str) -> str:
@@ -157,7 +163,7 @@ def read_manifest(root: Path) -> Manifest:
                 video = _video(line)
                 if video is not None:
                     videos[video.id] = video
-        except (ValueError, TypeError, UsageError) as error:
+        except (ValueError, ProtocolError, UsageError) as error:
             remedy = "" if NO_LOSSY in str(error) else "; prepare another folder"
             raise CorpusError(f"{path}, line {number}: {error}{remedy}") from error
     return Manifest(header, videos)
@@ -167,15 +173,9 @@ def _header(line: bytes) -> Header:
     data = _object(line)
     if data.get("version") != MANIFEST_VERSION:
         raise ValueError(f"format version {data.get('version')!r}; this program reads {MANIFEST_VERSION}")
-    if data.get("codec", "lossless") != "lossless":
-        raise ValueError(f"the folder was prepared with --codec {data['codec']!r:.80}, {NO_LOSSY}")
-    header = _record(Header, data)
-    if header.size not in SIZES:
-        raise ValueError(f"size {header.size!r:.80}: this program reads {', '.join(SIZES)}")
-    Rows.parse(header.rows)
-    if not _whole(header.videos, 1, math.inf):
-        raise ValueError(f"{header.videos!r} videos")
-    return header
+    if (codec := data.get("codec", "lossless")) != "lossless":
+        raise ValueError(f"the folder was prepared with --codec {codec!r:.80}, {NO_LOSSY}")
+    return Header.from_dict(_known(data))
 
 
 def _video(line: bytes) -> PreparedVideo | None:
@@ -183,45 +183,18 @@ def _video(line: bytes) -> PreparedVideo | None:
     data = _object(line)
     if data.pop("aside", False) is True:
         return None
-    video = _record(PreparedVideo, data)
+    video = PreparedVideo.from_dict(_known(data))
     path = PurePosixPath(video.id)
     if printable(video.id) != video.id:
         raise ValueError(f"id {printable(video.id)}: {UNPRINTABLE}")
     if path.is_absolute() or ".." in path.parts:
         raise ValueError(f"id {video.id!r} leads out of the folder")
-    sizes = (video.height_px, video.width_px)
-    if not _whole(video.frames, 1, LARGEST_FRAMES) or not all(
-        _whole(size, 0, LARGEST_INDEXED_SIDE_PX) for size in sizes
-    ):
-        raise ValueError(f"{video.id}: {video.frames!r} frames of {video.width_px!r}x{video.height_px!r} px")
     if video.scene:
         scene = b64decode(video.scene, validate=True)
         if not Scene.is_encoding(scene):  # of another release: it counts as not asked for
             return replace(video, scene="")
-        try:
-            Scene.from_bytes(scene)
-        except ProtocolError as error:
-            raise ValueError(f"{video.id}: {error}") from error
+        Scene.from_bytes(scene)
     return video
-
-
-def _record(kind: type[_Record], data: dict[str, Any]) -> _Record:
-    """Return the record with these fields.
-
-    Raises:
-        ValueError: a field is unknown, missing or of another type.
-    """
-    known = {each.name: each for each in fields(kind)}
-    data = {name: value for name, value in data.items() if name not in _OF_EARLIER}
-    if unknown := data.keys() - known.keys():
-        raise ValueError(f"unknown fields {', '.join(sorted(unknown))}")
-    for name, each in known.items():
-        if name not in data:
-            if each.default is MISSING:
-                raise ValueError(f"field {name!r} is missing")
-        elif not _FIELD_CHECKS[str(each.type)](data[name]):
-            raise ValueError(f"{name} = {data[name]!r:.80}: expected {each.type}")
-    return kind(**data)
 
 
 def _object(line: bytes) -> dict[str, Any]:
@@ -231,25 +204,8 @@ def _object(line: bytes) -> dict[str, Any]:
     return data
 
 
-def _whole(value: object, least: float, most: float) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
-
-
-def _is_text(value: object) -> bool:
-    return isinstance(value, str)
-
-
-def _is_rate(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf
-
-
-_FIELD_CHECKS: dict[str, Callable[[object], bool]] = {
-    # Annotations are text here, as in the wire's checks.
-    "int": lambda value: _whole(value, 0, 2**63 - 1),
-    "str": _is_text,
-    "str | None": lambda value: value is None or _is_text(value),
-    "float | None": lambda value: value is None or _is_rate(value),
-}
+def _known(data: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in data.items() if name not in _OF_EARLIER}
 
 
 @contextmanager
@@ -282,5 +238,5 @@ def write_manifest(
 
 
 def _line(item: Header | PreparedVideo) -> bytes:
-    values = {name: value for name, value in asdict(item).items() if name != "remark" or value}
+    values = item.to_dict()
     return json.dumps(values, allow_nan=False).encode() + b"\n"

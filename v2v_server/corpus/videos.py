@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.persisted import FloatOrNaN, Persisted
 from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import PIECE, Pieces, clip_pieces, firsts_of, sides_of
@@ -343,7 +344,7 @@ class SplitVideos:
 
 
 @dataclass(frozen=True, slots=True)
-class VideoEntry:
+class VideoEntry(Persisted):
     """A video that can be used.
 
     Attributes:
@@ -364,7 +365,7 @@ class VideoEntry:
     frames: int
     width_px: int
     height_px: int
-    frames_per_second: float
+    frames_per_second: FloatOrNaN
     codec: str
     threshold_pos: float | None = None
     threshold_neg: float | None = None

@@ -19,7 +19,7 @@ from pathlib import Path
 from v2v_protocol.errors import KeyRefused, UsageError
 from v2v_protocol.keys import SIDES, PeerKey, is_key, read_private, write_key, write_private
 from v2v_protocol.link.curve import new_key_pair
-from v2v_protocol.safe_json import parse_json
+from v2v_protocol.persisted import parse_json
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 

@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.safe_json import parse_json
+from v2v_protocol.persisted import parse_json
 
 NO_TRACK = -1
 LARGEST_NUMBER = 2**24 - 1

@@ -26,7 +26,7 @@ from functools import partial
 from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
-from v2v_protocol.refusal import Refusal
+from v2v_protocol.sample import Refusal
 from v2v_protocol.write_aside import is_writable
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.manifest import (

@@ -21,6 +21,7 @@ import numpy.typing as npt
 import xxhash
 
 from v2v_protocol.errors import VideoError
+from v2v_protocol.persisted import Persisted
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.manifest import prepared_name
 from v2v_server.corpus.scenes.analysis import SceneAnalysis
@@ -42,7 +43,7 @@ _Hashes = defaultdict[str, xxhash.xxh3_128]
 
 
 @dataclass(frozen=True, slots=True)
-class Transcoding:
+class Transcoding(Persisted):
     """One video to prepare.
 
     Attributes:
@@ -74,7 +75,7 @@ class Transcoding:
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class Made(Persisted):
     """A prepared and verified file.
 
     Attributes:

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_SCALE, MOST_STEPS_PER_GRID, Recipe
-from v2v_protocol.refusal import Refusal, RefusalKind
+from v2v_protocol.sample import Refusal, RefusalKind
 from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.scene import MOST_ANALYSED_FRAMES, NO_BARS, Flag, Pieces, Sides, sides_of

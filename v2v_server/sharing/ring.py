@@ -23,8 +23,7 @@ from functools import cached_property
 from typing import Any
 
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot, array_offsets, create_memory, read_arrays, seal_memory
-from v2v_protocol.messages import SampleHeader
-from v2v_protocol.wire import Buffer, Frames, encode
+from v2v_protocol.messages import Buffer, Frames, SampleHeader, encode
 
 mappings: weakref.WeakSet[object] = weakref.WeakSet()
 """All mappings that exist, each with a descriptor of its own: also those that only messages on their way refer to."""

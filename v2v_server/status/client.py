@@ -8,9 +8,8 @@ from typing import Any
 
 from v2v_protocol.errors import ProtocolError, RemoteError, ServerLost, UsageError
 from v2v_protocol.link.dealer import Dealer
-from v2v_protocol.messages import Denied, GetStatus, Status
-from v2v_protocol.safe_json import parse_json
-from v2v_protocol.wire import Frames, decode, encode
+from v2v_protocol.messages import Denied, Frames, GetStatus, Status, decode, encode
+from v2v_protocol.persisted import parse_json
 
 _AGAIN_SECONDS = 2.0
 """An unanswered request is repeated after this time: it may be lost with a connection."""

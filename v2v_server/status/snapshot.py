@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from v2v_protocol import PROTOCOL_VERSION, __version__
+from v2v_protocol.messages import LARGEST_HEADER_BYTES, encode
 from v2v_protocol.messages import Status as StatusMessage
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, encode
 from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.session import Session

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import os
 import struct
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 
 import msgpack
 import numpy as np
@@ -26,6 +26,7 @@ import numpy.typing as npt
 import xxhash
 
 from v2v_protocol.errors import ProtocolError, VideoError
+from v2v_protocol.persisted import Persisted, later
 from v2v_server.store.packing import PACK_METHODS, UnpackingError
 from v2v_server.video.colour.chroma import DEFAULT_MATRIX
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
@@ -47,7 +48,7 @@ _BLOCK = np.dtype([("bytes", "<u4"), ("check", "<u8")])
 
 
 @dataclass(frozen=True, slots=True)
-class Head:
+class Head(Persisted):
     """Head of a store file.
 
     Attributes:
@@ -83,16 +84,11 @@ class Head:
     group: int
     packing: str
     index: bytes = b""
-    bits: int = SDR.bits
-    transfer: str = SDR.transfer
-    matrix: str = DEFAULT_MATRIX
+    bits: int = later(SDR.bits)
+    transfer: str = later(SDR.transfer)
+    matrix: str = later(DEFAULT_MATRIX)
 
     def __post_init__(self) -> None:
-        kinds = {"str": str, "int": int, "float": float, "bool": bool, "bytes": bytes}
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if type(value) is not kinds[str(item.type)]:
-                raise ProtocolError(f"{item.name} is {value!r:.80}")
         inside = (
             1 <= self.height_px <= LARGEST_INDEXED_SIDE_PX
             and 1 <= self.width_px <= LARGEST_INDEXED_SIDE_PX
@@ -142,9 +138,7 @@ class Head:
 
     def to_bytes(self) -> bytes:
         """Return the bytes in front of the table."""
-        later = SDR._asdict() | {"matrix": DEFAULT_MATRIX}
-        defaults = {name for name, value in later.items() if getattr(self, name) == value}
-        head = msgpack.packb({name: value for name, value in asdict(self).items() if name not in defaults})
+        head = msgpack.packb(self.to_dict())
         return _PREFIX.pack(MAGIC, len(head), check(head, 0)) + head
 
 
@@ -172,8 +166,8 @@ def read_head(path: str, file: int, offset: int = 0) -> tuple[Head, int]:
     if len(head) != length or check(head, 0) != expected:
         raise VideoError(path, None, "the store file is corrupt (its head is damaged): re-create it with v2v-prepare")
     try:
-        return Head(**msgpack.unpackb(head)), _PREFIX.size + length
-    except (ProtocolError, TypeError, ValueError) as error:
+        return Head.from_dict(msgpack.unpackb(head)), _PREFIX.size + length
+    except (ProtocolError, ValueError) as error:
         raise VideoError(
             path, None, f"the store file is corrupt (its head: {error}): re-create it with v2v-prepare"
         ) from error

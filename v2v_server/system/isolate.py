@@ -4,9 +4,8 @@ It uses spawned processes and socket pairs only. Locks, queues and shared memory
 some containers do not have.
 
 A process that a hostile video has taken over costs only its job too. Jobs and results travel as msgpack, which executes
-nothing: a dataclass as the list of its fields, a class with ``to_bytes`` as these bytes. The function's annotations say
-which types they have. A result of another type or size counts as the death of its process, and waiting for the rest of
-a message counts as waiting for the result.
+nothing (:mod:`v2v_protocol.persisted`). The function's annotations say which types they have. A result of another type
+or size counts as the death of its process, and waiting for the rest of a message counts as waiting for the result.
 """
 
 from __future__ import annotations
@@ -18,18 +17,18 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 from pathlib import Path
 from socket import socket, socketpair
-from types import UnionType
-from typing import Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Generic, TypeVar, get_type_hints
 
 import msgpack
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.persisted import reader, to_plain
 from v2v_server.system.process import die_with_parent, limit_memory
 from v2v_server.system.sandbox import confine
 
@@ -42,7 +41,7 @@ _LIMITS: Mapping[str, Any] = {
     "max_buffer_size": LARGEST_MESSAGE_BYTES,
     "max_str_len": 1 << 16,
     "max_array_len": 1 << 17,
-    "max_map_len": 0,
+    "max_map_len": 64,
     "max_ext_len": 0,
     "use_list": False,
 }
@@ -113,8 +112,8 @@ def run_isolated(
 
     Args:
         function: must be picklable, and return rather than raise: an exception counts as its process's death. The
-            annotations of its last parameter and its result are the types of jobs and results: plain values, tuples,
-            dataclasses of them, and classes with ``to_bytes`` and ``from_bytes``.
+            annotations of its last parameter and its result are the types of jobs and results: those that
+            :mod:`v2v_protocol.persisted` reads.
         jobs: drawn as processes become free.
         processes: number of spawned processes; 0 runs the jobs in this process, unprotected.
         deadline_seconds: time limit of a job, including its process's start, before the process is killed; None: no
@@ -250,7 +249,7 @@ class _Lane(Generic[J, _R]):
             self._unpacker.feed(data)
             if not self._begun:
                 self._begun = self._unpacker.unpack() is None
-            result: _R = _typed(_hints(self._function)["return"], self._unpacker.unpack())
+            result: _R = reader(_hints(self._function)["return"])(self._unpacker.unpack())
             if self._unpacker.read_bytes(1):
                 raise ValueError("more than one result")
         except msgpack.OutOfData:
@@ -307,51 +306,14 @@ def _serve(
         signal.SIGINT, signal.SIG_IGN
     )  # a terminal sends it to all processes; the parent decides what follows
     connection.sendall(_packed(None))  # report that it began: from here on, its end is not a failed start
+    read = reader([*_hints(function).values()][-2])
     for job in msgpack.Unpacker(connection.makefile("rb", buffering=0), **_LIMITS):
-        connection.sendall(_packed(function(_typed([*_hints(function).values()][-2], job))))
+        connection.sendall(_packed(function(read(job))))
 
 
 def _hints(function: Callable[..., Any]) -> dict[str, Any]:
     """Return the types of a function's parameters, in order, and of its result."""
-    return get_type_hints(getattr(function, "func", function))
+    return get_type_hints(getattr(function, "func", function), include_extras=True)
 
 
-def _plain(value: Any) -> Any:
-    """Return plain data for what msgpack does not know."""
-    if isinstance(value, Path):
-        return os.fsencode(value)
-    return value.to_bytes() if hasattr(value, "to_bytes") else [getattr(value, each.name) for each in fields(value)]
-
-
-_packed: Callable[[Any], bytes] = partial(msgpack.packb, default=_plain)
-
-
-def _typed(kind: Any, value: Any) -> Any:
-    """Return plain data as a value of a type.
-
-    Raises:
-        KeyError, ValueError, OverflowError, V2VError: it is not one.
-    """
-    kinds = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
-    # A float that is whole may travel as an int.
-    by_plain = {int: float} if float in kinds else {}
-    kind = (by_plain | {_plain_type(each): each for each in kinds})[type(value)]
-    if kind in (Path, float):
-        return Path(os.fsdecode(value)) if kind is Path else float(value)
-    if kind is int and value >= 2**63:
-        raise OverflowError(f"{value} is larger than numbers are")
-    if type(value) is not tuple:
-        return value if kind is type(value) else kind.from_bytes(value)
-    parts = get_args(kind) or tuple(get_type_hints(kind).values())
-    if parts[-1:] == (...,):
-        parts = parts[:1] * len(value)
-    typed = tuple(_typed(part, each) for part, each in zip(parts, value, strict=True))
-    return kind(*typed) if isinstance(kind, type) else typed
-
-
-def _plain_type(kind: Any) -> type:
-    """Return the type of the plain data that stands for values of a type."""
-    if kind is Path or (hasattr(kind, "from_bytes") and kind not in (int, bool)):
-        return bytes
-    is_compound = get_origin(kind) is tuple or hasattr(kind, "_fields") or hasattr(kind, "__dataclass_fields__")
-    return tuple if is_compound else kind
+_packed: Callable[[Any], bytes] = partial(msgpack.packb, default=to_plain)

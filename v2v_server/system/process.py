@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from v2v_protocol import allocator
+from v2v_protocol import arena
 from v2v_protocol.errors import CorpusError
 
 _PR_SET_PDEATHSIG = 1
@@ -32,10 +32,10 @@ _LONGEST_PAUSE_SECONDS = 0.05
 
 
 def keep_freed_memory() -> bool:
-    """Call :func:`v2v_protocol.allocator.keep_freed_memory` for blocks of the size of a sample; a server or worker
+    """Call :func:`v2v_protocol.arena.keep_freed_memory` for blocks of the size of a sample; a server or worker
     returns larger free memory.
     """
-    return allocator.keep_freed_memory(most_bytes=allocator.LARGEST_SAMPLE_BYTES)
+    return arena.keep_freed_memory(most_bytes=arena.LARGEST_SAMPLE_BYTES)
 
 
 class _SchedAttr(ctypes.Structure):

@@ -40,6 +40,7 @@ from v2v_protocol.messages import (
     Begun,
     Denied,
     ErrorCode,
+    Frames,
     Goodbye,
     Lease,
     LeaseFailed,
@@ -49,8 +50,9 @@ from v2v_protocol.messages import (
     Result,
     Stop,
     WorkerHello,
+    decode,
+    encode,
 )
-from v2v_protocol.wire import Frames, decode, encode
 
 CREDIT = 2
 _PING_SECONDS = 5.0

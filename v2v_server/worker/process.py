@@ -35,14 +35,12 @@ import numpy.typing as npt
 import zstandard
 
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.addresses import leaves_host
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot, array_offsets, find_memory, open_memory
 from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoChanged, VideoError, VideoUnreadable
-from v2v_protocol.keys import key_for
+from v2v_protocol.keys import key_for, leaves_host
 from v2v_protocol.link.dealer import Dealer
-from v2v_protocol.messages import Lease, Result, WorkerHello
+from v2v_protocol.messages import Buffer, Frames, Lease, Result, WorkerHello, encode_sample
 from v2v_protocol.sample import Form, Layout, new_arrays
-from v2v_protocol.wire import Buffer, Frames, encode_sample
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.schedule.sequences import MOST_LEASE_BYTES
 from v2v_server.simulation.precision import USUAL

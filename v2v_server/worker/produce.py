@@ -30,11 +30,11 @@ from v2v_protocol.errors import (
 )
 from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
-from v2v_protocol.refusal import Refusal
-from v2v_protocol.safe_json import parse_json
+from v2v_protocol.persisted import parse_json
 from v2v_protocol.sample import (
     Layout,
     Provenance,
+    Refusal,
     Sample,
     SampleId,
     SampleParams,
@@ -460,7 +460,7 @@ def _pair(thresholds: tuple[float, ...]) -> tuple[float, float] | None:
 
 
 def _refusals(lease: Lease) -> tuple[Refusal, ...]:
-    return tuple(Refusal(**item) for item in lease.refusals["refusals"])
+    return tuple(map(Refusal.from_dict, lease.refusals["refusals"]))
 
 
 def _refuse_outside(video: str) -> None:

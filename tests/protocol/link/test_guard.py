@@ -22,8 +22,7 @@ import zmq
 from tests.waiting import until
 from v2v_protocol.link import guard
 from v2v_protocol.link.router import MOST_MESSAGE_FRAMES
-from v2v_protocol.messages import Ping, Pong
-from v2v_protocol.wire import encode
+from v2v_protocol.messages import Ping, Pong, encode
 from v2v_server.broker.actions import ToConsumer, ToWorker
 from v2v_server.broker.transport import BrokerInput, ConsumerGone, FromConsumer, FromWorker, Sockets
 from v2v_server.system.process import most_connections

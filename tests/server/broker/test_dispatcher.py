@@ -15,11 +15,13 @@ import msgpack
 import pytest
 from hypothesis import given, settings
 
-from tests.protocol.wire_messages import messages
+from tests.protocol.persisted_values import messages
 from tests.server.named_corpus import SMALL, SMALL_SPEC, corpus, video
 from tests.server.peers import CREDIT, DEADLINE, IDLE, Peers, frames_of, peers, sample_frames
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
 from v2v_protocol.messages import (
+    LARGEST_HEADER_BYTES,
+    LARGEST_REQUEST_BYTES,
     Begun,
     Denied,
     ErrorCode,
@@ -36,10 +38,12 @@ from v2v_protocol.messages import (
     Want,
     Welcome,
     WorkerHello,
+    decode,
+    decode_map,
+    encode,
 )
 from v2v_protocol.recipe import preset
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import LARGEST_HEADER_BYTES, LARGEST_REQUEST_BYTES, decode, decode_map, encode
 from v2v_server.broker import dispatcher as dispatcher_module
 from v2v_server.broker.actions import AddToQuarantine, Disconnect, GiveUp, ToConsumer
 from v2v_server.broker.dispatcher import MOST_BATCH_SIZE, MOST_FAULTS, MOST_TABLES

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from v2v_protocol.errors import ProtocolError
+from v2v_protocol.messages import encode_sample
 from v2v_protocol.sample import Form
-from v2v_protocol.wire import encode_sample
 from v2v_server.broker.grants import check_result
 from v2v_server.broker.leases import Request
 

@@ -24,8 +24,8 @@ from v2v_protocol.messages import (
     Result,
     SampleHeader,
     Unavailable,
+    decode_map,
 )
-from v2v_protocol.wire import decode_map
 from v2v_server.broker.leases import Cause, runs_alone
 
 _HALF_WRITTEN = (-1, -1, -1)

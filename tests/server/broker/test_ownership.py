@@ -12,8 +12,19 @@ import zmq
 from tests.server.broker.test_dispatcher import refused
 from tests.server.peers import Peers, peers
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.messages import Denied, ErrorCode, Goodbye, Hello, Message, Ping, Want, Welcome, WorkerHello
-from v2v_protocol.wire import decode, encode
+from v2v_protocol.messages import (
+    Denied,
+    ErrorCode,
+    Goodbye,
+    Hello,
+    Message,
+    Ping,
+    Want,
+    Welcome,
+    WorkerHello,
+    decode,
+    encode,
+)
 from v2v_server.broker.actions import ToConsumer, ToWorker
 from v2v_server.broker.transport import FromConsumer, FromWorker, Sockets
 

@@ -13,8 +13,8 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from v2v_protocol.errors import LimitExceeded
 from v2v_protocol.liveness import Liveness
+from v2v_protocol.messages import MOST_IN_FLIGHT_BYTES
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.wire import MOST_IN_FLIGHT_BYTES
 from v2v_server.broker.leases import LeaseBook, Request
 from v2v_server.broker.session import Session, Sessions
 from v2v_server.schedule.epoch import Schedule

@@ -13,9 +13,8 @@ from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import Peers, peers
 from v2v_client.memory import open_sample
 from v2v_protocol.arena import NO_SLOT, Slot
-from v2v_protocol.messages import Hello, Lease, SampleHeader, Want
+from v2v_protocol.messages import Hello, Lease, SampleHeader, Want, encode
 from v2v_protocol.sample import Form, array_layout
-from v2v_protocol.wire import encode
 from v2v_server.sharing.ring import SampleRing
 from v2v_server.worker.process import slot_arrays
 

@@ -8,8 +8,7 @@ import pytest
 
 from tests.server.peers import DEADLINE, Peers, answer_to, peers
 from v2v_protocol.arena import NO_SLOT
-from v2v_protocol.messages import ErrorCode, Result, SampleHeader, Want
-from v2v_protocol.wire import Buffer, decode, encode
+from v2v_protocol.messages import Buffer, ErrorCode, Result, SampleHeader, Want, decode, encode
 
 ARENA = f"17:9:12:{'0123456789abcdef' * 2}"
 

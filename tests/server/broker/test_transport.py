@@ -16,8 +16,7 @@ import zmq
 
 from tests.waiting import until
 from v2v_protocol.link import router
-from v2v_protocol.messages import Ping, Pong, Stop
-from v2v_protocol.wire import encode
+from v2v_protocol.messages import Ping, Pong, Stop, encode
 from v2v_server.broker.actions import ToConsumer, ToWorker
 from v2v_server.broker.transport import BrokerInput, ConsumerGone, FromConsumer, FromWorker, InFlight, Sockets
 

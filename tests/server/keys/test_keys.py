@@ -21,8 +21,7 @@ from v2v_protocol.errors import KeyRefused, UsageError, V2VError
 from v2v_protocol.keys import is_key, key_for, read_key
 from v2v_protocol.link.curve import secure
 from v2v_protocol.link.dealer import Dealer, Handshakes, mechanism_of
-from v2v_protocol.messages import Ping, Pong
-from v2v_protocol.wire import encode, largest_frame_bytes
+from v2v_protocol.messages import Ping, Pong, encode, largest_frame_bytes
 from v2v_server.broker.actions import ToConsumer
 from v2v_server.broker.transport import BrokerInput, FromConsumer, FromWorker, Sockets
 from v2v_server.commands.keys import main

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.server.named_corpus import SMALL, SMALL_SPEC, NamedCorpus, corpus, video
-from v2v_protocol.refusal import Refusal
+from v2v_protocol.sample import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.videos import VideoEntry

@@ -10,7 +10,7 @@ from tests.server.named_corpus import corpus, video
 from tests.server.peers import Peers
 from tests.server.queues import Queues, ToyPool
 from v2v_protocol.messages import Status as StatusMessage
-from v2v_protocol.wire import decode
+from v2v_protocol.messages import decode
 from v2v_server.broker.actions import Action, SendStatus, ToConsumer, ToWorker
 from v2v_server.config import ServeConfig
 from v2v_server.status.parts import StatusFields

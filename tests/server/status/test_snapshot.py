@@ -12,9 +12,8 @@ from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import Peers, answer_to, peers
 from tests.server.status.services import WALL, Published, View, json_of, published
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
-from v2v_protocol.messages import GetStatus, Goodbye, Hello, Result, Want, WorkerHello
-from v2v_protocol.refusal import Refusal
-from v2v_protocol.wire import encode
+from v2v_protocol.messages import GetStatus, Goodbye, Hello, Result, Want, WorkerHello, encode
+from v2v_protocol.sample import Refusal
 from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
 from v2v_server.broker.leases import Cause
 from v2v_server.broker.session import RETURN_SECONDS

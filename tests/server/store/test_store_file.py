@@ -210,7 +210,7 @@ def test_large_pictures_come_in_small_groups() -> None:
 )
 def test_heads_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ProtocolError):
-        replace(head_of(np.zeros((4, 8, 8), np.uint8)), **wrong)
+        Head.from_dict(head_of(np.zeros((4, 8, 8), np.uint8)).to_dict() | wrong)
 
 
 @pytest.mark.parametrize("method", ["zstd", "lz4", "raw"])

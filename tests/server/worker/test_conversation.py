@@ -7,13 +7,14 @@ from dataclasses import replace
 import msgpack
 import pytest
 
-from tests.protocol.wire_messages import example
+from tests.protocol.persisted_values import example
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.errors import RemoteError, VersionMismatch, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import (
     Begun,
     Denied,
     ErrorCode,
+    Frames,
     Goodbye,
     Lease,
     LeaseFailed,
@@ -23,8 +24,9 @@ from v2v_protocol.messages import (
     Result,
     Stop,
     WorkerHello,
+    decode,
+    encode,
 )
-from v2v_protocol.wire import Frames, decode, encode
 from v2v_server.worker.conversation import (
     Inspect,
     Leave,

@@ -11,8 +11,7 @@ from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from tests.server.peers import DEADLINE, Peers, peers
 from v2v_protocol.errors import SampleUnavailable, VideoError
 from v2v_protocol.messages import Begun, Denied, ErrorCode, Goodbye, Hello, Lease
-from v2v_protocol.refusal import Refusal
-from v2v_protocol.sample import Sample
+from v2v_protocol.sample import Refusal, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import ALONE_AFTER, Cause
 from v2v_server.corpus.catalogue import Catalogue

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.protocol.wire_messages import example
+from tests.protocol.persisted_values import example
 from v2v_protocol import sample
 from v2v_protocol.errors import ProtocolError, SidecarError, VideoError
-from v2v_protocol.messages import Lease, LeaseFailed, WorkerHello
+from v2v_protocol.messages import Lease, LeaseFailed, WorkerHello, decode, encode
 from v2v_protocol.sample import FromSidecar
-from v2v_protocol.wire import decode, encode
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.sidecar import fingerprint_of
 from v2v_server.worker import produce as reading

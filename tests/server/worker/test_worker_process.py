@@ -16,11 +16,23 @@ import pytest
 import zmq
 
 from tests.oracles.dealers import wait
-from tests.protocol.wire_messages import example
+from tests.protocol.persisted_values import example
 from v2v_protocol.errors import SidecarError, UsageError, VideoError
-from v2v_protocol.messages import Begun, Goodbye, Lease, LeaseFailed, Message, Ping, Pong, Result, Stop, WorkerHello
+from v2v_protocol.messages import (
+    Begun,
+    Goodbye,
+    Lease,
+    LeaseFailed,
+    Message,
+    Ping,
+    Pong,
+    Result,
+    Stop,
+    WorkerHello,
+    decode,
+    encode,
+)
 from v2v_protocol.sample import Layout, new_arrays
-from v2v_protocol.wire import decode, encode
 from v2v_server.commands.worker import main as worker_command
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.simulation.precision import Variant

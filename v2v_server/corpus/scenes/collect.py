@@ -18,6 +18,7 @@ import numpy as np
 import xxhash
 
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
+from v2v_protocol.persisted import Persisted
 from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.manifest import Manifest
 from v2v_server.corpus.probe import LARGEST_PROBE_BYTES, LONGEST_SECONDS, VideoProgress, batches
@@ -168,7 +169,7 @@ def figures(video: IndexRow | _Job, scene: Scene) -> Figures:
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
+class _Job(Persisted):
     id: str
     fingerprint: str
     frames: int

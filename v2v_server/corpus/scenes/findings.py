@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2v_protocol.persisted import Persisted
 from v2v_server.corpus.scenes.scene import NOISE, SEGMENT_FRAMES, Flag, Scene, Sides, firsts_of, sides_of
 from v2v_server.corpus.scenes.stretches import Spans, pattern_of, runs_of
 
@@ -24,7 +25,7 @@ _NOISY_LEVELS = 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class Defect:
+class Defect(Persisted):
     """A defect of the frames that were analysed.
 
     Attributes:

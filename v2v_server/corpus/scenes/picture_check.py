@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from v2v_protocol.errors import V2VError
+from v2v_protocol.persisted import Persisted
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
@@ -87,7 +88,7 @@ CHANGES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Excerpt:
+class Excerpt(Persisted):
     """The part of a video that is looked at, in the rows that are used."""
 
     id: str

@@ -15,13 +15,14 @@ import os
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgpack
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.errors import ProtocolError, UsageError, VideoError
+from v2v_protocol.persisted import reader
 from v2v_server.store.format import BLOCK_ROWS, Head, check, group_frames_for
 from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
 from v2v_server.video.decode import DecodedClip
@@ -159,8 +160,7 @@ class Plane:
         return array.reshape(count, self.values, -1, columns)[:, :, first : first + rows]
 
 
-@dataclass(frozen=True, slots=True)
-class PlanePlace:
+class PlanePlace(NamedTuple):
     """Version of a plane, and where its store file lies."""
 
     version: int
@@ -168,9 +168,12 @@ class PlanePlace:
     bytes: int
 
 
+_read_places = reader(Mapping[str, PlanePlace])
+
+
 def pack_footer(places: Mapping[str, PlanePlace]) -> bytes:
     """Return the end of a file with planes."""
-    body = msgpack.packb({name: [place.version, place.offset, place.bytes] for name, place in places.items()})
+    body = msgpack.packb(dict(places))
     return body + _SUFFIX.pack(len(body), check(body, 0), _MAGIC)
 
 
@@ -190,15 +193,11 @@ def read_footer(path: str, file: int) -> dict[str, PlanePlace]:
     try:
         if len(body) != length or check(body, 0) != expected:
             raise ValueError("damaged")
-        return {str(name): _place(value, end - length) for name, value in msgpack.unpackb(body).items()}
-    except (ValueError, TypeError, AttributeError) as error:
+        places: dict[str, PlanePlace] = _read_places(msgpack.unpackb(body))
+        if any(place.offset + place.bytes > end - length for place in places.values()):
+            raise ValueError(f"a plane ends behind byte {end - length}")
+        return places
+    except (ValueError, ProtocolError) as error:
         raise VideoError(
             path, None, f"the store file is corrupt (its list of planes: {error}): re-create it with v2v-prepare"
         ) from error
-
-
-def _place(value: Any, end: int) -> PlanePlace:
-    version, offset, size = value
-    if not all(type(number) is int for number in value) or not 0 <= offset <= offset + size <= end:
-        raise ValueError(f"place {value!r:.80}")
-    return PlanePlace(version, offset, size)
