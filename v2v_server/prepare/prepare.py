@@ -42,14 +42,12 @@ from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX, Made, Transcoding, transcode
 from v2v_server.store.packing import DEFAULT_SIZE, SIZES
 from v2v_server.store.planes import OPTIONAL
+from v2v_server.store.quota import LEAST_FREE_BYTES
 from v2v_server.store.reader import StoreFile
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.orientation import PixelRect
 from v2v_server.video.rows import Rows
-
-LEAST_FREE_BYTES = 1 << 30
-"""Always keep this much disk space free: a full disk stops other programs."""
 
 _STORED_BITS_PER_PIXEL = 2.2
 """Size of a store file, median of the measured clips (docs/prepare.md): 0.7 to 3.4."""
@@ -62,8 +60,8 @@ _AT_A_TIME = 1024
 """Files that are read at a time, so that the memory for the requests does not grow with the corpus."""
 _CRASHES = "crashes the transcoder: its process died"
 
-Progress = Callable[[int, int, int, int], None]
-"""Progress callback: (source frames done, source frames in total, bytes written, bytes expected in total)."""
+PrepareProgress = Callable[[int, int, int, int], None]
+"""PrepareProgress callback: (source frames done, source frames in total, bytes written, bytes expected in total)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +107,7 @@ def prepare(
     scene: bool = False,
     planes: tuple[str, ...] = (),
     single: bool = False,
-    progress: Progress | None = None,
+    progress: PrepareProgress | None = None,
 ) -> Report:
     """Transcode a corpus. A video that cannot be transcoded is recorded with the reason, and the others continue.
 

@@ -14,11 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from v2v_protocol.errors import UsageError
-from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
-from v2v_server.video.decode import DecodedClip
-from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import MOST_BITS, Signal
-from v2v_server.video.probe import VideoFacts
 
 if TYPE_CHECKING:  # a server's command line, which names the kinds, starts without the decoder
     from v2v_server.video.collect import ClipRequest, DecodedPicture

@@ -21,6 +21,7 @@ from tests.server.video.lethal_reads import always_exits, always_killed, killed_
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged, VideoError
 from v2v_server.corpus import catalogue as catalogue_module
 from v2v_server.corpus import index as index_file
+from v2v_server.corpus import probe as probe_module
 from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
 from v2v_server.corpus.index import SCHEMA_VERSION
 from v2v_server.corpus.manifest import MANIFEST_NAME
@@ -28,7 +29,6 @@ from v2v_server.corpus.probe import ProbeFile, probe_files
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint, is_same_file
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.probe import probe as probe_module
 from v2v_server.video.rows import Rows
 
 

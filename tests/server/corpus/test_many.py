@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from v2v_server.corpus import probe
 from v2v_server.corpus import videos as columns
 from v2v_server.corpus.catalogue import index_path, open_catalogue
 from v2v_server.corpus.index import IndexRow, Store
-from v2v_server.video.probe import probe
 
 VIDEOS = 2000
 MOST_BYTES = 820

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from tests.clips import damaged, panned_luma, truncated, write_clip
 from tests.oracles.decoded import decode_luma
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_protocol.messages import decode
+from v2v_server.video import decode
 from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.decode import decode_cuts
 from v2v_server.video.frame_index import unseekable
