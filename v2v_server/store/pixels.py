@@ -102,7 +102,8 @@ class Pixels(Protocol):
 
 def signal_of(pixels: Pixels, index: FrameIndex) -> Signal:
     """Return what the levels of a video mean, by its first frame, whatever the sample."""
-    from v2v_server.video.collect import ClipRequest
+    from v2v_server.video.collect import ClipRequest, Cut
+    from v2v_server.video.luma import MOST_BITS
 
     cut = Cut(1, (0, 0, 1, 1))
     return pixels.clips(ClipRequest(index, index.first, (cut,), most_bits=MOST_BITS, samples=((0, 0, 0),)))[0].signal
