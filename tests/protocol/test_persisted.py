@@ -23,8 +23,8 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, SampleId, SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.manifest import Header
-from v2v_server.flow.methods import METHODS
 from v2v_server.store.format import Head
+from v2v_server.store.packing import PACK_METHODS
 
 ROOT = Path(__file__).parents[2]
 FOUND = [
@@ -38,7 +38,7 @@ ID = SampleId("s" * 32, "c" * 32, 4, 2**64 - 1, 2**32 - 1, 2**48 - 1)
 PARAMS = SampleParams(0.2, 0.3, 0.1, 2, 1.5, ((4, 2),), 1.0, 1, 2, True, 0.0, (1, 2, 3, 2**32 - 1), {"leak_hz": 0.5})
 STREAM = StreamIdentity({"recipe": {"gamma": 2.2}}, "s" * 32, "c" * 32, 4, 100)
 EXAMPLES: dict[type[Any], Any] = {
-    Head: Head("v", "1-a", 8, 8, 0, 8, 0, 5, 5, 30.0, "h264", True, 2, next(iter(METHODS))),
+    Head: Head("v", "1-a", 8, 8, 0, 8, 0, 5, 5, 30.0, "h264", True, 2, next(iter(PACK_METHODS))),
     Header: Header("full", "fast", 3, "videos", "d" * 32),
     SampleId: ID,
     SampleParams: PARAMS,
@@ -50,8 +50,8 @@ EXAMPLES: dict[type[Any], Any] = {
 """Classes whose fields also have to fit each other."""
 OF_OTHER_FORM = (Recipe, StreamSpec, ResumeState)
 """Classes that read more than they write: presets and parts of a recipe, a stream beside the place in it."""
-WITH_PICTURES = ("_Excerpt", "_Middle")
-"""Classes with the index of a real video; tests of isolated processes have them."""
+WITH_PICTURES = ("Excerpt",)
+"""Classes with the index of a real video: tests of isolated processes have them."""
 checked = [cls for cls in CLASSES if cls not in OF_OTHER_FORM and cls.__name__ not in WITH_PICTURES]
 each_class = pytest.mark.parametrize("cls", checked, ids=lambda cls: cls.__name__)
 

@@ -194,6 +194,7 @@ def _refreshed(
         with without_collections():
             unasked = list[str]()
             table, states = VideoTable.read(joined(ids, store.rows(kind), unasked), len(ids))
+            states[table.codec == "v2v store"] = GONE  # earlier releases named store files by their own bytes
             stale = _changed(source, ids, states, notice)
         del states
         store.forget(_gone(source, unasked, notice))

@@ -31,9 +31,9 @@ from v2v_server.corpus import probe
 from v2v_server.commands.catalogue import main
 probe._MOST_TOGETHER = 2
 look = probe._facts
-def slow(path):
+def slow(path, kind):
     time.sleep(0.1)
-    return look(path)
+    return look(path, kind)
 probe._facts = slow
 import v2v_server.corpus.ahead as ahead
 refresh = ahead.refresh_index
