@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 from tests.clips import panned_luma, write_clip
 from tests.test_commands import MODULES, ROOT
@@ -99,6 +100,11 @@ def test_documented_commands_run(
         (tmp_path / name).symlink_to(clips / "0.mp4")
     for name in FOLDERS:
         (tmp_path / name).symlink_to(clips)
+    if any("REDS" in line for line in lines):
+        pictures = tmp_path / "REDS" / "train_sharp" / "000"
+        pictures.mkdir(parents=True)
+        for number, luma in enumerate(panned_luma(203, 128, 128)):
+            Image.fromarray(luma).save(pictures / f"{number:08d}.png")
     for line in lines:
         program, *given = shlex.split(line, comments=True)
         smaller = SMALLER.get(program, [])

@@ -15,7 +15,7 @@ a file, a saved state, or another process, which may hold anything. A field's an
     bool, str, bytes, None  nothing else
     tuple[T, ...]           a list of at most LARGEST_LIST
     tuple[A, B], NamedTuple a list of these
-    Mapping[str, T]         a map; with Any, of plain values that are nested at most MOST_LEVELS deep
+    Mapping[str, T]         a map; with Any, of plain values that are nested at most MOST_DEPTH deep
     A | B                   either; no two of them may look alike
     a Persisted             a map of its fields
     Path, any from_bytes    bytes
@@ -43,7 +43,7 @@ from v2v_protocol.errors import LimitExceeded, ProtocolError, UsageError
 from v2v_protocol.settings import LATER, nearest
 
 LARGEST_LIST = 65_536
-MOST_LEVELS = 16
+MOST_DEPTH = 16
 """Containers within containers. Deeper ones could not even be shown in an error message (RecursionError)."""
 T = TypeVar("T")
 Read: TypeAlias = Callable[[Any], Any]
@@ -103,7 +103,11 @@ def add_fields(plain: dict[str, Any], item: Any) -> dict[str, Any]:
 
 
 def read_fields(kind: Callable[..., T], values: Any) -> T:
-    """Return a Persisted of the fields that its ``to_dict`` wrote; raise as ``from_dict`` does."""
+    """Return a Persisted of the fields that its ``to_dict`` wrote.
+
+    Raises:
+        ProtocolError: as of :meth:`Persisted.from_dict`.
+    """
     if not isinstance(values, dict):
         raise ProtocolError(f"{kind.__name__} = {shown(values)}: expected a map of its fields")
     readers, read, name = _readers(kind), {}, ""
@@ -192,7 +196,11 @@ class _Rule(NamedTuple):
 
 @cache
 def reader(kind: Any) -> Read:
-    """Return a function that returns plain data as a value of a type, and raises ProtocolError for any other data."""
+    """Return a function that returns plain data as a value of a type.
+
+    Raises:
+        ProtocolError: by the function, for any other data.
+    """
     kinds, expected, fits, convert = _rule(kind)
     first = kinds[0]
 
@@ -241,7 +249,7 @@ def _rule(kind: Any) -> _Rule:
             lambda it: make(read(value) for read, value in zip(row, it, strict=True)),
         )
     if origin is not None and parts[1] is Any:
-        return _Rule((dict,), f"a map nested at most {MOST_LEVELS} deep", _is_shallow)
+        return _Rule((dict,), f"a map nested at most {MOST_DEPTH} deep", _is_shallow)
     if origin is not None:
         key, value = map(reader, parts)
         return _Rule((dict,), "a map", None, lambda it: {key(name): value(each) for name, each in it.items()})
@@ -269,7 +277,7 @@ def _list_of(kind: Any) -> Read:
 
 def _is_shallow(value: dict[str, Any]) -> bool:
     level: list[Any] = [value]
-    for _ in range(MOST_LEVELS):
+    for _ in range(MOST_DEPTH):
         inner: list[Any] = []
         for outer in level:
             inner.extend(outer.values() if type(outer) is dict else outer)

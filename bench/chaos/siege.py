@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 
 from bench.chaos.fleet import Fleet
 from bench.chaos.hostile import KEYED_KINDS, KINDS, PEERS
-from bench.chaos.trimming_server import MODULE, settled_mib, trimmed_mib
+from bench.chaos.trimming_server import MODULE, settled_mib
 from bench.corpus import add_source, run_folder
 from bench.frame import Column, Record, Report, add_positive, add_whole, beyond, chosen, progress
 from bench.processes import cpu_seconds, rss_mib
@@ -87,12 +87,10 @@ def besiege(
 ) -> list[dict[str, Any]]:
     """Attack with all kinds in turns; return one record for each kind."""
     found: dict[str, list[dict[str, float]]] = {kind: [] for kind in kinds}
-    stretch(fleet, seconds)
     for kind in kinds:  # what a kind takes once, such as caches and pages of small objects, is no leak
         with fleet.attacked(kind, last=not urgent):
             stretch(fleet, seconds)
-    stretch(fleet, seconds)
-    start = trimmed_mib(fleet.server.pid or 0)
+    start = settled_mib(fleet.server.pid or 0)
     for turn in range(turns):
         for kind in kinds:
             before = stretch(fleet, seconds / 2)

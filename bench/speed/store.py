@@ -148,8 +148,10 @@ def prepared(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
             progress(f"{video.id}: prepare")
             top, bottom = catalogue.rows.bounds(video.height_px)
             index = catalogue.frame_index(video.id).to_bytes()
-            window = top, 0, bottom - top, video.width_px
-            job = Transcoding(video, catalogue.path(video.id), DEFAULT_SIZE, root, window=window, index=index)
+            job = Transcoding(
+                video, catalogue.path(video.id), DEFAULT_SIZE, root,
+                window=(top, 0, bottom - top, video.width_px), index=index,
+            )  # fmt: skip
             fastest = {"prepare_cpu_seconds": math.inf, "prepare_scene_cpu_seconds": math.inf}
             for name in _TURNS * list(fastest):
                 started = time.process_time()

@@ -212,8 +212,8 @@ def test_preparing_onto_a_full_disk(source: Path, tmp_path: Path, cache: Path, r
     size, filler = {"nothing": (64, 64), "a manifest": (64, 60), "some videos": (400, 4)}[room]
     # Without the free space that it keeps for others, which would end it before the disk is full.
     program = (
-        "from v2v_server.prepare import prepare, resume; "
-        "prepare.LEAST_FREE_BYTES = resume.LEAST_FREE_BYTES = -(1 << 40); "
+        "from v2v_server.prepare import prepare; "
+        "prepare.LEAST_FREE_BYTES = -(1 << 40); "
         "import sys; from v2v_server.commands.prepare import main; sys.exit(main())"
     )
     run = f'{sys.executable} -c "{program}" "$@" || echo "ended with status $?"; cp -r "{disk}/out" "{after}"'

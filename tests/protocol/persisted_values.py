@@ -13,7 +13,7 @@ from typing import Annotated, Any, get_args, get_origin
 from hypothesis import strategies as st
 
 from v2v_protocol.messages import Message
-from v2v_protocol.persisted import LARGEST_LIST, MOST_LEVELS
+from v2v_protocol.persisted import LARGEST_LIST, MOST_DEPTH
 
 MESSAGES: tuple[type[Any], ...] = get_args(Message)
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
@@ -81,7 +81,7 @@ def fits(kind: Any, value: Any) -> bool:
         hints = parts or tuple(typing.get_type_hints(kind).values())
         return isinstance(value, list | tuple) and len(value) == len(hints) and all(map(fits, hints, value))
     if origin is not None and isinstance(value, dict):
-        return depth(value) <= MOST_LEVELS if parts[1] is Any else all(fits(parts[1], v) for v in value.values())
+        return depth(value) <= MOST_DEPTH if parts[1] is Any else all(fits(parts[1], v) for v in value.values())
     if kind is Path or (hasattr(kind, "from_bytes") and kind is not bool):
         return type(value) is bytes
     return isinstance(value, dict) if origin is not None or hasattr(kind, "from_dict") else type(value) is kind
