@@ -1,0 +1,1 @@
+"""The former place of :class:`v2v_client.Patience`."""
