@@ -22,10 +22,10 @@ import errno
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from v2v_protocol.errors import CorpusError
+from v2v_protocol.errors import CorpusError, ProtocolError
 from v2v_protocol.persisted import Persisted, parse_json
 from v2v_server.corpus.catalogue import index_path
 from v2v_server.system.process import lock, open_private
@@ -233,7 +233,7 @@ def write_entry(
                 f"{known.latest} lines read before; restart the programs that use it"
             )
         numbered = replace(entry, snapshot=len(lines) + 1)
-        line = json.dumps(asdict(numbered)).encode() + b"\n"
+        line = json.dumps(numbered.to_dict()).encode() + b"\n"
         kept = whole.rfind(b"\n") + 1
         out.truncate(kept)
         try:
@@ -261,18 +261,9 @@ def _parse(file: Path, whole: bytes) -> Quarantine:
     quarantine = Quarantine()
     for number, line in enumerate(whole.split(b"\n")[:-1], 1):
         try:
-            quarantine.extend([_entry(parse_json(line))])
-        except (ValueError, TypeError, CorpusError) as error:
+            quarantine.extend([QuarantineEntry.from_dict(parse_json(line))])
+        except (ValueError, ProtocolError, CorpusError) as error:
             raise CorpusError(
                 f"quarantine file {file}, line {number} is damaged ({error}); correct or delete the line"
             ) from error
     return quarantine
-
-
-def _entry(fields: dict[str, object]) -> QuarantineEntry:
-    entry = QuarantineEntry(**fields)  # type: ignore[arg-type]
-    for name, value in asdict(entry).items():
-        expected = int if name in ("snapshot", "frame") else str
-        if type(value) is not expected:
-            raise TypeError(f"{name} = {value!r}: expected {expected.__name__}")
-    return entry

@@ -59,7 +59,7 @@ def equations(given: Recorded, threshold: float, seed: int) -> Recorded:
     own = random.uniform(0.05, 2.0) * np.array([1.0, random.uniform(1.0, 1.5)])[:: random.choice((-1, 1))]
     positive, negative = (threshold, threshold) if threshold else own
     levels = np.log(1e-3 + given.known_light.of(given.frames))
-    start = random.uniform(-negative, positive, levels.shape[1])
+    start = np.asarray(random.uniform(-negative, positive, levels.shape[1]))
     events = dense_events(levels, given.frame_us.astype(np.float64), start, positive, negative)
     return of_events(given, events.seconds, events.pixel, events.polarity > 0)
 

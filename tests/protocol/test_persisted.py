@@ -29,7 +29,7 @@ from v2v_server.store.packing import PACK_METHODS
 ROOT = Path(__file__).parents[2]
 FOUND = [
     (".".join(file.relative_to(ROOT).with_suffix("").parts), name)
-    for package in ("v2v_protocol", "v2v_server", "v2v_client")
+    for package in ("v2v_protocol", "v2v_server", "v2v_tools", "v2v_client")
     for file in sorted((ROOT / package).rglob("*.py"))
     for name in re.findall(r"^class (\w+)\(Persisted\)", file.read_text(), re.MULTILINE)
 ]

@@ -61,7 +61,7 @@ _AT_A_TIME = 1024
 _CRASHES = "crashes the transcoder: its process died"
 
 PrepareProgress = Callable[[int, int, int, int], None]
-"""PrepareProgress callback: (source frames done, source frames in total, bytes written, bytes expected in total)."""
+"""Progress callback: (source frames done, source frames in total, bytes written, bytes expected in total)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,7 +54,7 @@ class Transcoding(Persisted):
         stands: whether the target is this already, and only its statistics are wanted.
         scene: whether to compute the scene statistics.
         planes: names of the planes to store beside the luma, of :data:`v2v_server.store.planes.OPTIONAL`.
-        window: the part of its upright pictures to store. PixelRect and index are filled in when the job is due.
+        window: the part of its upright pictures to store. Window and index are filled in when the job is due.
         index: its ``FrameIndex.to_bytes()``.
     """
 

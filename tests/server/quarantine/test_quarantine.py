@@ -192,6 +192,7 @@ def test_a_last_line_that_was_cut_off_is_left_out_and_written_over(tmp_path: Pat
         b'{"snapshot": 2}',
         b'{"snapshot": 2, "path": "v", "fingerprint": "f", "frame": 0, "reason": "r", "time": "t", "more": 1}',
         b'{"snapshot": 2, "path": "v", "fingerprint": "f", "frame": "0", "reason": "r", "time": "t"}',
+        b'{"snapshot": 2, "path": "v", "fingerprint": "f", "frame": -1, "reason": "r", "time": "t"}',
         b'{"snapshot": 2, "path": null, "fingerprint": "f", "frame": 0, "reason": "r", "time": "t"}',
         b'{"snapshot": 3, "path": "v", "fingerprint": "f", "frame": 0, "reason": "r", "time": "t"}',
         b'{"snapshot": 1, "path": "v", "fingerprint": "f", "frame": 0, "reason": "r", "time": "t"}',
