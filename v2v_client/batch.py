@@ -184,7 +184,7 @@ class Batch(Drawn):
         return self.rows("boxes")
 
     def rows(self, name: str) -> list[list[torch.Tensor]]:
-        """Return a label with a number of rows in each frame: for each sample a list of [n, columns], without empty rows.
+        """Return a label with rows in each frame: for each sample a list of [n, columns], without empty rows.
 
         Raises:
             UsageError: the dataset did not request this array.

@@ -180,12 +180,6 @@ MOST_STEPS_PER_GRID = 1024
 """Largest number of steps between video frames that a grid of ``voxel_seconds`` may span."""
 BRIGHTEST = 50.0
 """Upper limit of light where a recipe uses the transfer that a video states; white is 1. PQ reaches 49.3."""
-SMALLEST_THRESHOLD_SHARE = 0.25
-"""Lower limit of a pixel's threshold under mismatch, as a share of the nominal threshold."""
-LARGEST_NORMAL = 6.56
-"""No noise deviates by more standard deviations (``v2v_server.simulation.noise``)."""
-LARGEST_EVENTS = 2.0**49
-"""Largest number of events of a pixel in a clip. With more, float64 no longer resolves a threshold."""
 
 
 @dataclass(frozen=True, slots=True)

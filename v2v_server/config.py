@@ -52,7 +52,9 @@ class ServeConfig:
         0.0, 0.0, HIGHEST_RATE_HZ, "rate of picture sequences without time stamps; 0: unknown", unit="Hz", metavar="N"
     )
     rows: str = text("full", "rows of each picture to use: full, top:0.54 (WebVid), top:180px, 0.1:0.6", metavar="ROWS")
-    cache_dir: str = text("", "folder of the catalogue index (default: the user's cache folder)", metavar="DIR")
+    cache_dir: str = text(
+        "", "folder of the catalogue index and the quarantine (default: the user's cache folder)", metavar="DIR"
+    )
     cache: str = text(
         "",
         "folder that caches decoded frames for later epochs; servers may share it",

@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "v2v-catalogue --videos /data/webvid --merge /data/parts",
         ],
     )  # fmt: skip
-    videos = parser.group("Videos, as for v2v-serve")
+    videos = parser.group("Videos")
     videos.add_argument(
         "--videos", required=True, metavar="DIR", help="folder, video, list file, or s3://bucket/prefix"
     )

@@ -51,7 +51,8 @@ class VideosKind:
         if self.videos_kind not in PIXEL_KINDS or not 0 <= self.rate <= (HIGHEST_RATE_HZ if self.has_parts else 0):
             what = f"--videos-kind {self.videos_kind}, --rate {self.rate:g}"
             raise UsageError(
-                f"{what}: choose one of {', '.join(PIXEL_KINDS)}; sequences can have a rate up to {HIGHEST_RATE_HZ:g}"
+                f"{what}: choose one of {', '.join(PIXEL_KINDS)}; sequences can have a rate up to "
+                f"{HIGHEST_RATE_HZ:g} Hz"
             )
 
     @classmethod
