@@ -39,7 +39,7 @@ from v2v_client.loadtest import percentile
 from v2v_protocol.command import Parser
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.quarantine import quarantine_path, read_quarantine
-from v2v_server.store.picture_sequence import id_of
+from v2v_server.store.video_file import id_of
 
 _POLL_SECONDS = 0.05
 _LAST_BATCH_SECONDS = 120.0
