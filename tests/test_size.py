@@ -29,8 +29,8 @@ LIMITS = {
     "tests": (37459, 378),
 }
 WAY_FILES, WAY_RETURNS = 73, 254
-"""Files that one sample visits, and returns to an earlier one; 89 and 258 at commit 419dc2ec. Measured 70 and 245; a busy
-host adds pings and waits."""
+"""Files that one sample visits, and returns to an earlier one; 89 and 258 at commit 419dc2ec. Measured 70 and 245; a
+busy host adds pings and waits."""
 
 
 def size_of(package: str) -> tuple[int, int]:
