@@ -25,7 +25,7 @@ pytestmark = [
 ]
 
 SMALL = ("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=40")
-ROOT, NOBODY, ALICE = 0, 65534, 12345
+ROOT, OTHER_USER, ALICE = 0, 65534, 12345
 TAKE_A_BATCH = """
 import sys
 from v2v_client import V2VStreamDataset
@@ -79,7 +79,7 @@ def status_of(address: str, user: int) -> subprocess.CompletedProcess[str]:
 
 def test_another_user_gets_no_reply_and_root_and_the_own_user_do(serve: Callable[..., tuple[str, Path]]) -> None:
     address, log = serve(ROOT, "--workers", "0")
-    refused = status_of(address, NOBODY)
+    refused = status_of(address, OTHER_USER)
     assert refused.returncode == 1
     assert "Without keys it serves its own user only" in refused.stderr
     assert "refused a connection of user 65534" in log.read_text()
@@ -93,7 +93,7 @@ def test_a_refusal_stays_on_a_terminal(serve: Callable[..., tuple[str, Path]]) -
     shown = ""
     while "batches/s" not in shown:
         shown += os.read(ours, 1 << 16).decode()
-    assert status_of(address, NOBODY).returncode == 1
+    assert status_of(address, OTHER_USER).returncode == 1
     while "batches/s" not in shown.partition("refused a connection of user 65534")[2]:
         shown += os.read(ours, 1 << 16).decode()
     before, _, after = shown.partition("refused a connection of user 65534")
@@ -104,7 +104,7 @@ def test_a_refusal_stays_on_a_terminal(serve: Callable[..., tuple[str, Path]]) -
 
 
 def test_root_is_admitted_by_the_server_of_another_user(serve: Callable[..., tuple[str, Path]]) -> None:
-    address, log = serve(NOBODY, "--workers", "0")
+    address, log = serve(OTHER_USER, "--workers", "0")
     assert status_of(address, ROOT).returncode == 0
     assert status_of(address, ALICE).returncode == 1
     assert "refused a connection of user 12345" in log.read_text()
@@ -113,13 +113,13 @@ def test_root_is_admitted_by_the_server_of_another_user(serve: Callable[..., tup
 def test_a_workers_port_without_keys_is_for_the_same_user(serve: Callable[..., tuple[str, Path]]) -> None:
     _, log = serve(ALICE, "--workers", "0", "--worker-bind", "tcp://127.0.0.1:*")
     (port,) = [line.rpartition("workers to ")[2] for line in log.read_text().splitlines() if "workers to " in line]
-    assert status_of(port, NOBODY).returncode == 1
+    assert status_of(port, OTHER_USER).returncode == 1
     assert status_of(port, ALICE).returncode == 0
 
 
 def test_insecure_serves_every_user(serve: Callable[..., tuple[str, Path]]) -> None:
     address, log = serve(ALICE, "--workers", "0", "--insecure")
-    assert status_of(address, NOBODY).returncode == 0
+    assert status_of(address, OTHER_USER).returncode == 0
     assert "refused" not in log.read_text()
 
 
@@ -147,8 +147,8 @@ def test_the_page_is_for_the_same_user_unless_it_is_insecure(serve: Callable[...
     _, log = serve(ALICE, "--workers", "0", "--page", str(closed))
     assert got(closed, ALICE) == "200\n"
     assert got(closed, ROOT) == "200\n"
-    assert got(closed, NOBODY) == ""
+    assert got(closed, OTHER_USER) == ""
     assert "refused a connection of user 65534" in log.read_text()
     assert "the page serves only root and the server's user" in log.read_text()
     serve(ROOT, "--workers", "0", "--page", str(opened), "--insecure")
-    assert got(opened, NOBODY) == "200\n"
+    assert got(opened, OTHER_USER) == "200\n"

@@ -564,7 +564,7 @@ def _check_sizes(broker: Broker, recipe: Recipe, layout: Mapping[str, tuple[str,
 
 def _table(broker: Broker, spec: StreamSpec) -> SequenceTable:
     recipe = spec.recipe
-    # The sequences depend only on these fields, so many specs share a table.
+    # The sequences depend only on these fields, so one table serves many specs.
     geometry = (
         recipe.frames_needed,
         spec.samples_per_decode,
