@@ -20,7 +20,7 @@ CORE = ("v2v_protocol", "v2v_server", "v2v_tools", "v2v_client", "v2v_pictures",
 LIMITS = {
     "v2v_protocol": (2326, 23),
     "v2v_server": (14847, 140),
-    "v2v_tools": (2619, 29),
+    "v2v_tools": (2356, 23),
     "v2v_client": (1946, 16),
     "v2v_pictures": (798, 11),
     "v2v_recordings": (1032, 14),

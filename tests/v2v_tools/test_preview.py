@@ -18,8 +18,8 @@ from tests.oracles.rendered import rendered_scene
 from v2v_pictures.camera import Camera
 from v2v_pictures.labels import class_colour
 from v2v_protocol.errors import CorpusError, UsageError
-from v2v_tools.preview import command
-from v2v_tools.preview.preview import Shot, preview
+from v2v_tools import preview as command
+from v2v_tools.preview import Shot, preview
 
 TINY = {"voxels_per_clip": 3, "crop_height_px": 48, "crop_width_px": 64}
 
@@ -184,7 +184,7 @@ def _shares(
         cameras.extend(shown)
         return np.zeros((8, 8, 3), np.uint8)
 
-    monkeypatch.setattr("v2v_tools.preview.preview.draw_sheet", keep)
+    monkeypatch.setattr("v2v_tools.preview.draw_sheet", keep)
     shots = [Shot("a", TINY | recipe, 0)]
     preview(str(source), tmp_path / "a.png", shots, {}, title="t", cache_dir=str(tmp_path), with_flow=False)
     return [camera.noise_share([0, 1, 2]) for camera in cameras]

@@ -25,7 +25,6 @@ from v2v_server.labels.formats import READERS
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.pixels import VideosKind
 from v2v_server.video.rows import Rows
-from v2v_server.video.source import clean_aperture
 from v2v_tools.doctor.motion import look_at_motion
 from v2v_tools.motion import describe_start, start_events
 from v2v_tools.remake import Remaker, open_shown
@@ -138,16 +137,6 @@ def _how_videos_are_stored(catalogue: Catalogue) -> Iterator[Line]:
             "them is decoded from the beginning of its file"
         )
         yield "note", "corpus", text, "run v2v-prepare once: all frames of a prepared corpus are quick to read"
-    if not catalogue.source.is_local:
-        return
-    shown = {id: clean_aperture(catalogue.path(id)) for id in ids}
-    if cropped := [f"{id}: {float(size[0]):g}x{float(size[1]):g} px" for id, size in shown.items() if size]:
-        text = (
-            f"{len(cropped)} videos state a clean aperture, a part of the picture for players to show "
-            f"({name_all(cropped)}): it is not applied, the whole stored picture is served"
-        )
-        change = "crop such videos once (ffmpeg -i IN -vf crop=W:H OUT) if their borders hold no picture"
-        yield "note", "corpus", text, change
 
 
 def _labels(catalogue: Catalogue) -> Iterator[Line]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import os
 import re
 import resource
@@ -18,24 +19,23 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
 
 from packaging.requirements import Requirement
 
 from v2v_protocol.command import version_of
 from v2v_server.store.pixels import VideosKind
-from v2v_server.system.process import usable_cores
+from v2v_server.system.process import control_groups, usable_cores
 from v2v_server.system.sandbox import can_confine
 
 OK, NOTE, BAD = "ok", "note", "bad"
 EXTRAS = ("server", "client", "trainer")
 """Extras of the distribution: where the videos are, where the GPU is, and there with the paper's networks."""
-DECODERS = ("h264", "hevc", "vp8", "vp9", "libdav1d", "mpeg4", "mjpeg")
-ENCODERS = ("libx264",)
+CODECS = ("h264", "hevc", "vp8", "vp9", "libdav1d", "mpeg4", "mjpeg", "libx264")
+"""Decoders of usual videos, and the encoder of films."""
 _GIB = 1 << 30
 _LITTLE_MEMORY_BYTES = 1 << 30
-_SMALL_SHM_BYTES = 256 << 20
 _FEW_FILES = 4096
 _TORCH = """
 import json, torch
@@ -139,23 +139,14 @@ def _libraries() -> Iterator[Finding]:
         OK, "libraries",
         f"PyAV {av.__version__} (libavcodec {ffmpeg}), libzmq {zmq.zmq_version()}, numba {numba.__version__}",
     )  # fmt: skip
-    absent = [name for name in DECODERS if not _has_codec(av, name, "r")]
-    absent += [f"{name} (encoder)" for name in ENCODERS if not _has_codec(av, name, "w")]
+    absent = [name for name in CODECS if name not in av.codecs_available]
     if absent:
         change = "pip install --force-reinstall av, whose wheels bring FFmpeg with all of them"
         yield Finding(NOTE, "codecs", f"this FFmpeg lacks {', '.join(absent)}", change)
     else:
-        yield Finding(OK, "codecs", f"decodes {', '.join(DECODERS)}; encodes {', '.join(ENCODERS)}")
+        yield Finding(OK, "codecs", ", ".join(CODECS))
     if not zmq.has("curve"):
         yield Finding(NOTE, "keys", "this libzmq has no CURVE: no connections with keys", "pip install pyzmq again")
-
-
-def _has_codec(av: Any, name: str, mode: str) -> bool:
-    try:
-        av.Codec(name, mode)
-    except ValueError:  # PyAV's UnknownCodecError is one
-        return False
-    return True
 
 
 def _torch() -> Finding:
@@ -193,7 +184,6 @@ def _machine() -> Iterator[Finding]:
     yield Finding(OK, "cores", f"{cores}{why}; v2v-serve --workers {cores} keeps them busy")
     yield _memory()
     yield _sandbox()
-    yield from _shared_memory()
     kernels = os.environ.get("NUMBA_CACHE_DIR", "")  # chosen when v2v_server was imported
     if kernels:
         yield Finding(OK, "kernels", f"compiled kernels are kept in {kernels}")
@@ -209,17 +199,33 @@ def _machine() -> Iterator[Finding]:
 
 
 def _memory() -> Finding:
-    available = _kilobytes("MemAvailable") * 1024
-    limit, used = control_group_memory()
-    if not available and limit is None:
+    limits = control_group_memory()
+    with suppress(OSError):
+        found = re.search(r"^MemAvailable: +(\d+) kB", Path("/proc/meminfo").read_text(encoding="ascii"), re.M)
+        limits += [(math.inf, 1024 * int(found[1]))] if found else []
+    if not limits:
         return Finding(NOTE, "memory", "this system does not report free memory")
-    free = min(value for value in (available or None, None if limit is None else limit - used) if value is not None)
+    limit, free = min(limits, key=itemgetter(1))
     text = f"{free / _GIB:.1f} GiB free"
-    if limit is not None:
+    if limit < math.inf:
         text += f"; the control group's limit is {limit / _GIB:.1f} GiB"
     if free < _LITTLE_MEMORY_BYTES:
         return Finding(BAD, "memory", text, "free memory or raise the limit: a server and one worker need about 1 GiB")
     return Finding(OK, "memory", text)
+
+
+def control_group_memory(*where: Path) -> list[tuple[float, int]]:
+    """Return (limit, free), bytes, of each control group of this process that has a limit.
+
+    Args:
+        where: see :func:`v2v_server.system.process.control_groups`.
+    """
+    limits = list[tuple[float, int]]()
+    for folder in control_groups(*where):
+        with suppress(OSError, ValueError):  # "max", or the topmost group, which has no limit
+            limit, used = (int((folder / f"memory.{name}").read_text(encoding="ascii")) for name in ("max", "current"))
+            limits.append((limit, limit - used))
+    return limits
 
 
 def _sandbox() -> Finding:
@@ -229,45 +235,6 @@ def _sandbox() -> Finding:
         return Finding(OK, "sandbox", "processes that decode videos cannot start programs or open other files")
     text = f"no {' and no '.join(lacking)} here: a video that exploits a decoder gets more of its user's rights"
     return Finding(NOTE, "sandbox", text, "serve untrusted videos from a container, or with deploy/systemd")
-
-
-def _kilobytes(name: str, table: Path = Path("/proc/meminfo")) -> int:
-    with suppress(OSError):
-        for line in table.read_text(encoding="ascii").splitlines():
-            if line.startswith(f"{name}:"):
-                return int(line.split()[1])
-    return 0
-
-
-def control_group_memory(
-    groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")
-) -> tuple[int | None, int]:
-    """Return (limit, used), bytes, of the tightest control group among this process's own and those above it.
-
-    Linux, version 2. The limit is None if no group has one.
-    """
-    with suppress(OSError, ValueError):
-        (path,) = (line[3:] for line in own.read_text(encoding="utf-8").splitlines() if line.startswith("0::"))
-        found, folder = [], groups
-        for part in ("", *path.strip("/").split("/")):
-            folder = folder / part
-            with suppress(OSError, ValueError):  # "max", or the topmost group, which has none
-                limit = int((folder / "memory.max").read_text(encoding="ascii"))
-                found.append((limit, int((folder / "memory.current").read_text(encoding="ascii"))))
-        if found:
-            return min(found, key=lambda each: each[0] - each[1])
-    return None, 0
-
-
-def _shared_memory(folder: str = "/dev/shm") -> Iterator[Finding]:
-    with suppress(OSError):
-        free = shutil.disk_usage(folder).free
-        if free >= _SMALL_SHM_BYTES:
-            yield Finding(OK, "/dev/shm", f"{free / _GIB:.1f} GiB free")
-        else:
-            change = "docker run --shm-size 1g; v2v-stream itself does not use it"
-            text = f"{free >> 20} MiB free: too little for a DataLoader with num_workers above 0"
-            yield Finding(NOTE, "/dev/shm", text, change)
 
 
 def _port(port: int) -> Finding:

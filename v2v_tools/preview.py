@@ -7,7 +7,9 @@ with shorter clips or smaller crops, and the output says so.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +22,15 @@ from v2v_pictures.camera import Camera
 from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes
 from v2v_pictures.film import FRAMES_PER_SECOND, draw_film
 from v2v_pictures.sheet import draw_sheet
-from v2v_protocol.errors import CorpusError, UsageError
+from v2v_protocol.command import Parser, run_command
+from v2v_protocol.errors import CorpusError, UsageError, V2VError
 from v2v_protocol.progress import Progress
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, sidecar_endings
 from v2v_protocol.spec import StreamSpec
+from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting, spec_fields
 from v2v_protocol.write_aside import check_output, write_file
+from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import defects_of_video
 from v2v_server.motion.prediction import Prediction
@@ -51,6 +56,7 @@ LABELS = ("boxes", "masks")
 PICTURE_SUFFIXES = (".png", ".mp4", ".gif", ".html")
 _SMALLEST_CROP_PX = 16
 _GIF_EVERY = 2  # every other bin: half the size
+_MOST_CAMERAS = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,24 +255,101 @@ def _whole_picture(catalogue: Catalogue, provenance: Provenance, recipe: Recipe)
 
 
 def _fitted_stream(catalogue: Catalogue, spec: Mapping[str, Any], recipe: Any) -> StreamSpec:
-    """Return the stream of a recipe that :func:`_fitted` has made fit."""
-    stream = StreamSpec.from_dict({**spec, "recipe": recipe})
-    return StreamSpec.from_dict({**spec, "recipe": _fitted(catalogue, stream)})
-
-
-def _fitted(catalogue: Catalogue, stream: StreamSpec) -> Recipe:
-    """Return the recipe, with shorter clips or smaller crops if the videos admit no others."""
-    recipe = stream.recipe
+    """Return the stream of a recipe, with shorter clips or smaller crops if the videos admit no others."""
     while True:
-        table = SequenceTable(catalogue.videos, catalogue.rows, stream)
+        stream = StreamSpec.from_dict({**spec, "recipe": recipe})
+        table, recipe = SequenceTable(catalogue.videos, catalogue.rows, stream), stream.recipe
         if table.count:
-            return recipe
-        longest = max(table.longest_clips, default=0)
+            return stream
+        longest, sides = max(table.longest_clips, default=0), (recipe.crop_height_px, recipe.crop_width_px)
         if longest:
             recipe = recipe.replace(voxels_per_clip=longest)
-        elif min(recipe.crop_height_px, recipe.crop_width_px) * 3 // 4 >= _SMALLEST_CROP_PX:
-            smaller = (side * 3 // 4 for side in (recipe.crop_height_px, recipe.crop_width_px))
-            recipe = recipe.replace(**dict(zip(("crop_height_px", "crop_width_px"), smaller, strict=True)))
+        elif min(sides) * 3 // 4 >= _SMALLEST_CROP_PX:
+            recipe = recipe.replace(crop_height_px=sides[0] * 3 // 4, crop_width_px=sides[1] * 3 // 4)
         else:
             raise CorpusError(f"no video can be shown: {table.refusals[0]}")
-        stream = StreamSpec.from_dict({**stream.to_dict(), "recipe": recipe})
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit status."""
+    parser = Parser(
+        "v2v-preview", "VIDEO|DIR [VIDEO ...] --out FILE [flags]",
+        "Show the effect of a recipe on your videos: frames, events, flow, activity.",
+        [
+            "v2v-preview clips/ --out sheet.png --recipe davis346",
+            "v2v-preview clip.mp4 --out compared.html --compare paper clean davis346",
+        ],
+    )  # fmt: skip
+    cameras = parser.group("Virtual cameras")
+    cameras.add_argument("--seeds", type=int, metavar="N", help="virtual cameras to draw (default 4)")
+    cameras.add_argument(
+        "--seed", type=int, metavar="S",
+        help="seed of the first camera; the others have the next seeds (default: seeds whose crops show motion)",
+    )  # fmt: skip
+    cameras.add_argument(
+        "--compare", nargs="+", metavar="NAME", help="show the same clip under these recipes instead, one camera each"
+    )
+    videos = parser.group("Videos")
+    videos.add_argument(
+        "sources", nargs="+", metavar="VIDEO|DIR",
+        help="a video, a folder of videos, or a list file; with several, each gets a FILE-NAME of its own",
+    )  # fmt: skip
+    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "cache_dir")
+    out = parser.group("Output")
+    parser.add_output(
+        "Output", "--out", PICTURE_SUFFIXES, f"picture, film or page: {', '.join(PICTURE_SUFFIXES)}", required=True
+    )
+    out.add_argument(
+        "--moments", type=int, default=1, metavar="N", help="number of voxel grids of each camera (default 1)"
+    )
+    out.add_argument("--no-flow", action="store_true", help="leave optical flow out")
+    add_spec(parser)
+    return run_command(parser, _run, argv, failures=(V2VError,), interrupted="interrupted; nothing was written")
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    count = 4 if arguments.seeds is None else arguments.seeds
+    for flag, value in (("--seeds", count), ("--moments", arguments.moments)):
+        if not 1 <= value <= _MOST_CAMERAS:
+            raise UsageError(f"{flag} {value}: give 1 to {_MOST_CAMERAS}")
+    first = arguments.seed or 0
+    if arguments.compare:
+        if arguments.recipe is not None:
+            raise UsageError("--compare names the recipes: leave --recipe out")
+        if arguments.seeds is not None:
+            raise UsageError("--compare shows each recipe with one seed: leave --seeds out")
+        looks = [Shot(Path(name).stem, recipe_setting(name, arguments.set), first) for name in arguments.compare]
+        what = "the same clip under " + ", ".join(look.title for look in looks)
+    else:
+        name = asked_recipe(arguments) or "paper"
+        recipe = recipe_setting(name, arguments.set)
+        looks = [Shot("", recipe, seed) for seed in range(first, first + count)]
+        what = f'virtual cameras drawn from the recipe "{Path(name).stem}"'
+    if arguments.seed is None:
+        what += ", chosen where something moves"
+    stem, names = arguments.out.stem, [Path(source).stem for source in arguments.sources]
+    named = {
+        arguments.out.with_stem(f"{stem}-{name}"): source for name, source in zip(names, arguments.sources, strict=True)
+    }
+    if len(named) < len(names):
+        raise UsageError(f"two of the videos are named {max(names, key=names.count)}: preview them one at a time")
+    for path, source in named.items():
+        preview(
+            source,
+            path if len(named) > 1 else arguments.out,
+            looks,
+            # Recipes are compared on one clip, so the order must not depend on how many sequences each admits.
+            spec_fields(arguments) | ({"shuffle": False} if arguments.compare else {}),
+            title=f"{Path(source).name}: {what}",
+            find_motion=arguments.seed is None,
+            list_file=arguments.list,
+            rows=arguments.rows or "full",
+            with_flow=not arguments.no_flow,
+            moments=arguments.moments,
+            cache_dir=arguments.cache_dir,
+            kind=VideosKind.of(vars(arguments)),
+        )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
