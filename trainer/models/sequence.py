@@ -68,6 +68,9 @@ class VoxelNetwork(nn.Module):
         padding: position of the padding: bottom and right (V2V), all sides (E2VID and its successors; the odd pixel
             goes to the top and the left), or top and left (E-RAFT). Near the border the outputs depend on it.
         normalizes: whether every voxel grid is passed through :func:`normalize_voxels` first.
+
+    Raises:
+        UsageError: ``padding`` is unknown.
     """
 
     task: ClassVar[str] = "reconstruction"
@@ -98,7 +101,7 @@ class VoxelNetwork(nn.Module):
 
     @classmethod
     def own_tensor(cls, _name: str, tensor: Tensor) -> Tensor:
-        """Return the part of a published tensor that this network uses. ``_name`` is its name here."""
+        """Return the part of a published tensor [...] that this network uses. ``_name`` is its name here."""
         return tensor
 
     @classmethod
@@ -194,7 +197,10 @@ class VoxelNetwork(nn.Module):
 
 
 def predict(layer: nn.Module, x: Tensor) -> Tensor:
-    """Apply the last, 1x1 convolution outside autocast: a bfloat16 picture would have steps of 1/256 near white."""
+    """Apply the last, 1x1 convolution to features [N, C, H, W].
+
+    It runs outside autocast: a bfloat16 picture would have steps of 1/256 near white.
+    """
     with torch.autocast(x.device.type, enabled=False):
         picture: Tensor = layer(x.to(next(layer.parameters()).dtype))
         return picture

@@ -64,7 +64,7 @@ class StringColumn(Sequence[str]):
         return np.diff(self._ends)
 
     def where(self, mask: npt.NDArray[np.bool_]) -> StringColumn:
-        """Return the strings at which the mask is set."""
+        """Return the strings at which the mask, [n], is set."""
         if mask.all():
             return self
         return StringColumn(self.utf8[np.repeat(mask, self.lengths)].data, self.lengths[mask])
@@ -161,7 +161,7 @@ class VideoTable:
         return cls(ids, fingerprints, *numbers, codec, remark, problem, summaries), np.stack((size, mtime, ctime), 1)
 
     def where(self, mask: npt.NDArray[np.bool_]) -> VideoTable:
-        """Return the rows at which the mask is set."""
+        """Return the rows at which the mask, [n], is set."""
         if mask.all():
             return self
         columns: list[Any] = [getattr(self, name) for name in self.__slots__]

@@ -98,7 +98,7 @@ class BoxTable:
         return cls(frames, corners, numbers, annotated)
 
     def at(self, frame: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-        """Return corners and numbers of the boxes of one frame.
+        """Return corners, [n, 4], and numbers, [n, 2], of the boxes of one frame.
 
         Raises:
             ValueError: the frame has no labels.
@@ -129,7 +129,11 @@ def checked(box: Box) -> Box:
 
 
 def read_coco(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
-    """Read a COCO-VID file."""
+    """Read a COCO-VID file.
+
+    Raises:
+        ValueError: it is malformed, or describes another video.
+    """
     content = parse_json(_content(file))
     if not isinstance(content, dict):
         raise ValueError("is not a JSON object with images and annotations")
@@ -164,7 +168,11 @@ def read_coco(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
 
 
 def read_mot(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
-    """Read a MOT Challenge text."""
+    """Read a MOT Challenge text.
+
+    Raises:
+        ValueError: a line is malformed.
+    """
     boxes = []
     for where, line in _lines(file):
         values = _numbers(where, line.split(","), _MOT_COLUMNS, 6, 10)
@@ -203,6 +211,9 @@ def read_yolo(folder: Traversable, picture_px: tuple[int, int]) -> BoxTable:
     Args:
         folder: the files.
         picture_px: height and width of the picture, which the coordinates are shares of.
+
+    Raises:
+        ValueError: a line is malformed.
     """
     boxes = []
     height_px, width_px = picture_px

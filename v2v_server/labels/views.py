@@ -48,7 +48,11 @@ def view_boxes(
 
 
 def kept_boxes(corners: npt.NDArray[np.float64], share: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """Return the numbers of the boxes that stay, largest area in the crop first; equal ones keep their order."""
+    """Return the numbers of the boxes that stay, largest area in the crop first; equal ones keep their order.
+
+    Args:
+        corners, share: [n, 4] and [n], as :func:`view_boxes` returns them.
+    """
     sides = corners[:, 2:] - corners[:, :2]
     stays = (share >= LEAST_SHARE) & (sides >= LEAST_SIDE_PX).all(axis=1)
     (kept,) = np.nonzero(stays)

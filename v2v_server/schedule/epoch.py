@@ -47,6 +47,9 @@ class Permutation:
         n: size of the domain, at least 1.
         seed: 0 .. 2**64 - 1.
         epoch: 0 .. 2**32 - 1.
+
+    Raises:
+        ValueError: ``n`` is below 1.
     """
 
     def __init__(self, n: int, seed: int, epoch: int) -> None:
