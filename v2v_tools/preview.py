@@ -65,7 +65,7 @@ class Shot:
 
     Attributes:
         title: written beside the camera; "" writes the seed.
-        recipe: fields or a preset's name.
+        recipe: its name, or fields.
         seed: of the sample.
     """
 

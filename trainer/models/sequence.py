@@ -50,11 +50,11 @@ class VoxelNetwork(nn.Module):
     """Map sequences of voxel grids to sequences of pictures or flow. Subclasses implement :meth:`unroll`.
 
     The memory is a value: it is passed in as ``state`` and returned, and the module keeps no state between calls. None
-    is the state after a reset (zeros). Calls on consecutive pieces of a sequence, each with the state returned by the
+    is the state after a reset (zeros). Calls on consecutive parts of a sequence, each with the state returned by the
     previous call, give the same result as one call on the whole.
 
     ``forward`` takes the whole sequence, so that wrappers of it (DistributedDataParallel) see one call per training
-    step. Memory of the activations is proportional to T: evaluate long recordings in short pieces.
+    step. Memory of the activations is proportional to T: evaluate long recordings in short parts.
 
     A subclass sets these class attributes:
         task: name of its task in :data:`trainer.tasks.TASKS`.
@@ -118,7 +118,7 @@ class VoxelNetwork(nn.Module):
         raise NotImplementedError
 
     def unroll(self, x: Tensor, state: Any, steps: int, guide: Guide | None) -> tuple[Tensor, Any]:
-        """Run the network over a piece of a sequence.
+        """Run the network over a part of a sequence.
 
         Args:
             x: voxel grids [T*B, bins, H, W], time-major, H and W multiples of ``size_multiple``.
@@ -133,12 +133,12 @@ class VoxelNetwork(nn.Module):
         raise NotImplementedError
 
     def forward(self, voxels: Tensor, state: Any = None, guide: Guide | None = None) -> tuple[Tensor, Any]:
-        """Compute the outputs for a piece of a sequence.
+        """Compute the outputs for a part of a sequence.
 
         Args:
             voxels: [B, T, bins, H, W], any dtype (the stream's int8 counts are converted here, on the device), not
                 normalised.
-            state: the state returned for the previous piece, or None at the start of a sequence.
+            state: the state returned for the previous part, or None at the start of a sequence.
             guide: in training, true pictures to mix in.
 
         Returns:

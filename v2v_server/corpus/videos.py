@@ -47,7 +47,7 @@ _ASKED = 16
 
 
 class StringColumn(Sequence[str]):
-    """Strings in one piece of memory.
+    """Strings in one block of memory.
 
     Args:
         utf8: their UTF-8 one after the other, which sorts as the strings do; or bytes that are never read as strings.
@@ -235,7 +235,7 @@ def _columns(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
 
 
 def _utf8(strings: Sequence[str]) -> tuple[bytes, array[int]]:
-    """Return strings as UTF-8 in one piece, and the bytes of each."""
+    """Return strings as UTF-8 in one block, and the bytes of each."""
     text = "".join(strings)
     if text.isascii():
         return text.encode(), array("i", map(len, strings))

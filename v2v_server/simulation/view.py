@@ -24,7 +24,7 @@ FrameArray = npt.NDArray[Any]
 
 
 class Window(NamedTuple):
-    """A rectangle of the upright video picture."""
+    """A rectangle of the upright video picture; a window of ``trainer/evaluation`` is a time."""
 
     top_px: int
     left_px: int

@@ -27,7 +27,7 @@ MPEG-1, 2, 4 and MJPEG: their standards leave the precision of the inverse trans
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """What one sample takes of a clip.
+    """What one sample takes of a clip: a number of frames, and a part of the picture. No shot boundary, which is CUTS.
 
     Attributes:
         count: number of frames, at least 1; with a stride, of those that are taken.

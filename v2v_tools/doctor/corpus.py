@@ -41,7 +41,7 @@ def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, k
 
     Args:
         videos, rows, cache_dir, kind: as of :func:`v2v_server.corpus.catalogue.open_catalogue`.
-        recipe: name of a preset, or a YAML file.
+        recipe: name of a recipe, or a YAML file.
 
     Raises:
         UsageError: wrong recipe or rows.

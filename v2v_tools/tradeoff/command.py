@@ -29,8 +29,8 @@ from v2v_tools.tradeoff.measures import (
     accuracy,
     cpu_seconds,
     diversity,
+    leases_of,
     making,
-    places_of,
     predicted_loss,
 )
 from v2v_tools.tradeoff.report import ERROR_KEY, best, error_fields, name_dominated, tables
@@ -122,19 +122,19 @@ def _run(asked: argparse.Namespace) -> int:
 def _measured(corpus: Mapping[str, Catalogue], compared: Sequence[ServeSetting]) -> list[dict[str, Any]]:
     """Return the records of all settings, of the two rows that give the scale, and of the diversity."""
     models = {setting: full_model(setting, compared) for setting in compared}
-    places = {
-        setting: places_of(setting, corpus[setting.form])
+    leases = {
+        setting: leases_of(setting, corpus[setting.form])
         for setting in dict.fromkeys((*(setting.single for setting in compared), *models.values()))
     }
     show(f"timing {len(compared)} settings", sys.stderr)
-    works = {each.name: making(places[each.single], each.spec.samples_per_decode) for each in compared}
-    seconds = cpu_seconds(works, max(len(each.leases) for each in places.values()))
-    records, scale = [], []
+    works = {each.name: making(leases[each.single], each.spec.samples_per_decode) for each in compared}
+    seconds = cpu_seconds(works, max(len(each.each) for each in leases.values()))
+    records, scale = list[dict[str, Any]](), list[dict[str, Any]]()
     for model in dict.fromkeys(models.values()):  # one for each recipe
         mine = [setting for setting in compared if models[setting] == model]
         show(f"comparing {len(mine)} settings with {model.way}", sys.stderr)
-        sums = accuracy(places[model], {setting.way: places[setting.single] for setting in mine})
-        loss = predicted_loss(places[model])
+        sums = accuracy(leases[model], {setting.way: leases[setting.single] for setting in mine})
+        loss = predicted_loss(leases[model])
         predicted = {}
         if loss.can_be_followed or loss.is_slow:
             predicted = {0.0: loss.errors("linear"), SUBSTEP_PX: loss.errors("divided")}
@@ -155,7 +155,7 @@ def _measured(corpus: Mapping[str, Catalogue], compared: Sequence[ServeSetting])
         scale = scale or [{"measure": "scale", "way": row, **error_fields(sums[row])} for row in (NOISE_ROW, DRAW_ROW)]
         records += found
     show("measuring diversity", sys.stderr)
-    return records + scale + diversity(places[compared[0].single])
+    return records + scale + diversity(leases[compared[0].single])
 
 
 def _nbytes(clips: Catalogue) -> int:

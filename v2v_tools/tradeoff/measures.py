@@ -1,11 +1,12 @@
 """What is measured of each setting: errors against its full model, and processor time; and how alike samples are.
 
-A place is a sequence of the corpus with four views, the samples of one decode next to each other.
+Everything is measured on the same sequences of the corpus in each form. A lease of each has four views: samples of one
+decode, next to each other.
 
 **Errors.** The full model has exactly decoded frames, all effects of the recipe, and the shortest sub-steps of all
 settings. Both sides are the same camera: the sample's own draw and noise key, with both thresholds set to the value in
 question. Hot pixels are left out: they fire alike on both sides and would make every relative error look small. With V
-the voxels and R those of the full model, summed over all places, so that a clip weighs as much as it has events:
+the voxels and R those of the full model, summed over all leases, so that a clip weighs as much as it has events:
 
     voxel error    sum |V - R| / sum |R|
     count error    (sum |V| - sum |R|) / sum |R|
@@ -45,19 +46,19 @@ from v2v_tools.tradeoff.settings import ServeSetting
 THRESHOLDS = (0.05, 0.2, 0.5, 1.0, 2.0)
 NOISE_ROW, DRAW_ROW = "another noise seed", "another threshold draw"
 _VIEWS = 4
-_PLACES_OF_A_CLIP = 2
+_LEASES_OF_A_CLIP = 2
 _ROUNDS = 3
 
 
-class Places(NamedTuple):
-    """Folder of a form's videos, and a lease for each place, of its four views."""
+class Leases(NamedTuple):
+    """Folder of a form's videos, and leases of four views each."""
 
     root: Path
-    leases: Sequence[Lease]
+    each: Sequence[Lease]
 
 
-def places_of(setting: ServeSetting, clips: Catalogue) -> Places:
-    """Return two places for each clip, or all there are, spread over the corpus in its order; seed 0, epoch 0.
+def leases_of(setting: ServeSetting, clips: Catalogue) -> Leases:
+    """Return two leases for each clip, or all there are, spread over the corpus in its order; seed 0, epoch 0.
 
     Raises:
         UsageError: none of the clips is long enough for a sequence.
@@ -66,23 +67,24 @@ def places_of(setting: ServeSetting, clips: Catalogue) -> Places:
     table = SequenceTable(clips.videos, clips.rows, spec)
     if not table.count:
         raise UsageError(f"{setting.name}: none of the clips is long enough for a sequence")
-    schedule, count = Schedule.of(table, spec), min(_PLACES_OF_A_CLIP * len(clips.videos), table.count)
+    schedule, count = Schedule.of(table, spec), min(_LEASES_OF_A_CLIP * len(clips.videos), table.count)
     leases = []
-    for place in (number * table.count // count for number in range(count)):
-        index, *siblings = range(place * _VIEWS, (place + 1) * _VIEWS)
+    for number in range(count):
+        first = number * table.count // count * _VIEWS
+        index, *siblings = range(first, first + _VIEWS)
         leases.append(
             lease_for(
                 Request(b"", 0, index), sequence=schedule.candidate(0, 0, index, 0), catalogue=clips, spec=spec, seed=0,
                 arrays=DEFAULT_ARRAYS, siblings=tuple(siblings),
             )
         )  # fmt: skip
-    return Places(clips.folder, leases)
+    return Leases(clips.folder, leases)
 
 
-def seen(places: Places, place: int, views: int = 1) -> list[SampleContext]:
-    """Return the first views of a place before simulation, without hot pixels, from one decode."""
-    lease, contexts = places.leases[place], []
-    for decoded in decode_for(lease, lease.indices[:views], Folder(places.root)):
+def seen(leases: Leases, number: int, views: int = 1) -> list[SampleContext]:
+    """Return the first views of a lease before simulation, without hot pixels, from one decode."""
+    lease, contexts = leases.each[number], []
+    for decoded in decode_for(lease, lease.indices[:views], Folder(leases.root)):
         context, _ = sample_context(lease, decoded, {})
         context.params = dataclasses.replace(context.params, hot_pixel_count=0)
         contexts.append(context)
@@ -107,21 +109,21 @@ def compare(voxels: npt.NDArray[Any], reference: npt.NDArray[Any]) -> npt.NDArra
     return np.array([np.abs(part, dtype=np.float64).sum() for part in parts])
 
 
-def accuracy(model: Places, others: Mapping[str, Places]) -> dict[str, npt.NDArray[np.float64]]:
+def accuracy(model: Leases, others: Mapping[str, Leases]) -> dict[str, npt.NDArray[np.float64]]:
     """Return the sums of :func:`compare` for settings that have one full model, [thresholds, 3], by name.
 
     Args:
         model: the full model.
-        others: by name; the same places in the same order.
+        others: by name; of the same sequences in the same order.
 
     Returns:
         also under NOISE_ROW the model with the noise of another key, and under DRAW_ROW with the thresholds of another
         sample's draw: the scale for the errors of the others.
     """
     sums = {name: np.zeros((len(THRESHOLDS), 3)) for name in (*others, NOISE_ROW, DRAW_ROW)}
-    for place, lease in enumerate(model.leases):
-        (exact,), drawn = seen(model, place), plan_sample(lease, lease.indices[1]).params
-        contexts = {name: seen(places, place)[0] for name, places in others.items()}
+    for number, lease in enumerate(model.each):
+        (exact,), drawn = seen(model, number), plan_sample(lease, lease.indices[1]).params
+        contexts = {name: seen(other, number)[0] for name, other in others.items()}
         for row, threshold in enumerate(np.array(THRESHOLDS, np.float32).tolist()):
             camera = dataclasses.replace(exact.params, threshold_pos=threshold, threshold_neg=threshold)
             noisy = dataclasses.replace(camera, noise_key=drawn.noise_key)
@@ -133,28 +135,28 @@ def accuracy(model: Places, others: Mapping[str, Places]) -> dict[str, npt.NDArr
     return sums
 
 
-def predicted_loss(places: Places) -> Prediction:
-    """Predict what the first sample of each place loses between its frames."""
-    views = (seen(places, place)[0] for place in range(len(places.leases)))
+def predicted_loss(leases: Leases) -> Prediction:
+    """Predict what the first sample of each lease loses between its frames."""
+    views = (seen(leases, number)[0] for number in range(len(leases.each)))
     return sum((predict(eight_bits(view.view, view.signal)) for view in views), Prediction())
 
 
-def diversity(places: Places) -> list[dict[str, Any]]:
-    """Return the records of siblings, samples of one decode, and of a batch of different places.
+def diversity(leases: Leases) -> list[dict[str, Any]]:
+    """Return the records of siblings, samples of one decode, and of a batch of different sequences.
 
-    There are none where there is only one place. ``effective_samples_of_n`` is the number of independent samples that n
+    There are none where there is only one lease. ``effective_samples_of_n`` is the number of independent samples that n
     siblings are worth for a mean: n / (1 + (n - 1) r), the design effect of Kish (Survey Sampling, 1965).
     """
-    count = len(places.leases)
+    count = len(leases.each)
     if count < 2:
         return []
-    contexts = (context for place in range(count) for context in seen(places, place, _VIEWS))
+    contexts = (context for number in range(count) for context in seen(leases, number, _VIEWS))
     courses = [np.abs(simulated(context, context.params)).sum(axis=(2, 3)).ravel() for context in contexts]
     with np.errstate(divide="ignore", invalid="ignore"):  # of a constant course, nothing correlates
         alike = np.nan_to_num(np.corrcoef(np.array(courses, np.float64)))
-    place, view = np.divmod(np.arange(len(alike)), _VIEWS)
-    r = float(alike[np.equal.outer(place, place) & ~np.eye(len(alike), dtype=bool)].mean())
-    s = float(alike[np.equal.outer(view, view) & np.not_equal.outer(place, place)].mean())
+    lease, view = np.divmod(np.arange(len(alike)), _VIEWS)
+    r = float(alike[np.equal.outer(lease, lease) & ~np.eye(len(alike), dtype=bool)].mean())
+    s = float(alike[np.equal.outer(view, view) & np.not_equal.outer(lease, lease)].mean())
     beyond = max(0.0, (r - s) / (1.0 - s)) if s < 1.0 else 0.0
     worth = {f"effective_samples_of_{n}": n / (1 + (n - 1) * beyond) for n in (2, 4)}
     return [
@@ -163,36 +165,36 @@ def diversity(places: Places) -> list[dict[str, Any]]:
     ]
 
 
-def making(places: Places, samples_per_decode: int) -> Callable[[int], None]:
-    """Return the work of a server worker: make all views of a place, the same samples for 1, 2 or 4 of a decode."""
+def making(leases: Leases, samples_per_decode: int) -> Callable[[int], None]:
+    """Return the work of a server worker: make all views of a lease, the same samples for 1, 2 or 4 of a decode."""
 
-    def make(place: int) -> None:
-        lease = places.leases[place % len(places.leases)]
+    def make(number: int) -> None:
+        lease = leases.each[number % len(leases.each)]
         for first in range(0, _VIEWS, samples_per_decode):
             indices = lease.indices[first : first + samples_per_decode]
-            for index, decoded in zip(indices, decode_for(lease, indices, Folder(places.root)), strict=True):
+            for index, decoded in zip(indices, decode_for(lease, indices, Folder(leases.root)), strict=True):
                 make_sample(dataclasses.replace(lease, indices=(index,)), decoded)
 
     return make
 
 
-def cpu_seconds(works: Mapping[str, Callable[[int], None]], places: int) -> dict[str, float]:
-    """Do all works in turns, place by place, every other round in reverse order.
+def cpu_seconds(works: Mapping[str, Callable[[int], None]], leases: int) -> dict[str, float]:
+    """Do all works in turns, lease by lease, every other round in reverse order.
 
     Args:
-        works: by name; each makes the views of the place of a number.
-        places: number of places.
+        works: by name; each makes the views of the lease of a number.
+        leases: number of leases.
 
     Returns:
-        processor seconds of a sample: the mean over the places of each one's fastest round.
+        processor seconds of a sample: the mean over the leases of each one's fastest round.
     """
-    seconds = {name: np.zeros((_ROUNDS, places)) for name in works}
+    seconds = {name: np.zeros((_ROUNDS, leases)) for name in works}
     for work in works.values():
         work(0)  # files into memory, code compiled
-    for number in range(_ROUNDS):
-        for place in range(places):
-            for name in list(works)[:: 1 - 2 * (number % 2)]:
+    for turn in range(_ROUNDS):
+        for number in range(leases):
+            for name in list(works)[:: 1 - 2 * (turn % 2)]:
                 begun = time.process_time()
-                works[name](place)
-                seconds[name][number, place] = time.process_time() - begun
+                works[name](number)
+                seconds[name][turn, number] = time.process_time() - begun
     return {name: float(taken.min(axis=0).mean()) / _VIEWS for name, taken in seconds.items()}

@@ -29,11 +29,11 @@ from v2v_tools.tradeoff.measures import (
     DRAW_ROW,
     NOISE_ROW,
     THRESHOLDS,
-    Places,
+    Leases,
     compare,
     cpu_seconds,
     diversity,
-    places_of,
+    leases_of,
 )
 from v2v_tools.tradeoff.report import ERROR_KEY, best, dominates, dominators, error_fields
 from v2v_tools.tradeoff.settings import BESIDE, SOURCE, STORES, ServeSetting, axes, full_model, settings
@@ -178,7 +178,7 @@ def test_every_setting_is_a_configuration_of_the_server(setting: ServeSetting, t
     assert command in file.read_text(encoding="utf-8")
 
 
-def test_works_take_turns_and_the_fastest_round_of_each_place_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_works_take_turns_and_the_fastest_round_of_each_lease_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [0.0]
     monkeypatch.setattr(time, "process_time", lambda: clock[0])
     costs = {
@@ -188,8 +188,8 @@ def test_works_take_turns_and_the_fastest_round_of_each_place_counts(monkeypatch
     done: list[str] = []
 
     def work(name: str) -> Callable[[int], None]:
-        def do(place: int) -> None:
-            done.append(f"{name}{place}")
+        def do(number: int) -> None:
+            done.append(f"{name}{number}")
             clock[0] += next(costs[name])
 
         return do
@@ -200,14 +200,14 @@ def test_works_take_turns_and_the_fastest_round_of_each_place_counts(monkeypatch
     assert found == {"a": (1.0 + 2.0) / 2 / 4, "b": 10.0 / 4}  # of four views
 
 
-def test_one_place_alone_has_no_diversity(tmp_path: Path) -> None:
+def test_one_lease_alone_has_no_diversity(tmp_path: Path) -> None:
     (tmp_path / "clips").mkdir()
     write_clip(tmp_path / "clips" / "a.mp4", panned_luma(40, 100, 180))
     spec = StreamSpec(recipe=Recipe(voxels_per_clip=3, crop_height_px=64, crop_width_px=64))
     with contextlib.closing(open_catalogue(tmp_path / "clips", cache_dir=tmp_path / "cache", processes=0)) as catalogue:
-        root, leases = places_of(ServeSetting(SOURCE, spec), catalogue)
-    assert diversity(Places(root, leases[:1])) == []
-    siblings, batch = diversity(Places(root, leases))
+        root, leases = leases_of(ServeSetting(SOURCE, spec), catalogue)
+    assert diversity(Leases(root, leases[:1])) == []
+    siblings, batch = diversity(Leases(root, leases))
     assert (siblings["name"], batch["name"]) == ("siblings", "batch")
     assert -1 <= batch["course_correlation"] < 1
     assert 1 <= siblings["effective_samples_of_2"] <= 2
