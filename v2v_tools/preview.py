@@ -60,7 +60,7 @@ _MOST_CAMERAS = 32
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class PreviewCamera:
     """One camera of a preview.
 
     Attributes:
@@ -77,7 +77,7 @@ class Shot:
 def preview(
     source: str,
     out: Path,
-    shots: Sequence[Shot],
+    wanted: Sequence[PreviewCamera],
     spec: Mapping[str, Any],
     *,
     title: str,
@@ -95,10 +95,10 @@ def preview(
     Args:
         source, list_file, rows: the corpus, as for a server.
         out: .png (a sheet), .mp4 or .gif (a film), or .html (both in one file).
-        shots: the cameras.
+        wanted: the cameras.
         spec: other fields of the StreamSpec; None in any takes the default.
         title: of the page.
-        find_motion: take other seeds than those of ``shots``, whose crops show motion. Equal seeds stay equal.
+        find_motion: take other seeds than those of ``wanted``, whose crops show motion. Equal seeds stay equal.
         with_flow: show optical flow too.
         moments: voxel grids to show of each camera on a sheet.
         cache_dir: folder of the catalogue index; None: the user's cache.
@@ -111,23 +111,23 @@ def preview(
         SampleUnavailable, VideoUnreadable: see :func:`v2v_tools.remake.remake`.
     """
     check_output("--out", out, PICTURE_SUFFIXES, [source])  # before any work
-    scene = StreamSpec.from_dict({**spec, "recipe": shots[0].recipe}).scene != "off"
+    scene = StreamSpec.from_dict({**spec, "recipe": wanted[0].recipe}).scene != "off"
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir, kind=kind)
     cameras: list[Camera] = []
     loss, started, notes = Prediction(), np.zeros(2), dict[str, list[str]]()
     try:
-        first = _fitted_stream(catalogue, spec, shots[0].recipe)
+        first = _fitted_stream(catalogue, spec, wanted[0].recipe)
         wholes = WholePictures(catalogue, first)
         if find_motion:
-            shots, note = _moving(shots, Remaker(catalogue, first), wholes)
+            wanted, note = _moving(wanted, Remaker(catalogue, first), wholes)
             say(note)
         with Progress("simulating", "cameras") as progress:
-            for shot in shots:
-                camera, lost, events = _camera(catalogue, shot, spec, with_flow, notes)
+            for each in wanted:
+                camera, lost, events = _camera(catalogue, each, spec, with_flow, notes)
                 cameras.append(camera)
                 loss += lost
                 started = started + events
-                progress(len(cameras), len(shots))  # the first may include compiling; the estimate begins after it
+                progress(len(cameras), len(wanted))  # the first may include compiling; the estimate begins after it
         whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
         shown = sorted({camera.provenance.video for camera in cameras}) if first.scene == "off" else ()
         defects = [each for id in shown for each in defects_of_video(catalogue, id)]
@@ -135,7 +135,7 @@ def preview(
         catalogue.close()
     _check_sizes(cameras, out.suffix.lower())
     for note, titles in notes.items():
-        say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
+        say(f"{', '.join(titles) if len(titles) < len(wanted) else 'all cameras'}: {note}")
     say(f"{describe_start(started)} (recipe field start)")
     say(describe_loss(loss, defects))
     write_file(out, _content(out.suffix.lower(), whole, cameras, title, moments))
@@ -161,9 +161,11 @@ def _check_sizes(cameras: Sequence[Camera], kind: str) -> None:
         )
 
 
-def _moving(shots: Sequence[Shot], remaker: Remaker, wholes: WholePictures) -> tuple[list[Shot], str]:
+def _moving(
+    wanted: Sequence[PreviewCamera], remaker: Remaker, wholes: WholePictures
+) -> tuple[list[PreviewCamera], str]:
     """Return the same cameras with seeds that show motion, and a note for the user."""
-    asked = sorted({shot.seed for shot in shots})
+    asked = sorted({each.seed for each in wanted})
     chosen, moving = moving_seeds(remaker, wholes, len(asked))
     seeds = dict(zip(asked, chosen, strict=True))
     names = f"seed{'s' if len(chosen) > 1 else ''} {', '.join(map(str, chosen))}"
@@ -171,7 +173,7 @@ def _moving(shots: Sequence[Shot], remaker: Remaker, wholes: WholePictures) -> t
         note = f"{names}: chosen because their crops show motion; --seed 0 takes what chance gives"
     else:
         note = f"{names}: {moving} of {len(chosen)} crops show more motion than noise, no more were found"
-    return [dataclasses.replace(shot, seed=seeds[shot.seed]) for shot in shots], note
+    return [dataclasses.replace(each, seed=seeds[each.seed]) for each in wanted], note
 
 
 def _sequence_of(catalogue: Catalogue, provenance: Provenance) -> VideoSequence:
@@ -196,14 +198,15 @@ def _content(kind: str, whole: Camera, cameras: Sequence[Camera], title: str, mo
 
 
 def _camera(
-    catalogue: Catalogue, shot: Shot, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
+    catalogue: Catalogue, wanted: PreviewCamera, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
 ) -> tuple[Camera, Prediction, npt.NDArray[np.float64]]:
     """Make one camera's clip; predict what it loses between frames, and count what its start makes.
 
     Adds the titles of the cameras that a note is about to ``notes``, by its text.
     """
-    title = shot.title or f"seed {shot.seed}"
-    asked, stream = StreamSpec.from_dict({**spec, "recipe": shot.recipe}), _fitted_stream(catalogue, spec, shot.recipe)
+    title = wanted.title or f"seed {wanted.seed}"
+    asked = StreamSpec.from_dict({**spec, "recipe": wanted.recipe})
+    stream = _fitted_stream(catalogue, spec, wanted.recipe)
     if stream != asked:
         fitted, recipe = stream.recipe, asked.recipe
         note = (
@@ -215,7 +218,7 @@ def _camera(
     sidecars = catalogue.sidecars
     labels = [name for name in LABELS if any(sidecars[each].fingerprints for each in sidecar_endings((name,)))]
     arrays = ("voxels", "frames", *(("flow",) if with_flow else ()), *labels)
-    made = Remaker(catalogue, stream, arrays).made(shot.seed, 0, 0)
+    made = Remaker(catalogue, stream, arrays).made(wanted.seed, 0, 0)
     provenance = made.sample.provenance
     remark = f"{provenance.video} {provenance.remark}" if provenance.remark else ""
     for note in filter(None, (remark, _signal_note(catalogue, provenance, stream.recipe))):
@@ -318,12 +321,14 @@ def _run(arguments: argparse.Namespace) -> None:
             raise UsageError("--compare names the recipes: leave --recipe out")
         if arguments.seeds is not None:
             raise UsageError("--compare shows each recipe with one seed: leave --seeds out")
-        looks = [Shot(Path(name).stem, recipe_setting(name, arguments.set), first) for name in arguments.compare]
-        what = "the same clip under " + ", ".join(look.title for look in looks)
+        wanted = [
+            PreviewCamera(Path(name).stem, recipe_setting(name, arguments.set), first) for name in arguments.compare
+        ]
+        what = "the same clip under " + ", ".join(each.title for each in wanted)
     else:
         name = asked_recipe(arguments) or "paper"
         recipe = recipe_setting(name, arguments.set)
-        looks = [Shot("", recipe, seed) for seed in range(first, first + count)]
+        wanted = [PreviewCamera("", recipe, seed) for seed in range(first, first + count)]
         what = f'virtual cameras drawn from the recipe "{Path(name).stem}"'
     if arguments.seed is None:
         what += ", chosen where something moves"
@@ -337,7 +342,7 @@ def _run(arguments: argparse.Namespace) -> None:
         preview(
             source,
             path if len(named) > 1 else arguments.out,
-            looks,
+            wanted,
             # Recipes are compared on one clip, so the order must not depend on how many sequences each admits.
             spec_fields(arguments) | ({"shuffle": False} if arguments.compare else {}),
             title=f"{Path(source).name}: {what}",

@@ -21,10 +21,10 @@ from v2v_server.corpus.scenes import picture_check
 from v2v_server.corpus.scenes.findings import COMBED, DUPLICATES
 from v2v_server.corpus.scenes.picture_check import defects_of_video
 from v2v_server.motion.prediction import predict
-from v2v_tools.doctor import command, machine
+from v2v_tools.doctor import command
 from v2v_tools.doctor import corpus as doctor_corpus
 from v2v_tools.doctor import motion as doctor_motion
-from v2v_tools.doctor.machine import BAD, NOTE, OK, Finding, control_group_memory
+from v2v_tools.doctor.command import BAD, NOTE, OK, Finding, control_group_memory
 from v2v_tools.motion import describe_loss
 
 
@@ -33,8 +33,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a process that loads torch, or processes that decode, and whatever this machine's memory is."""
     for module in (picture_check, doctor_motion):
         monkeypatch.setattr(module, "usable_cores", lambda: 0)
-    monkeypatch.setattr(machine, "_torch", lambda: Finding(OK, "torch", "here"))
-    monkeypatch.setattr(machine, "_memory", lambda: Finding(OK, "memory", "enough"))
+    monkeypatch.setattr(command, "_torch", lambda: Finding(OK, "torch", "here"))
+    monkeypatch.setattr(command, "_memory", lambda: Finding(OK, "memory", "enough"))
 
 
 def told(capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
@@ -105,9 +105,9 @@ def test_what_is_missing_or_too_old_is_named(
             raise metadata.PackageNotFoundError(name)
         return str(found.get(name) or version(name))
 
-    monkeypatch.setattr(machine.metadata, "version", pretended)
-    assert {"av<19,>=18", "pyzmq>=26"} == set(machine._missing("server"))
-    assert {"av<19,>=18", "pyzmq>=26"} == set(machine._missing("trainer"))  # one of its own, one of the client's
+    monkeypatch.setattr(command.metadata, "version", pretended)
+    assert {"av<19,>=18", "pyzmq>=26"} == set(command._missing("server"))
+    assert {"av<19,>=18", "pyzmq>=26"} == set(command._missing("trainer"))  # one of its own, one of the client's
     status, said = told(capsys, "--videos", ".")
     assert status == 1  # neither part is whole
     assert "pip install '.[server]'" in said
@@ -121,8 +121,8 @@ def test_a_server_without_torch_is_whole(monkeypatch: pytest.MonkeyPatch, capsys
             raise metadata.PackageNotFoundError(name)
         return version(name)
 
-    monkeypatch.setattr(machine.metadata, "version", without_torch)
-    monkeypatch.setattr(machine, "_torch", lambda: Finding(BAD, "torch", "was loaded"))
+    monkeypatch.setattr(command.metadata, "version", without_torch)
+    monkeypatch.setattr(command, "_torch", lambda: Finding(BAD, "torch", "was loaded"))
     status, said = told(capsys, "--port", str(free_port()))
     assert status == 0
     assert "torch" not in said
@@ -151,14 +151,14 @@ def test_a_gpu_that_torch_does_not_see_is_in_the_way(monkeypatch: pytest.MonkeyP
     monkeypatch.undo()
     done = subprocess.CompletedProcess([], 0, stdout='warning\n["2.9+cpu", []]\n')
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: done)
-    monkeypatch.setattr(machine, "_cards", lambda: "NVIDIA H100")
-    assert machine._torch().level == BAD
-    monkeypatch.setattr(machine, "_cards", lambda: "")
-    assert machine._torch().level == NOTE
+    monkeypatch.setattr(command, "_cards", lambda: "NVIDIA H100")
+    assert command._torch().level == BAD
+    monkeypatch.setattr(command, "_cards", lambda: "")
+    assert command._torch().level == NOTE
     done.stdout = '["2.9", ["NVIDIA H100"]]\n'
-    assert machine._torch().level == OK
+    assert command._torch().level == OK
     done.stdout = ""
-    assert machine._torch().level == BAD
+    assert command._torch().level == BAD
 
 
 def test_the_limits_of_memory_are_those_of_all_control_groups(tmp_path: Path) -> None:

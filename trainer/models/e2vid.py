@@ -164,7 +164,7 @@ class E2VID(VoxelNetwork):
 
     @classmethod
     def own_tensor(cls, name: str, tensor: Tensor) -> Tensor:
-        """Keep channel 0, the picture, of E2VID+'s prediction layer, [3, C, 1, 1], which also predicts flow."""
+        """Keep channel 0, the picture, of E2VID+'s prediction layer, [3, ...], which also predicts flow."""
         return tensor[:1].clone() if PREDICTION.fullmatch(name) and len(tensor) == 3 else tensor
 
     @classmethod

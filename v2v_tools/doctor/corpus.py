@@ -36,7 +36,7 @@ _VIDEOS_OPENED = 10_000
 """Most videos of which more is read than their line of the index."""
 
 
-def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, kind: VideosKind) -> Iterator[Line]:
+def check_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, kind: VideosKind) -> Iterator[Line]:
     """Check a corpus and yield lines of the report.
 
     Args:

@@ -41,9 +41,9 @@ from v2v_server.simulation.intensity import eight_bits
 from v2v_server.worker.arrays import SampleContext
 from v2v_server.worker.produce import decode_for, make_sample, plan_sample, sample_context
 from v2v_tools.remake import lease_for
+from v2v_tools.tradeoff.report import THRESHOLDS
 from v2v_tools.tradeoff.settings import ServeSetting
 
-THRESHOLDS = (0.05, 0.2, 0.5, 1.0, 2.0)
 NOISE_ROW, DRAW_ROW = "another noise seed", "another threshold draw"
 _VIEWS = 4
 _LEASES_OF_A_CLIP = 2
@@ -69,13 +69,11 @@ def leases_of(setting: ServeSetting, clips: Catalogue) -> Leases:
         raise UsageError(f"{setting.name}: none of the clips is long enough for a sequence")
     schedule, count = Schedule.of(table, spec), min(_LEASES_OF_A_CLIP * len(clips.videos), table.count)
     leases = []
-    for number in range(count):
-        first = number * table.count // count * _VIEWS
-        index, *siblings = range(first, first + _VIEWS)
+    for index in (number * table.count // count * _VIEWS for number in range(count)):
         leases.append(
             lease_for(
                 Request(b"", 0, index), sequence=schedule.candidate(0, 0, index, 0), catalogue=clips, spec=spec, seed=0,
-                arrays=DEFAULT_ARRAYS, siblings=tuple(siblings),
+                arrays=DEFAULT_ARRAYS, siblings=tuple(range(index + 1, index + _VIEWS)),
             )
         )  # fmt: skip
     return Leases(clips.folder, leases)

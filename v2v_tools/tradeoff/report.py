@@ -13,8 +13,9 @@ from rich.console import Console
 from rich.table import Table
 
 from v2v_protocol.errors import UsageError
-from v2v_tools.tradeoff.measures import THRESHOLDS
 
+THRESHOLDS = (0.05, 0.2, 0.5, 1.0, 2.0)
+"""Contrast thresholds at which errors are measured."""
 ERROR_THRESHOLD = 0.2
 ERROR_KEY = f"voxel_error_at_{ERROR_THRESHOLD:g}"
 """The error that settings are judged by."""

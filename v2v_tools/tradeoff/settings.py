@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.programs import show
@@ -73,10 +74,14 @@ class ServeSetting:
             planes = "".join(f" --planes {name}" for name in planes_for([self.spec]))
             flags = f"--rows {rows} --size {STORES[self.form]}{planes}"
             lines += [f"# Prepare the corpus first: v2v-prepare SOURCE PREPARED {flags}", "# and serve PREPARED."]
-        usual = StreamSpec().to_dict()
-        changed = {name: value for name, value in self.spec.to_dict().items() if usual.get(name) != value}
-        chosen = {"rows": rows, "samples_per_decode": self.spec.samples_per_decode, **changed}
-        return "\n".join([*lines, format_yaml(chosen)])
+        chosen = {"rows": rows, "samples_per_decode": self.spec.samples_per_decode}
+        return "\n".join([*lines, format_yaml(chosen | _changes(self.spec.to_dict(), StreamSpec().to_dict()))])
+
+
+def _changes(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that differ from the usual ones; of a mapping those in it."""
+    changed = {name: value for name, value in values.items() if usual.get(name) != value}
+    return {name: _changes(value, usual[name]) if name == "recipe" else value for name, value in changed.items()}
 
 
 def planes_for(specs: Iterable[StreamSpec]) -> tuple[str, ...]:

@@ -28,14 +28,13 @@ from v2v_tools.tradeoff import command as tradeoff
 from v2v_tools.tradeoff.measures import (
     DRAW_ROW,
     NOISE_ROW,
-    THRESHOLDS,
     Leases,
     compare,
     cpu_seconds,
     diversity,
     leases_of,
 )
-from v2v_tools.tradeoff.report import ERROR_KEY, best, dominates, dominators, error_fields
+from v2v_tools.tradeoff.report import ERROR_KEY, THRESHOLDS, best, dominates, dominators, error_fields
 from v2v_tools.tradeoff.settings import BESIDE, SOURCE, STORES, ServeSetting, axes, full_model, settings
 
 
