@@ -35,7 +35,7 @@ from v2v_server.system.sandbox import can_confine
 OK, NOTE, BAD = "ok", "note", "bad"
 EXTRAS = ("server", "client", "trainer")
 """Extras of the distribution: where the videos are, where the GPU is, and there with the paper's networks."""
-CODECS = ("h264", "hevc", "vp8", "vp9", "libdav1d", "mpeg4", "mjpeg", "libx264")
+NEEDED_CODECS = ("h264", "hevc", "vp8", "vp9", "libdav1d", "mpeg4", "mjpeg", "libx264")
 """Decoders of usual videos, and the encoder of films."""
 _GIB = 1 << 30
 _LITTLE_MEMORY_BYTES = 1 << 30
@@ -142,12 +142,12 @@ def _libraries() -> Iterator[Finding]:
         OK, "libraries",
         f"PyAV {av.__version__} (libavcodec {ffmpeg}), libzmq {zmq.zmq_version()}, numba {numba.__version__}",
     )  # fmt: skip
-    absent = [name for name in CODECS if name not in av.codecs_available]
+    absent = [name for name in NEEDED_CODECS if name not in av.codecs_available]
     if absent:
         change = "pip install --force-reinstall av, whose wheels bring FFmpeg with all of them"
         yield Finding(NOTE, "codecs", f"this FFmpeg lacks {', '.join(absent)}", change)
     else:
-        yield Finding(OK, "codecs", ", ".join(CODECS))
+        yield Finding(OK, "codecs", ", ".join(NEEDED_CODECS))
     if not zmq.has("curve"):
         yield Finding(NOTE, "keys", "this libzmq has no CURVE: no connections with keys", "pip install pyzmq again")
 
