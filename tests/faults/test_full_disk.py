@@ -29,7 +29,7 @@ from v2v_server.prepare.prepare import prepare
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX
 from v2v_server.quarantine import read_quarantine
 from v2v_server.simulation.precision import warm_up
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.store_file import StoreFile
 
 INJECT = Path(__file__).parent / "inject"
 COMPILED = pytest.mark.usefixtures("_compiled")

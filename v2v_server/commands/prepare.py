@@ -25,7 +25,7 @@ from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
 from v2v_server.prepare import prepare
 from v2v_server.prepare.prepare import Report, check_destination
-from v2v_server.store.packing import DEFAULT_SIZE, SIZES
+from v2v_server.store.format import DEFAULT_SIZE, SIZES
 from v2v_server.store.pixels import VideosKind
 from v2v_server.store.planes import OPTIONAL, PLANES
 from v2v_server.system.process import usable_cores

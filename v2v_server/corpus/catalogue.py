@@ -46,7 +46,7 @@ from v2v_server.corpus.sources.source import (
 from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos, VideoTable, joined, missing_arrays
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.store.pixels import VIDEOS, VideosKind
-from v2v_server.store.reader import STORE_FORMAT
+from v2v_server.store.store_file import STORE_FORMAT
 from v2v_server.system.process import cache_folder, without_collections
 from v2v_server.system.status_fields import gauge, text
 from v2v_server.video.frame_index import FrameIndex, unseekable

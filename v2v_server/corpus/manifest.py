@@ -27,7 +27,7 @@ from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.listfile import UNPRINTABLE
-from v2v_server.store.packing import SIZES
+from v2v_server.store.format import SIZES
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
 from v2v_server.video.rows import Rows
 
@@ -48,7 +48,7 @@ class Header(Persisted):
 
     Attributes:
         rows: rows of the source's pictures that it holds, canonical.
-        size: how its files are packed, a key of :data:`v2v_server.store.packing.SIZES`.
+        size: how its files are packed, a key of :data:`v2v_server.store.format.SIZES`.
         videos: how many videos the source corpus has; the folder is finished when it has a record of each.
         source: name of the source folder, for people.
         source_digest: digest of the source's catalogue with these rows.

@@ -40,10 +40,10 @@ from v2v_server.corpus.manifest import (
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX, Made, Transcoding, transcode
-from v2v_server.store.packing import DEFAULT_SIZE, SIZES
+from v2v_server.store.format import DEFAULT_SIZE, SIZES
 from v2v_server.store.planes import OPTIONAL
 from v2v_server.store.quota import LEAST_FREE_BYTES
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.store_file import StoreFile
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.orientation import PixelRect
@@ -114,7 +114,7 @@ def prepare(
     Args:
         catalogue: the source; its ``rows`` are stored.
         destination: the folder to create or to continue.
-        size: how the files are packed, a key of :data:`v2v_server.store.packing.SIZES`.
+        size: how the files are packed, a key of :data:`v2v_server.store.format.SIZES`.
         processes: number of parallel transcoding processes, spawned; 0 transcodes in this process.
         scene: also compute the scene statistics; for a video prepared without them they are computed from its source,
             and its file stays.

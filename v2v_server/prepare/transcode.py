@@ -27,11 +27,10 @@ from v2v_server.corpus.manifest import prepared_name
 from v2v_server.corpus.scenes.analysis import SceneAnalysis
 from v2v_server.corpus.scenes.scene import MOST_ANALYSED_FRAMES, Scene
 from v2v_server.corpus.videos import VideoEntry
-from v2v_server.store.packing import SIZES
+from v2v_server.store.format import SIZES
 from v2v_server.store.pixels import kind_of, open_pixels
 from v2v_server.store.planes import whole_cut
-from v2v_server.store.reader import StoreFile
-from v2v_server.store.writer import write_store
+from v2v_server.store.store_file import StoreFile, write_store
 from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import MOST_BITS
@@ -49,7 +48,7 @@ class Transcoding(Persisted):
     Attributes:
         video: as catalogued.
         source: its file.
-        size: how the file is packed, a key of :data:`v2v_server.store.packing.SIZES`.
+        size: how the file is packed, a key of :data:`v2v_server.store.format.SIZES`.
         root: the folder to write to, resolved.
         stands: whether the target is this already, and only its statistics are wanted.
         scene: whether to compute the scene statistics.

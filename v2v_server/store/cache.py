@@ -24,13 +24,11 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.errors import CorpusError, VideoError, VideoUnreadable
-from v2v_server.store.format import PIECE_FRAMES
-from v2v_server.store.packing import QUICK, RAW, Packing
+from v2v_server.store.format import PIECE_FRAMES, QUICK, RAW, Packing
 from v2v_server.store.pixels import Pixels
 from v2v_server.store.planes import OPTIONAL, PLANES, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
-from v2v_server.store.reader import StoreFile, read_clips
-from v2v_server.store.writer import write_store
+from v2v_server.store.store_file import StoreFile, read_clips, write_store
 from v2v_server.system.status_fields import GIB
 from v2v_server.video.collect import ClipRequest
 from v2v_server.video.decode import DecodedClip

@@ -23,8 +23,8 @@ if TYPE_CHECKING:  # a server's command line, which names the kinds, starts with
     from v2v_server.video.probe import VideoFacts
 
 PIXEL_KINDS: Mapping[str, tuple[str, ...]] = {
-    "videos": ("reader", "video_file"),
-    "sequences": ("reader", "picture_sequence"),
+    "videos": ("store_file", "video_file"),
+    "sequences": ("store_file", "picture_sequence"),
 }
 """What a video of a corpus is, by ``--videos-kind``: the files here, in the order in which they are asked. The last one
 takes any path. It has ``id_of(path)``, the id of the video that a file belongs to, and ``LOOKED_FOR``, for people."""

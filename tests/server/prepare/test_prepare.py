@@ -23,7 +23,7 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.manifest import MANIFEST_NAME, read_manifest
 from v2v_server.corpus.probe import facts_of
 from v2v_server.prepare.prepare import Report, prepare
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.store_file import StoreFile
 from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.fingerprint import fingerprint, is_same_file
 from v2v_server.video.probe import probe

@@ -30,7 +30,7 @@ from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.manifest import MANIFEST_NAME, read_manifest
 from v2v_server.prepare.prepare import find_standing, prepare, refuse_links
 from v2v_server.prepare.transcode import PARTIAL_SUFFIX, Transcoding
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.store_file import StoreFile
 from v2v_server.video.fingerprint import fingerprint
 
 _KILLED_SECONDS = 60.0

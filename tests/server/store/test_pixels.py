@@ -132,7 +132,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2v_server.store.planes.plane import Plane
+from v2v_server.store.planes import Plane
 
 
 class Peaks(Plane):
@@ -167,7 +167,7 @@ PLANE = Peaks(version=1, dtype="|u1", values=1, cell_px=8, serves="peaks")
 '''
 
 LINES = (
-    ("v2v_server/store/pixels.py", '"reader", "video_file"', '"toy_raw", "toy_world", '),
+    ("v2v_server/store/pixels.py", '"store_file", "video_file"', '"toy_raw", "toy_world", '),
     ("v2v_server/store/planes/__init__.py", '"motion", "detail"', '"peaks", '),
 )
 
@@ -184,7 +184,7 @@ from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.prepare.prepare import prepare
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.pixels import signal_of
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.store_file import StoreFile
 from v2v_server.store.toy_world import drawn
 from v2v_server.video.luma import SDR
 
