@@ -2,7 +2,7 @@
 
     serve.py      one server: runs the loop; config.py: its settings
     commands/     the command lines
-    prepare/      `v2v-prepare`
+    prepare.py    `v2v-prepare`
     status/       what the operator sees
     supervise/    start and restart workers
     broker/       which worker makes which sample for which consumer

@@ -260,7 +260,7 @@ class Catalogue:
         refusals: files, folders and lines of the list that give no video, by id.
         notes: what the user ought to be told: an index that cannot be kept, counts that contradict the list.
         digest: 32 hexadecimal digits that name this snapshot: equal digests, equal videos.
-        prepared: how the folder was made if it is a prepared one (see :mod:`v2v_server.prepare.prepare`). Its videos
+        prepared: how the folder was made if it is a prepared one (see :mod:`v2v_server.prepare`). Its videos
             are those of its source in number, order, id and frames, so that every position means the same frames;
             one without a sound prepared file is refused when it is opened, like a damaged one.
         scene_digest: names this snapshot together with the statistics of its videos; None without them.

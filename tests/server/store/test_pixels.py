@@ -181,7 +181,7 @@ import numpy as np
 
 from tests.digests.rows import Row, samples_of
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.prepare.prepare import prepare
+from v2v_server.prepare import prepare
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.pixels import signal_of
 from v2v_server.store.store_file import StoreFile

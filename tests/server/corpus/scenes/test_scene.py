@@ -38,7 +38,7 @@ from v2v_server.corpus.scenes.scene import (
     Scene,
     Sides,
 )  # fmt: skip
-from v2v_server.prepare.prepare import prepare
+from v2v_server.prepare import prepare
 from v2v_server.system.isolate import run_twice
 from v2v_server.video.rows import Rows
 
