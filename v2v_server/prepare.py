@@ -38,16 +38,16 @@ from v2v_protocol.persisted import Persisted
 from v2v_protocol.sample import Refusal
 from v2v_protocol.write_aside import is_writable, write_aside_and_rename
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.manifest import (
-    MANIFEST_NAME,
+from v2v_server.corpus.scenes.analysis import SceneAnalysis
+from v2v_server.corpus.scenes.scene import MOST_ANALYSED_FRAMES, Scene
+from v2v_server.corpus.sources.prepared import (
     Header,
     PreparedVideo,
     prepared_name,
     read_manifest,
     write_manifest,
 )
-from v2v_server.corpus.scenes.analysis import SceneAnalysis
-from v2v_server.corpus.scenes.scene import MOST_ANALYSED_FRAMES, Scene
+from v2v_server.corpus.sources.source import MANIFEST_NAME
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.store.format import DEFAULT_SIZE, SIZES
 from v2v_server.store.pixels import kind_of, open_pixels

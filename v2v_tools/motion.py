@@ -16,8 +16,7 @@ from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.scenes.findings import Defect
-from v2v_server.corpus.scenes.picture_check import CHANGES, hides_motion
+from v2v_server.corpus.scenes.picture_check import CHANGES, Defect, hides_motion
 from v2v_server.motion.prediction import SUBSTEP_PX, Prediction, predict
 from v2v_server.schedule.sequences import VideoSequence
 from v2v_server.simulation.effects import NOISE

@@ -24,7 +24,7 @@ from tests.waiting import until
 from v2v_client import Batch
 from v2v_client.local_server import LocalServer
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.manifest import read_manifest
+from v2v_server.corpus.sources.prepared import read_manifest
 from v2v_server.prepare import PARTIAL_SUFFIX, prepare
 from v2v_server.quarantine import read_quarantine
 from v2v_server.simulation.precision import warm_up

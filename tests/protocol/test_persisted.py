@@ -22,7 +22,7 @@ from v2v_protocol.persisted import LARGEST_LIST, Int64, reader, to_plain
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, SampleId, SampleParams
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.manifest import Header
+from v2v_server.corpus.sources.prepared import Header
 from v2v_server.store.format import PACK_METHODS, Head
 
 ROOT = Path(__file__).parents[2]

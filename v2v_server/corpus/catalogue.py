@@ -24,26 +24,35 @@ from v2v_protocol.errors import CorpusError, IndexUnreadable, VideoChanged
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.figures import SceneCollection, collect_sidecars, files_for_lease, sidecar_kind
 from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
-from v2v_server.corpus.manifest import ABSENT, Header
 from v2v_server.corpus.probe import VideoProgress, batches, probe_files
-from v2v_server.corpus.scenes.collect import SceneCollection
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sidecars import Sidecars, collect_sidecars, files_for_lease, sidecar_kind
-from v2v_server.corpus.sources.listfile import ListEntry, left_out_note
+from v2v_server.corpus.sources.prepared import ABSENT, Header
 from v2v_server.corpus.sources.sidecar import sidecar_id
 from v2v_server.corpus.sources.source import (
     COPIES_GIB,
     GONE,
     FileState,
+    ListEntry,
     Notice,
     SourceOptions,
     VideoSource,
     by_parts,
     is_said,
+    left_out_note,
     open_source,
 )
-from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos, VideoTable, joined, missing_arrays
+from v2v_server.corpus.videos import (
+    NO_THRESHOLDS,
+    CorpusFacts,
+    Sidecars,
+    Thresholds,
+    Videos,
+    VideoTable,
+    joined,
+    missing_arrays,
+)
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.store.pixels import VIDEOS, VideosKind
 from v2v_server.store.store_file import STORE_FORMAT

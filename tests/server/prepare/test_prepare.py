@@ -20,8 +20,9 @@ from tests.oracles.decoded import decode_luma
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_server.commands.prepare import main as prepare_main
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.manifest import MANIFEST_NAME, read_manifest
 from v2v_server.corpus.probe import facts_of
+from v2v_server.corpus.sources.prepared import read_manifest
+from v2v_server.corpus.sources.source import MANIFEST_NAME
 from v2v_server.prepare import Report, prepare
 from v2v_server.store.store_file import StoreFile
 from v2v_server.video.collect import ClipRequest, Cut

@@ -27,7 +27,8 @@ from tests.waiting import until
 from v2v_protocol.errors import CorpusError, VideoError
 from v2v_server.commands.prepare import main, summary
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.manifest import MANIFEST_NAME, read_manifest
+from v2v_server.corpus.sources.prepared import read_manifest
+from v2v_server.corpus.sources.source import MANIFEST_NAME
 from v2v_server.prepare import PARTIAL_SUFFIX, Transcoding, find_standing, prepare, refuse_links
 from v2v_server.store.store_file import StoreFile
 from v2v_server.video.fingerprint import fingerprint
