@@ -11,7 +11,7 @@
     schedule/     which sequence each index is made from
     corpus/       which videos exist
     store/        prepared clips, lossless
-    flow/         optical flow
+    flow.py       optical flow
     simulation/   the virtual camera
     video/        from a file to luma
     system/       services of the operating system

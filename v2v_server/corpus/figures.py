@@ -32,7 +32,7 @@ from v2v_server.corpus.sources.prepared import Manifest
 from v2v_server.corpus.sources.sidecar import files_between, open_sidecar, read_files, sidecar_id
 from v2v_server.corpus.sources.source import Notice, VideoSource, by_parts
 from v2v_server.corpus.videos import Sidecars, SplitVideos, VideoTable, encoded_pieces, joined
-from v2v_server.labels.formats import check_labels
+from v2v_server.labels import check_labels
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated, run_twice
 from v2v_server.video.collect import ClipRequest, Cut

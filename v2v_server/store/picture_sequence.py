@@ -25,7 +25,7 @@ from av.video.frame import VideoFrame
 from v2v_protocol.errors import VideoError
 from v2v_protocol.programs import printable
 from v2v_protocol.sample import ARRAYS, sidecar_endings
-from v2v_server.labels.formats import frame_of
+from v2v_server.labels import frame_of
 from v2v_server.store.video_file import VideoFile
 from v2v_server.video.collect import Stack
 from v2v_server.video.fingerprint import TIMES, files_in, unreadable

@@ -49,8 +49,7 @@ from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
-from v2v_server.labels.formats import READERS, BoxTable, numbered_files, read_mask
-from v2v_server.labels.views import kept_boxes, view_boxes, view_mask
+from v2v_server.labels import READERS, BoxTable, kept_boxes, numbered_files, read_mask, view_boxes, view_mask
 from v2v_server.motion import cells_of, levels_of
 from v2v_server.simulation.draw import choose_crop, draw
 from v2v_server.simulation.intensity import eight_bits

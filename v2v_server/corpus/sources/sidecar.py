@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import VideoChanged, VideoError, VideoGone
 from v2v_protocol.sample import ARRAYS, sidecar_endings
-from v2v_server.labels.formats import frame_of
+from v2v_server.labels import frame_of
 from v2v_server.video.fingerprint import unreadable
 
 if TYPE_CHECKING:
