@@ -58,8 +58,7 @@ from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import MOST_BITS
-from v2v_server.video.orientation import PixelRect
+from v2v_server.video.picture import MOST_BITS, PixelRect
 from v2v_server.video.rows import Rows
 
 _STORED_BITS_PER_PIXEL = 2.2

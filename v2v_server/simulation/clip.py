@@ -22,7 +22,7 @@ from v2v_server.simulation.intensity import Intensity, log_table_float64
 from v2v_server.simulation.kernels import KernelInput, Voxels
 from v2v_server.simulation.precision import AUTO, EFFECTS_MARGIN, check_thresholds, choose, noise_sum
 from v2v_server.simulation.voxel import Levels, bin_edges, timed_edges
-from v2v_server.video.luma import MOST_BITS, SDR, TRANSFERS, Signal
+from v2v_server.video.picture import MOST_BITS, SDR, TRANSFERS, Signal
 
 _WEIGHTS = (299, 587, 114)
 """Weights of red, green and blue in grey (ITU-R BT.601), thousandths."""

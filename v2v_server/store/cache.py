@@ -32,7 +32,7 @@ from v2v_server.store.store_file import StoreFile, read_clips, write_store
 from v2v_server.system.status_fields import GIB
 from v2v_server.video.collect import ClipRequest
 from v2v_server.video.decode import DecodedClip
-from v2v_server.video.orientation import PixelRect
+from v2v_server.video.picture import PixelRect
 
 _LOCK_SECONDS = 0.06
 """Longest wait for the lock of the folder; a sample does without the cache rather than wait."""

@@ -34,9 +34,8 @@ import zstandard
 
 from v2v_protocol.errors import ProtocolError, VideoError
 from v2v_protocol.persisted import Persisted, later
-from v2v_server.video.colour.chroma import DEFAULT_MATRIX
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
-from v2v_server.video.luma import MIXED, MOST_BITS, SDR, TRANSFERS, Signal
+from v2v_server.video.picture import DEFAULT_MATRIX, MIXED, MOST_BITS, SDR, TRANSFERS, Signal
 
 Bytes = bytes | memoryview
 
@@ -152,8 +151,8 @@ class Head(Persisted):
         group: frames in a group.
         packing: method of :mod:`v2v_server.store.format`.
         index: ``FrameIndex.to_bytes()`` of the source; empty in a piece.
-        bits, transfer: of the source (``v2v_server.video.luma.Signal``).
-        matrix: of the plane "chroma" (``v2v_server.video.colour.chroma.Chroma``). These three are left out of the file
+        bits, transfer: of the source (``v2v_server.video.picture.Signal``).
+        matrix: of the plane "chroma" (``v2v_server.video.picture.Chroma``). These three are left out of the file
             where they are the defaults.
     """
 

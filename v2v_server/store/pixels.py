@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # a server's command line, which names the kinds, starts with
     from v2v_server.video.collect import ClipRequest, DecodedPicture
     from v2v_server.video.decode import DecodedClip
     from v2v_server.video.frame_index import FrameIndex
-    from v2v_server.video.luma import Signal
+    from v2v_server.video.picture import Signal
     from v2v_server.video.probe import VideoFacts
 
 PIXEL_KINDS: Mapping[str, tuple[str, ...]] = {
@@ -104,7 +104,7 @@ class Pixels(Protocol):
 def signal_of(pixels: Pixels, index: FrameIndex) -> Signal:
     """Return what the levels of a video mean, by its first frame, whatever the sample."""
     from v2v_server.video.collect import ClipRequest, Cut
-    from v2v_server.video.luma import MOST_BITS
+    from v2v_server.video.picture import MOST_BITS
 
     cut = Cut(1, (0, 0, 1, 1))
     return pixels.clips(ClipRequest(index, index.first, (cut,), most_bits=MOST_BITS, samples=((0, 0, 0),)))[0].signal

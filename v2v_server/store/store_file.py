@@ -40,8 +40,7 @@ from v2v_server.system.process import make_private
 from v2v_server.video.collect import ClipRequest, DecodedPicture
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import MIXED, SDR, Signal
-from v2v_server.video.orientation import PixelRect
+from v2v_server.video.picture import MIXED, SDR, PixelRect, Signal
 from v2v_server.video.probe import VideoFacts
 
 STORE_FORMAT = "v2v store file"

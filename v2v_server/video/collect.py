@@ -12,10 +12,24 @@ import numpy.typing as npt
 from av.video.frame import VideoFrame
 
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.video.colour.chroma import DEFAULT_MATRIX, Chroma, ChromaCut, ChromaStack
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import MIXED, SDR, TRANSFERS, BeyondBits, LumaFormat, Signal, copy_luma, luma_plane, stretch
-from v2v_server.video.orientation import Orientation, PixelRect
+from v2v_server.video.picture import (
+    DEFAULT_MATRIX,
+    MIXED,
+    SDR,
+    TRANSFERS,
+    BeyondBits,
+    Chroma,
+    ChromaCut,
+    ChromaStack,
+    LumaFormat,
+    Orientation,
+    PixelRect,
+    Signal,
+    copy_luma,
+    luma_plane,
+    stretch,
+)
 
 BIT_EXACT_CODECS = frozenset({
     "h264", "hevc", "vp8", "vp9", "av1", "ffv1", "huffyuv", "ffvhuff", "png", "utvideo",
@@ -54,7 +68,7 @@ class ClipRequest:
         cuts: what each sample takes of them, at least one.
         stride: takes frames start, start + stride ...
         rows: (first, one after the last) usable row, which the cells of a cut count from; None: all rows.
-        most_bits: bits of a level to keep of deeper luma, 8 to ``luma.MOST_BITS``; None: 8, and the signal is SDR,
+        most_bits: bits of a level to keep of deeper luma, 8 to ``picture.MOST_BITS``; None: 8, and the signal is SDR,
             whatever the file states.
         samples: (seed, epoch, index) of the sample of each cut, for pixels that differ from sample to sample; empty
             where no sample is made.
@@ -116,7 +130,7 @@ class DecodedPicture:
         codec: name of the format that it was decoded from.
         bit_exact: whether every host decodes these very bytes.
         colour: [2, rows, columns] int8, Cb and Cr; None if they were not asked for.
-        matrix: of the colour (:class:`v2v_server.video.colour.chroma.Chroma`).
+        matrix: of the colour (:class:`v2v_server.video.picture.Chroma`).
     """
 
     luma: npt.NDArray[Any]
@@ -133,7 +147,7 @@ class DecodedFrame(NamedTuple):
 
     Attributes:
         frame: the frame.
-        samples, luma: see :func:`v2v_server.video.luma.luma_plane`.
+        samples, luma: see :func:`v2v_server.video.picture.luma_plane`.
         orientation, height_px, width_px: of the upright picture.
         signal: what the levels mean that were asked for.
         codec: FFmpeg's name of the format.

@@ -30,10 +30,9 @@ from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError
 from v2v_server.video.collect import BIT_EXACT_CODECS, ClipRequest, Cut, DecodedFrame, DecodedPicture, Stack, Watch
-from v2v_server.video.colour.chroma import Chroma
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
-from v2v_server.video.luma import SDR, Signal
 from v2v_server.video.packets import is_unreferenced, length_bytes
+from v2v_server.video.picture import SDR, Chroma, Signal
 from v2v_server.video.source import opened, packets, reason
 
 _VERSIONED_CODECS = frozenset({"h264", "mpeg4"})
@@ -44,8 +43,8 @@ class DecodedClip:
     """A range of frames.
 
     Attributes:
-        frames: [count, h, w], C-contiguous: full-range luma (see :mod:`v2v_server.video.luma`), uint8, or uint16 if the
-            signal has more than 8 bits.
+        frames: [count, h, w], C-contiguous: full-range luma (see :mod:`v2v_server.video.picture`), uint8, or uint16
+            if the signal has more than 8 bits.
         seconds: [count] float64, presentation times; NaN where unknown.
         codec: FFmpeg's name of the format.
         bit_exact: whether every host decodes these very bytes.

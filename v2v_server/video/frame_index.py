@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, UsageError
-from v2v_server.video.orientation import Orientation
+from v2v_server.video.picture import Orientation
 
 NO_TIMESTAMP = -(2**63)
 """Stands for an unknown pts or dts (FFmpeg's AV_NOPTS_VALUE)."""

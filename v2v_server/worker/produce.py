@@ -60,9 +60,8 @@ from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache, Cached
 from v2v_server.video.collect import ClipRequest, Cut
-from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import DecodedClip
-from v2v_server.video.luma import MIXED, MOST_BITS, SDR
+from v2v_server.video.picture import MIXED, MOST_BITS, SDR, ChromaCut
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, fill_rows, makes, simulate
 from v2v_server.worker.scene_choice import (
@@ -103,7 +102,7 @@ def frames_rgb(context: SampleContext, out: npt.NDArray[Any]) -> None:
         chroma = np.stack([apply_view(each[:, rows[:, None], columns], view, context.recipe) for each in chroma])
         rows, columns = (np.arange(side, dtype=np.int64) for side in size)
     # Import lazily: most workers make no colour.
-    from v2v_server.video.colour.rgb import add_colour, differences_of
+    from v2v_server.video.rgb import add_colour, differences_of
 
     add_colour(grey[:, 0], chroma, places, rows, columns, differences_of(matrix, params.contrast or 1.0), out)
 

@@ -27,7 +27,7 @@ from v2v_server.video.collect import DecodedPicture
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import unseekable
-from v2v_server.video.luma import SDR
+from v2v_server.video.picture import SDR
 from v2v_server.video.probe import VideoFacts
 
 
@@ -81,7 +81,7 @@ from v2v_server.video.collect import DecodedPicture
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import unseekable
-from v2v_server.video.luma import SDR
+from v2v_server.video.picture import SDR
 from v2v_server.video.probe import VideoFacts
 
 FRAMES, HEIGHT, WIDTH = 30, 32, 40
@@ -186,7 +186,7 @@ from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.pixels import signal_of
 from v2v_server.store.store_file import StoreFile
 from v2v_server.store.toy_world import drawn
-from v2v_server.video.luma import SDR
+from v2v_server.video.picture import SDR
 
 root = Path(sys.argv[1])
 row = Row("paper", count=4)

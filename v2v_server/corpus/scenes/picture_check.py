@@ -29,8 +29,7 @@ from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.system.process import usable_cores
 from v2v_server.video.collect import ClipRequest, Cut
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import SDR, Signal
-from v2v_server.video.orientation import PixelRect
+from v2v_server.video.picture import SDR, PixelRect, Signal
 from v2v_server.video.probe import DOLBY_VISION
 
 DUPLICATES, CUTS, FADES, BARS, STILL, BLACK, WHITE, COMBED, NOISY = FINDING_KINDS = (

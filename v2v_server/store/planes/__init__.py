@@ -31,8 +31,7 @@ from v2v_protocol.persisted import reader
 from v2v_server.store.format import BLOCK_ROWS, Head, check, group_frames_for
 from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
 from v2v_server.video.decode import DecodedClip
-from v2v_server.video.luma import SDR, Signal
-from v2v_server.video.orientation import PixelRect
+from v2v_server.video.picture import SDR, PixelRect, Signal
 
 if TYPE_CHECKING:
     from v2v_server.store.store_file import StoreFile

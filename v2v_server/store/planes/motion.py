@@ -15,8 +15,7 @@ import numpy as np
 from v2v_server.store.planes import Files, Plane
 from v2v_server.video.collect import ClipRequest, Cut, DecodedFrame, DecodedPicture, Watch
 from v2v_server.video.decode import DecodedClip
-from v2v_server.video.luma import SDR, Signal
-from v2v_server.video.orientation import PixelRect
+from v2v_server.video.picture import SDR, PixelRect, Signal
 
 if TYPE_CHECKING:
     from v2v_server.motion import Cells, MotionOfCuts, Vectors
