@@ -56,7 +56,7 @@ from v2v_server.store.quota import LEAST_FREE_BYTES
 from v2v_server.store.store_file import StoreFile, write_store
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
-from v2v_server.video.collect import ClipRequest, Cut
+from v2v_server.video.decode import ClipRequest, Cut
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.picture import MOST_BITS, PixelRect
 from v2v_server.video.rows import Rows

@@ -24,8 +24,7 @@ from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.view import apply_view, without_margin
 from v2v_server.store.pixels import signal_of
 from v2v_server.system.compile_cache import cv2
-from v2v_server.video.collect import ClipRequest, Cut
-from v2v_server.video.decode import DecodedClip
+from v2v_server.video.decode import ClipRequest, Cut, DecodedClip
 from v2v_server.video.picture import SDR
 from v2v_server.worker.produce import Decoded, make_sample, plan_sample
 from v2v_tools.remake import RemadeSample, Remaker, lease_for

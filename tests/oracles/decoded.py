@@ -8,8 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.video.collect import ClipRequest, Cut
-from v2v_server.video.decode import DecodedClip, decode_cuts, stream_pictures
+from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, decode_cuts, stream_pictures
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.picture import PixelRect
 

@@ -35,7 +35,7 @@ from v2v_server.corpus.videos import Sidecars, SplitVideos, VideoTable, encoded_
 from v2v_server.labels import check_labels
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated, run_twice
-from v2v_server.video.collect import ClipRequest, Cut
+from v2v_server.video.decode import ClipRequest, Cut
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.picture import PixelRect
 from v2v_server.video.rows import Rows

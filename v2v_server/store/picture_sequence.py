@@ -27,7 +27,7 @@ from v2v_protocol.programs import printable
 from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_server.labels import frame_of
 from v2v_server.store.video_file import VideoFile
-from v2v_server.video.collect import Stack
+from v2v_server.video.decode import Stack
 from v2v_server.video.fingerprint import TIMES, files_in, unreadable
 from v2v_server.video.frame_index import unseekable
 from v2v_server.video.picture import LumaFormat, Orientation

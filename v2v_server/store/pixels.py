@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from v2v_protocol.errors import UsageError
 
 if TYPE_CHECKING:  # a server's command line, which names the kinds, starts without the decoder
-    from v2v_server.video.collect import ClipRequest, DecodedPicture
-    from v2v_server.video.decode import DecodedClip
+    from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture
     from v2v_server.video.frame_index import FrameIndex
     from v2v_server.video.picture import Signal
     from v2v_server.video.probe import VideoFacts
@@ -103,7 +102,7 @@ class Pixels(Protocol):
 
 def signal_of(pixels: Pixels, index: FrameIndex) -> Signal:
     """Return what the levels of a video mean, by its first frame, whatever the sample."""
-    from v2v_server.video.collect import ClipRequest, Cut
+    from v2v_server.video.decode import ClipRequest, Cut
     from v2v_server.video.picture import MOST_BITS
 
     cut = Cut(1, (0, 0, 1, 1))

@@ -37,8 +37,7 @@ from v2v_server.store.format import (
 )
 from v2v_server.store.planes import PLANES, Files, PlanePlace, pack_footer, read_footer
 from v2v_server.system.process import make_private
-from v2v_server.video.collect import ClipRequest, DecodedPicture
-from v2v_server.video.decode import DecodedClip
+from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.picture import MIXED, SDR, PixelRect, Signal
 from v2v_server.video.probe import VideoFacts

@@ -59,8 +59,7 @@ from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache, Cached
-from v2v_server.video.collect import ClipRequest, Cut
-from v2v_server.video.decode import DecodedClip
+from v2v_server.video.decode import ClipRequest, Cut, DecodedClip
 from v2v_server.video.picture import MIXED, MOST_BITS, SDR, ChromaCut
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, fill_rows, makes, simulate

@@ -25,7 +25,7 @@ from v2v_server.corpus.sources.prepared import read_manifest
 from v2v_server.corpus.sources.source import MANIFEST_NAME
 from v2v_server.prepare import Report, prepare
 from v2v_server.store.store_file import StoreFile
-from v2v_server.video.collect import ClipRequest, Cut
+from v2v_server.video.decode import ClipRequest, Cut
 from v2v_server.video.fingerprint import fingerprint, is_same_file
 from v2v_server.video.probe import probe
 from v2v_server.video.rows import Rows

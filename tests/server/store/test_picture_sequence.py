@@ -30,7 +30,7 @@ from v2v_server.prepare import prepare
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.picture_sequence import PictureSequence, id_of
 from v2v_server.store.pixels import VideosKind
-from v2v_server.video.collect import ClipRequest, Cut
+from v2v_server.video.decode import ClipRequest, Cut
 
 SEQUENCES, AT_25 = VideosKind("sequences"), VideosKind("sequences", 25.0)
 FRAMES, HEIGHT, WIDTH = 30, 32, 40

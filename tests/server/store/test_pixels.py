@@ -23,7 +23,7 @@ from contextlib import nullcontext
 
 import numpy as np
 
-from v2v_server.video.collect import DecodedPicture
+from v2v_server.video.decode import DecodedPicture
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import unseekable
@@ -77,7 +77,7 @@ from contextlib import nullcontext
 
 import numpy as np
 
-from v2v_server.video.collect import DecodedPicture
+from v2v_server.video.decode import DecodedPicture
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import unseekable

@@ -27,7 +27,7 @@ from v2v_server.store.pixels import signal_of
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.system.process import usable_cores
-from v2v_server.video.collect import ClipRequest, Cut
+from v2v_server.video.decode import ClipRequest, Cut
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.picture import SDR, PixelRect, Signal
 from v2v_server.video.probe import DOLBY_VISION

@@ -29,8 +29,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import ProtocolError, UsageError, VideoError
 from v2v_protocol.persisted import reader
 from v2v_server.store.format import BLOCK_ROWS, Head, check, group_frames_for
-from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
-from v2v_server.video.decode import DecodedClip
+from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, DecodedPicture
 from v2v_server.video.picture import SDR, PixelRect, Signal
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.store.planes import Files, Plane
-from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
-from v2v_server.video.decode import DecodedClip
+from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, DecodedPicture
 from v2v_server.video.picture import CHROMA_CELL_PX, Chroma, ChromaCut, Signal
 
 

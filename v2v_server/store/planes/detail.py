@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.store.planes import Files, Plane
-from v2v_server.video.collect import ClipRequest, DecodedPicture
-from v2v_server.video.decode import DecodedClip
+from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture
 from v2v_server.video.picture import SDR, Signal
 
 

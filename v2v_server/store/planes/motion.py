@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from v2v_server.store.planes import Files, Plane
-from v2v_server.video.collect import ClipRequest, Cut, DecodedFrame, DecodedPicture, Watch
-from v2v_server.video.decode import DecodedClip
+from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, DecodedFrame, DecodedPicture, Watch
 from v2v_server.video.picture import SDR, PixelRect, Signal
 
 if TYPE_CHECKING:
