@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_pictures import canvas
-from v2v_pictures.canvas import Canvas
-from v2v_pictures.colours import DARKER, Image
+from v2v_pictures.canvas import DARKER, Canvas, Image
 
 _WIDTH_PX, _PANEL_PX, _LINE_PX = 1400, 190, 22
 _COLUMNS = 2

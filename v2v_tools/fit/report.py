@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from v2v_pictures.colours import Image
+from v2v_pictures.canvas import Image
 from v2v_pictures.comparison import Curves, draw_comparison
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.safe_yaml import format_yaml
