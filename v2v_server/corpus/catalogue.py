@@ -29,7 +29,6 @@ from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
 from v2v_server.corpus.probe import VideoProgress, batches, probe_files
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.prepared import ABSENT, Header
-from v2v_server.corpus.sources.sidecar import sidecar_id
 from v2v_server.corpus.sources.source import (
     COPIES_GIB,
     GONE,
@@ -42,6 +41,7 @@ from v2v_server.corpus.sources.source import (
     is_said,
     left_out_note,
     open_source,
+    sidecar_id,
 )
 from v2v_server.corpus.videos import (
     NO_THRESHOLDS,

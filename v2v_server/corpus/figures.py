@@ -29,8 +29,15 @@ from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.probe import LARGEST_PROBE_BYTES, LONGEST_SECONDS, VideoProgress, batches
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_ANALYSED_FRAMES, PIECE, Scene
 from v2v_server.corpus.sources.prepared import Manifest
-from v2v_server.corpus.sources.sidecar import files_between, open_sidecar, read_files, sidecar_id
-from v2v_server.corpus.sources.source import Notice, VideoSource, by_parts
+from v2v_server.corpus.sources.source import (
+    Notice,
+    VideoSource,
+    by_parts,
+    files_between,
+    open_sidecar,
+    read_files,
+    sidecar_id,
+)
 from v2v_server.corpus.videos import Sidecars, SplitVideos, VideoTable, encoded_pieces, joined
 from v2v_server.labels import check_labels
 from v2v_server.system.compile_cache import compile_cache
@@ -260,7 +267,7 @@ def collect_sidecars(
         store: the index.
         videos: fingerprint of each video's file, by id.
         shape: of each video.
-        endings: see :mod:`v2v_server.corpus.sources.sidecar`.
+        endings: see :mod:`v2v_server.corpus.sources.source`.
         processes: number of processes that read; 0 reads in this one.
         notice: progress callback.
     """

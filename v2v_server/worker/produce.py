@@ -46,8 +46,7 @@ from v2v_protocol.sample import (
 )
 from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
-from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.corpus.sources.source import VideoSource, open_sidecar, sidecar_id
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.labels import READERS, BoxTable, kept_boxes, numbered_files, read_mask, view_boxes, view_mask
 from v2v_server.motion import cells_of, levels_of

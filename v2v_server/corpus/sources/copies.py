@@ -42,8 +42,6 @@ from v2v_protocol.errors import (
     VideoUnreadable,
 )
 from v2v_protocol.programs import printable
-from v2v_server.corpus.sources.sidecar import fingerprint_of as sidecar_fingerprint
-from v2v_server.corpus.sources.sidecar import is_sidecar, state_text
 from v2v_server.corpus.sources.source import (
     GONE,
     MANIFEST_NAME,
@@ -53,6 +51,9 @@ from v2v_server.corpus.sources.source import (
     SourceOptions,
     VideoSource,
     count_left_out,
+    is_sidecar,
+    sidecar_fingerprint,
+    state_text,
 )
 from v2v_server.store.quota import MOST_GIB, PARTIAL, QuotaFolder
 from v2v_server.system.process import cache_folder, lock, make_private, open_private
