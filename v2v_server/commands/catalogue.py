@@ -17,8 +17,8 @@ from v2v_protocol.progress import Progress, format_duration
 from v2v_protocol.spec import SCENES
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, index_path, list_corpus, open_catalogue, refresh_index
-from v2v_server.corpus.figures import SceneCollection
 from v2v_server.corpus.index import Shard, make_folder, merge_parts, parts_in, write_part
+from v2v_server.corpus.probe import SceneCollection
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
 from v2v_server.store.pixels import VideosKind
 from v2v_server.system.process import usable_cores

@@ -3,8 +3,7 @@
 catalogue        the snapshot that everything else works from: listed, indexed, opened
 videos           its videos in columns
 sources          where the videos come from
-probe            probing many files in processes of their own
+probe            reading many files in processes of their own: videos, their scenes, their sidecars
 index            what probing found, on disk
-figures          what the index holds beside that of all videos: statistics of their scenes, files beside them
 scenes           what the videos show, and what is wrong with it
 """

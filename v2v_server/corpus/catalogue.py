@@ -24,9 +24,16 @@ from v2v_protocol.errors import CorpusError, IndexUnreadable, VideoChanged
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.figures import SceneCollection, collect_sidecars, files_for_lease, sidecar_kind
 from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
-from v2v_server.corpus.probe import VideoProgress, batches, probe_files
+from v2v_server.corpus.probe import (
+    SceneCollection,
+    VideoProgress,
+    batches,
+    collect_sidecars,
+    files_for_lease,
+    probe_files,
+    sidecar_kind,
+)
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.prepared import ABSENT, Header
 from v2v_server.corpus.sources.source import (

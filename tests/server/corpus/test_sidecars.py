@@ -16,7 +16,7 @@ from tests.clips import panned_luma, write_clip
 from v2v_protocol import sample
 from v2v_protocol.errors import VideoChanged, VideoError, VideoGone
 from v2v_protocol.sample import FromSidecar
-from v2v_server.corpus import figures as collecting
+from v2v_server.corpus import probe as collecting
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources import source as asking
 from v2v_server.corpus.sources.source import SourceOptions, open_sidecar, open_source, read_files, sidecar_id

@@ -18,7 +18,7 @@ from tests.clips import damaged, panned_luma, write_clip
 from tests.pieces import pieces, shots
 from tests.server.corpus.failing_storage import failing_opens
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
-from v2v_server.corpus import figures as collect
+from v2v_server.corpus import probe as collect
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.scenes.analysis import analyse
 from v2v_server.corpus.scenes.scene import (
