@@ -1,6 +1,6 @@
 """Draw films of events, grey pictures and flow side by side, as PNG and as video. Images are RGB.
 
-Events are drawn as the sum over the bins of a voxel grid, in the colours of :mod:`v2v_pictures.canvas`.
+Events are drawn as the sum over the bins of a voxel grid, in the colours of :mod:`v2v_pictures.colours`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from v2v_pictures import canvas, files
+from v2v_pictures import colours, files
 from v2v_pictures.canvas import SOFT, Canvas
 from v2v_protocol.errors import UsageError
 
@@ -35,12 +35,12 @@ def draw_events(voxels: npt.NDArray[np.generic]) -> Image:
     """Draw signed counts [..., bins, H, W] as [..., H, W, 3], all in one scale."""
     counts = voxels.astype(np.float32).sum(axis=-3)
     counts[np.abs(counts) < LEAST_COUNT] = 0
-    return canvas.draw_events(counts, canvas.full_colour([counts]))
+    return colours.draw_events(counts, colours.full_colour([counts]))
 
 
 def draw_grey(pictures: npt.NDArray[np.floating]) -> Image:
     """Draw grey values [..., H, W] in 0 .. 1 (clipped) as [..., H, W, 3]."""
-    return canvas.draw_grey(pictures)
+    return colours.draw_grey(pictures)
 
 
 def flow_scale(flow: npt.NDArray[np.floating]) -> float:
@@ -51,7 +51,7 @@ def flow_scale(flow: npt.NDArray[np.floating]) -> float:
 def draw_flow(flow: npt.NDArray[np.floating], scale: float) -> Image:
     """Draw flow [..., 2, H, W] (x, y) px as [..., H, W, 3], with full colour at ``scale`` px and darker beyond it."""
     fields = flow.reshape(-1, *flow.shape[-3:])
-    drawn = np.stack([canvas.draw_flow(field, scale) for field in fields])
+    drawn = np.stack([colours.draw_flow(field, scale) for field in fields])
     return drawn.reshape(*flow.shape[:-3], *drawn.shape[1:])
 
 
@@ -96,8 +96,8 @@ def add_header(picture: Image, panels: Sequence[str], title: str = "", *, time_r
         x = left + number * width / len(panels) + 2
         page.text(x, top - _NAMES_PX, name)
         if name == EVENTS:
-            end = page.text(x, top - _NAMES_PX + 20, "brighter", colour=canvas.BRIGHTER, size=_SMALL_PT)
-            page.text(end + 6, top - _NAMES_PX + 20, "darker", colour=canvas.DARKER, size=_SMALL_PT)
+            end = page.text(x, top - _NAMES_PX + 20, "brighter", colour=colours.BRIGHTER, size=_SMALL_PT)
+            page.text(end + 6, top - _NAMES_PX + 20, "darker", colour=colours.DARKER, size=_SMALL_PT)
     if time_runs_down:
         page.text(2, top, "time", colour=SOFT)
         page.vector(left / 2, top + 26, 0, height - 34)

@@ -1,6 +1,7 @@
 """Pictures and films of event data, drawn one way everywhere: preview, demo, training, benchmarks.
 
-    canvas.py    a page: text, panels, bars, arrows, hatching; the palette; event counts, grey pictures and flow as RGB
+    canvas.py    a page: text, panels, bars, arrows, hatching; the palette
+    colours.py   event counts, grey pictures and flow as RGB, and one scale for all panels of a page
     camera.py    one simulated clip as its virtual camera saw it: activity over time, pauses, moments worth showing
     sheet.py     a page of cameras: activity over the clip, frame, bins, flow, labels, with headings and legend
     grids.py     voxel grids alone, as `simulate` returns them

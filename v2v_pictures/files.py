@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image as Pictures
 
 from v2v_pictures import canvas
-from v2v_pictures.canvas import BRIGHTER, DARKER, Image
+from v2v_pictures.colours import BRIGHTER, DARKER, Image
 from v2v_protocol.write_aside import write_file
 
 _GIF_COLOURS, _GIF_COMMON, _GIF_STEP = 96, 24, 8

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 
 from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import GAP_PX, PAGE_MARGIN_PX, Canvas, Image, draw_events, draw_grey, label
+from v2v_pictures.canvas import GAP_PX, PAGE_MARGIN_PX, Canvas, label
+from v2v_pictures.colours import Image, draw_events, draw_grey
 from v2v_pictures.sheet import LABEL_PX, TICKS_PX, Scale, draw_strip, events_heading, flow_panel, labelled_panel
 
 _TITLE_PX, _STRIP_PX = 58, 50

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_pictures import canvas
-from v2v_pictures.canvas import GAP_PX, PAGE_MARGIN_PX, Canvas, Image, draw_events, full_colour
+from v2v_pictures.canvas import GAP_PX, PAGE_MARGIN_PX, Canvas
+from v2v_pictures.colours import Image, draw_events, full_colour
 from v2v_pictures.sheet import MOST_BINS, SCALE_PX, bin_headings, draw_scale, events_heading
 
 _HEADING_PX, _LABEL_PX, _SCALE_PX = 74, 140, 100

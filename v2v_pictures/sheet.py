@@ -16,21 +16,8 @@ import numpy.typing as npt
 
 from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import (
-    BRIGHTER,
-    DARKER,
-    GAP_PX,
-    PAGE_MARGIN_PX,
-    Canvas,
-    Image,
-    Rgb,
-    draw_events,
-    draw_flow,
-    draw_grey,
-    draw_wheel,
-    full_colour,
-    label,
-)
+from v2v_pictures.canvas import GAP_PX, PAGE_MARGIN_PX, Canvas, Rgb, label
+from v2v_pictures.colours import BRIGHTER, DARKER, Image, draw_events, draw_flow, draw_grey, draw_wheel, full_colour
 
 LABEL_PX, TICKS_PX = 22, 24
 """Above and below the strip."""

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.frame import panels
-from v2v_pictures.canvas import BRIGHTER, DARKER
+from v2v_pictures.colours import BRIGHTER, DARKER
 from v2v_server.simulation import simulate
 
 _THRESHOLD, _BINS, _FRAMES = 0.3, 5, 21

@@ -15,7 +15,7 @@ from tests.clips import panned_luma, write_clip
 from v2v_client import UsageError, V2VDataset, V2VStreamDataset
 from v2v_client.batch import _drawing, draw_samples
 from v2v_client.position import ResumeState, StreamIdentity
-from v2v_pictures.canvas import BRIGHTER
+from v2v_pictures.colours import BRIGHTER
 from v2v_protocol.recipe import Recipe
 from v2v_server.simulation import simulate
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from v2v_pictures.canvas import draw_flow, draw_wheel
+from v2v_pictures.colours import draw_flow, draw_wheel
 
 RED = (255, 0, 0)
 

@@ -18,21 +18,8 @@ from PIL import Image as Pictures
 from tests.pictures.cameras import camera, has, record_texts, without_noise
 from tests.protocol.test_sample import PARAMS, PROVENANCE
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import (
-    BRIGHTER,
-    DARKER,
-    INK,
-    MARK,
-    PAGE_MARGIN_PX,
-    PAUSED_INK,
-    Canvas,
-    beginning,
-    draw_events,
-    draw_grey,
-    full_colour,
-    shortened,
-    text_width,
-)
+from v2v_pictures.canvas import INK, MARK, PAGE_MARGIN_PX, PAUSED_INK, Canvas, beginning, shortened, text_width
+from v2v_pictures.colours import BRIGHTER, DARKER, draw_events, draw_grey, full_colour
 from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write_png
 from v2v_pictures.film import draw_film
 from v2v_pictures.sheet import (

@@ -20,7 +20,7 @@ from trainer.pictures import (
     side_by_side,
     write_png,
 )
-from v2v_pictures.canvas import BRIGHTER, DARKER
+from v2v_pictures.colours import BRIGHTER, DARKER
 from v2v_protocol.errors import UsageError
 
 

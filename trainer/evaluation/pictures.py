@@ -13,7 +13,7 @@ import numpy as np
 
 from trainer.evaluation.reconstruct import Step
 from trainer.pictures import EVENTS, PANEL_GAP_PX, Image, add_header, draw_events, draw_grey
-from v2v_pictures import canvas
+from v2v_pictures import colours
 from v2v_pictures.canvas import SOFT, Canvas
 
 CAPTION_PX = 18
@@ -72,7 +72,7 @@ def draw_recording(rows: Sequence[Image], name: str, windows_seconds: Sequence[f
     for y, image, text in (
         (
             8,
-            canvas.draw_events(2 * ramp - 1, 1.0),
+            colours.draw_events(2 * ramp - 1, 1.0),
             "events of a window: darker, none, brighter; a scale for each line",
         ),
         (34, draw_grey(ramp), "grey of reconstruction and camera: 0 is black, 1 is white"),

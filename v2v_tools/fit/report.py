@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_pictures import canvas
-from v2v_pictures.canvas import DARKER, Canvas, Image
+from v2v_pictures.canvas import Canvas
+from v2v_pictures.colours import DARKER, Image
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.safe_yaml import format_yaml
 from v2v_protocol.settings import settings_of
