@@ -147,12 +147,9 @@ def labelled_panel(
     """
     if camera.masks is not None:
         image = tint(image, camera.masks[grid])
-    page.panel(x, y, image, tile_px, tile_px)
+    left, top, scale = page.panel(x, y, image, tile_px, tile_px)
     if camera.boxes is None:
         return
-    height, width = image.shape[:2]
-    scale = min(tile_px / width, tile_px / height)
-    left, top = x + (tile_px - width * scale) / 2, y + (tile_px - height * scale) / 2
     for x0, y0, x1, y1, category, *_ in camera.boxes[grid]:
         if category < 0:
             continue
@@ -396,11 +393,8 @@ def events_heading(page: Canvas, x: float, y: float, what: str = "simulated even
 
 def flow_panel(page: Canvas, x: int, y: int, flow: npt.NDArray[np.generic], largest_px: float, tile_px: int) -> None:
     """Draw flow [2, H, W], px, in colour and with arrows, whose length grows with the flow up to ``largest_px``."""
-    page.panel(x, y, draw_flow(flow, largest_px), tile_px, tile_px)
-    height, width = flow.shape[1:]
-    scale = min(tile_px / width, tile_px / height)
-    x0, y0 = x + (tile_px - width * scale) / 2, y + (tile_px - height * scale) / 2
-    rows, columns = (np.linspace(0, side, _ARROWS + 1).round().astype(int) for side in (height, width))
+    x0, y0, scale = page.panel(x, y, draw_flow(flow, largest_px), tile_px, tile_px)
+    rows, columns = (np.linspace(0, side, _ARROWS + 1).round().astype(int) for side in flow.shape[1:])
     for top, bottom in pairwise(rows):
         for left, right in pairwise(columns):
             if bottom <= top or right <= left:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from v2v_protocol.errors import UsageError
+from v2v_recordings.archive import package
 from v2v_recordings.items import (
     NS_PER_UNIT,
     ConvertOptions,
@@ -53,7 +54,7 @@ def holds(path: Path, *names: str) -> bool:
     Raises:
         UsageError: it is an HDF5 file, but damaged.
     """
-    if not path.is_file() or path.suffix.lower() not in SUFFIXES or not _h5py(path).is_hdf5(path):
+    if not path.is_file() or path.suffix.lower() not in SUFFIXES or not package("h5py", str(path)).is_hdf5(path):
         return False
     with open_hdf5(path) as file:
         return all(name in file for name in names)
@@ -69,7 +70,7 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
     with contextlib.suppress(ImportError):
         importlib.import_module(_PLUGIN)
     try:
-        with _h5py(path).File(path, "r") as file:
+        with package("h5py", str(path)).File(path, "r") as file:
             require_self_contained(file, path)
             yield file
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
@@ -148,13 +149,6 @@ def sensor_size(shape: Any, path: Path) -> SensorSize:
     if len(sides) != 2 or sides.dtype.kind not in "iu":
         raise UsageError(f"{path}: the sensor's size is stated as {shape}, not as height and width")
     return SensorSize(int(sides[1]), int(sides[0]))
-
-
-def _h5py(path: Path) -> Any:
-    try:
-        return importlib.import_module("h5py")
-    except ModuleNotFoundError as error:
-        raise UsageError(f"{path}: needs the package {error.name}: pip install h5py") from error
 
 
 def require_self_contained(file: h5py.File, path: Path) -> None:
