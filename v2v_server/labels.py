@@ -119,22 +119,23 @@ class BoxTable:
         return self.corners[first:end], self.numbers[first:end]
 
 
-def checked(box: Box) -> Box:
-    """Return the box.
+def checked(where: str, box: Box) -> Box:
+    """Return the box, which lies at ``where``.
 
     Raises:
         ValueError: one of its numbers is outside its limits.
     """
     if not 0 <= box.frame <= _LARGEST_FRAME:
-        raise ValueError(f"frame {box.frame} of a box: give a whole number from 0")
+        raise ValueError(f"{where}: frame {box.frame} of a box: give a whole number from 0")
     if not all(-_LARGEST_PX <= number <= _LARGEST_PX for number in box[1:5]):  # also NaN
-        raise ValueError(f"box {list(box[1:5])}: coordinates are at most {_LARGEST_PX:g} px")
+        raise ValueError(f"{where}: box {list(box[1:5])}: coordinates are at most {_LARGEST_PX:g} px")
     if box.width < 0 or box.height < 0:
-        raise ValueError(f"box {list(box[1:5])}: width and height are at least 0")
+        raise ValueError(f"{where}: box {list(box[1:5])}: width and height are at least 0")
     if not 0 <= box.category <= LARGEST_NUMBER:
-        raise ValueError(f"class {box.category}: give a whole number from 0 to {LARGEST_NUMBER}")
+        raise ValueError(f"{where}: class {box.category}: give a whole number from 0 to {LARGEST_NUMBER}")
     if not NO_TRACK <= box.track <= LARGEST_NUMBER:
-        raise ValueError(f"track {box.track}: give a whole number from 0 to {LARGEST_NUMBER}, or {NO_TRACK} for none")
+        what = f"give a whole number from 0 to {LARGEST_NUMBER}, or {NO_TRACK} for none"
+        raise ValueError(f"{where}: track {box.track}: {what}")
     return box
 
 
@@ -169,7 +170,7 @@ def read_coco(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
         if (image := entry.whole("image_id")) not in frames:
             raise ValueError(f"annotations[{place}]: images has no id {image}")
         box = Box(frames[image], *entry.four("bbox"), entry.whole("category_id"), entry.track())
-        boxes.append(entry.checked(box))
+        boxes.append(checked(f"annotations[{place}]", box))
     return BoxTable.of(boxes, frozenset(numbers))
 
 
@@ -186,7 +187,7 @@ def read_mot(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
             raise ValueError(f"{where}: frame {frame:g}: MOT counts frames from 1")
         # Tools write -1 for the track of a detection.
         box = Box(_whole(where, frame) - 1, left - 1, top - 1, width, height, category, _whole(where, track))
-        boxes.append(_checked(where, box))
+        boxes.append(checked(where, box))
     return BoxTable.of(boxes)
 
 
@@ -227,7 +228,7 @@ def read_yolo(folder: Traversable, picture_px: tuple[int, int]) -> BoxTable:
             )
             track = _whole(where, values[5]) if len(values) == 6 else NO_TRACK
             category = _whole(where, values[0])
-            boxes.append(_checked(where, Box(frame, x - width / 2, y - height / 2, width, height, category, track)))
+            boxes.append(checked(where, Box(frame, x - width / 2, y - height / 2, width, height, category, track)))
     return BoxTable.of(boxes)
 
 
@@ -387,9 +388,6 @@ class _Entry:
             what = f"{self._place} has {stated[0]!r:.20}x{stated[1]!r:.20} px, the video {width}x{height} px"
             raise ValueError(f"{what}: scale its boxes to the video, and state that size")
 
-    def checked(self, box: Box) -> Box:
-        return _checked(self._place, box)
-
 
 def _list(content: Mapping[str, Any], key: str, optional: bool = False) -> list[Any]:
     value = content.get(key, [] if optional else None)
@@ -428,13 +426,6 @@ def _whole(where: str, value: float) -> int:
     if not value.is_integer():
         raise ValueError(f"{where}: {value} is not a whole number; frame, class and track are")
     return int(value)
-
-
-def _checked(where: str, box: Box) -> Box:
-    try:
-        return checked(box)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
 
 
 LEAST_SHARE = 0.1
