@@ -23,7 +23,7 @@ from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.prepare.prepare import prepare
+from v2v_server.prepare import prepare
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.cache import Cache, make_cache

@@ -18,7 +18,7 @@ from tests.clips import panned_luma, write_clip
 from tests.faults.private_mounts import ABSENT_SHM, FULL_SHM, READ_ONLY_SHM, mounted
 from tests.stream.conftest import digest, epoch_of
 from v2v_client.local_server import LocalServer
-from v2v_server.corpus.manifest import read_manifest
+from v2v_server.corpus.sources.prepared import read_manifest
 
 NO_SEMAPHORES = Path(__file__).parent / "no_semaphores"
 

@@ -13,7 +13,7 @@ from v2v_protocol.errors import V2VError
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_source
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.packing import QUICK, RAW
+from v2v_server.store.format import QUICK, RAW
 from v2v_server.system.log import Log, StartTimes, report_errors
 from v2v_server.system.process import die_with_parent
 from v2v_server.system.status_fields import GIB

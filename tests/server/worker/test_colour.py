@@ -23,11 +23,11 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.prepare.prepare import prepare
+from v2v_server.prepare import prepare
 from v2v_server.schedule.epoch import Schedule
 from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.store_file import StoreFile
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import decode_for, make_sample
 from v2v_tools.remake import Remaker, lease_for
