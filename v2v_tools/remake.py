@@ -26,8 +26,7 @@ from v2v_server.broker.grants import next_candidate
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
-from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
-from v2v_server.schedule.sequences import SequenceTable, VideoSequence
+from v2v_server.schedule import MOST_CANDIDATES, Schedule, SequenceTable, VideoSequence
 from v2v_server.store.pixels import VIDEOS, VideosKind
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
@@ -79,7 +78,7 @@ class Remaker:
         table = SequenceTable(catalogue.videos, catalogue.rows, spec)
         if not table.count:
             raise CorpusError(f"no video gives a sequence: {'; '.join(map(str, table.refusals[:3]))}")
-        self._schedule = Schedule.of(table, spec)
+        self._schedule = Schedule(table, spec)
         self.count = self._schedule.count
 
     def sequence(self, seed: int, epoch: int, index: int) -> VideoSequence:

@@ -40,18 +40,6 @@ from v2v_protocol.messages import (
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleId, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.actions import (
-    Action,
-    AddToQuarantine,
-    CheckVideo,
-    Disconnect,
-    GiveUp,
-    SendStatus,
-    ToConsumer,
-    ToWorker,
-    denial,
-    malformed,
-)
 from v2v_server.broker.grants import (
     answer_shared,
     as_leased,
@@ -64,13 +52,23 @@ from v2v_server.broker.grants import (
     quarantine_candidate,
     refuse_quarantined,
 )
-from v2v_server.broker.leases import Cause, Loss, Request, Stall, judge
+from v2v_server.broker.leases import MOST_WORKERS, SILENCE_SECONDS, Cause, Loss, Request, Stall, clean_name, judge
 from v2v_server.broker.session import Session
-from v2v_server.broker.state import Broker
-from v2v_server.broker.worker_registry import MOST_WORKERS, SILENCE_SECONDS, clean_name
+from v2v_server.broker.state import (
+    Action,
+    AddToQuarantine,
+    Broker,
+    CheckVideo,
+    Disconnect,
+    GiveUp,
+    SendStatus,
+    ToConsumer,
+    ToWorker,
+    denial,
+    malformed,
+)
 from v2v_server.quarantine import QuarantineEntry
-from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.sequences import MOST_CLIP_BYTES, SequenceTable
+from v2v_server.schedule import MOST_CLIP_BYTES, Schedule, SequenceTable
 
 MOST_SESSIONS = 4096
 MOST_FAULTS = 16
@@ -504,7 +502,7 @@ def admit(broker: Broker, identity: bytes, hello: Hello, workers: int, now: floa
             "saved state to None: the sequences that they refused then return"
         )
     table = _table(broker, spec)
-    schedule = Schedule.of(table, spec)
+    schedule = Schedule(table, spec)
     if not schedule.count:
         raise UsageError(
             f"{table.count} sequences do not fill a block of sibling_spacing = {spec.sibling_spacing}: use a "

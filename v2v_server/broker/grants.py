@@ -25,23 +25,22 @@ from v2v_protocol.errors import IndexUnreadable, ProtocolError, V2VError
 from v2v_protocol.messages import Lease, SampleHeader, Unavailable, decode, encode, largest_packed_bytes
 from v2v_protocol.sample import Form, Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.actions import (
+from v2v_server.broker.leases import Request, bounded_seconds, runs_alone
+from v2v_server.broker.session import Session
+from v2v_server.broker.state import (
     Action,
     AddToQuarantine,
+    Broker,
     CheckVideo,
+    RefusalPart,
     ReportRefusal,
     ToConsumer,
     ToWorker,
 )
-from v2v_server.broker.leases import Request, runs_alone
-from v2v_server.broker.session import Session
-from v2v_server.broker.state import Broker, RefusalPart
-from v2v_server.broker.worker_registry import bounded_seconds
 from v2v_server.corpus.videos import CorpusFacts, VideoEntry
 from v2v_server.quarantine import QuarantineEntry
-from v2v_server.schedule.epoch import MOST_CANDIDATES
-from v2v_server.schedule.sequences import VideoSequence
-from v2v_server.sharing.ring import SharedSample
+from v2v_server.schedule import MOST_CANDIDATES, VideoSequence
+from v2v_server.sharing import SharedSample
 
 LONGEST_REASON = 500
 """Characters kept of a refusal's reason."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +12,7 @@ from rich.live import Live
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import ServerLost, V2VError
-from v2v_server.status.client import StatusClient
+from v2v_server.status.snapshot import StatusClient
 from v2v_server.status.terminal import draw, line
 
 _LIVE_SECONDS, _LINE_SECONDS = 1.0, 10.0
@@ -72,7 +71,3 @@ def _live(console: Console, client: StatusClient, state: dict[str, Any], timeout
             except ServerLost as error:  # the server may come back
                 note = f"{error} The state shown is old."
             live.update(draw(state, note), refresh=True)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

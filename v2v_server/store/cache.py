@@ -31,7 +31,7 @@ from v2v_server.store.planes import OPTIONAL, PLANES, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
 from v2v_server.store.reader import StoreFile, read_clips
 from v2v_server.store.writer import write_store
-from v2v_server.system.status_fields import GIB
+from v2v_server.system.log import GIB
 from v2v_server.video.collect import ClipRequest
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.orientation import PixelRect
