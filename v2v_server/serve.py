@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from v2v_protocol.arena import LARGEST_SAMPLE_BYTES, give_back_freed_memory, keep_freed_memory
+from v2v_protocol.arena import give_back_freed_memory
 from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoGone
 from v2v_protocol.link.router import ConsumerGone, FromConsumer, FromWorker, InFlight, Sockets
 from v2v_protocol.link.user import OwnUser
@@ -51,7 +51,7 @@ from v2v_server.store.pixels import VideosKind
 from v2v_server.supervise.local_host import WorkerProcess
 from v2v_server.supervise.pool import Pool, Scaling, make_pool, question_workers
 from v2v_server.system.log import GIB, Level, Log
-from v2v_server.system.process import most_connections, open_many_files, usable_cores
+from v2v_server.system.process import keep_freed_memory, most_connections, open_many_files, usable_cores
 from v2v_server.video.rows import Rows
 
 _LONGEST_TURN_SECONDS = 1.0
@@ -111,7 +111,7 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, *, d
         UsageError: an address cannot be bound, the port file cannot be written, or the engine is not available.
         WorkerCrashLoop: the workers die without finishing anything.
     """
-    keep_freed_memory(most_bytes=LARGEST_SAMPLE_BYTES)
+    keep_freed_memory()
     open_many_files()
     log, label = Log(is_json=config.log_format == "json"), f"w{secrets.token_hex(4)}"
     # All that may be refused comes before the videos, which can take minutes to catalogue.
@@ -135,70 +135,53 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, *, d
             admits=None if is_open else OwnUser(_OWN_USER_RULE, log.say).admits,
         )
         opened.callback(sockets.close)
-        _serve(config, log, standbys, sockets, page, keys, label, debug=debug)
-
-
-def _serve(
-    config: ServeConfig,
-    log: Log,
-    standbys: list[WorkerProcess] | None,
-    sockets: Sockets,
-    page: PageProcess | None,
-    keys: KeyFolder | None,
-    label: str,
-    *,
-    debug: bool,
-) -> None:
-    """Open the catalogue and run the loop. Errors: see :func:`serve`."""
-    catalogue = load_catalogue(config)
-    table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
-    summary = corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused)
-    for line in (*catalogue.notes, *summary):
-        log.say(line)
-    catalogue.fail_fast()
-    if not table.count:
-        raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")
-    quarantine_file = quarantine_path(catalogue.source.name, config.cache_dir or None)
-    quarantine = read_quarantine(quarantine_file)
-    for entry in quarantine.entries(quarantine.latest):
-        log.say(f"in quarantine: {entry}")
-    dispatcher = Dispatcher(
-        catalogue.facts,
-        config.spec,
-        complete=lambda lease, spec: complete_lease(lease, catalogue, spec),
-        quarantine=quarantine,
-        wall_clock=utc_now,
-        lease_deadline_seconds=config.lease_deadline_seconds,
-        session_idle_seconds=config.session_idle_seconds,
-        max_credit_bytes=config.max_credit_bytes,
-        expected_workers=config.workers_in_all,
-        share_bytes=int(config.share_gib * GIB),
-    )
-    # Workers of this host use an address that requires no key.
-    worker_flags = [*(["--keys", ""] if config.engine == "local" else []), "--log-format", config.log_format]
-    if config.cache:
-        worker_flags += ["--cache", str(Path(config.cache).absolute()), "--cache-gib", str(config.cache_gib)]
-    worker_flags += ["--cache-raw"] * config.cache_raw + ["--debug"] * debug
-    worker_flags += catalogue.source.worker_flags()
-    stop = threading.Event()
-    sockets.has_session = dispatcher.has_session
-    with stop_on_signals(stop):
+        catalogue = load_catalogue(config)
+        table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
+        summary = corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused)
+        for line in (*catalogue.notes, *summary):
+            log.say(line)
+        catalogue.fail_fast()
+        if not table.count:
+            raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")
+        quarantine_file = quarantine_path(catalogue.source.name, config.cache_dir or None)
+        quarantine = read_quarantine(quarantine_file)
+        for entry in quarantine.entries(quarantine.latest):
+            log.say(f"in quarantine: {entry}")
+        dispatcher = Dispatcher(
+            catalogue.facts,
+            config.spec,
+            complete=lambda lease, spec: complete_lease(lease, catalogue, spec),
+            quarantine=quarantine,
+            wall_clock=utc_now,
+            lease_deadline_seconds=config.lease_deadline_seconds,
+            session_idle_seconds=config.session_idle_seconds,
+            max_credit_bytes=config.max_credit_bytes,
+            expected_workers=config.workers_in_all,
+            share_bytes=int(config.share_gib * GIB),
+        )
+        # Workers of this host use an address that requires no key.
+        worker_flags = [*(["--keys", ""] if config.engine == "local" else []), "--log-format", config.log_format]
+        if config.cache:
+            worker_flags += ["--cache", str(Path(config.cache).absolute()), "--cache-gib", str(config.cache_gib)]
+        worker_flags += ["--cache-raw"] * config.cache_raw + ["--debug"] * debug
+        worker_flags += catalogue.source.worker_flags()
+        stop = threading.Event()
+        sockets.has_session = dispatcher.has_session
+        opened.enter_context(stop_on_signals(stop))
         pool = make_pool(config, catalogue.source, label, worker_flags, keys, standbys)
+        opened.callback(catalogue.close)
         server = Server(config, catalogue, dispatcher, sockets, pool, quarantine_file, page=page, log=log)
-        try:
-            if pool.is_local and (question := question_workers(config.most_workers, usable_cores())):
-                log.say(question, "warning")
-            pool.start(sockets.local_address if pool.is_local else sockets.worker_address)
-            pool.scale(config.least_workers)
-            check_in_background(catalogue, config.spec, stop, log.say)
-            if page is not None:
-                page.start(sockets.local_address)
-                log.say(f"page: {page.url}")
-            while not stop.is_set() and config.parent_pid in (0, os.getppid()):
-                server.turn(_TURN_SECONDS)
-        finally:
-            server.close()
-            catalogue.close()
+        opened.callback(server.close)
+        if pool.is_local and (question := question_workers(config.most_workers, usable_cores())):
+            log.say(question, "warning")
+        pool.start(sockets.local_address if pool.is_local else sockets.worker_address)
+        pool.scale(config.least_workers)
+        check_in_background(catalogue, config.spec, stop, log.say)
+        if page is not None:
+            page.start(sockets.local_address)
+            log.say(f"page: {page.url}")
+        while not stop.is_set() and config.parent_pid in (0, os.getppid()):
+            server.turn(_TURN_SECONDS)
 
 
 class Server:
@@ -300,8 +283,6 @@ class Server:
         for stop in self._dispatcher.stop_workers():
             self._sockets.send(stop.identity, stop.frames, to_worker=True)
         self._pool.stop()
-        if self._page is not None:
-            self._page.stop()
         self._sockets.close()
         if self._port_file is not None:
             with contextlib.suppress(OSError):  # for instance, its folder is gone; the server cannot repair that

@@ -137,7 +137,7 @@ def test_the_workers_that_a_credit_is_settled_for(monkeypatch: pytest.MonkeyPatc
         raise Stopped(expected_workers)
 
     for what_changes_this_process in ("keep_freed_memory", "open_many_files"):
-        monkeypatch.setattr(f"v2v_server.serve.{what_changes_this_process}", lambda **_: None)
+        monkeypatch.setattr(f"v2v_server.serve.{what_changes_this_process}", lambda: None)
     monkeypatch.setattr("v2v_server.serve.load_catalogue", lambda config: corpus(video("a.mp4")))
     monkeypatch.setattr("v2v_server.serve.Dispatcher", dispatcher)
     with pytest.raises(Stopped, match=f"^{expected}$"):

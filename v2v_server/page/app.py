@@ -226,7 +226,7 @@ def exposition(status: StatusFields | None, accept: str = "") -> tuple[bytes, st
         accept: the request's Accept header.
     """
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(SimpleNamespace(collect=lambda: metrics_of(status)))  # type: ignore[arg-type]
+    registry.register(SimpleNamespace(collect=lambda: metrics_of(status)))
     encode, content_type = choose_encoder(accept)
     return encode(registry), content_type
 

@@ -28,7 +28,7 @@ from v2v_protocol.keys import PeerKey, nameless_key
 from v2v_protocol.programs import environment
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
-from v2v_server.supervise.pool import Exit, Host, ProcessStatus
+from v2v_server.supervise.pool import Exit, ProcessStatus
 from v2v_server.worker.logbook import Logbook
 
 _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
@@ -189,7 +189,7 @@ def make_host(
     return LocalHost(root, flags, standbys)
 
 
-class LocalHost(Host["LocalPlace"]):
+class LocalHost:
     """This host.
 
     Args:
@@ -220,6 +220,9 @@ class LocalHost(Host["LocalPlace"]):
         """Return a place for the worker of a slot."""
         return LocalPlace(self)
 
+    def request(self, workers: int) -> None:
+        """Do nothing: this host has no reservations."""
+
     def refresh(self, now: float) -> None:
         """Note the time and whether the host is short of memory."""
         self._now = now
@@ -236,6 +239,13 @@ class LocalHost(Host["LocalPlace"]):
         """Wait until the workers have ended; return the places of those that have not."""
         deadline = time.monotonic() + seconds
         return [place for place in places if not place.wait(max(0.0, deadline - time.monotonic()))]
+
+    def news(self) -> list[str]:
+        """Return no lines: all workers are on this host."""
+        return []
+
+    def close(self) -> None:
+        """Do nothing: the places hold all there is."""
 
 
 class LocalPlace:

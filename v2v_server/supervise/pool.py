@@ -115,7 +115,7 @@ AnyPlace = TypeVar("AnyPlace", bound=WorkerPlace)
 
 
 class Host(Protocol[AnyPlace]):
-    """Runs workers' processes. What a kind of host does not define, it need not do.
+    """Runs workers' processes.
 
     Attributes:
         is_local: whether all workers run on this host.
@@ -139,7 +139,6 @@ class Host(Protocol[AnyPlace]):
 
     def news(self) -> list[str]:
         """Return lines for the operator since the last call."""
-        return []
 
     def close(self) -> None:
         """Release what the host holds, after its places."""
@@ -503,7 +502,7 @@ class Scaling:
         self._since = now
         self._calls = 0
         self._waiting = self._idle = 0.0
-        self._lacking = False
+        self._lacking: bool = False
 
     def _more(self, waiting: float, idle: float) -> Decision | None:
         if self._target >= self._most or waiting < _WAITING or idle > _BUSY:

@@ -1,6 +1,6 @@
 """Services of the operating system, and of libraries that use them.
 
-process         limits, cores, long time slices, children that die with their parent, locks, private files
+process         memory that stays, cores, long time slices, children that die with their parent, locks, private files
 isolate         a function applied to many items in processes of their own, so that a crash costs one item
 sandbox         restrictions of a process that decodes: programs, networks, writing
 compile_cache   where numba stores compiled kernels; OpenCV, imported on first use

@@ -1,4 +1,4 @@
-"""Services of the operating system: limits, cores, long time slices, children that die with their parent,
+"""Services of the operating system: memory that stays, cores, long time slices, children that die with their parent,
 locks, private files.
 """
 
@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from v2v_protocol import arena
 from v2v_protocol.errors import CorpusError
 
 _PR_SET_PDEATHSIG = 1
@@ -28,6 +29,13 @@ MOST_CONNECTIONS = 4096 + 256
 _MOST_FILES = 1 << 16  # one connection per consumer and worker, and one logbook per worker
 _SCHED_ATTR_CALLS = {"x86_64": (315, 314), "aarch64": (275, 274)}  # numbers of sched_getattr and sched_setattr
 _LONGEST_PAUSE_SECONDS = 0.05
+
+
+def keep_freed_memory() -> bool:
+    """Call :func:`v2v_protocol.arena.keep_freed_memory` for blocks of the size of a sample; a server or worker
+    returns larger free memory.
+    """
+    return arena.keep_freed_memory(most_bytes=arena.LARGEST_SAMPLE_BYTES)
 
 
 class _SchedAttr(ctypes.Structure):

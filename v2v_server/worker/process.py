@@ -36,13 +36,11 @@ import zstandard
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import (
-    LARGEST_SAMPLE_BYTES,
     NO_SLOT,
     ArenaName,
     Slot,
     array_offsets,
     find_memory,
-    keep_freed_memory,
     open_memory,
 )
 from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoChanged, VideoError, VideoUnreadable
@@ -59,6 +57,7 @@ from v2v_server.system.log import Log
 from v2v_server.system.process import (
     die_with_parent,
     give_way,
+    keep_freed_memory,
     limit_memory,
     limit_processor_time,
     resident_bytes,
@@ -621,7 +620,7 @@ def run_worker(
     if parent_pid is not None:
         die_with_parent(parent_pid)
     key_for(address, "worker", keys)  # reports a wrong key at once
-    keep_freed_memory(most_bytes=LARGEST_SAMPLE_BYTES)
+    keep_freed_memory()
     limit_memory(LARGEST_MEMORY_BYTES)
     # A worker uses one core. OpenCV reads this when it is loaded, which some recipes never do.
     os.environ["OPENCV_FOR_THREADS_NUM"] = "1"

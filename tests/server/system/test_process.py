@@ -133,7 +133,7 @@ def test_a_server_may_have_more_connections_than_the_thousand_of_a_service(monke
     def load(config: ServeConfig) -> Catalogue:
         raise CorpusError("seen enough")
 
-    monkeypatch.setattr("v2v_server.serve.keep_freed_memory", lambda **_: done.append("memory"))
+    monkeypatch.setattr("v2v_server.serve.keep_freed_memory", lambda: done.append("memory"))
     monkeypatch.setattr("v2v_server.serve.open_many_files", lambda: done.append("files"))
     monkeypatch.setattr("v2v_server.serve.load_catalogue", load)
     with pytest.raises(CorpusError):
