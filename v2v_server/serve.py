@@ -99,7 +99,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
     return catalogue
 
 
-def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, *, debug: bool = False) -> None:
+def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debug: bool = False) -> None:
     """Run a server until SIGINT or SIGTERM.
 
     Args:

@@ -1,7 +1,6 @@
 """What the broker knows, as one value, and the actions that it wants done. The loop (:mod:`v2v_server.serve`) has the
-sockets, the processes and the disk, and does them. The functions of :mod:`v2v_server.broker.grants` and the handlers of
-:mod:`v2v_server.broker.dispatcher` change the value; all other parts only read. No I/O, but for the index of the
-corpus, which :attr:`Broker.complete` reads.
+sockets, the processes and the disk, and does them. :mod:`v2v_server.broker.dispatcher` changes the value; all other
+parts only read. No I/O, but for the index of the corpus, which :attr:`Broker.complete` reads.
 """
 
 from __future__ import annotations

@@ -48,4 +48,4 @@ def _run(arguments: argparse.Namespace) -> None:
     with start_ahead(config) as standbys:
         from v2v_server.serve import serve  # takes as long as the imports of a worker, which run meanwhile
 
-        serve(config, standbys, debug=arguments.debug)
+        serve(config, standbys, arguments.debug)

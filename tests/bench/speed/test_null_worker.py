@@ -12,7 +12,7 @@ from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from v2v_client import V2VStreamDataset
 from v2v_protocol.messages import decode_map, decode_sample
 from v2v_protocol.sample import DEFAULT_ARRAYS, Form, Provenance, SampleId, array_layout
-from v2v_server.broker.grants import check_result
+from v2v_server.broker.dispatcher import check_result
 from v2v_server.broker.leases import Request
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_tools.remake import lease_for
