@@ -20,7 +20,7 @@ from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_w
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_server.status.snapshot import StatusClient
+from v2v_server.status.client import StatusClient
 from v2v_server.system.sandbox import can_confine
 
 ATTEMPTS = Path(__file__).parent / "attempts"

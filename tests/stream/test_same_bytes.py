@@ -19,7 +19,7 @@ from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.status.snapshot import StatusClient
+from v2v_server.status.client import StatusClient
 from v2v_tools.remake import remake
 
 

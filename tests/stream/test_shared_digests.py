@@ -13,7 +13,7 @@ from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
-from v2v_server.status.snapshot import StatusClient
+from v2v_server.status.client import StatusClient
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.messages import Hello, Want, encode
 from v2v_protocol.recipe import Recipe
-from v2v_server.status.snapshot import StatusClient
+from v2v_server.status.client import StatusClient
 
 Samples = list[tuple[int, str]]
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from v2v_server.status.snapshot import StatusClient
+from v2v_server.status.client import StatusClient
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("v2v_protocol", "v2v_server", "v2v_tools", "v2v_client", "v2v_pictures", "v2v_recordings")

@@ -12,7 +12,7 @@ from rich.live import Live
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import ServerLost, V2VError
-from v2v_server.status.snapshot import StatusClient
+from v2v_server.status.client import StatusClient
 from v2v_server.status.terminal import draw, line
 
 _LIVE_SECONDS, _LINE_SECONDS = 1.0, 10.0

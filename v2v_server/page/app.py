@@ -48,7 +48,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from v2v_protocol.errors import V2VError
 from v2v_protocol.link.user import OwnUser
-from v2v_server.status.snapshot import PARTS, StatusClient, StatusFields, meanings_at, rows_at
+from v2v_server.status.client import StatusClient
+from v2v_server.status.snapshot import PARTS, StatusFields, meanings_at, rows_at
 from v2v_server.system.log import GIB, Log, Meaning
 from v2v_server.system.process import die_with_parent
 

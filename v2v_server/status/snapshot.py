@@ -1,4 +1,4 @@
-"""The status of a server: its fields, its bottleneck, how it is built and answered, and how it is requested.
+"""The status of a server: its fields, its bottleneck, how it is built, and who gets it.
 
 Every number has one owner (counters, sessions, workers, leases, the history) and is read there. :data:`PARTS` says
 where each field is in JSON; all views walk the fields. A field may be added at any time. Raise :data:`STATUS_VERSION`
@@ -29,15 +29,11 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, TypeAlias
 
 from v2v_protocol import PROTOCOL_VERSION, __version__
-from v2v_protocol.errors import ProtocolError, RemoteError, ServerLost, UsageError
-from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.link.router import Sockets
-from v2v_protocol.messages import LARGEST_HEADER_BYTES, Denied, GetStatus, Status, decode, encode
-from v2v_protocol.persisted import parse_json
+from v2v_protocol.messages import LARGEST_HEADER_BYTES, Status, encode
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Member, clean_name
 from v2v_server.broker.session import AWAY_SECONDS, Session
@@ -58,8 +54,6 @@ LARGEST_SHARE = 0.02
 MOST_SHOWN = 1000
 """Largest number of workers listed, and of consumers; the others are only counted."""
 _MOST_SPECS = 8
-_AGAIN_SECONDS = 2.0
-"""An unanswered request is repeated after this time: it may be lost with a connection."""
 WINDOW_SECONDS = 10.0
 NOTE_SECONDS = 1.0
 _LEAST_PRESENT_SECONDS = 1.0
@@ -694,77 +688,3 @@ class StatusPublisher:
         frames = encode(Status(to_json(self.status(now))))
         self._answer_at = now + max(ANSWER_SECONDS, (self._processor_clock() - began) / LARGEST_SHARE)
         return [(ToWorker if each.is_worker_side else ToConsumer)(each.identity, frames) for each in waiting]
-
-
-class StatusClient:
-    """One connection to a server.
-
-    Args:
-        address: where consumers or workers connect, ``tcp://host:port``.
-        keys: file of a consumer's key; None: the one that ``V2V_KEYS`` names, "": no key.
-
-    Raises:
-        UsageError: the address is malformed.
-        KeyRefused: the key file cannot be used.
-    """
-
-    def __init__(self, address: str, keys: str | None = None) -> None:
-        self._address = address
-        self._link = Dealer(address, keys)
-        try:
-            self._link.connect()
-        except UsageError:
-            self.close()
-            raise
-
-    def __enter__(self) -> StatusClient:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def get_status(self, timeout_seconds: float = 10.0) -> dict[str, Any]:
-        """Return the current status, see :mod:`v2v_server.status.snapshot`.
-
-        Raises:
-            ServerLost: there is no answer in this time.
-            RemoteError: the server is too busy.
-            KeyRefused: the server does not accept the key.
-            ProtocolError, VersionMismatch: the peer is no such server, or has another version.
-        """
-        end = time.monotonic() + timeout_seconds
-        ask_at = time.monotonic()
-        while self._link.receive(0) is not None:
-            pass  # a late answer to an earlier request
-        while (now := time.monotonic()) < end:
-            if now >= ask_at:
-                ask_at = now + _AGAIN_SECONDS
-                self._link.send(encode(GetStatus()))
-            frames = self._link.receive(max(0.0, min(end, ask_at) - now))
-            if frames is None:
-                self._link.has_reconnected()  # raises if the server refuses the key
-                continue
-            match decode(frames[0]):
-                case Denied(code, text):
-                    raise RemoteError(code, f"{self._address} refused: {text}")
-                case Status(encoded):
-                    return self._read(encoded)
-        raise ServerLost(
-            f"{self._address}: no answer for {timeout_seconds:g} s; is v2v-serve running there? Without keys it serves "
-            "its own user only"
-        )
-
-    def _read(self, encoded: bytes) -> dict[str, Any]:
-        try:
-            status = parse_json(encoded)
-        except ValueError as error:
-            raise ProtocolError(f"{self._address} sent a status that is not JSON") from error
-        if not isinstance(status, dict) or not isinstance(status.get("version"), int):
-            raise ProtocolError(f"{self._address} sent a status without a version")
-        return status
-
-    def close(self) -> None:
-        """End the connection."""
-        self._link.close()
