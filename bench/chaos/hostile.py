@@ -41,8 +41,8 @@ from tests.oracles.dealers import NextDealer, Reader
 from v2v_protocol.errors import KeyRefused, V2VError
 from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
 from v2v_protocol.keys import PeerKey, key_for, read_key
-from v2v_protocol.link.curve import new_key_pair
 from v2v_protocol.link.dealer import Dealer
+from v2v_protocol.link.router import new_key_pair
 from v2v_protocol.messages import LARGEST_REQUEST_BYTES, MOST_CONTAINERS, GetStatus, Hello, Want, encode
 
 PEERS = 8
