@@ -3,9 +3,7 @@
     canvas.py    a page: text, panels, bars, arrows, hatching; the palette
     colours.py   event counts, grey pictures and flow as RGB, and one scale for all panels of a page
     camera.py    one simulated clip as its virtual camera saw it: activity over time, pauses, moments worth showing
-    strip.py     a camera's activity over its clip
-    overview.py  the whole picture of a video, and where in it the cameras look
-    sheet.py     a page of cameras: frame, bins, flow, with headings and legend
+    sheet.py     a page of cameras: activity over the clip, frame, bins, flow, labels, with headings and legend
     grids.py     voxel grids alone, as `simulate` returns them
     film.py      the same clips as a film
     files.py     PNG, GIF, MP4, and one HTML file that holds both

@@ -52,8 +52,12 @@ class Canvas:
         size = next((size for size in range(TITLE_PT, TEXT_PT, -1) if text_width(text, size) <= width), TEXT_PT)
         self.text(x, y, shortened(text, width, size), size=size)
 
-    def panel(self, x: int, y: int, image: Image, width_px: int, height_px: int) -> None:
-        """Draw a picture with a thin border, scaled to fit the given size; shade what it does not cover."""
+    def panel(self, x: int, y: int, image: Image, width_px: int, height_px: int) -> tuple[float, float, float]:
+        """Draw a picture with a thin border, scaled to fit the given size; shade what it does not cover.
+
+        Returns:
+            left and top of the picture on the page, px, and its scale.
+        """
         height, width = image.shape[:2]
         scale = min(width_px / width, height_px / height)
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -64,6 +68,7 @@ class Canvas:
         self.box(x, y, x + width_px, y + height_px, SHADE)
         self._page.paste(scaled, (x + (width_px - size[0]) // 2, y + (height_px - size[1]) // 2))
         self._draw.rectangle((x - 1, y - 1, x + width_px, y + height_px), outline=LINE)
+        return x + (width_px - width * scale) / 2, y + (height_px - height * scale) / 2, scale
 
     def box(self, left: float, top: float, right: float, bottom: float, colour: Rgb) -> None:
         """Fill a rectangle, without its right column and bottom row; draw nothing below one whole pixel."""

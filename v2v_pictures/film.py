@@ -8,9 +8,7 @@ from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
 from v2v_pictures.canvas import GAP_PX, PAGE_MARGIN_PX, Canvas, label
 from v2v_pictures.colours import Image, draw_events, draw_grey
-from v2v_pictures.labels import labelled_panel
-from v2v_pictures.sheet import Scale, events_heading, flow_panel
-from v2v_pictures.strip import LABEL_PX, TICKS_PX, draw_strip
+from v2v_pictures.sheet import LABEL_PX, TICKS_PX, Scale, draw_strip, events_heading, flow_panel, labelled_panel
 
 _TITLE_PX, _STRIP_PX = 58, 50
 _CAMERA_PX, _NAMES_PX, _BETWEEN_PX = 52, 30, 20

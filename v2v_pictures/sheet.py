@@ -1,6 +1,8 @@
 """A page of virtual cameras: for each its draw, its activity over time, and frame, bins and flow of some moments.
 
 Headings over the columns, an arrow for time, named pauses, and a legend below explain it. All panels share one scale.
+The parts of the page come first: the strip of a camera's activity, the labels of a panel, and the whole picture of a
+video with the places where the cameras look.
 """
 
 from __future__ import annotations
@@ -14,13 +16,259 @@ import numpy.typing as npt
 
 from v2v_pictures import canvas
 from v2v_pictures.camera import Camera
-from v2v_pictures.canvas import GAP_PX, PAGE_MARGIN_PX, Canvas, label
+from v2v_pictures.canvas import GAP_PX, PAGE_MARGIN_PX, Canvas, Rgb, label
 from v2v_pictures.colours import BRIGHTER, DARKER, Image, draw_events, draw_flow, draw_grey, draw_wheel, full_colour
-from v2v_pictures.labels import labelled_panel
-from v2v_pictures.overview import draw_overview, overview_height, overview_width, whole_panel
-from v2v_pictures.strip import LABEL_PX, TICKS_PX, draw_strip
 
-_TITLE_PX, _HEADING_PX, _CAMERA_PX, _STRIP_PX, _LEGEND_PX = 64, 58, 38, 54, 132
+LABEL_PX, TICKS_PX = 22, 24
+"""Above and below the strip."""
+_HATCH_PX = 7
+_PALE = 0.6
+"""How much of the way to white the bars of noise are."""
+
+
+def draw_strip(
+    page: Canvas,
+    camera: Camera,
+    left: int,
+    top: int,
+    width: int,
+    height: int,
+    highest: float,
+    picks: Sequence[int] = (),
+    cursor: int | None = None,
+) -> None:
+    """Draw the strip, with LABEL_PX of text above it and TICKS_PX below it.
+
+    Args:
+        left, top, width, height: of the strip itself, px.
+        highest: events a pixel and bin of a full bar, which reaches from the middle to the edge; above 0, written above
+            the strip. Higher rates are cut there. One value for all strips of a page makes them comparable. A bar's
+            length is the square root of its share, so that a quiet camera still shows when it fires.
+        picks: voxel grids to point at.
+        cursor: a bin to draw a line at, for films.
+    """
+    rates, middle = camera.rates, top + height / 2
+    x = page.text(left, top - LABEL_PX, f"events over {camera.timing or 'the whole clip'}")
+    page.text(x + 12, top - LABEL_PX, f"full bar: {highest:.2g} or more a pixel and bin", colour=canvas.SOFT)
+    count = rates.shape[1]
+    at = [left + width * number / count for number in range(count + 1)]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], camera.paused, [False]])))
+    pauses = [(at[start], at[end]) for start, end in zip(edges[::2], edges[1::2], strict=True)]
+    for start, end in pauses:
+        page.hatch(start, top, end, top + height)
+    moving = np.where(camera.paused, 0.0, rates if camera.quiet is None else np.minimum(camera.quiet, rates))
+    for bars, brighter, darker in ((rates, _pale(BRIGHTER), _pale(DARKER)), (moving, BRIGHTER, DARKER)):
+        for number, (up, down) in enumerate(np.sqrt(np.minimum(bars / highest, 1.0)).T * (height / 2)):
+            page.box(at[number], middle - up, at[number + 1], middle, brighter)
+            page.box(at[number], middle, at[number + 1], middle + down, darker)
+    for start, end in pauses:  # seen behind full bars too
+        page.hatch(start, top, end, top + _HATCH_PX)
+        page.hatch(start, top + height - _HATCH_PX, end, top + height)
+    page.line(left, middle, left + width, middle, canvas.LINE)
+    page.frame(left, top, left + width, top + height)
+    for start, end in pauses:
+        if end - start > canvas.text_width("paused") + 8:
+            centre, half = (start + end) / 2, canvas.text_width("paused") / 2 + 4
+            page.box(centre - half, middle - 10, centre + half, middle + 11, canvas.PAPER)
+            page.text(centre, middle, "paused", anchor="mm")
+    bins = camera.voxels.shape[1]
+    for pick in picks:
+        page.frame(at[pick * bins], top, at[(pick + 1) * bins], top + height, canvas.MARK, 2)
+    if cursor is not None:
+        page.line(at[cursor], top - 3, at[cursor], top + height + 3, canvas.MARK, 3)
+        picks = [cursor // bins]
+    _ticks(page, len(camera.voxels), left, width, top + height + 4, picks)
+
+
+def _ticks(page: Canvas, grids: int, left: int, width: int, top: int, picks: Sequence[int]) -> None:
+    """Write the number of each pick below it, and those of the first and last grid where they fit."""
+    free_from, free_to = float(left), float(left + width)
+    for place, pick in enumerate(picks):
+        text = f"{pick + 1}" if len(picks) > 1 else f"voxel grid {pick + 1}"
+        half = canvas.text_width(text) / 2
+        centre = min(max(left + width * (pick + 0.5) / grids, left + half), left + width - half)
+        if place == 0:
+            free_to = centre - half - 12
+        if place == 0 or centre - half > free_from:
+            page.text(centre, top, text, colour=canvas.MARK, anchor="ma")
+            free_from = centre + half + 12
+    if left + canvas.text_width("voxel grid 1") < free_to or not picks:
+        page.text(left, top, "voxel grid 1", colour=canvas.SOFT)
+    if left + width - canvas.text_width(str(grids)) > free_from:
+        page.text(left + width, top, str(grids), colour=canvas.SOFT, anchor="ra")
+
+
+def _pale(colour: Rgb) -> Rgb:
+    red, green, blue = (round(part + _PALE * (255 - part)) for part in colour)
+    return red, green, blue
+
+
+_COLOURS: tuple[Rgb, ...] = (
+    (0, 128, 70),
+    (190, 110, 0),
+    (120, 50, 170),
+    (0, 130, 140),
+    (120, 110, 0),
+    (180, 0, 140),
+)
+"""Colours of the classes, in turn: none is the red or blue of events."""
+_TINT = 0.45
+_NO_OBJECT = (0, 255)
+_TEXT_PT = 12
+
+
+def class_colour(category: int) -> Rgb:
+    """Return the colour of a class."""
+    return _COLOURS[category % len(_COLOURS)]
+
+
+def tint(image: Image, mask: npt.NDArray[np.uint8]) -> Image:
+    """Return a picture [H, W, 3] tinted by the classes of a mask [H, W]; classes 0 and 255 leave it as it is."""
+    tinted = image.astype(np.float32)
+    for category in np.unique(mask):
+        if category not in _NO_OBJECT:
+            place = mask == category
+            tinted[place] += _TINT * (np.array(class_colour(int(category)), np.float32) - tinted[place])
+    result: Image = np.rint(tinted).astype(np.uint8)
+    return result
+
+
+def labelled_panel(
+    page: Canvas, camera: Camera, grid: int, x: int, y: int, image: Image, tile_px: int, *, with_text: bool = False
+) -> None:
+    """Draw a panel with the boxes and the mask of one voxel grid's frame.
+
+    Args:
+        camera: has the labels; without any, this is only the panel.
+        grid: number of the voxel grid.
+        x, y, tile_px: place and side of the panel, px.
+        image: [H, W, 3], as large as the camera's frames.
+        with_text: write the class of each box.
+    """
+    if camera.masks is not None:
+        image = tint(image, camera.masks[grid])
+    left, top, scale = page.panel(x, y, image, tile_px, tile_px)
+    if camera.boxes is None:
+        return
+    for x0, y0, x1, y1, category, *_ in camera.boxes[grid]:
+        if category < 0:
+            continue
+        colour = class_colour(int(category))
+        right, bottom = left + x1 * scale - 1, top + y1 * scale - 1
+        page.frame(left + x0 * scale, top + y0 * scale, right, bottom, colour, 2)
+        if with_text:
+            text = f"{int(category)}"
+            size = canvas.text_width(text, _TEXT_PT) + 4
+            page.box(left + x0 * scale, top + y0 * scale, left + x0 * scale + size, top + y0 * scale + 15, colour)
+            page.text(left + x0 * scale + 2, top + y0 * scale + 1, text, size=_TEXT_PT, colour=canvas.PAPER)
+
+
+_TEXT_PX, _BELOW_PX, _STRIP_PX = 34, 34, 54
+_LEAST_STRIP_PX = 490
+_LEAST_HEIGHT_PX = 150
+_HIGHEST_TILES = 1.75
+"""Height of an upright picture, in tiles."""
+
+
+def overview_width(tile_px: int) -> int:
+    """Return how wide a page must be, px."""
+    return 2 * PAGE_MARGIN_PX + 2 * (2 * tile_px + GAP_PX) + 3 * GAP_PX + _LEAST_STRIP_PX
+
+
+def overview_height(whole: Camera, tile_px: int) -> int:
+    """Return how much of a page the overview takes, px."""
+    return _TEXT_PX + max(_LEAST_HEIGHT_PX, _panel(whole, tile_px)[1]) + _BELOW_PX
+
+
+def draw_overview(
+    page: Canvas, whole: Camera, cameras: Sequence[Camera], top: int, tile_px: int, full: float, highest_rate: float
+) -> None:
+    """Draw the video's frame with a numbered box for each camera, the events beside it, and the activity.
+
+    Args:
+        whole: a camera that sees the whole picture.
+        cameras: those of the page; a box shows each one that looks at the same frames.
+        top: first row of the overview, px.
+        tile_px: a panel is two of these and a gap wide.
+        full, highest_rate: see :class:`v2v_pictures.sheet.Scale`.
+    """
+    (grid,), (width, height) = whole.moments(1), _panel(whole, tile_px)
+    bins = whole.voxels.shape[1]
+    liveliest = max(range(bins), key=lambda bin_: float(whole.rates[:, grid * bins + bin_].sum()))
+    left = [PAGE_MARGIN_PX, PAGE_MARGIN_PX + width + 2 * GAP_PX]
+    page.text(left[0], top, "The whole picture", size=canvas.HEADING_PT)
+    page.text(left[1], top, "its events", size=canvas.HEADING_PT)
+    top += _TEXT_PX
+    page.panel(left[0], top, draw_grey(whole.frames[grid]), width, height)
+    page.panel(left[1], top, draw_events(whole.voxels[grid, liveliest], full), width, height)
+    boxes = [(number, camera) for number, camera in enumerate(cameras, 1) if _same_clip(whole, camera)]
+    for _, camera in boxes:
+        for x in left:
+            _box(page, camera, x, top, width, height)
+    numbers: dict[tuple[int, int], list[str]] = {}  # cameras of one box share its label
+    for number, camera in boxes:
+        across, down, *_ = _place(camera, width, height)
+        numbers.setdefault((round(left[0] + across) + 2, round(top + down) + 2), []).append(str(number))
+    for (label_x, label_y), names in numbers.items():  # above all boxes
+        canvas.label(page, label_x, label_y, ", ".join(names), canvas.MARK)
+    x = left[1] + width + 3 * GAP_PX
+    strip_width = page.width_px - PAGE_MARGIN_PX - x
+    lines = [whole.title, f"shown: bin {liveliest + 1} of voxel grid {grid + 1}"]
+    if boxes:
+        lines.append("boxes: where the cameras below look")
+    if warning := whole.warning([grid]):
+        lines.insert(0, warning)
+    for number, line in enumerate(lines):
+        page.text(
+            x, top + 22 * number, canvas.shortened(line, strip_width), colour=canvas.SOFT if number else canvas.INK
+        )
+    draw_strip(page, whole, x, top + 22 * len(lines) + LABEL_PX + GAP_PX, strip_width, _STRIP_PX, highest_rate, [grid])
+
+
+def _panel(whole: Camera, tile_px: int) -> tuple[int, int]:
+    """Return width and height of a panel, px."""
+    height, width = whole.frames.shape[1:]
+    scale = min((2 * tile_px + GAP_PX) / width, _HIGHEST_TILES * tile_px / height)
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def _same_clip(whole: Camera, camera: Camera) -> bool:
+    one, other = whole.provenance, camera.provenance
+    same = (one.video, one.start_frame) == (other.video, other.start_frame)
+    return same and camera.whole is not None
+
+
+def whole_panel(page: Canvas, camera: Camera, x: int, y: int, width_px: int, height_px: int) -> None:
+    """Draw the video's picture, small, and a box around what the camera sees of it."""
+    if camera.whole is None:
+        return
+    height, width = camera.whole.shape
+    scale = min(width_px / width, height_px / height)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    page.panel(x, y, draw_grey(camera.whole), *size)
+    _box(page, camera, x, y, *size)
+
+
+def _box(page: Canvas, camera: Camera, x: int, y: int, width_px: int, height_px: int) -> None:
+    """Draw a box around what the camera sees of the picture that lies in this panel."""
+    left, top, right, bottom = _place(camera, width_px, height_px)
+    for colour, wider in ((canvas.PAPER, 1), (canvas.MARK, 0)):
+        page.frame(x + left - wider, y + top - wider, x + right - 1 + wider, y + bottom - 1 + wider, colour, 2 + wider)
+
+
+def _place(camera: Camera, width_px: int, height_px: int) -> tuple[float, float, float, float]:
+    """Return left, top, right and bottom of the camera's crop in a whole picture of this size, px."""
+    assert camera.whole is not None
+    height, width = camera.whole.shape
+    across, down = width_px / width, height_px / height
+    left, top, right, bottom = camera.crop
+    return (
+        max(0.0, left * across), max(0.0, top * down),
+        min(float(width_px), right * across), min(float(height_px), bottom * down),
+    )  # fmt: skip
+
+
+_TITLE_PX, _HEADING_PX, _CAMERA_PX, _LEGEND_PX = 64, 58, 38, 132
 SCALE_PX = 341
 _BETWEEN_PX = 26
 _LEAST_SOURCE_PX = 120
@@ -145,11 +393,8 @@ def events_heading(page: Canvas, x: float, y: float, what: str = "simulated even
 
 def flow_panel(page: Canvas, x: int, y: int, flow: npt.NDArray[np.generic], largest_px: float, tile_px: int) -> None:
     """Draw flow [2, H, W], px, in colour and with arrows, whose length grows with the flow up to ``largest_px``."""
-    page.panel(x, y, draw_flow(flow, largest_px), tile_px, tile_px)
-    height, width = flow.shape[1:]
-    scale = min(tile_px / width, tile_px / height)
-    x0, y0 = x + (tile_px - width * scale) / 2, y + (tile_px - height * scale) / 2
-    rows, columns = (np.linspace(0, side, _ARROWS + 1).round().astype(int) for side in (height, width))
+    x0, y0, scale = page.panel(x, y, draw_flow(flow, largest_px), tile_px, tile_px)
+    rows, columns = (np.linspace(0, side, _ARROWS + 1).round().astype(int) for side in flow.shape[1:])
     for top, bottom in pairwise(rows):
         for left, right in pairwise(columns):
             if bottom <= top or right <= left:

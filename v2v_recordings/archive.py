@@ -7,6 +7,7 @@ import posixpath
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
@@ -142,6 +143,24 @@ class Archive:
         """Return the size of a picture; raises as :meth:`picture`."""
         height, width = self.picture(member).shape
         return SensorSize(width, height)
+
+
+def package(name: str, what: str) -> Any:
+    """Import a package that only some forms need.
+
+    Args:
+        name: of the module.
+        what: needs it, for the error message.
+
+    Raises:
+        UsageError: it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"{what} needs the package {error.name}: pip install '.[convert]' in a checkout of v2v-stream"
+        ) from error
 
 
 def holds(path: Path, check: Callable[[Archive], Any], suffix: str = ".zip") -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.archive import starts_with
+from v2v_recordings.archive import package, starts_with
 from v2v_recordings.faery_reader import read_prophesee
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, ReadProgress, SensorSize
 
@@ -45,20 +45,15 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
     Raises:
         UsageError: the bag is damaged, has no topic or several topics of events, or an unsupported encoding.
     """
+    rosbag1 = package("rosbags.rosbag1", "a bag")
     try:
-        from rosbags.rosbag1 import Reader, ReaderError
-    except ImportError as error:
-        raise UsageError(
-            "bags need the rosbags package: pip install '.[convert]' in a checkout of v2v-stream"
-        ) from error
-    try:
-        with Reader(path) as bag:
+        with rosbag1.Reader(path) as bag:
             events = _events_topic(bag.connections, options.events_topic, path)
             images = _images_topic(bag.connections, events, options.images_topic, path)
             is_packets = any(each.topic == events and each.msgtype == EVENT_PACKETS for each in bag.connections)
             read_messages = _read_packets if is_packets else _read_arrays
             yield from read_messages(_messages(bag, (events, images), progress), events, path)
-    except (ReaderError, struct.error, OSError) as error:
+    except (rosbag1.ReaderError, struct.error, OSError) as error:
         raise UsageError(
             f"{path}: the bag cannot be read: {error}; if it was cut, `rosbag reindex` repairs it"
         ) from error

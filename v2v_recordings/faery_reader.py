@@ -11,7 +11,6 @@ import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
@@ -19,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.archive import starts_with
+from v2v_recordings.archive import package, starts_with
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, ReadProgress, SensorSize
 
 ES_HEAD_BYTES, ES_EVENT_BYTES, ES_LONGEST_STEP_US = 20, 5, 127
@@ -64,7 +63,7 @@ def read_aedat4(path: Path, options: ConvertOptions, progress: ReadProgress) -> 
     Raises:
         UsageError: the file is damaged or has no events, or its frames are not 8-bit or not of the whole sensor.
     """
-    with _errors_of_faery(path), _faery().aedat.Decoder(path) as decoder:
+    with _errors_of_faery(path), package("faery", "this form").aedat.Decoder(path) as decoder:
         first = {track.data_type: track for track in reversed(decoder.tracks())}
         if "events" not in first:
             raise UsageError(f"{path} has no stream of events")
@@ -96,7 +95,8 @@ def read_prophesee(path: Path, options: ConvertOptions, progress: ReadProgress) 
     fallback = None if options.size is None else (options.size.width, options.size.height)
     header = _header(path)
     is_evt = path.suffix.lower() != ".dat" or EVT_LINE.search(header) is not None
-    decode = _faery().evt.Decoder if is_evt else _faery().dat.Decoder
+    faery = package("faery", "this form")
+    decode = faery.evt.Decoder if is_evt else faery.dat.Decoder
     with _errors_of_faery(path), decode(path, fallback, None) as decoder:
         if is_evt and decoder.version not in WORDS:
             raise UsageError(f"{path} is in EVT 2.1, which is not supported; EVT 2, EVT 3 and DAT are")
@@ -129,7 +129,7 @@ def read_es(path: Path, _options: ConvertOptions, progress: ReadProgress) -> Ite
         UsageError: the file is damaged or holds something else.
     """
     end, last_us = ES_HEAD_BYTES, 0
-    with _errors_of_faery(path), _faery().es.Decoder(path, 0) as decoder:
+    with _errors_of_faery(path), package("faery", "this form").es.Decoder(path, 0) as decoder:
         if decoder.event_type != "dvs":
             raise UsageError(f"{path} holds {decoder.event_type} events; only dvs can be read")
         yield SensorSize(*decoder.dimensions)
@@ -214,17 +214,6 @@ def _frame(frame: Any, size: SensorSize, path: Path) -> Picture:
             f"8-bit frames of the whole sensor, {size.width} x {size.height}, can be converted"
         )
     return Picture(int(frame.t) * 1000, pixels)
-
-
-def _faery() -> ModuleType:
-    try:
-        import faery
-    except ImportError as error:
-        raise UsageError(
-            "this form needs the faery package: pip install '.[convert]' in a checkout of v2v-stream"
-        ) from error
-    module: ModuleType = faery
-    return module
 
 
 @contextlib.contextmanager

@@ -1,4 +1,16 @@
-"""Open HDF5 files from untrusted sources, which may refer to other files; read columns of events, and pictures."""
+"""Open HDF5 files from untrusted sources, which may refer to other files; read columns of events, and pictures.
+
+Here is also the reader of the layout of event_cnn_minimal and V2V, which ``v2v-convert`` writes
+(``trainer.evaluation.layout``):
+
+| path | content |
+|---|---|
+| ``events/ts``, ``xs``, ``ys``, ``ps`` | [N]: s, px, px, above 0 for a brightness increase |
+| ``images/*`` | uint8 [H, W]; attribute ``timestamp``, s, or ``event_idx`` |
+| ``flow/*`` | float32 [2, H, W]; attribute ``timestamp``, s |
+| attributes ``sensor_resolution``, ``start_ns`` | height and width; time 0 in the clock of the raw recording |
+| attribute ``light`` | of the pictures, if it is known (``Light.parse``) |
+"""
 
 from __future__ import annotations
 
@@ -12,7 +24,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.items import EventChunk, Note, Picture, ReadProgress, SensorSize, to_ns
+from v2v_recordings.archive import package
+from v2v_recordings.items import (
+    NS_PER_UNIT,
+    ConvertOptions,
+    EventChunk,
+    FlowField,
+    Item,
+    Light,
+    Note,
+    Picture,
+    ReadProgress,
+    SensorSize,
+    to_ns,
+)
 
 if TYPE_CHECKING:
     import h5py
@@ -29,7 +54,7 @@ def holds(path: Path, *names: str) -> bool:
     Raises:
         UsageError: it is an HDF5 file, but damaged.
     """
-    if not path.is_file() or path.suffix.lower() not in SUFFIXES or not _h5py(path).is_hdf5(path):
+    if not path.is_file() or path.suffix.lower() not in SUFFIXES or not package("h5py", str(path)).is_hdf5(path):
         return False
     with open_hdf5(path) as file:
         return all(name in file for name in names)
@@ -45,7 +70,7 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
     with contextlib.suppress(ImportError):
         importlib.import_module(_PLUGIN)
     try:
-        with _h5py(path).File(path, "r") as file:
+        with package("h5py", str(path)).File(path, "r") as file:
             require_self_contained(file, path)
             yield file
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
@@ -126,13 +151,6 @@ def sensor_size(shape: Any, path: Path) -> SensorSize:
     return SensorSize(int(sides[1]), int(sides[0]))
 
 
-def _h5py(path: Path) -> Any:
-    try:
-        return importlib.import_module("h5py")
-    except ModuleNotFoundError as error:
-        raise UsageError(f"{path}: needs the package {error.name}: pip install h5py") from error
-
-
 def require_self_contained(file: h5py.File, path: Path) -> None:
     """Check that everything in an HDF5 file is stored in that file.
 
@@ -171,3 +189,38 @@ def _external_error(path: Path, name: str, what: str) -> UsageError:
         f"{path}: {name.replace('//', '/')} {what}, and only data inside the file is read: make the file "
         "self-contained with h5repack or h5copy -f ext"
     )
+
+
+def recognises_layout(path: Path) -> bool:
+    """Return whether the path is an HDF5 file with ``events/ts``."""
+    return holds(path, "events/ts")
+
+
+def read_layout(path: Path, _options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
+    """Yield the items of a recording.
+
+    Raises:
+        UsageError: a part is missing, damaged or has another shape.
+    """
+    with open_hdf5(path) as file:
+        origin_ns = int(file.attrs.get("start_ns", 0))
+        if "light" in file.attrs:
+            yield Light.parse(str(file.attrs["light"]))
+        stated = file.attrs.get("sensor_resolution", file.get("sensor_resolution"))
+        if stated is not None:
+            yield sensor_size(stated, path)
+        columns = {name: file.get(f"events/{name}") for name in ("ts", "xs", "ys", "ps")}
+        yield from events(columns, str(path), progress, ns_per_unit=NS_PER_UNIT["s"], offset_ns=origin_ns)
+        for kind in ("images", "flow"):
+            for key in sorted(file.get(kind, ())):
+                item = file[f"{kind}/{key}"]
+                seconds = item.attrs.get("timestamp")
+                if seconds is None and "event_idx" in item.attrs:
+                    seconds = file["events/ts"][min(int(item.attrs["event_idx"]), len(file["events/ts"]) - 1)]
+                t_ns = int(to_ns(np.array([seconds], np.float64), f"{path}: {kind}/{key}")[0]) + origin_ns
+                if kind == "flow":
+                    yield FlowField(t_ns, item[:].astype(np.float32))
+                elif len(getattr(item, "shape", ())) != 2 or item.dtype != np.uint8:
+                    raise UsageError(f"{path}: images/{key} is {item}, not uint8 [H, W]")
+                else:
+                    yield Picture(t_ns, item[:])

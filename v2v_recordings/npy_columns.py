@@ -25,9 +25,8 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings import archive as archives
 from v2v_recordings import hdf5
-from v2v_recordings.archive import Archive
+from v2v_recordings.archive import Archive, holds
 from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, ReadProgress, SensorSize
 
 FOLDER = ("events_ts.npy", "events_xy.npy", "events_p.npy")
@@ -37,8 +36,8 @@ _METADATA, _IMAGES, _IMAGE_TIMES = "metadata.json", "images.npy", "images_ts.npy
 
 def recognises(path: Path) -> bool:
     """Return whether the path is a folder or zip file with EVREAL's columns, or a ``.npz`` with x, y, t and p."""
-    return archives.holds(path, lambda archive: all(map(archive.named, FOLDER))) or (
-        path.is_file() and archives.holds(path, lambda archive: all(map(archive.named, NPZ)), suffix=".npz")
+    return holds(path, lambda archive: all(map(archive.named, FOLDER))) or (
+        path.is_file() and holds(path, lambda archive: all(map(archive.named, NPZ)), suffix=".npz")
     )
 
 

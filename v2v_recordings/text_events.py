@@ -1,22 +1,38 @@
 """Read text files of events: one ``t x y p`` per line, p in {0, 1} or {-1, 1}; the first line may be ``width height``.
 
 Spaces, tabs or commas separate values. Lines that begin with ``#`` are comments. A byte order mark is skipped.
+
+IJRR (Mueggler et al. 2017) has such a text, ``events.txt``, in a zip or folder with ``images.txt`` (``t path``) and
+PNGs. A single text file of events is read as well. EVAID-R has ``event/*.txt`` (us), ``gt/*.png``, ``timestamps.txt``
+(us) and ``shape.txt`` (``W H``).
 """
 
 from __future__ import annotations
 
 import codecs
 import io
+import posixpath
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import IO
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.archive import Archive
-from v2v_recordings.items import NS_PER_UNIT, EventChunk, Item, Note, Picture, ReadProgress, SensorSize, to_ns
+from v2v_recordings.archive import Archive, holds
+from v2v_recordings.items import (
+    NS_PER_UNIT,
+    ConvertOptions,
+    EventChunk,
+    Item,
+    Note,
+    Picture,
+    ReadProgress,
+    SensorSize,
+    to_ns,
+)
 
 BLOCK_BYTES = 1 << 22
 COMMENT = re.compile(rb"^[ \t]*#[^\r\n]*", re.MULTILINE)
@@ -134,3 +150,94 @@ def _first_bad_line(block: bytes, name: str, lines_before: int) -> str:
         if line.strip() and _numbers(line) is None:
             return f"{name}, line {number}: {_shown(line)} is not `t x y p` with whole x and y and p of -1, 0 or 1"
     return f"{name}: the lines after {lines_before} are not `t x y p`"
+
+
+_EVENTS = "events.txt"
+_IMAGES = "images.txt"
+TEXT_SUFFIXES = (".txt", ".csv")
+
+
+def recognises_ijrr(path: Path) -> bool:
+    """Return whether the path is a text file, or an archive with ``events.txt``."""
+    is_text = path.is_file() and path.suffix.lower() in TEXT_SUFFIXES
+    return is_text or holds(path, lambda archive: archive.named(_EVENTS))
+
+
+def read_ijrr(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
+    """Yield the items of one recording.
+
+    Raises:
+        UsageError: a part is missing or malformed.
+    """
+    with Archive(path) as archive:
+        events = path.name if archive.is_single else archive.find(_EVENTS)
+        pictures = _listed_pictures(archive)
+        if pictures:
+            yield archive.size(pictures[0][1])
+        yield from read_texts(archive, [events or _EVENTS], pictures, options.time_unit, progress)
+
+
+def _listed_pictures(archive: Archive) -> list[tuple[int, str]]:
+    """Return time (ns) and member of every line of ``images.txt``; an empty list without that file."""
+    listing = archive.find(_IMAGES)
+    if listing is None:
+        return []
+    with archive.open(listing) as stream:
+        lines = stream.read().decode("utf-8-sig", "replace").splitlines()
+    pictures = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        where = f"{archive.where(listing)}, line {number}"
+        seconds, _, name = line.strip().partition(" ")
+        try:
+            t_ns = int(to_ns(np.array([float(seconds)]), where)[0])
+        except ValueError:
+            raise UsageError(f"{where}: {line!r} is not `seconds path`") from None
+        member = listing[: -len(_IMAGES)] + name.strip().replace("\\", "/")
+        if member not in archive.bytes_of:
+            raise UsageError(f"{where} names {name.strip()}, which does not exist")
+        pictures.append((t_ns, member))
+    return pictures
+
+
+_EVAID_TIMES = "timestamps.txt"
+SHAPE = "shape.txt"
+PICTURES = (".png", ".jpg", ".jpeg")
+
+
+def recognises_evaid(path: Path) -> bool:
+    """Return whether the path is an archive with ``timestamps.txt`` and a folder ``event``."""
+    return holds(path, lambda archive: archive.named(_EVAID_TIMES) and _evaid_members(archive, "event", (".txt",)))
+
+
+def read_evaid(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
+    """Yield the items of one recording. The event files are read in the order of their names.
+
+    Raises:
+        UsageError: a part is missing or malformed.
+    """
+    with Archive(path) as archive:
+        times_us = archive.integers(archive.find(_EVAID_TIMES) or _EVAID_TIMES)
+        events, pictures = _evaid_members(archive, "event", (".txt",)), _evaid_members(archive, "gt", PICTURES)
+        if len(times_us) != len(pictures):
+            raise UsageError(f"{path}: {len(pictures)} pictures in gt/, but {len(times_us)} times in {_EVAID_TIMES}")
+        if (stated := archive.find(SHAPE)) is not None:
+            shape = archive.integers(stated)
+            if len(shape) != 2:
+                raise UsageError(f"{path}: {SHAPE} holds {shape}, not `width height`")
+            yield SensorSize(*shape)
+        elif pictures:
+            yield archive.size(pictures[0])
+        timed = [(1000 * time_us, member) for time_us, member in zip(times_us, pictures, strict=True)]
+        yield from read_texts(archive, events, timed, options.time_unit or "us", progress)
+
+
+def _evaid_members(archive: Archive, folder: str, suffixes: tuple[str, ...]) -> list[str]:
+    """Return the files in the folder of this name in numeric order: 2.txt before 10.txt."""
+    found = [
+        member
+        for member in archive.bytes_of
+        if posixpath.basename(posixpath.dirname(member)).lower() == folder and member.lower().endswith(suffixes)
+    ]
+    return sorted(found, key=lambda member: (len(member), member))

@@ -2,7 +2,7 @@
 
     serve.py      one server: runs the loop; config.py: its settings
     commands/     the command lines
-    prepare/      `v2v-prepare`
+    prepare.py    `v2v-prepare`
     status/       what the operator sees
     supervise/    start and restart workers
     broker/       which worker makes which sample for which consumer
@@ -11,7 +11,7 @@
     schedule/     which sequence each index is made from
     corpus/       which videos exist
     store/        prepared clips, lossless
-    flow/         optical flow
+    flow.py       optical flow
     simulation/   the virtual camera
     video/        from a file to luma
     system/       services of the operating system

@@ -16,18 +16,16 @@ from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.scenes.findings import Defect
-from v2v_server.corpus.scenes.picture_check import CHANGES, hides_motion
+from v2v_server.corpus.scenes.picture_check import CHANGES, Defect, hides_motion
 from v2v_server.motion.prediction import SUBSTEP_PX, Prediction, predict
-from v2v_server.schedule.sequences import VideoSequence
+from v2v_server.schedule import VideoSequence
 from v2v_server.simulation.effects import NOISE
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.view import apply_view, without_margin
 from v2v_server.store.pixels import signal_of
 from v2v_server.system.compile_cache import cv2
-from v2v_server.video.collect import ClipRequest, Cut
-from v2v_server.video.decode import DecodedClip
-from v2v_server.video.luma import SDR
+from v2v_server.video.decode import ClipRequest, Cut, DecodedClip
+from v2v_server.video.picture import SDR
 from v2v_server.worker.produce import Decoded, make_sample, plan_sample
 from v2v_tools.remake import RemadeSample, Remaker, lease_for
 

@@ -34,11 +34,11 @@ from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import defects_of_video
 from v2v_server.motion.prediction import Prediction
-from v2v_server.schedule.sequences import SequenceTable, VideoSequence
+from v2v_server.schedule import SequenceTable, VideoSequence
 from v2v_server.simulation.intensity import tone_table
 from v2v_server.store.pixels import VIDEOS, VideosKind, signal_of
-from v2v_server.video.collect import ClipRequest, Cut
-from v2v_server.video.luma import SDR
+from v2v_server.video.decode import ClipRequest, Cut
+from v2v_server.video.picture import SDR
 from v2v_server.video.probe import DOLBY_VISION
 from v2v_tools.motion import (
     WholePictures,

@@ -39,7 +39,7 @@ from tests.oracles.rendered import Reals
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.corpus.scenes.analysis import analyse
-from v2v_server.corpus.scenes.findings import BARS, COMBED, CUTS, DUPLICATES, FADES, STILL, Defect, defects_of
+from v2v_server.corpus.scenes.picture_check import BARS, COMBED, CUTS, DUPLICATES, FADES, STILL, Defect, defects_of
 from v2v_server.corpus.scenes.scene import MOTION, Scene
 from v2v_server.video.probe import probe
 from v2v_server.worker.scene_choice import CleanFrames

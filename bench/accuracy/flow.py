@@ -26,7 +26,7 @@ from tests.oracles.decoded import decode_luma
 from tests.oracles.known_motion import PHOTOGRAPHS, Grey, Scene, photograph, scenes
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import V2VError
-from v2v_server.flow.methods import AUTO, METHODS, Estimator, choose, estimator
+from v2v_server.flow import AUTO, METHODS, Estimator, choose, estimator
 from v2v_server.video.probe import probe
 
 HEIGHT_PX, WIDTH_PX, CROP_PX = 180, 596, 128

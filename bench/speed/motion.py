@@ -68,7 +68,7 @@ def forms_of(video: Path, folder: Path, colour: bool) -> Iterator[tuple[str, str
             planes = () if form == "store" else (form,)
             with closing(open_catalogue(source, processes=0)) as catalogue:
                 target = folder / clip / form
-                prepare.prepare(catalogue, target, planes=planes, processes=0)
+                prepare(catalogue, target, planes=planes, processes=0)
             yield clip, form, target
 
 

@@ -35,11 +35,9 @@ from tests.oracles.decoded import decode_luma, stream_luma
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import CorpusError
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.prepare.transcode import Transcoding, transcode
-from v2v_server.store.format import Head, group_frames_for
-from v2v_server.store.packing import DEFAULT_SIZE, DENSE, FAST, QUICK, RAW, Packing
-from v2v_server.store.reader import StoreFile
-from v2v_server.store.writer import StoreWriter
+from v2v_server.prepare import Transcoding, transcode
+from v2v_server.store.format import DEFAULT_SIZE, DENSE, FAST, QUICK, RAW, Head, Packing, group_frames_for
+from v2v_server.store.store_file import StoreFile, StoreWriter
 from v2v_server.video.rows import Rows
 
 Luma = npt.NDArray[np.uint8]

@@ -37,7 +37,7 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol import NUMERICS_VERSION, __version__
 from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION
-from v2v_server.prepare.prepare import prepare
+from v2v_server.prepare import prepare
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.video.rows import Rows
 

@@ -24,12 +24,11 @@ from tests.waiting import until
 from v2v_client import Batch
 from v2v_client.local_server import LocalServer
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.manifest import read_manifest
-from v2v_server.prepare.prepare import prepare
-from v2v_server.prepare.transcode import PARTIAL_SUFFIX
+from v2v_server.corpus.sources.prepared import read_manifest
+from v2v_server.prepare import PARTIAL_SUFFIX, prepare
 from v2v_server.quarantine import read_quarantine
 from v2v_server.simulation.precision import warm_up
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.store_file import StoreFile
 
 INJECT = Path(__file__).parent / "inject"
 COMPILED = pytest.mark.usefixtures("_compiled")
@@ -177,7 +176,7 @@ def source(tmp_path: Path) -> Path:
 
 def _preparing(source: Path, out: Path, cache: Path) -> list[str]:
     settings = ["--workers", "2", "--cache-dir", str(cache)]
-    return ["v2v_server.commands.prepare", str(source), str(out), *settings]
+    return ["v2v_protocol.programs", "prepare", str(source), str(out), *settings]
 
 
 def _require_it_goes_on(source: Path, out: Path, cache: Path) -> None:
@@ -212,13 +211,13 @@ def test_preparing_onto_a_full_disk(source: Path, tmp_path: Path, cache: Path, r
     size, filler = {"nothing": (64, 64), "a manifest": (64, 60), "some videos": (400, 4)}[room]
     # Without the free space that it keeps for others, which would end it before the disk is full.
     program = (
-        "from v2v_server.prepare import prepare; "
+        "from v2v_server import prepare; "
         "prepare.LEAST_FREE_BYTES = -(1 << 40); "
         "import sys; from v2v_server.commands.prepare import main; sys.exit(main())"
     )
     run = f'{sys.executable} -c "{program}" "$@" || echo "ended with status $?"; cp -r "{disk}/out" "{after}"'
     setup = f'mount -t tmpfs -o size={size}k tmpfs "{disk}"; head -c {filler}K /dev/zero > "{disk}/filler"'
-    command = mounted(setup, ["sh", "-c", run, "sh", *_preparing(source, disk / "out", cache)[1:]])
+    command = mounted(setup, ["sh", "-c", run, "sh", *_preparing(source, disk / "out", cache)[2:]])
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if room == "nothing":
         assert "ended with status 2" in done.stdout

@@ -27,7 +27,7 @@ from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.precision import AUTO, Real, choose, noise_sum
 from v2v_server.simulation.voxel import rounding_tolerance
-from v2v_server.video.luma import SDR, Signal
+from v2v_server.video.picture import SDR, Signal
 
 
 @dataclass(frozen=True)

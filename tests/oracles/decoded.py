@@ -8,10 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.video.collect import ClipRequest, Cut
-from v2v_server.video.decode import DecodedClip, decode_cuts, stream_pictures
+from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, decode_cuts, stream_pictures
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.orientation import PixelRect
+from v2v_server.video.picture import PixelRect
 
 
 def decode_luma(

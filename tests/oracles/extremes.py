@@ -30,7 +30,7 @@ from v2v_server.simulation.draw import draw, noise_key_of_seed
 from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.precision import LIMITS
 from v2v_server.simulation.voxel import rounding_tolerance
-from v2v_server.video.luma import SDR, Signal
+from v2v_server.video.picture import SDR, Signal
 
 Frames = npt.NDArray[Any]
 HEIGHT_PX, WIDTH_PX, STEPS = 6, 8, 60

@@ -15,7 +15,7 @@ def encode(light: Reals, transfer: str, gamma: float) -> Reals:
 
     Args:
         light: 0 or more.
-        transfer: a name of ``v2v_server.video.luma.TRANSFERS``, or "" for a gamma.
+        transfer: a name of ``v2v_server.video.picture.TRANSFERS``, or "" for a gamma.
         gamma: of SDR.
     """
     if transfer == "pq":

@@ -10,8 +10,7 @@ import pytest
 from tests.pictures.cameras import camera
 from v2v_pictures.canvas import Canvas
 from v2v_pictures.film import draw_film
-from v2v_pictures.labels import class_colour, labelled_panel, tint
-from v2v_pictures.sheet import draw_sheet
+from v2v_pictures.sheet import class_colour, draw_sheet, labelled_panel, tint
 
 
 @pytest.mark.parametrize("with_text", [False, True])

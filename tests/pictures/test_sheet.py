@@ -22,9 +22,15 @@ from v2v_pictures.canvas import INK, MARK, PAGE_MARGIN_PX, PAUSED_INK, Canvas, b
 from v2v_pictures.colours import BRIGHTER, DARKER, draw_events, draw_grey, full_colour
 from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write_png
 from v2v_pictures.film import draw_film
-from v2v_pictures.overview import draw_overview, overview_height, overview_width, whole_panel
-from v2v_pictures.sheet import draw_sheet, flow_panel
-from v2v_pictures.strip import draw_strip
+from v2v_pictures.sheet import (
+    draw_overview,
+    draw_sheet,
+    draw_strip,
+    flow_panel,
+    overview_height,
+    overview_width,
+    whole_panel,
+)
 from v2v_protocol.errors import UsageError
 
 WHITE = (255, 255, 255)

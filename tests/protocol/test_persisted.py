@@ -22,9 +22,8 @@ from v2v_protocol.persisted import LARGEST_LIST, Int64, reader, to_plain
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, SampleId, SampleParams
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.manifest import Header
-from v2v_server.store.format import Head
-from v2v_server.store.packing import PACK_METHODS
+from v2v_server.corpus.sources.prepared import Header
+from v2v_server.store.format import PACK_METHODS, Head
 
 ROOT = Path(__file__).parents[2]
 FOUND = [

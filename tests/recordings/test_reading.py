@@ -24,9 +24,8 @@ from trainer.convert.conversion import in_layout
 from trainer.evaluation.readers import Recording
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
-from v2v_recordings.forms import recognise
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, SensorSize
-from v2v_recordings.reading import LATE_NS, _Clock, read_items
+from v2v_recordings.reading import LATE_NS, _Clock, read_items, recognise
 from v2v_tools.event_files import EVENT_WRITERS, write_events
 from v2v_tools.fit.recording import read_recording
 

@@ -15,10 +15,9 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, CorpusPart
-from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.corpus.videos import CorpusFacts, VideoEntry
+from v2v_server.corpus.videos import CorpusFacts, Sidecars, VideoEntry
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
 

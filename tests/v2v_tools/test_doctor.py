@@ -18,8 +18,7 @@ from tests.clips import damaged, panned_luma, truncated, write_clip
 from v2v_protocol.recipe import Recipe
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.scenes import picture_check
-from v2v_server.corpus.scenes.findings import COMBED, DUPLICATES
-from v2v_server.corpus.scenes.picture_check import defects_of_video
+from v2v_server.corpus.scenes.picture_check import COMBED, DUPLICATES, defects_of_video
 from v2v_server.motion.prediction import predict
 from v2v_tools.doctor import command
 from v2v_tools.doctor import corpus as doctor_corpus

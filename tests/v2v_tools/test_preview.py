@@ -16,7 +16,7 @@ from PIL import Image as Pictures
 from tests.clips import panned_luma, write_clip
 from tests.oracles.rendered import rendered_scene
 from v2v_pictures.camera import Camera
-from v2v_pictures.labels import class_colour
+from v2v_pictures.sheet import class_colour
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_tools import preview as command
 from v2v_tools.preview import PreviewCamera, preview

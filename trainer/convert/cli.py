@@ -17,7 +17,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
 from v2v_protocol.write_aside import write_json
 from v2v_recordings import items
-from v2v_recordings.forms import FORMS
+from v2v_recordings.reading import FORMS
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -12,9 +12,8 @@ from pathlib import Path
 from trainer.convert.writer import RecordingWriter, Written
 from trainer.evaluation import layout
 from v2v_protocol.errors import UsageError
-from v2v_recordings.forms import FORMS, recognise
 from v2v_recordings.items import ConvertOptions, ReadProgress
-from v2v_recordings.reading import read_items
+from v2v_recordings.reading import FORMS, read_items, recognise
 
 EVENT_SUFFIXES = (*layout.SUFFIXES, ".npz", ".raw", ".aedat4", ".es", ".dat", ".bag")
 """Suffixes of files that hold events and nothing else; a text may be anything."""

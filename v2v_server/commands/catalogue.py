@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
-from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.errors import CorpusError, UsageError, V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress, format_duration
 from v2v_protocol.spec import SCENES
 from v2v_server.config import ServeConfig
-from v2v_server.corpus.ahead import Ahead, Part, catalogue_ahead, catalogue_shard
-from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.index import Shard
-from v2v_server.corpus.sources.source import COPIES_GIB
+from v2v_server.corpus.catalogue import Catalogue, index_path, list_corpus, open_catalogue, refresh_index
+from v2v_server.corpus.index import Shard, make_folder, merge_parts, parts_in, write_part
+from v2v_server.corpus.probe import SceneCollection
+from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
 from v2v_server.store.pixels import VideosKind
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
@@ -69,8 +69,37 @@ def _run(arguments: argparse.Namespace) -> None:
         raise UsageError("--shard K/N needs --out DIR, and --out needs --shard: give both or neither")
     if arguments.shard is not None and arguments.merge is not None:
         raise UsageError("--shard makes a part, --merge combines all of them: give one of them")
-    asked = Ahead(
-        videos=arguments.videos,
+    begun = time.monotonic()
+    shard = None if arguments.shard is None else Shard.parse(arguments.shard)
+    with Progress("probing videos") as shown:
+        probed = _Probed(shown)
+        if shard is not None:
+            lines = _catalogue_shard(arguments, shard, probed)
+        else:
+            catalogue = _catalogue_all(arguments, probed)
+    if shard is None:
+        lines = _of_all(catalogue)
+    for line in [*lines, f"probed {probed.files} files in {format_duration(time.monotonic() - begun)}"]:
+        show(line)
+
+
+def _source(arguments: argparse.Namespace) -> VideoSource:
+    kind, copies_gib = VideosKind.of(vars(arguments)), arguments.copies_gib or COPIES_GIB
+    options = SourceOptions(arguments.list, arguments.copies, copies_gib, arguments.cache_dir, kind)
+    return open_source(arguments.videos, options)
+
+
+def _catalogue_all(arguments: argparse.Namespace, probed: _Probed) -> Catalogue:
+    """Open the catalogue of a corpus with all of its files in the index: those of the parts, and those not probed yet.
+
+    Raises:
+        CorpusError: as for ``open_catalogue``; or parts are missing or cannot be read.
+    """
+    if arguments.merge is not None:
+        complete = parts_in(Path(arguments.merge))
+        merge_parts(index_path(_source(arguments).name, arguments.cache_dir), complete)
+    return open_catalogue(
+        arguments.videos,
         list_file=arguments.list,
         rows=Rows.parse(arguments.rows or "full"),
         cache_dir=arguments.cache_dir,
@@ -79,37 +108,44 @@ def _run(arguments: argparse.Namespace) -> None:
         kind=VideosKind.of(vars(arguments)),
         scene=arguments.scene != "off",
         processes=arguments.workers,
+        progress=probed,
+        notice=probed.notice,
     )
-    begun = time.monotonic()
-    shard = None if arguments.shard is None else Shard.parse(arguments.shard)
-    with Progress("probing videos") as shown:
-        probed = _Probed(shown)
-        if shard is not None:
-            part = catalogue_shard(asked, shard, Path(arguments.out), probed, shown.notice)
-        else:
-            parts = None if arguments.merge is None else Path(arguments.merge)
-            catalogue = catalogue_ahead(asked, parts, probed, shown.notice)
-    lines = _of_part(part, shard) if shard is not None else _of_all(catalogue)
-    for line in [*lines, f"probed {probed.files} files in {format_duration(time.monotonic() - begun)}"]:
-        show(line)
+
+
+def _catalogue_shard(arguments: argparse.Namespace, shard: Shard, probed: _Probed) -> list[str]:
+    """Catalogue a shard of a corpus, write its index to the parts, and return lines that say so.
+
+    Progress is kept in this host's cache folder, so that a killed run continues.
+
+    Raises:
+        CorpusError: there is no such corpus, or a folder cannot be written to.
+    """
+    make_folder(out := Path(arguments.out))
+    source = _source(arguments)
+    corpus = list_corpus(source, Rows.parse(arguments.rows or "full"), probed.notice)
+    ids = [id for id in corpus.ids if shard.holds(id)]
+    scenes = SceneCollection(corpus.rows) if arguments.scene != "off" else None
+    index = index_path(source.name, arguments.cache_dir, shard)
+    store, table, notes = refresh_index(source, ids, index, scenes, arguments.workers, probed, probed.notice)
+    store.close()
+    if notes:
+        raise CorpusError(notes[0])
+    problems = Counter(problem for problem in table.problem if problem is not None)
+    path, usable = write_part(index, out, shard), len(ids) - problems.total()
+    lines = [f"shard {shard}: {len(ids)} of {len(corpus.ids)} videos, {usable} can be used"]
+    return [*lines, *(f"  {count}: {reason}" for reason, count in problems.most_common(_SHOWN)), f"part: {path}"]
 
 
 class _Probed:
     """Count the files that are probed, and show the progress."""
 
     def __init__(self, shown: Progress) -> None:
-        self._shown, self.files = shown, 0
+        self._shown, self.notice, self.files = shown, shown.notice, 0
 
     def __call__(self, done: int, total: int) -> None:
         self.files += 1
         self._shown(done, total)
-
-
-def _of_part(part: Part, shard: Shard) -> list[str]:
-    unusable = part.problems.total()
-    lines = [f"shard {shard}: {part.taken_in} of {part.videos} videos, {part.taken_in - unusable} can be used"]
-    lines += [f"  {count}: {reason}" for reason, count in part.problems.most_common(_SHOWN)]
-    return [*lines, f"part: {part.path}"]
 
 
 def _of_all(catalogue: Catalogue) -> list[str]:
@@ -124,7 +160,3 @@ def _of_all(catalogue: Catalogue) -> list[str]:
         if catalogue.scene_digest is not None:
             lines.append(f"with scenes: {catalogue.scene_digest}")
         return lines
-
-
-if __name__ == "__main__":
-    sys.exit(main())

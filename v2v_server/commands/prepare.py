@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -22,10 +21,9 @@ from v2v_protocol.spec import SCENES
 from v2v_protocol.write_aside import write_json
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.sources.listfile import LIST_SUFFIXES
-from v2v_server.prepare import prepare
-from v2v_server.prepare.prepare import Report, check_destination
-from v2v_server.store.packing import DEFAULT_SIZE, SIZES
+from v2v_server.corpus.sources.source import LIST_SUFFIXES
+from v2v_server.prepare import Report, check_destination, prepare
+from v2v_server.store.format import DEFAULT_SIZE, SIZES
 from v2v_server.store.pixels import VideosKind
 from v2v_server.store.planes import OPTIONAL, PLANES
 from v2v_server.system.process import usable_cores
@@ -97,7 +95,7 @@ def _run(arguments: argparse.Namespace) -> int:
             notice=probing.notice,
         )
     with contextlib.closing(catalogue), Progress("preparing", "frames") as shown:
-        report = prepare.prepare(
+        report = prepare(
             catalogue,
             arguments.destination,
             arguments.size,
@@ -163,7 +161,3 @@ def _listed(title: str, items: list[tuple[str, str]]) -> list[str]:
 
 def _size(made: int, expected: int) -> str:
     return f"{made / 1e9:.1f} of about {expected / 1e9:.1f} GB" if expected else ""
-
-
-if __name__ == "__main__":
-    sys.exit(main())

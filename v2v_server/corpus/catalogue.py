@@ -25,30 +25,46 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
-from v2v_server.corpus.manifest import ABSENT, Header
-from v2v_server.corpus.probe import VideoProgress, batches, probe_files
-from v2v_server.corpus.scenes.collect import SceneCollection
+from v2v_server.corpus.probe import (
+    SceneCollection,
+    VideoProgress,
+    batches,
+    collect_sidecars,
+    files_for_lease,
+    probe_files,
+    sidecar_kind,
+)
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sidecars import Sidecars, collect_sidecars, files_for_lease, sidecar_kind
-from v2v_server.corpus.sources.listfile import ListEntry, left_out_note
-from v2v_server.corpus.sources.sidecar import sidecar_id
+from v2v_server.corpus.sources.prepared import ABSENT, Header
 from v2v_server.corpus.sources.source import (
     COPIES_GIB,
     GONE,
     FileState,
+    ListEntry,
     Notice,
     SourceOptions,
     VideoSource,
     by_parts,
     is_said,
+    left_out_note,
     open_source,
+    sidecar_id,
 )
-from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos, VideoTable, joined, missing_arrays
+from v2v_server.corpus.videos import (
+    NO_THRESHOLDS,
+    CorpusFacts,
+    Sidecars,
+    Thresholds,
+    Videos,
+    VideoTable,
+    joined,
+    missing_arrays,
+)
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.store.pixels import VIDEOS, VideosKind
-from v2v_server.store.reader import STORE_FORMAT
+from v2v_server.store.store_file import STORE_FORMAT
+from v2v_server.system.log import gauge, text
 from v2v_server.system.process import cache_folder, without_collections
-from v2v_server.system.status_fields import gauge, text
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
 
@@ -260,7 +276,7 @@ class Catalogue:
         refusals: files, folders and lines of the list that give no video, by id.
         notes: what the user ought to be told: an index that cannot be kept, counts that contradict the list.
         digest: 32 hexadecimal digits that name this snapshot: equal digests, equal videos.
-        prepared: how the folder was made if it is a prepared one (see :mod:`v2v_server.prepare.prepare`). Its videos
+        prepared: how the folder was made if it is a prepared one (see :mod:`v2v_server.prepare`). Its videos
             are those of its source in number, order, id and frames, so that every position means the same frames;
             one without a sound prepared file is refused when it is opened, like a damaged one.
         scene_digest: names this snapshot together with the statistics of its videos; None without them.

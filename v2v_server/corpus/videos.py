@@ -24,11 +24,10 @@ from v2v_protocol.persisted import FloatOrNaN, Persisted
 from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import PIECE, Pieces, clip_pieces, firsts_of, sides_of
-from v2v_server.corpus.sidecars import Sidecars
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.pixels import kind_of
 from v2v_server.store.planes import PLANES
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.store_file import StoreFile
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
 from v2v_server.video.rows import Rows
 
@@ -486,6 +485,23 @@ def _has_plane(source: VideoSource, id: str, name: str) -> bool:
             return isinstance(pixels, StoreFile) and name in pixels.planes
     except VideoError:  # making a sample says why
         return True
+
+
+@dataclass(frozen=True, slots=True)
+class Sidecars:
+    """The sidecars of one ending. The mappings are by the video's id.
+
+    Attributes:
+        fingerprints: videos without such a sidecar are missing.
+        digest: names all of them.
+        states: sizes and times, see :meth:`v2v_server.corpus.sources.source.VideoSource.sidecar_state`.
+        problems: why a sidecar is not used.
+    """
+
+    fingerprints: Mapping[str, str]
+    digest: str
+    states: Mapping[str, str] = field(default_factory=dict)
+    problems: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ import numpy.typing as npt
 
 from v2v_server.motion.lanes import BLOCK_PX, CELL_PX, block_difference
 from v2v_server.motion.pyramid import PAD_PX, Cells, GreyPicture, Pyramid, compiled
-from v2v_server.video.orientation import PixelRect
+from v2v_server.video.picture import PixelRect
 
 Vectors = npt.NDArray[np.int16]
 """[2, ceil(h / CELL_PX), ceil(w / CELL_PX)] int16: x (right) and y (down), in 1/UNITS_PER_PX px."""

@@ -9,7 +9,7 @@ import numpy as np
 from v2v_server.motion.matching import Vectors, motion, motion_if_any
 from v2v_server.motion.pyramid import Cells, Pyramid
 from v2v_server.simulation.view import FrameArray
-from v2v_server.video.collect import Cut
+from v2v_server.video.decode import Cut
 
 
 class MotionOfPictures:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.motion.lanes import CELL_PX
-from v2v_server.video.orientation import PixelRect
+from v2v_server.video.picture import PixelRect
 
 GreyPicture = npt.NDArray[np.uint8]
 """[h, w] uint8."""

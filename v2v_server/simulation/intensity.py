@@ -34,7 +34,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.simulation.voxel import FINE_STEPS
-from v2v_server.video.luma import SDR, Signal
+from v2v_server.video.picture import SDR, Signal
 
 Doubles = npt.NDArray[np.float64]
 _Table = TypeVar("_Table", bound=npt.NDArray[Any])
@@ -157,7 +157,7 @@ _LIGHT: dict[str, Callable[[Doubles], Doubles]] = {
     "log316": _log(2.5),
     "linear": lambda value: value,
 }
-"""i(V) by the names of ``luma.TRANSFERS``."""
+"""i(V) by the names of ``picture.TRANSFERS``."""
 
 
 def _power(base: Doubles, exponent: float) -> Doubles:

@@ -45,7 +45,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_EVENTS, Recipe
 from v2v_protocol.spec import VOXEL_DTYPES
-from v2v_server.video.luma import MOST_BITS, Signal
+from v2v_server.video.picture import MOST_BITS, Signal
 
 AUTO = "auto"
 Real = type[np.floating[Any]]

@@ -17,7 +17,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation.draw import resized_size
 from v2v_server.system.compile_cache import cv2
-from v2v_server.video.luma import SDR, Signal
+from v2v_server.video.picture import SDR, Signal
 
 FrameArray = npt.NDArray[Any]
 """Grey levels: uint8, or uint16 for a signal of more than 8 bits."""

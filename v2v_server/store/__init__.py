@@ -1,11 +1,9 @@
 """The lossless clip store: decoded luma on disk. A sample reads only the blocks of its crop.
 
-format       layout of a store file
+format       layout of a store file, and the compression of its blocks
 differences  the pixels of a block and the differences that are stored for them
-packing      compression of these differences
 planes       named arrays beside the luma, each in a file: motion, detail, chroma
-writer       write a file, frame by frame
-reader       store files, opened; read a clip from some of them
+store_file   store files: opened, read as clips, and written frame by frame
 pixels       what frames are read from: the protocol, and its kinds
 video_file   a video, decoded
 picture_sequence  a folder or archive of numbered pictures, decoded

@@ -14,7 +14,6 @@ A fault here costs time but no sample: its video is then decoded without the cac
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import secrets
 import time
@@ -24,17 +23,14 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.errors import CorpusError, VideoError, VideoUnreadable
-from v2v_server.store.format import PIECE_FRAMES
-from v2v_server.store.packing import QUICK
+from v2v_server.store.format import PIECE_FRAMES, QUICK
 from v2v_server.store.pixels import Pixels
 from v2v_server.store.planes import OPTIONAL, PLANES, whole_cut
-from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder
-from v2v_server.store.reader import StoreFile, read_clips
-from v2v_server.store.writer import write_store
-from v2v_server.system.status_fields import GIB
-from v2v_server.video.collect import ClipRequest
-from v2v_server.video.decode import DecodedClip
-from v2v_server.video.orientation import PixelRect
+from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder, delete_unless_read
+from v2v_server.store.store_file import StoreFile, read_clips, write_store
+from v2v_server.system.log import GIB
+from v2v_server.video.decode import ClipRequest, DecodedClip
+from v2v_server.video.picture import PixelRect
 
 _LOCK_SECONDS = 0.06
 """Longest wait for the lock of the folder; a sample does without the cache rather than wait."""
@@ -75,7 +71,8 @@ class Cache:
         self.trouble = ""
         self.on_wait: Callable[[bool], object] = lambda waits: None
         with contextlib.suppress(OSError):
-            _remove_abandoned(folder)
+            for path in (folder / PARTIAL).iterdir():
+                delete_unless_read(path)  # of a worker that is gone; a live one holds the lock of its file
 
     def clips(
         self, pixels: Pixels, video: str, fingerprint: str, request: ClipRequest
@@ -287,11 +284,3 @@ def make_cache(folder: Path) -> None:
         QuotaFolder(folder, 0, _LOCK_SECONDS).make()
     except OSError as error:
         raise CorpusError(f"--cache {folder}: cannot be written to: {error.strerror or error}") from error
-
-
-def _remove_abandoned(folder: Path) -> None:
-    """Remove temporary files of workers that are gone; live workers hold locks on theirs."""
-    for path in (folder / PARTIAL).iterdir():
-        with contextlib.suppress(OSError), path.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            path.unlink()

@@ -10,6 +10,9 @@ A group is up to :attr:`Head.group` consecutive frames. A block is a group of fr
 begins, the length of each block (they follow each other row by row), the hash of each block, and the hash of the record
 itself. Every hash is seeded with the position of what it covers, so a valid block at another position is rejected.
 
+A block is compressed densely (zstd), for reading in half the time (LZ4HC), or not at all. It is checked before it is
+unpacked, and unpacked into a known number of bytes.
+
 A file is written under another name, its head last, and renamed when it is complete. It is read with ``pread`` and
 never mapped: truncating a mapped file kills the process that reads it.
 """
@@ -18,19 +21,103 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
+import lz4.block
 import msgpack
 import numpy as np
 import numpy.typing as npt
 import xxhash
+import zstandard
 
 from v2v_protocol.errors import ProtocolError, VideoError
 from v2v_protocol.persisted import Persisted, later
-from v2v_server.store.packing import PACK_METHODS, UnpackingError
-from v2v_server.video.colour.chroma import DEFAULT_MATRIX
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
-from v2v_server.video.luma import MIXED, MOST_BITS, SDR, TRANSFERS, Signal
+from v2v_server.video.picture import DEFAULT_MATRIX, MIXED, MOST_BITS, SDR, TRANSFERS, Signal
+
+Bytes = bytes | memoryview
+
+
+@dataclass(frozen=True, slots=True)
+class Packing:
+    """How blocks are compressed; reading them needs only the method.
+
+    Attributes:
+        method: "zstd", "lz4", or "raw", which compresses nothing.
+        search: zstd: match search settings, as ``ZstdCompressionParameters`` takes them.
+        level: level of LZ4HC.
+    """
+
+    method: str
+    search: tuple[tuple[str, int], ...] = ()
+    level: int = 0
+
+    def packer(self) -> Callable[[Bytes], bytes]:
+        """Return a function that compresses a block. It is not thread-safe."""
+        if self.method == "zstd":
+            parameters = zstandard.ZstdCompressionParameters(write_content_size=False, **dict(self.search))
+            return zstandard.ZstdCompressor(compression_params=parameters).compress
+        if self.method == "raw":
+            return bytes
+        return lambda block: lz4.block.compress(
+            block, mode="high_compression", compression=self.level, store_size=False
+        )
+
+
+def _zstd(strategy: int, hash_log: int, min_match: int, search_log: int) -> Packing:
+    search = {"strategy": strategy, "hash_log": hash_log, "chain_log": hash_log, "min_match": min_match}
+    return Packing("zstd", (*search.items(), ("search_log", search_log), ("window_log", 15)))
+
+
+# Differences of decoded frames have few repetitions apart from zeros; entropy coding is what makes them small. So only
+# long repetitions are searched for: short ones also slow down reading.
+DENSE = _zstd(zstandard.STRATEGY_LAZY, 15, 6, 5)
+QUICK = _zstd(zstandard.STRATEGY_FAST, 6, 7, 1)
+"""Packing of the cache: 4 % larger than :data:`DENSE`, and written six times as fast."""
+FAST = Packing("lz4", level=6)
+
+RAW = Packing("raw")
+
+SIZES = {"dense": DENSE, "fast": FAST, "raw": RAW}
+"""How a prepared folder may store its files, by name."""
+DEFAULT_SIZE = "dense"
+PACK_METHODS = ("zstd", "lz4", "raw")
+
+
+class UnpackingError(Exception):
+    """A block does not unpack to the expected bytes."""
+
+
+def unpack(method: str, packed: Bytes, size: int) -> Bytes:
+    """Return the ``size`` bytes of a block.
+
+    Raises:
+        UnpackingError: it holds something else.
+    """
+    try:
+        if method == "zstd":
+            # The decompressor allocates the size that a frame claims, whatever the limit is.
+            claimed = zstandard.frame_content_size(packed)
+            if claimed > size:
+                raise UnpackingError(f"claims {claimed} bytes instead of {size}")
+            block: Bytes = _decompressor().decompress(packed, max_output_size=size)
+        elif method == "raw":
+            block = packed
+        else:
+            block = lz4.block.decompress(packed, uncompressed_size=size)
+    except (zstandard.ZstdError, lz4.block.LZ4BlockError) as error:
+        raise UnpackingError(f"does not decompress: {error}") from error
+    if len(block) != size:
+        raise UnpackingError(f"decompresses to {len(block)} bytes instead of {size}")
+    return block
+
+
+@cache
+def _decompressor() -> zstandard.ZstdDecompressor:
+    return zstandard.ZstdDecompressor()
+
 
 MAGIC = b"V2VSTOR1"
 BLOCK_ROWS, BLOCK_COLUMNS = 32, 32
@@ -62,10 +149,10 @@ class Head(Persisted):
         codec: FFmpeg's name of the source's format.
         bit_exact: whether every host decodes the source to these bytes.
         group: frames in a group.
-        packing: method of :mod:`v2v_server.store.packing`.
+        packing: method of :mod:`v2v_server.store.format`.
         index: ``FrameIndex.to_bytes()`` of the source; empty in a piece.
-        bits, transfer: of the source (``v2v_server.video.luma.Signal``).
-        matrix: of the plane "chroma" (``v2v_server.video.colour.chroma.Chroma``). These three are left out of the file
+        bits, transfer: of the source (``v2v_server.video.picture.Signal``).
+        matrix: of the plane "chroma" (``v2v_server.video.picture.Chroma``). These three are left out of the file
             where they are the defaults.
     """
 

@@ -25,13 +25,12 @@ from av.video.frame import VideoFrame
 from v2v_protocol.errors import VideoError
 from v2v_protocol.programs import printable
 from v2v_protocol.sample import ARRAYS, sidecar_endings
-from v2v_server.labels.formats import frame_of
+from v2v_server.labels import frame_of
 from v2v_server.store.video_file import VideoFile
-from v2v_server.video.collect import Stack
+from v2v_server.video.decode import Stack
 from v2v_server.video.fingerprint import TIMES, files_in, unreadable
 from v2v_server.video.frame_index import unseekable
-from v2v_server.video.luma import LumaFormat
-from v2v_server.video.orientation import Orientation
+from v2v_server.video.picture import LumaFormat, Orientation
 from v2v_server.video.probe import VideoFacts
 from v2v_server.video.source import LARGEST_PICTURE_PX, reason
 

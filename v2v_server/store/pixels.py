@@ -16,15 +16,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 from v2v_protocol.errors import UsageError
 
 if TYPE_CHECKING:  # a server's command line, which names the kinds, starts without the decoder
-    from v2v_server.video.collect import ClipRequest, DecodedPicture
-    from v2v_server.video.decode import DecodedClip
+    from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture
     from v2v_server.video.frame_index import FrameIndex
-    from v2v_server.video.luma import Signal
+    from v2v_server.video.picture import Signal
     from v2v_server.video.probe import VideoFacts
 
 PIXEL_KINDS: Mapping[str, tuple[str, ...]] = {
-    "videos": ("reader", "video_file"),
-    "sequences": ("reader", "picture_sequence"),
+    "videos": ("store_file", "video_file"),
+    "sequences": ("store_file", "picture_sequence"),
 }
 """What a video of a corpus is, by ``--videos-kind``: the files here, in the order in which they are asked. The last one
 takes any path. It has ``id_of(path)``, the id of the video that a file belongs to, and ``LOOKED_FOR``, for people."""
@@ -103,8 +102,8 @@ class Pixels(Protocol):
 
 def signal_of(pixels: Pixels, index: FrameIndex) -> Signal:
     """Return what the levels of a video mean, by its first frame, whatever the sample."""
-    from v2v_server.video.collect import ClipRequest, Cut
-    from v2v_server.video.luma import MOST_BITS
+    from v2v_server.video.decode import ClipRequest, Cut
+    from v2v_server.video.picture import MOST_BITS
 
     cut = Cut(1, (0, 0, 1, 1))
     return pixels.clips(ClipRequest(index, index.first, (cut,), most_bits=MOST_BITS, samples=((0, 0, 0),)))[0].signal

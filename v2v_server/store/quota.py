@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from v2v_server.system.log import GIB, counter, gauge, text
 from v2v_server.system.process import lock, open_private
-from v2v_server.system.status_fields import GIB, counter, gauge, text
 
 LEAST_FREE_BYTES = GIB
 """Always keep this much disk space free."""
@@ -144,14 +144,14 @@ class QuotaFolder:
             OSError: see :meth:`locked`.
         """
         with self.locked() as used:
-            used.add(-_evicted(path))
+            used.add(-delete_unless_read(path))
 
     def _evict(self, used: Used, size: int) -> None:
         enough = max(0, int(self.most_bytes * _KEPT_SHARE) - size)
         for oldest in _oldest_first(self.folder):
             if used.bytes <= enough and self.free_bytes >= self.least_free_bytes:
                 return
-            used.add(-_evicted(oldest))
+            used.add(-delete_unless_read(oldest))
 
 
 def used_bytes(folder: Path) -> int:
@@ -193,7 +193,7 @@ def _oldest_first(folder: Path) -> list[Path]:
     return [Path(path) for _, path in sorted((entry.stat().st_mtime_ns, entry.path) for entry in _files(folder))]
 
 
-def _evicted(path: Path) -> int:
+def delete_unless_read(path: Path) -> int:
     """Delete a file, and return the bytes that this freed; 0 if it has a reader."""
     with contextlib.suppress(OSError), path.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

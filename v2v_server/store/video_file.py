@@ -8,8 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 from v2v_server.store.planes.motion import by_cut, watch_motion
-from v2v_server.video.collect import ClipRequest, DecodedPicture
-from v2v_server.video.decode import DecodedClip, Way, decode_cuts, stream_pictures
+from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture, Way, decode_cuts, stream_pictures
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.probe import VideoFacts, probe
 

@@ -4,12 +4,10 @@ source       opening it, for sequential reading, and what its container states b
 probe        what it holds, and which frames decode
 packets      what a packet says without being decoded
 frame_index  which frames it has, and where decoding may begin
-decode       a range of frames, exactly
-collect      the asked frames of one pass of a decoder
-colour       colour of the frames
-luma         which grey is meant
+decode       a range of frames, exactly: what is asked for, and the frames of each pass of a decoder
+picture      what the samples of a decoded picture mean: luma, colour, orientation
+rgb          red, green and blue from grey and colour, compiled
 full_range   limited range to full range, compiled
-orientation  how a stored picture must be turned
 rows         which rows may be used
 fingerprint  which file it is
 """

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError, UsageError
-from v2v_server.video.orientation import Orientation
+from v2v_server.video.picture import Orientation
 
 NO_TIMESTAMP = -(2**63)
 """Stands for an unknown pts or dts (FFmpeg's AV_NOPTS_VALUE)."""
@@ -165,31 +165,36 @@ class FrameIndex:
             raise ProtocolError(f"frame index: {frames} frames from {first}, {keys} keyframes; limit {most_frames}")
         if not (numerator and denominator and height and width) or flags > _SEEKABLE | _TRANSPOSE | _FLIP_Y | _FLIP_X:
             raise ProtocolError(f"frame index: time base {numerator}/{denominator}, {width}x{height} px, flags {flags}")
-        stored = (frames + 2 * keys) * _INT64.itemsize if seekable else 0
-        values = np.frombuffer(_inflated(data[_HEADER.size :], stored), _INT64).astype(np.int64)
-        if seekable:
-            pts, keyframes, dts = np.split(values, [frames, frames + keys])
-            pts, keyframes, dts = np.cumsum(np.cumsum(pts)), np.cumsum(keyframes), np.cumsum(dts)
-        else:
-            if keys:
-                raise ProtocolError(f"frame index: {keys} keyframes though it is not seekable")
-            pts, keyframes, dts = np.broadcast_to(np.int64(NO_TIMESTAMP), (frames,)), values, values
-        if seekable and (pts[0] == NO_TIMESTAMP or not _increasing(pts)):
+        packed = data[_HEADER.size :]
+        if not seekable:
+            if keys or packed:
+                raise ProtocolError(f"frame index: {keys} keyframes and {len(packed)} bytes though it is not seekable")
+            return unseekable(frames, (numerator, denominator), height, width, orientation, first)
+        stored = inflated("frame index", packed, (frames + 2 * keys) * _INT64.itemsize)
+        values = np.frombuffer(stored, _INT64).astype(np.int64)
+        pts, keyframes, dts = np.split(values, [frames, frames + keys])
+        pts, keyframes, dts = np.cumsum(np.cumsum(pts)), np.cumsum(keyframes), np.cumsum(dts)
+        if pts[0] == NO_TIMESTAMP or not _increasing(pts):
             raise ProtocolError("frame index: time stamps that do not increase")
         if keys and (keyframes[0] < first or keyframes[-1] >= first + frames or not _increasing(keyframes)):
             raise ProtocolError(
                 f"frame index: keyframes outside frames {first} .. {first + frames - 1}, or in disorder"
             )
-        return cls(first, pts, keyframes, dts, (numerator, denominator), height, width, seekable, orientation)
+        return cls(first, pts, keyframes, dts, (numerator, denominator), height, width, True, orientation)
 
 
 def unseekable(
-    frames: int, time_base: tuple[int, int], height_px: int, width_px: int, orientation: Orientation = _UPRIGHT
+    frames: int,
+    time_base: tuple[int, int],
+    height_px: int,
+    width_px: int,
+    orientation: Orientation = _UPRIGHT,
+    first: int = 0,
 ) -> FrameIndex:
     """Return the index of a file whose frames can only be counted from its beginning."""
     none = np.empty(0, np.int64)
     pts = np.broadcast_to(np.int64(NO_TIMESTAMP), (frames,))
-    return FrameIndex(0, pts, none, none, time_base, height_px, width_px, False, orientation)
+    return FrameIndex(first, pts, none, none, time_base, height_px, width_px, False, orientation)
 
 
 def _steps(values: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
@@ -203,17 +208,17 @@ def _increasing(values: npt.NDArray[np.int64]) -> bool:
     return bool(np.all(values[1:] > values[:-1]))
 
 
-def _inflated(packed: bytes, size: int) -> bytes:
-    """``packed`` decompressed to exactly ``size`` bytes; never allocates much more than that."""
-    if not size:
-        if packed:
-            raise ProtocolError(f"frame index: {len(packed)} bytes left over")
-        return b""
+def inflated(what: str, packed: bytes, size: int) -> bytes:
+    """Return ``packed`` decompressed to exactly ``size`` bytes; never allocate much more than that.
+
+    Raises:
+        ProtocolError: it is something else; the message begins with what it should be.
+    """
     stream = zlib.decompressobj()
     try:
         raw = stream.decompress(packed, size + 1)
     except zlib.error as error:
-        raise ProtocolError(f"frame index does not decompress: {error}") from error
+        raise ProtocolError(f"{what} does not decompress: {error}") from error
     if len(raw) != size or not stream.eof or stream.unused_data:
-        raise ProtocolError(f"frame index decompresses to {len(raw)} bytes; its header promises {size}")
+        raise ProtocolError(f"{what} decompresses to {len(raw)} bytes; its header promises {size}")
     return raw

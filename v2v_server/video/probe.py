@@ -23,12 +23,10 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError
-from v2v_server.video.colour.chroma import SMPTE_240M, stated_matrix
 from v2v_server.video.decode import decodes_as_listed
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX, NO_TIMESTAMP, FrameIndex, unseekable
-from v2v_server.video.luma import LumaFormat
-from v2v_server.video.orientation import Orientation
 from v2v_server.video.packets import Fields, PacketSigns, is_hidden, steps_and_gaps, times_are_doubtful
+from v2v_server.video.picture import SMPTE_240M, LumaFormat, Orientation, stated_matrix
 from v2v_server.video.source import (
     count_transport_pictures,
     describe_cut,
@@ -60,7 +58,7 @@ class VideoFacts:
         pixel_format: FFmpeg's name of the decoded format ("yuv420p10le").
         frames_per_second: average rate: from the time stamps, without gaps, else the container's; NaN if unknown.
         rotation_degrees: of the first frame's display matrix, counter-clockwise as FFmpeg reports it (-90 .. 180).
-        full_range: whether luma spans 0 .. 255 (see :mod:`v2v_server.video.luma`).
+        full_range: whether luma spans 0 .. 255 (see :mod:`v2v_server.video.picture`).
         index: the frames.
         interlaced: whether the first picture, or any that is stored as two fields, says that its even and odd rows were
             taken at different times.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from decimal import Decimal
 
 from v2v_protocol.errors import UsageError
 
@@ -83,9 +84,4 @@ class Rows:
 
 def _plain(share: float) -> str:
     """Return the shortest decimal that reads back as the same float, never in scientific notation."""
-    text = repr(share)
-    if "e" in text:
-        mantissa, exponent = text.split("e")
-        digits = mantissa.replace(".", "")
-        text = "0." + "0" * (-int(exponent) - 1) + digits
-    return text
+    return f"{Decimal(repr(share)):f}"

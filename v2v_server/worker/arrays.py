@@ -30,8 +30,7 @@ from v2v_server.simulation.kernels import Voxels
 from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.view import FrameArray, Window
 from v2v_server.simulation.voxel import Levels
-from v2v_server.video.colour.chroma import Chroma, ChromaCut
-from v2v_server.video.luma import SDR, Signal
+from v2v_server.video.picture import SDR, Chroma, ChromaCut, Signal
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,11 +46,9 @@ from v2v_protocol.sample import (
 )
 from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
-from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.corpus.sources.source import VideoSource, open_sidecar, sidecar_id
 from v2v_server.flow import FlowSettings, flow_for
-from v2v_server.labels.formats import READERS, BoxTable, numbered_files, read_mask
-from v2v_server.labels.views import kept_boxes, view_boxes, view_mask
+from v2v_server.labels import READERS, BoxTable, kept_boxes, numbered_files, read_mask, view_boxes, view_mask
 from v2v_server.motion import cells_of, levels_of
 from v2v_server.simulation.draw import choose_crop, draw
 from v2v_server.simulation.intensity import eight_bits
@@ -60,10 +58,8 @@ from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache, Cached
-from v2v_server.video.collect import ClipRequest, Cut
-from v2v_server.video.colour.chroma import ChromaCut
-from v2v_server.video.decode import DecodedClip
-from v2v_server.video.luma import MIXED, MOST_BITS, SDR
+from v2v_server.video.decode import ClipRequest, Cut, DecodedClip
+from v2v_server.video.picture import MIXED, MOST_BITS, SDR, ChromaCut
 from v2v_server.video.rows import Rows
 from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, fill_rows, makes, simulate
 from v2v_server.worker.scene_choice import (
@@ -108,7 +104,7 @@ def frames_rgb(context: SampleContext, out: npt.NDArray[Any]) -> None:
         chroma = np.stack([apply_view(each[:, rows[:, None], columns], view, context.recipe) for each in chroma])
         rows, columns = (np.arange(side, dtype=np.int64) for side in size)
     # Import lazily: most workers make no colour.
-    from v2v_server.video.colour.rgb import add_colour, differences_of
+    from v2v_server.video.rgb import add_colour, differences_of
 
     add_colour(grey[:, 0], chroma, places, rows, columns, differences_of(matrix, params.contrast or 1.0), out)
 

@@ -11,7 +11,7 @@ between the voxel's two frames:
               examines the pair itself
     moving    otherwise: dis-fast-lean
 
-The limits are those by which "auto" judges each pair of pictures (:mod:`v2v_server.flow.methods`), without its cost.
+The limits are those by which "auto" judges each pair of pictures (:mod:`v2v_server.flow`), without its cost.
 Where "auto" would use dis-fast, dis-fast-lean refines three times instead of five, within the tolerance
 (docs/scene.md).
 """
@@ -47,7 +47,7 @@ from v2v_server.corpus.scenes.scene import (
     Scene,
     Sides,
 )
-from v2v_server.flow.methods import AUTO, SLOW_METHOD, SLOW_PX, STILL_GREY_LEVELS, STILL_METHOD
+from v2v_server.flow import AUTO, SLOW_METHOD, SLOW_PX, STILL_GREY_LEVELS, STILL_METHOD
 from v2v_server.simulation.draw import FrameTimes, resized_size
 from v2v_server.simulation.view import Window
 from v2v_server.video.decode import DecodedClip

@@ -20,9 +20,9 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import look_at_pictures, name_all
-from v2v_server.corpus.sources.sidecar import open_sidecar, sidecar_id
-from v2v_server.labels.formats import READERS
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.corpus.sources.source import open_sidecar, sidecar_id
+from v2v_server.labels import READERS
+from v2v_server.schedule import SequenceTable
 from v2v_server.store.pixels import VideosKind
 from v2v_server.video.rows import Rows
 from v2v_tools.doctor.motion import look_at_motion

@@ -8,8 +8,7 @@ from dataclasses import astuple, replace
 from v2v_protocol.errors import V2VError
 from v2v_protocol.progress import Progress
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.scenes.findings import Defect
-from v2v_server.corpus.scenes.picture_check import Excerpt, examine, hides_motion, spread_excerpts
+from v2v_server.corpus.scenes.picture_check import Defect, Excerpt, examine, hides_motion, spread_excerpts
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.system.isolate import Died
 from v2v_server.system.process import usable_cores

@@ -13,8 +13,8 @@ from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec_flags import read_yaml_mapping, recipe_setting
-from v2v_recordings.forms import FORMS
 from v2v_recordings.items import add_options, options_of
+from v2v_recordings.reading import FORMS
 from v2v_tools.fit.fit import FittedCamera, fit
 from v2v_tools.fit.lab import camera_of, measure, table
 from v2v_tools.fit.report import draw_fit, report_lines, write_recipe

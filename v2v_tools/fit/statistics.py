@@ -13,7 +13,7 @@ from v2v_protocol.sample import SampleParams
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.kernels import list_events
-from v2v_server.video.luma import SDR, Signal
+from v2v_server.video.picture import SDR, Signal
 from v2v_tools.fit.increments import intervals_us, still_time
 from v2v_tools.fit.interval import Doubles
 from v2v_tools.fit.recording import Recorded

@@ -34,8 +34,7 @@ from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.motion.prediction import Prediction, predict
-from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.worker.arrays import SampleContext
@@ -67,7 +66,7 @@ def leases_of(setting: ServeSetting, clips: Catalogue) -> Leases:
     table = SequenceTable(clips.videos, clips.rows, spec)
     if not table.count:
         raise UsageError(f"{setting.name}: none of the clips is long enough for a sequence")
-    schedule, count = Schedule.of(table, spec), min(_LEASES_OF_A_CLIP * len(clips.videos), table.count)
+    schedule, count = Schedule(table, spec), min(_LEASES_OF_A_CLIP * len(clips.videos), table.count)
     leases = []
     for index in (number * table.count // count * _VIEWS for number in range(count)):
         leases.append(

@@ -21,8 +21,8 @@ from v2v_protocol.safe_yaml import format_yaml, parse_yaml
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.prepare.prepare import prepare
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.prepare import prepare
+from v2v_server.schedule import SequenceTable
 from v2v_server.store.planes import OPTIONAL, PLANES
 from v2v_server.video.rows import Rows
 

@@ -9,7 +9,7 @@ from tests.server.peers import Peers, peers
 from v2v_protocol import sample
 from v2v_protocol.messages import Hello, Unavailable, Welcome
 from v2v_protocol.sample import FromSidecar
-from v2v_server.corpus.sidecars import Sidecars
+from v2v_server.corpus.videos import Sidecars
 
 ENDING, ARRAYS = ".label.json", ("voxels", "label")
 

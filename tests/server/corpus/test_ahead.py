@@ -21,8 +21,7 @@ from tests.waiting import until
 from v2v_protocol.errors import UsageError
 from v2v_server.commands import catalogue
 from v2v_server.commands.catalogue import main
-from v2v_server.corpus.ahead import Ahead
-from v2v_server.corpus.catalogue import index_path
+from v2v_server.corpus.catalogue import index_path, open_catalogue, refresh_index
 from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Shard, Store
 
 _SLOWLY = """
@@ -35,7 +34,7 @@ def slow(path, kind):
     time.sleep(0.1)
     return look(path, kind)
 probe._facts = slow
-import v2v_server.corpus.ahead as ahead
+import v2v_server.commands.catalogue as ahead
 refresh = ahead.refresh_index
 ahead.refresh_index = lambda root, ids, path, scenes, processes, *more: refresh(root, ids, path, scenes, 0, *more)
 sys.exit(main(sys.argv[1:]))
@@ -59,7 +58,13 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def run(corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
     """Return a function that runs the command, which probes in this process: the slow test starts the real ones."""
-    monkeypatch.setattr(catalogue, "Ahead", lambda **asked: Ahead(**(asked | {"processes": 0})))
+    monkeypatch.setattr(
+        catalogue, "open_catalogue", lambda videos, **asked: open_catalogue(videos, **(asked | {"processes": 0}))
+    )
+    monkeypatch.setattr(
+        catalogue, "refresh_index",
+        lambda root, ids, path, scenes, processes, *more: refresh_index(root, ids, path, scenes, 0, *more),
+    )  # fmt: skip
 
     def on(host: str, *flags: str, videos: str = "") -> tuple[int, str, str]:
         """Exit status, and what was said and complained of, on a host with a cache folder of its own."""
@@ -87,7 +92,17 @@ def test_parts_of_three_hosts_are_the_catalogue_of_one(corpus: Path, tmp_path: P
     assert len(digests(whole)) == 2
     assert "10 videos can be used" in whole
     assert "  broken.mp4" in whole
-    program = [sys.executable, "-m", "v2v_server.commands.catalogue", "--videos", str(corpus), *scene, "--workers", "1"]
+    program = [
+        sys.executable,
+        "-m",
+        "v2v_protocol.programs",
+        "catalogue",
+        "--videos",
+        str(corpus),
+        *scene,
+        "--workers",
+        "1",
+    ]
     hosts = [
         subprocess.Popen(
             [*program, "--cache-dir", str(tmp_path / f"host {number}"), "--shard", f"{number}/3", "--out", parts],

@@ -24,9 +24,9 @@ from v2v_server.corpus import index as index_file
 from v2v_server.corpus import probe as probe_module
 from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
 from v2v_server.corpus.index import SCHEMA_VERSION
-from v2v_server.corpus.manifest import MANIFEST_NAME
 from v2v_server.corpus.probe import ProbeFile, probe_files
 from v2v_server.corpus.sources.folder import Folder
+from v2v_server.corpus.sources.source import MANIFEST_NAME
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint, is_same_file
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows

@@ -16,12 +16,10 @@ from tests.clips import panned_luma, write_clip
 from v2v_protocol import sample
 from v2v_protocol.errors import VideoChanged, VideoError, VideoGone
 from v2v_protocol.sample import FromSidecar
-from v2v_server.corpus import sidecars as collecting
+from v2v_server.corpus import probe as collecting
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.sources import sidecar
 from v2v_server.corpus.sources import source as asking
-from v2v_server.corpus.sources.sidecar import open_sidecar, read_files, sidecar_id
-from v2v_server.corpus.sources.source import SourceOptions, open_source
+from v2v_server.corpus.sources.source import SourceOptions, open_sidecar, open_source, read_files, sidecar_id
 
 JSON, MASKS = ".boxes.json", ".masks/"
 ARRAYS = ("boxes", "masks")
@@ -266,7 +264,7 @@ def test_a_lease_names_only_the_files_of_its_frames(corpus: Path, kind: str) -> 
 def test_files_too_large_for_one_clip_are_an_error_of_the_sidecar(
     corpus: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sidecar, "MOST_LENT_BYTES", 6)
+    monkeypatch.setattr(asking, "MOST_LENT_BYTES", 6)
     fingerprint, table = read_files(corpus / "deep/b.x.masks")
     source = open_source(str(corpus), SourceOptions())
     with (

@@ -15,13 +15,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import v2v_server.flow.clip as clip_module
+import v2v_server.flow as clip_module
 from tests.server.flow.fields import RECIPE, camera_params, panned
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.flow import FlowSettings, flow_for
-from v2v_server.flow.methods import STILL_METHOD, Estimator, guarded
+from v2v_server.flow import STILL_METHOD, Estimator, FlowSettings, flow_for, guarded
 from v2v_server.simulation.draw import draw, resized_size
 from v2v_server.simulation.view import Window, apply_view, source_window, without_margin
 

@@ -8,7 +8,7 @@ import pytest
 
 from bench.accuracy import flow as benchmark
 from tests.oracles.known_motion import DEGRADATIONS, KINDS, Scene, photograph, scenes
-from v2v_server.flow.clip import consistent
+from v2v_server.flow import consistent
 
 TEXTURES = {name: photograph(name) for name in ("coffee", "camera", "chelsea")}
 

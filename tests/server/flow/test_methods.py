@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests.server.flow.fields import panned
 from v2v_protocol.errors import UsageError
-from v2v_server.flow.methods import (
+from v2v_server.flow import (
     METHODS,
     MOVING_METHOD,
     SLOW_METHOD,

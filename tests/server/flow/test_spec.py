@@ -8,8 +8,7 @@ import pytest
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import FlowMethod, StreamSpec
-from v2v_server.flow import FlowSettings
-from v2v_server.flow.methods import AUTO, METHODS
+from v2v_server.flow import AUTO, METHODS, FlowSettings
 
 
 def test_both_sides_know_the_same_names() -> None:

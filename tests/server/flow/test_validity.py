@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2v_server.flow.clip import consistent
+from v2v_server.flow import consistent
 
 
 def uniform(x: float, y: float, height: int = 40, width: int = 50) -> np.ndarray:

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from v2v_server.labels import formats
-from v2v_server.labels.formats import READERS, Box, BoxTable, check_labels, frame_of, numbered_files
+from v2v_server import labels as formats
+from v2v_server.labels import READERS, Box, BoxTable, check_labels, frame_of, numbered_files
 
 PICTURE_PX = (60, 80)
 Boxes = list[tuple[int, int, int, int, int, int, int]]

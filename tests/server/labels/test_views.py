@@ -15,8 +15,7 @@ from PIL import Image
 
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.labels.formats import read_mask
-from v2v_server.labels.views import LEAST_SHARE, LEAST_SIDE_PX, kept_boxes, view_boxes, view_mask
+from v2v_server.labels import LEAST_SHARE, LEAST_SIDE_PX, kept_boxes, read_mask, view_boxes, view_mask
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.view import Window, apply_view, source_window
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from tests.oracles.rendered import rendered_scene
 from v2v_server.motion import Cells, MotionOfCuts, Pyramid, motions
-from v2v_server.video.collect import Cut
+from v2v_server.video.decode import Cut
 
 
 @settings(deadline=None, max_examples=25)

@@ -20,11 +20,12 @@ from tests.oracles.decoded import decode_luma
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_server.commands.prepare import main as prepare_main
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.manifest import MANIFEST_NAME, read_manifest
 from v2v_server.corpus.probe import facts_of
-from v2v_server.prepare.prepare import Report, prepare
-from v2v_server.store.reader import StoreFile
-from v2v_server.video.collect import ClipRequest, Cut
+from v2v_server.corpus.sources.prepared import read_manifest
+from v2v_server.corpus.sources.source import MANIFEST_NAME
+from v2v_server.prepare import Report, prepare
+from v2v_server.store.store_file import StoreFile
+from v2v_server.video.decode import ClipRequest, Cut
 from v2v_server.video.fingerprint import fingerprint, is_same_file
 from v2v_server.video.probe import probe
 from v2v_server.video.rows import Rows
@@ -159,9 +160,7 @@ def test_a_source_that_is_waited_for_in_vain_fails_alone(
     (tmp_path / "source").mkdir()
     for name in ("x.mp4", "y.mp4"):
         shutil.copy(source / "b.mp4", tmp_path / "source" / name)
-    monkeypatch.setattr(
-        "v2v_server.prepare.prepare._deadline_seconds", lambda job: {"x.mp4": 0.1}.get(job.video.id, 60)
-    )
+    monkeypatch.setattr("v2v_server.prepare._deadline_seconds", lambda job: {"x.mp4": 0.1}.get(job.video.id, 60))
     with closing(open_catalogue(tmp_path / "source", cache_dir=tmp_path / "cache", processes=0)) as catalogue:
         (tmp_path / "source" / "x.mp4").unlink()
         os.mkfifo(tmp_path / "source" / "x.mp4")

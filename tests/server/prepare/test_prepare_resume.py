@@ -27,10 +27,10 @@ from tests.waiting import until
 from v2v_protocol.errors import CorpusError, VideoError
 from v2v_server.commands.prepare import main, summary
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.manifest import MANIFEST_NAME, read_manifest
-from v2v_server.prepare.prepare import find_standing, prepare, refuse_links
-from v2v_server.prepare.transcode import PARTIAL_SUFFIX, Transcoding
-from v2v_server.store.reader import StoreFile
+from v2v_server.corpus.sources.prepared import read_manifest
+from v2v_server.corpus.sources.source import MANIFEST_NAME
+from v2v_server.prepare import PARTIAL_SUFFIX, Transcoding, find_standing, prepare, refuse_links
+from v2v_server.store.store_file import StoreFile
 from v2v_server.video.fingerprint import fingerprint
 
 _KILLED_SECONDS = 60.0
@@ -128,7 +128,7 @@ def test_finished_files_are_looked_at_together_and_told_of(
         assert several.wait(60.0), "the files are read one after the other"
         return find_standing(*file)
 
-    monkeypatch.setattr("v2v_server.prepare.prepare.find_standing", among_others)
+    monkeypatch.setattr("v2v_server.prepare.find_standing", among_others)
     steps: list[tuple[int, int]] = []
     assert run(source, out, progress=lambda *step: steps.append(step[:2])).kept == 5
     assert steps == [(0, 126), (24, 126), (48, 126), (72, 126), (96, 126), (126, 126)]
@@ -167,7 +167,7 @@ def test_a_prepared_file_that_cannot_be_read_is_not_given_up(
             raise VideoError(str(path), None, "cannot be read: Permission denied") from PermissionError(13, "denied")
         return StoreFile(path)
 
-    monkeypatch.setattr("v2v_server.prepare.prepare.StoreFile", refuse)
+    monkeypatch.setattr("v2v_server.prepare.StoreFile", refuse)
     with pytest.raises(CorpusError, match=r"3\.mp4 cannot be read: Permission denied, .* nothing was changed"):
         run(source, out)
     assert (out / MANIFEST_NAME).read_bytes() == manifest
@@ -213,7 +213,7 @@ def test_a_finished_folder_with_a_failure_stays_finished(
     def stop(job: Transcoding) -> None:
         raise _Stop
 
-    monkeypatch.setattr("v2v_server.prepare.prepare.transcode", stop)
+    monkeypatch.setattr("v2v_server.prepare.transcode", stop)
     with pytest.raises(_Stop):
         run(source, out)
     assert opened(out).digest == before
@@ -228,7 +228,7 @@ def test_a_look_that_fails_costs_no_prepared_file(
     def refuse(job: Transcoding) -> None:
         raise VideoError(str(job.source), 3, "is damaged")
 
-    monkeypatch.setattr("v2v_server.prepare.prepare.transcode", refuse)
+    monkeypatch.setattr("v2v_server.prepare.transcode", refuse)
     report = run(source, out, scene=True)
     assert report.videos == first.videos == tuple(video for _, video in sorted(read_manifest(out).videos.items()))
     assert [refusal.reason for refusal in report.not_looked_at] == ["frame 3: is damaged"] * 5
@@ -241,7 +241,7 @@ def test_ctrl_c_says_that_the_same_command_goes_on(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("v2v_server.prepare.prepare.prepare", interrupted)
+    monkeypatch.setattr("v2v_server.commands.prepare.prepare", interrupted)
     assert main([str(source), str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache"), "--workers", "1"]) == 130
     assert capsys.readouterr().err == "v2v-prepare: interrupted; run the same command to continue\n"
 
@@ -380,7 +380,8 @@ def test_killed_at_a_random_moment(source: Path, tmp_path: Path, turn: int) -> N
     command = [
         sys.executable,
         "-m",
-        "v2v_server.commands.prepare",
+        "v2v_protocol.programs",
+        "prepare",
         str(source),
         str(out),
         "--workers",

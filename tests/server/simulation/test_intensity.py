@@ -22,7 +22,7 @@ from v2v_server.simulation.intensity import (
     logarithm,
     tone_table,
 )
-from v2v_server.video.luma import SDR, TRANSFERS, Signal
+from v2v_server.video.picture import SDR, TRANSFERS, Signal
 
 SIGNALS = [Signal(bits, transfer) for bits in (8, 10, 12) for transfer in ("", *TRANSFERS.values())]
 

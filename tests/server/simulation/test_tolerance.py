@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from tests.server.simulation.test_times import real_frames
 from v2v_protocol.recipe import Recipe
-from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.clip import COSTS, changed_shares, left_out, simulate_clip
 from v2v_server.simulation.draw import draw
-from v2v_server.simulation.effects.tolerance import COSTS, changed_shares, left_out
 from v2v_server.simulation.kernels import Voxels
 
 CAMERA = Recipe(

@@ -16,7 +16,7 @@ from v2v_server.simulation.intensity import Intensity
 from v2v_server.simulation.kernels import KernelInput
 from v2v_server.simulation.precision import AUTO, USUAL, Variant, choose, variants
 from v2v_server.simulation.voxel import bin_edges
-from v2v_server.video.luma import MOST_BITS, SDR, Signal
+from v2v_server.video.picture import MOST_BITS, SDR, Signal
 
 LOAD_AND_COUNT = """
 import json

@@ -27,9 +27,9 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.store.cache import Cache, make_cache, piece_frames
-from v2v_server.store.packing import RAW
+from v2v_server.store.format import RAW
 from v2v_server.store.quota import used_bytes
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.store_file import StoreFile
 from v2v_server.worker.process import Clips
 from v2v_server.worker.produce import make_sample
 
@@ -169,7 +169,7 @@ def test_a_write_that_fails(source: Path, folder: Path, monkeypatch: pytest.Monk
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("v2v_server.store.writer.StoreWriter.close", full)
+    monkeypatch.setattr("v2v_server.store.store_file.StoreWriter.close", full)
     assert set(epoch(source, Cache(folder, 1 << 30, 0))) == {"miss: cannot be written to: No space left on device"}
     assert not pieces(folder)
     assert not list((folder / "partial").iterdir())
@@ -237,7 +237,7 @@ def test_what_a_killed_worker_leaves_is_not_used_and_removed(source: Path, folde
     """Killed in the middle of a piece: the file is there, under a name that is never read."""
     program = (
         "import os, signal, sys\nfrom pathlib import Path\nimport v2v_server.store.cache as cache\n"
-        "from v2v_server.store.writer import StoreWriter\n"
+        "from v2v_server.store.store_file import StoreWriter\n"
         "from tests.server.store.test_cache import leases_of, Clips, Folder\n"
         "cache.piece_frames = lambda rows, width: 16\n"
         "StoreWriter.close = lambda self, **more: os.kill(os.getpid(), signal.SIGKILL)\n"

@@ -19,7 +19,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server import motion
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.store_file import StoreFile
 from v2v_server.worker.produce import decode_for, make_sample
 
 ROWS, PLANES = "top:0.9", ("motion",)

@@ -26,11 +26,11 @@ from tests.digests.rows import Row, samples_of
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources.source import SourceOptions, open_source
-from v2v_server.prepare.prepare import prepare
+from v2v_server.prepare import prepare
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.picture_sequence import PictureSequence, id_of
 from v2v_server.store.pixels import VideosKind
-from v2v_server.video.collect import ClipRequest, Cut
+from v2v_server.video.decode import ClipRequest, Cut
 
 SEQUENCES, AT_25 = VideosKind("sequences"), VideosKind("sequences", 25.0)
 FRAMES, HEIGHT, WIDTH = 30, 32, 40

@@ -23,11 +23,11 @@ from contextlib import nullcontext
 
 import numpy as np
 
-from v2v_server.video.collect import DecodedPicture
+from v2v_server.video.decode import DecodedPicture
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import unseekable
-from v2v_server.video.luma import SDR
+from v2v_server.video.picture import SDR
 from v2v_server.video.probe import VideoFacts
 
 
@@ -77,11 +77,11 @@ from contextlib import nullcontext
 
 import numpy as np
 
-from v2v_server.video.collect import DecodedPicture
+from v2v_server.video.decode import DecodedPicture
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import unseekable
-from v2v_server.video.luma import SDR
+from v2v_server.video.picture import SDR
 from v2v_server.video.probe import VideoFacts
 
 FRAMES, HEIGHT, WIDTH = 30, 32, 40
@@ -132,7 +132,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2v_server.store.planes.plane import Plane
+from v2v_server.store.planes import Plane
 
 
 class Peaks(Plane):
@@ -167,7 +167,7 @@ PLANE = Peaks(version=1, dtype="|u1", values=1, cell_px=8, serves="peaks")
 '''
 
 LINES = (
-    ("v2v_server/store/pixels.py", '"reader", "video_file"', '"toy_raw", "toy_world", '),
+    ("v2v_server/store/pixels.py", '"store_file", "video_file"', '"toy_raw", "toy_world", '),
     ("v2v_server/store/planes/__init__.py", '"motion", "detail"', '"peaks", '),
 )
 
@@ -181,12 +181,12 @@ import numpy as np
 
 from tests.digests.rows import Row, samples_of
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.prepare.prepare import prepare
+from v2v_server.prepare import prepare
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.pixels import signal_of
-from v2v_server.store.reader import StoreFile
+from v2v_server.store.store_file import StoreFile
 from v2v_server.store.toy_world import drawn
-from v2v_server.video.luma import SDR
+from v2v_server.video.picture import SDR
 
 root = Path(sys.argv[1])
 row = Row("paper", count=4)

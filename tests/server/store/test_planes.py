@@ -14,11 +14,9 @@ from hypothesis import strategies as st
 
 from tests.server.store.test_store_file import PACKINGS, head_of, in_folder, written
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_server.store.packing import QUICK, Packing
-from v2v_server.store.planes import PLANES, plane
-from v2v_server.store.planes.plane import Plane
-from v2v_server.store.reader import StoreFile
-from v2v_server.store.writer import StoreWriter
+from v2v_server.store.format import QUICK, Packing
+from v2v_server.store.planes import PLANES, Plane, read_footer
+from v2v_server.store.store_file import StoreFile, StoreWriter
 
 KINDS = {
     "motion": PLANES["motion"],
@@ -30,8 +28,7 @@ KINDS = {
 
 @pytest.fixture(autouse=True)
 def kinds(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("reader", "writer"):
-        monkeypatch.setattr(f"v2v_server.store.{module}.PLANES", KINDS)
+    monkeypatch.setattr("v2v_server.store.store_file.PLANES", KINDS)
 
 
 def arrays_of(kind: Plane, count: int, rows: int, width: int, seed: int) -> npt.NDArray[Any]:
@@ -99,7 +96,7 @@ def test_a_damaged_plane_is_found_and_harms_no_luma(moving: tuple[Path, npt.NDAr
     path, motion = moving
     content = bytearray(path.read_bytes())
     with StoreFile(path) as stored:
-        place = plane.read_footer(str(path), stored._file)["motion"]
+        place = read_footer(str(path), stored._file)["motion"]
     at = data.draw(st.integers(place.offset, len(content) - 1))
     content[at] ^= 1 << data.draw(st.integers(0, 7))
     other = path.with_name("y")

@@ -14,10 +14,20 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from v2v_protocol.errors import ProtocolError, UsageError, VideoChanged, VideoError, VideoUnreadable
-from v2v_server.store.format import GROUP_FRAMES, Head, group_frames_for, pack_record
-from v2v_server.store.packing import DENSE, FAST, QUICK, RAW, Packing, UnpackingError, unpack
-from v2v_server.store.reader import StoreFile, is_store_file
-from v2v_server.store.writer import StoreWriter
+from v2v_server.store.format import (
+    DENSE,
+    FAST,
+    GROUP_FRAMES,
+    QUICK,
+    RAW,
+    Head,
+    Packing,
+    UnpackingError,
+    group_frames_for,
+    pack_record,
+    unpack,
+)
+from v2v_server.store.store_file import StoreFile, StoreWriter, is_store_file
 
 PACKINGS = st.sampled_from([DENSE, FAST, QUICK, RAW])
 in_folder = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -13,10 +13,16 @@ from av.video.reformatter import ColorRange, Colorspace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v2v_server.video.colour.chroma import ChromaCut, ChromaStack, stated_matrix
-from v2v_server.video.colour.rgb import add_colour, differences_of
-from v2v_server.video.luma import LumaFormat, luma_plane, range_table
-from v2v_server.video.orientation import Orientation
+from v2v_server.video.picture import (
+    ChromaCut,
+    ChromaStack,
+    LumaFormat,
+    Orientation,
+    luma_plane,
+    range_table,
+    stated_matrix,
+)
+from v2v_server.video.rgb import add_colour, differences_of
 
 FORMATS = ("yuv420p", "yuvj420p", "yuv422p", "yuv444p", "yuv411p", "nv12", "nv21", "nv24", "yuv420p10le", "yuv444p12be")
 ORIENTATIONS = [Orientation(*flags) for flags in product((False, True), repeat=3)]

@@ -19,10 +19,9 @@ from tests.clips import damaged, panned_luma, truncated, write_clip
 from tests.oracles.decoded import decode_luma
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_server.video import decode
-from v2v_server.video.collect import ClipRequest, Cut
-from v2v_server.video.decode import decode_cuts
+from v2v_server.video.decode import ClipRequest, Cut, decode_cuts
 from v2v_server.video.frame_index import unseekable
-from v2v_server.video.luma import range_table
+from v2v_server.video.picture import range_table
 from v2v_server.video.probe import VideoFacts, probe
 
 FRAMES = 50

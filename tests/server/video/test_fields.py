@@ -11,8 +11,8 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from tests.field_coded import write_field_coded
 from tests.oracles.decoded import decode_luma
-from v2v_server.video.luma import range_table
 from v2v_server.video.packets import Fields
+from v2v_server.video.picture import range_table
 from v2v_server.video.probe import probe
 
 LUMA = panned_luma(20, 64, 48, full_range=False)

@@ -17,9 +17,8 @@ from v2v_server.corpus.probe import probe_files
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.video import probe as probing
 from v2v_server.video import source
-from v2v_server.video.collect import ClipRequest, Cut
-from v2v_server.video.colour.chroma import ChromaCut
-from v2v_server.video.decode import decode_cuts
+from v2v_server.video.decode import ClipRequest, Cut, decode_cuts
+from v2v_server.video.picture import ChromaCut
 from v2v_server.video.probe import probe
 from v2v_server.video.source import CODECS, FORMATS
 

@@ -17,8 +17,8 @@ from tests.clips import panned_luma, write_clip
 from tests.oracles.decoded import decode_luma
 from v2v_server.video.decode import decodes_as_listed
 from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.luma import range_table
 from v2v_server.video.packets import is_scaled, may_be_not_coded, times_are_doubtful
+from v2v_server.video.picture import range_table
 from v2v_server.video.probe import VideoFacts, probe
 
 Change = Callable[[av.Packet, int], av.Packet]

@@ -9,7 +9,7 @@ import pytest
 from av.video.frame import VideoFrame
 from av.video.reformatter import ColorRange, Colorspace
 
-from v2v_server.video.luma import LumaFormat, luma_plane, range_table, stretch
+from v2v_server.video.picture import LumaFormat, luma_plane, range_table, stretch
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12])

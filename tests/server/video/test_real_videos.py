@@ -13,8 +13,7 @@ import pytest
 
 from tests.oracles.decoded import decode_luma
 from v2v_protocol.errors import VideoError
-from v2v_server.video.luma import LumaFormat, range_table
-from v2v_server.video.orientation import Orientation
+from v2v_server.video.picture import LumaFormat, Orientation, range_table
 from v2v_server.video.probe import probe
 
 FOLDER = Path(os.environ.get("V2V_TEST_VIDEOS", Path(__file__).parents[4] / "shared" / "data" / "videos"))

@@ -29,7 +29,7 @@ from v2v_server.corpus.sources.folder import Folder
 from v2v_server.simulation.intensity import light_table
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.planes.detail import detail_of, levels_of
-from v2v_server.video.luma import Signal, range_table
+from v2v_server.video.picture import Signal, range_table
 from v2v_server.worker.process import Clips
 from v2v_server.worker.produce import make_sample
 from v2v_tools.motion import WholePictures, predicted_loss

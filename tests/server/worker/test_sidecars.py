@@ -13,7 +13,7 @@ from v2v_protocol.errors import ProtocolError, SidecarError, VideoError
 from v2v_protocol.messages import Lease, LeaseFailed, WorkerHello, decode, encode
 from v2v_protocol.sample import FromSidecar
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.corpus.sources.sidecar import fingerprint_of
+from v2v_server.corpus.sources.source import sidecar_fingerprint
 from v2v_server.worker import produce as reading
 from v2v_server.worker.conversation import Make, Readiness, Send, WorkerConversation
 from v2v_server.worker.produce import errors_of_sidecar, open_sidecars, refused_sidecars, sidecar_files
@@ -35,7 +35,7 @@ def test_only_the_sidecars_of_asked_arrays_are_opened(tmp_path: Path) -> None:
     file = tmp_path / "deep" / "a.label.json"
     file.parent.mkdir()
     file.write_text("[1]")
-    mark = fingerprint_of(file)
+    mark = sidecar_fingerprint(file)
     known = lease(sidecars={ENDING: mark, ".other": "3-x"})
     assert sidecar_files(known) == {ENDING: ("deep/a.label.json", mark)}
     assert sidecar_files(lease(arrays=("frames",), sidecars={ENDING: mark})) == {}

@@ -12,8 +12,8 @@ from trainer.convert.conversion import convert
 from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.windows import picture_windows
 from v2v_protocol.errors import UsageError
-from v2v_recordings.forms import FORMS, RawForm, recognise
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, ReadProgress, SensorSize
+from v2v_recordings.reading import FORMS, RawForm, recognise
 
 
 def recognises(path: Path) -> bool:

@@ -49,7 +49,7 @@ from v2v_server.corpus.scenes.scene import (
     Sides,
 )
 from v2v_server.corpus.scenes.stretches import bars_of, change_of, duplicated, is_cut, is_flat, is_still, pieces_of
-from v2v_server.flow.methods import DIS_ULTRAFAST, GreyPicture, dis, one_thread
+from v2v_server.flow import DIS_ULTRAFAST, GreyPicture, dis, one_thread
 
 DARK_BELOW_LEVEL = 16
 CLIPPED_FROM_LEVEL = 250

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import ProtocolError
+from v2v_server.video.frame_index import inflated
 
 ANALYSIS_VERSION = 5
 """Raise it with every change of what an analysis finds: earlier ones are then repeated."""
@@ -233,13 +234,7 @@ class Scene:
         if end > MOST_ANALYSED_FRAMES or first % SEGMENT_FRAMES or not covered or count > max(0, end - first):
             raise ProtocolError(f"scene: frames {first} .. {end - 1} in {rows} segments and {count} pieces")
         size = PIECE.itemsize * count + 2 * COLUMNS * rows
-        stream = zlib.decompressobj()
-        try:
-            body = stream.decompress(data[_HEADER.size :], size + 1)
-        except zlib.error as error:
-            raise ProtocolError(f"scene does not decompress: {error}") from error
-        if len(body) != size or not stream.eof or stream.unused_data:
-            raise ProtocolError(f"scene decompresses to {len(body)} bytes; its header promises {size}")
+        body = inflated("scene", data[_HEADER.size :], size)
         pieces = np.frombuffer(body, PIECE, count).copy()
         ends = np.concatenate(([first], pieces["end"].astype(np.int64)))
         if ends[-1] != end or np.any(ends[1:] <= ends[:-1]):

@@ -15,16 +15,24 @@ from pathlib import Path, PurePosixPath
 
 from v2v_protocol.errors import CorpusError
 from v2v_protocol.programs import printable
-from v2v_server.corpus.manifest import MANIFEST_NAME
-from v2v_server.corpus.sources.listfile import (
+from v2v_server.corpus.sources.source import (
+    GONE,
     LIST_SUFFIXES,
+    MANIFEST_NAME,
+    NO_STATE,
     UNPRINTABLE,
+    FileState,
     ListEntry,
+    SourceOptions,
+    VideoSource,
+    answers,
+    check_local,
     count_left_out,
+    is_sidecar,
+    local_state,
     read_list,
+    sidecar_id,
 )
-from v2v_server.corpus.sources.sidecar import check_local, is_sidecar, local_state, sidecar_id
-from v2v_server.corpus.sources.source import GONE, NO_STATE, FileState, SourceOptions, VideoSource, answers
 from v2v_server.store.pixels import VIDEOS, VideosKind
 from v2v_server.video.fingerprint import files_in, unreadable
 

@@ -8,28 +8,422 @@ Errors are the same for every source: :class:`VideoGone` (not there), :class:`Vi
 
 On remote storage each question about a file is a round trip, most of it waiting, so several are under way at once
 (:func:`by_parts`).
+
+A sidecar is a file or folder beside a video that an array is made from, such as its labels. It has the video's name
+with another ending: ``clip.mp4`` has ``clip.boxes.json`` and ``clip.masks/``. An ending with a slash names a folder,
+with files at all depths; hidden files are passed over. The known endings are those that ``v2v_protocol.sample.ARRAYS``
+states. A sidecar's id is its path, with the slash.
+
+Its fingerprint is ``<size in bytes>-<32 hexadecimal digits>``, from the names and all bytes of its files. It is read
+whole when it is listed. Later a file is checked against the fingerprint, and a folder file by file against a table: the
+number at the end of a file's name is its frame, so a clip needs few of them.
 """
 
 from __future__ import annotations
 
+import csv
+import errno
+import hashlib
+import io
+import math
 import os
+import re
+import stat
 from abc import ABC, abstractmethod
 from array import array
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from importlib import import_module
-from pathlib import Path
+from importlib.resources.abc import Traversable
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeVar
+from zipfile import Path as ZipPath
+from zipfile import ZipFile
 
-from v2v_protocol.errors import CorpusError
-from v2v_server.corpus.sources.listfile import ListEntry, read_list
-from v2v_server.corpus.sources.sidecar import state_text
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoGone
+from v2v_protocol.programs import printable
+from v2v_protocol.sample import ARRAYS, sidecar_endings
+from v2v_server.labels import frame_of
 from v2v_server.store.pixels import VIDEOS, Pixels, VideosKind, kind_of, open_pixels
+from v2v_server.video.fingerprint import unreadable
 from v2v_server.video.rows import Rows
+
+LARGEST_FILE_BYTES, MOST_BYTES, MOST_FILES, MOST_FOLDERS = 4 << 30, 64 << 30, 1 << 20, 1 << 12
+"""Limits of one sidecar. A larger one is not read."""
+MOST_LENT_BYTES = 256 << 20
+"""Limit of the files of a folder that one clip needs: they are held in memory."""
+_BLOCK_BYTES = 1 << 20
+_LARGEST_TABLE_BYTES = 63 << 20
+_EVERY_FRAME = -1
+"""Stands for the frame of a file whose name has no number: every clip needs it."""
+_DIGEST = 16
+"""Bytes of the digest of a file."""
+
+
+def sidecar_id(video: str, ending: str) -> str:
+    """Return the id of a video's sidecar."""
+    return f"{video.rstrip('/') if video.endswith('/') else PurePosixPath(video).with_suffix('')}{ending}"
+
+
+def is_sidecar(id: str) -> bool:
+    """Return whether a file of this id is a sidecar, not a video."""
+    return id.endswith(sidecar_endings(tuple(ARRAYS)))
+
+
+def read_files(opened: Traversable) -> tuple[str, bytes]:
+    """Return the fingerprint of an opened sidecar, and a table of its files for :func:`files_between`.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    total, sha, rows = 0, hashlib.sha256(b"v2v sidecar 1\n"), []
+    for name, file in _files(opened):
+        size, content = 0, hashlib.sha256()
+        with file.open("rb") as stream:
+            while block := stream.read(_BLOCK_BYTES):
+                size += len(block)
+                content.update(block)
+        sha.update(f"{name}\0{size}\0".encode("utf-8", "surrogateescape") + content.digest())
+        total += size
+        frame = frame_of(name)
+        rows.append((_EVERY_FRAME if frame is None else frame, os.fsencode(name[1:]), content.digest()[:_DIGEST]))
+    longest = max(1, *(len(name) for _, name, _ in rows), 1)
+    table = longest.to_bytes(2, "little") + np.array(rows, _row(longest)).tobytes()
+    if len(table) > _LARGEST_TABLE_BYTES:
+        raise OSError(errno.EFBIG, f"has {len(rows)} files, whose names are too long: shorten the paths")
+    return f"{total}-{sha.hexdigest()[:32]}", table
+
+
+def sidecar_fingerprint(opened: Traversable) -> str:
+    """Return the fingerprint of an opened sidecar. Raises: see :func:`read_files`."""
+    return read_files(opened)[0]
+
+
+def files_between(table: bytes, first: int, end: int) -> bytes:
+    """Return the part of a table with the files of frames first .. end - 1, and those without a frame.
+
+    Raises:
+        ValueError: the table is damaged.
+    """
+    rows = _rows(table)
+    frames = rows["frame"]
+    part: bytes = rows[(frames == _EVERY_FRAME) | ((frames >= first) & (frames < end))].tobytes()
+    return table[:2] + part
+
+
+def _rows(table: bytes) -> npt.NDArray[np.void]:
+    return np.frombuffer(table, _row(int.from_bytes(table[:2], "little")), offset=2)
+
+
+def _row(longest: int) -> np.dtype[np.void]:
+    return np.dtype([("frame", "<i8"), ("name", f"S{longest}"), ("digest", f"V{_DIGEST}")])
+
+
+def local_state(path: Path, id: str) -> str:
+    """Return a text that changes with the files' sizes and times; "" if there is no such sidecar, or no file in it.
+
+    Raises:
+        OSError: it cannot be told, or the sidecar is beyond the limits.
+    """
+    try:
+        if stat.S_ISDIR(os.stat(path).st_mode) != id.endswith("/"):
+            return ""
+        found = ((name, os.stat(str(file))) for name, file in _files(path))
+        return state_text((name, (each.st_size, each.st_mtime_ns, each.st_ctime_ns)) for name, each in found)
+    except (FileNotFoundError, NotADirectoryError):
+        return ""
+
+
+def state_text(states: Iterable[tuple[str, tuple[int, int, int]]]) -> str:
+    """Return a digest of the states of a sidecar's files; "" without files.
+
+    Raises:
+        OSError: there are too many, or they are too large.
+    """
+    found, total = list[tuple[str, tuple[int, int, int]]](), 0
+    for name, state in states:
+        found.append((name, state))
+        total += state[0]
+        if len(found) > MOST_FILES or state[0] > LARGEST_FILE_BYTES or total > MOST_BYTES:
+            what = f"has {len(found)} files or more, with {total} bytes or more: the limit is {MOST_FILES} files of"
+            raise OSError(errno.EFBIG, f"{what} {LARGEST_FILE_BYTES >> 30} GiB each, and {MOST_BYTES >> 30} GiB in all")
+    return hashlib.sha256(repr(found).encode()).hexdigest()[:32] if found else ""
+
+
+def check_local(path: Path, id: str, fingerprint: str, state: str | None = None) -> None:
+    """Check a sidecar of this host.
+
+    Args:
+        path, id: where it is.
+        fingerprint: of a file; a folder is not read.
+        state: as listed, to be compared instead of the fingerprint.
+
+    Raises:
+        VideoGone, VideoDenied, VideoChanged, VideoUnreadable: it is gone, another one by now, or cannot be read.
+    """
+    try:
+        now = local_state(path, id)
+        is_read = now and state is None and not id.endswith("/")
+        found = _fingerprint_at(path, now) if is_read else fingerprint
+    except OSError as error:
+        raise unreadable(id, error) from error
+    if not now:
+        raise VideoGone(id, None, "cannot be read: there is no such sidecar")
+    if found != fingerprint or now != (state or now):
+        raise VideoChanged(id, None, f"changed since it was catalogued: {found} instead of {fingerprint}")
+
+
+@lru_cache(maxsize=4096)
+def _fingerprint_at(path: Path, state: str) -> str:
+    """Read a sidecar once for each of its states."""
+    return sidecar_fingerprint(path)
+
+
+@contextmanager
+def open_sidecar(source: VideoSource, id: str, fingerprint: str, table: bytes = b"") -> Iterator[Traversable]:
+    """Lend a sidecar until the end of the context: a file, or a folder in the manner of ``pathlib``.
+
+    Args:
+        source: where it comes from.
+        id: of the sidecar.
+        fingerprint: as catalogued; "" takes what is there now.
+        table: the files that a folder is lent with, see :func:`files_between`; not used without a fingerprint.
+
+    Raises:
+        VideoUnreadable, VideoChanged: it cannot be read, or differs.
+        VideoError: the files of the table are too large.
+        ValueError: the table is damaged.
+    """
+    with source.open_local(id, fingerprint) as path:
+        if id.endswith("/"):
+            with ZipFile(path) if path.is_file() else nullcontext() as packed:  # a copy from object storage
+                folder = path if packed is None else ZipPath(packed)
+                yield _checked(folder, id, table) if fingerprint else folder
+        else:
+            yield path
+
+
+def _checked(folder: Traversable, id: str, table: bytes) -> Traversable:
+    """Read the files of a table into memory, so that what was checked is what is used.
+
+    Raises:
+        VideoError, ValueError: see :func:`open_sidecar`.
+    """
+    memory, left = io.BytesIO(), MOST_LENT_BYTES
+    with ZipFile(memory, "w") as packed:
+        for _, raw, digest in _rows(table).tolist():
+            file = folder.joinpath(name := os.fsdecode(raw))
+            try:
+                if not file.is_file():  # opening a FIFO blocks until there is a writer
+                    raise FileNotFoundError(errno.ENOENT, f"there is no file {name}")
+                with file.open("rb") as stream:
+                    data = stream.read(left + 1)
+            except OSError as error:
+                raise unreadable(id, error) from error
+            left -= len(data)
+            if left < 0:
+                raise VideoError(id, None, f"the files of one clip have more than {MOST_LENT_BYTES} bytes, the limit")
+            if hashlib.sha256(data).digest()[:_DIGEST] != digest:
+                raise VideoChanged(id, None, f"changed since it was catalogued: {name} is another file")
+            packed.writestr(name, data)
+    return ZipPath(ZipFile(memory))
+
+
+def _files(opened: Traversable, name: str = "", folders: list[str] | None = None) -> Iterator[tuple[str, Traversable]]:
+    """Yield the files below a folder, sorted, with their relative paths; a single file has the path "".
+
+    Args:
+        folders: of the whole sidecar so far. Links may lead to one folder by many paths, each of which counts.
+
+    Raises:
+        OSError: there are too many folders, or a file is not a regular one: opening a FIFO blocks until there is a
+            writer. A link that leads in a circle ends as such a file, after about 40 folders.
+    """
+    if opened.is_file():
+        yield name, opened
+        return
+    if not opened.is_dir():
+        raise OSError(errno.EINVAL, "not a regular file, or a link that leads nowhere")
+    folders = [] if folders is None else folders
+    folders.append(name)
+    if len(folders) > MOST_FOLDERS:
+        raise OSError(
+            errno.EFBIG, f"has more than {MOST_FOLDERS} folders, the limit; do links lead to some repeatedly?"
+        )
+    for entry in sorted(opened.iterdir(), key=lambda entry: entry.name):
+        if not entry.name.startswith("."):
+            yield from _files(entry, f"{name}/{entry.name}", folders)
+
+
+_NO_VIDEO_SUFFIXES = frozenset({
+    ".7z", ".aac", ".ac3", ".aedat", ".aedat4", ".ass", ".bag", ".bib", ".bin", ".bmp", ".bz2", ".c", ".cfg", ".conf",
+    ".cpp", ".csv", ".dat", ".db", ".doc", ".docx", ".exr", ".flac", ".gz", ".h", ".h5", ".hdf5", ".htm", ".html",
+    ".info", ".ini", ".ipynb", ".jpeg", ".jpg", ".json", ".jsonl", ".log", ".lst", ".m4a", ".mat", ".md", ".md5",
+    ".mp3", ".nfo", ".npy", ".npz", ".ogg", ".opus", ".parquet", ".pdf", ".pickle", ".pkl", ".png", ".pt", ".pth",
+    ".py", ".raw", ".rst", ".sh", ".sha256", ".sqlite3", ".srt", ".sub", ".tar", ".tgz", ".thm", ".tif", ".tiff",
+    ".tmp", ".toml", ".tsv", ".txt", ".vtt", ".wav", ".webp", ".xlsx", ".xml", ".xz", ".yaml", ".yml", ".zip", ".zst",
+})  # fmt: skip
+_MOST_SUFFIXES_SHOWN = 10
+
+UNPRINTABLE = "its name is not UTF-8 text, or holds control characters; rename it"
+MANIFEST_NAME = "v2v-prepared.jsonl"
+"""Name of the file that makes a folder a prepared one."""
+LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
+_SUFFIX = re.compile(r"\.(?=.*[a-z]|26[45]$)[a-z0-9]+", re.IGNORECASE)
+_COLUMNS = "path", "frames", "c+", "c-", "rate"
+
+
+def count_left_out(name: str, left_out: Counter[str]) -> None:
+    """Count a file that may be a video of another ending."""
+    stem, _, ending = name.rpartition(".")
+    suffix = printable(f".{ending.lower()}")
+    if stem and len(suffix) <= 12 and suffix not in _NO_VIDEO_SUFFIXES:
+        left_out[suffix] += 1
+
+
+def left_out_note(left_out: Counter[str]) -> str:
+    """Return the line that reports files with other endings; "" where there is no such file."""
+    if not left_out:
+        return ""
+    shown = ", ".join(f"{suffix} ({count})" for suffix, count in sorted(left_out.items())[:_MOST_SUFFIXES_SHOWN])
+    more = len(left_out) - _MOST_SUFFIXES_SHOWN
+    return (
+        f"{left_out.total()} files have endings that are not looked at and were left out: {shown}"
+        f"{f' and {more} other endings' if more > 0 else ''}. Name those that are videos in a list file to serve them"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ListEntry:
+    """One line of a list file.
+
+    Attributes:
+        id: relative POSIX path of the video, normalised ("./a//b.mp4" is "a/b.mp4").
+        frames: the frame count the list states, or None.
+        threshold_pos, threshold_neg: contrast thresholds the list states, log units, or None.
+        rate: frames per second, or None.
+    """
+
+    id: str
+    frames: int | None = None
+    threshold_pos: float | None = None
+    threshold_neg: float | None = None
+    rate: float | None = None
+
+
+def read_list(path: str | os.PathLike[str], kind: VideosKind = VIDEOS) -> tuple[ListEntry, ...]:
+    """Read the entries of a list file like the paper's, in its order: one video a line, ``path frames c+ c- rate``.
+
+    The columns after the path may be left out from the right. A single threshold holds for both polarities. The rate is
+    for picture sequences without time stamps. Paths may hold spaces, since no path ends in a number of its own; ``#``
+    at the beginning of a line makes it a comment. In a ``.csv`` file commas separate the columns, which may be empty,
+    and a first line whose first column reads ``path`` is its heading. WebVid's own tables
+    (``videoid,contentUrl,duration,page_dir,name``) name ``page_dir/videoid.mp4``, as its downloaders write them.
+
+    Args:
+        kind: what a video is; a path without an ending names a folder if videos have parts.
+
+    Raises:
+        CorpusError: the file cannot be read, is empty, or a line makes no sense; the message gives the line number.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise CorpusError(f"list {path}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise CorpusError(f"list {path} is not UTF-8 text ({error.reason} at byte {error.start})") from error
+    is_csv, most = Path(path).suffix.lower() == ".csv", len(_COLUMNS) - (not kind.has_parts)
+    entries: dict[str, int] = {}
+    found: list[ListEntry] = []
+    webvid: list[int] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
+            fields = _comma_columns(line.strip()) if is_csv else _space_columns(line.strip(), most)
+            if not found and fields[0].lower() == "path":
+                continue
+            if not found and {"videoid", "page_dir"} <= set(fields):
+                webvid = [fields.index("page_dir"), fields.index("videoid")]
+                continue
+            entry = _webvid_entry(fields, *webvid) if webvid else _entry(fields, kind, most)
+            if entry.id in entries:
+                raise ValueError(f"{entry.id} is listed already in line {entries[entry.id]}")
+        except (ValueError, csv.Error) as error:
+            raise CorpusError(f"list {path}, line {number}: {error}") from error
+        entries[entry.id] = number
+        found.append(entry)
+    if not found:
+        raise CorpusError(f"list {path}: names no video; write one a line: path [frames [c+ [c-]]]")
+    return tuple(found)
+
+
+def _comma_columns(line: str) -> list[str]:
+    return [field.strip() for field in next(csv.reader([line], strict=True))]
+
+
+def _space_columns(line: str, most: int) -> list[str]:
+    words = list(_words_from_the_right(line, most))
+    return [line[: len(line) - sum(map(len, words))].strip(), *(word.strip() for word in reversed(words))]
+
+
+def _words_from_the_right(line: str, most: int) -> Iterator[str]:
+    """Yield the numbers that end a line, last first, each with the space in front of it; never the whole line."""
+    for _ in range(most - 1):
+        match = re.search(r"\s+(\S+)$", line)
+        if match is None or not _NUMBER.fullmatch(match[1]):
+            return
+        yield match[0]
+        line = line[: match.start()]
+
+
+def _webvid_entry(fields: list[str], folder: int, video: int) -> ListEntry:
+    if len(fields) <= max(folder, video):
+        raise ValueError(f"{len(fields)} columns, fewer than the heading has")
+    return ListEntry(_relative(f"{fields[folder]}/{fields[video]}.mp4"))
+
+
+def _entry(fields: list[str], kind: VideosKind, most: int) -> ListEntry:
+    if len(fields) > most:
+        raise ValueError(f"{len(fields)} columns; there are at most {most}: {' '.join(_COLUMNS[:most])}")
+    fields += [""] * (len(_COLUMNS) - len(fields))
+    frames, positive, negative, rate = (_number(field) if field else None for field in fields[1:])
+    if frames is not None and (frames < 1 or frames != int(frames)):
+        raise ValueError(f"{fields[1]} frames; give a whole number from 1")
+    for what, value in ("contrast threshold", positive), ("contrast threshold", negative), ("rate", rate):
+        if value is not None and value <= 0:
+            raise ValueError(f"{what} {value:g}; give one above 0")
+    count, negative = None if frames is None else int(frames), positive if negative is None else negative
+    return ListEntry(_relative(fields[0], kind), count, positive, negative, rate)
+
+
+def _number(field: str) -> float:
+    if not _NUMBER.fullmatch(field) or not math.isfinite(float(field)):
+        raise ValueError(f"{field!r} is not a number")
+    return float(field)
+
+
+def _relative(text: str, kind: VideosKind = VIDEOS) -> str:
+    path = PurePosixPath(text.replace("\\", "/"))
+    if path.is_absolute() or re.match(r"[A-Za-z]:/", str(path)):
+        raise ValueError(f"{text} is absolute; give paths relative to the folder of the videos")
+    if ".." in path.parts:
+        raise ValueError(f"{text} leaves the folder of the videos")
+    is_folder = kind.has_parts and path.suffix.lower() != ".zip"
+    if not (is_folder or _SUFFIX.fullmatch(path.suffix)):
+        raise ValueError(f"{text!r} does not name a video file")
+    if printable(text) != text:
+        raise ValueError(f"{printable(text)} holds control characters")
+    return f"{path}/" if is_folder else str(path)
+
 
 Q = TypeVar("Q")
 A = TypeVar("A")
@@ -116,7 +510,7 @@ def by_parts(question: Callable[[Sequence[Q]], A], files: Sequence[Q]) -> Genera
 
 
 if TYPE_CHECKING:
-    from v2v_server.corpus.manifest import Manifest
+    from v2v_server.corpus.sources.prepared import Manifest
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,7 +662,7 @@ class VideoSource(ABC):
         """Return the state of a folder of pictures from those of its files.
 
         Raises:
-            OSError: it is beyond the limits of :func:`v2v_server.corpus.sources.sidecar.state_text`.
+            OSError: it is beyond the limits of :func:`v2v_server.corpus.sources.source.state_text`.
         """
         size = sum(state[0] for _, state in files)
         return (size, int(state_text(files)[:15], 16), self.mark(id)) if files else GONE
@@ -306,7 +700,7 @@ class VideoSource(ABC):
 
         Returns:
             the text; or an error, if it cannot be told, or the sidecar is beyond the limits of
-            :func:`v2v_server.corpus.sources.sidecar.state_text`.
+            :func:`v2v_server.corpus.sources.source.state_text`.
         """
         return ""
 

@@ -6,7 +6,6 @@
     refractory.py     a pixel fires no events for a time after an event
     shot_noise.py     events of either sign, most in the dark
     dead_pixels.py    pixels that never fire
-    tolerance.py      which effects a clip does without
     state.py          inputs of an effect
     kernel.py         the general kernel: all effects, and events with times
 
@@ -19,7 +18,7 @@ here, named in :data:`EFFECTS`. The file states the equation, its source, and
     PANEL                     the panel of ``v2v-fit`` that shows it: "rates", "still", "pixels" or "intervals"
     prepare(value, clip)      its tables; for the value 0 they have the same types and switch everything off
 
-If ``tolerance`` of the spec may leave it out (``tolerance.py``), it also states
+If ``tolerance`` of the spec may leave it out (``simulation/clip.py``), it also states
 
     COST, MARGIN              its processor time, relative to the others; how many times the events that change on real
                               footage are at most those of its model

@@ -1,4 +1,4 @@
-"""The colour of a clip, Cb and Cr (:mod:`v2v_server.video.colour.chroma`)."""
+"""The colour of a clip, Cb and Cr (:mod:`v2v_server.video.picture`)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.store.planes.plane import Files, Plane
-from v2v_server.video.collect import ClipRequest, Cut, DecodedPicture
-from v2v_server.video.colour.chroma import CHROMA_CELL_PX, Chroma, ChromaCut
-from v2v_server.video.decode import DecodedClip
-from v2v_server.video.luma import Signal
+from v2v_server.store.planes import Files, Plane
+from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, DecodedPicture
+from v2v_server.video.picture import CHROMA_CELL_PX, Chroma, ChromaCut, Signal
 
 
 class Colour(Plane):

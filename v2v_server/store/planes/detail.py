@@ -2,7 +2,7 @@
 
     level = round(grey W / 255) + detail,  W = 2**bits - 1
 
-Grey and level are roundings of one sample of the video (``v2v_server.video.luma``): the detail of 12 bits is -9 to 9.
+Grey and level are roundings of one sample (``v2v_server.video.picture``): the detail of 12 bits is -9 to 9.
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.store.planes.plane import Files, Plane
-from v2v_server.video.collect import ClipRequest, DecodedPicture
-from v2v_server.video.decode import DecodedClip
-from v2v_server.video.luma import SDR, Signal
+from v2v_server.store.planes import Files, Plane
+from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture
+from v2v_server.video.picture import SDR, Signal
 
 
 class Detail(Plane):

@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from v2v_server.store.planes.plane import Files, Plane
-from v2v_server.video.collect import ClipRequest, Cut, DecodedFrame, DecodedPicture, Watch
-from v2v_server.video.decode import DecodedClip
-from v2v_server.video.luma import SDR, Signal
-from v2v_server.video.orientation import PixelRect
+from v2v_server.store.planes import Files, Plane
+from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, DecodedFrame, DecodedPicture, Watch
+from v2v_server.video.picture import SDR, PixelRect, Signal
 
 if TYPE_CHECKING:
     from v2v_server.motion import Cells, MotionOfCuts, Vectors
-    from v2v_server.store.reader import StoreFile
+    from v2v_server.store.store_file import StoreFile
 
 
 class Motion(Plane):

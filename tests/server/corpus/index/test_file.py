@@ -16,7 +16,7 @@ from tests.pieces import shots
 from v2v_protocol.errors import IndexUnreadable
 from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
 from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Store
-from v2v_server.corpus.scenes.collect import SceneCollection, figures
+from v2v_server.corpus.probe import SceneCollection, figures
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, COLUMNS, Scene
 from v2v_server.corpus.videos import VideoTable, joined
 from v2v_server.video.rows import Rows

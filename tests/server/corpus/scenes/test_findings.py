@@ -17,7 +17,7 @@ from tests.clips import write_clip
 from tests.oracles.decoded import stream_luma
 from v2v_protocol.errors import VideoError
 from v2v_server.corpus.scenes.analysis import analyse
-from v2v_server.corpus.scenes.findings import (
+from v2v_server.corpus.scenes.picture_check import (
     BARS,
     BLACK,
     COMBED,

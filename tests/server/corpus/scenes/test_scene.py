@@ -18,8 +18,8 @@ from tests.clips import damaged, panned_luma, write_clip
 from tests.pieces import pieces, shots
 from tests.server.corpus.failing_storage import failing_opens
 from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
+from v2v_server.corpus import probe as collect
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.scenes import collect
 from v2v_server.corpus.scenes.analysis import analyse
 from v2v_server.corpus.scenes.scene import (
     CHANGE,
@@ -38,7 +38,7 @@ from v2v_server.corpus.scenes.scene import (
     Scene,
     Sides,
 )  # fmt: skip
-from v2v_server.prepare.prepare import prepare
+from v2v_server.prepare import prepare
 from v2v_server.system.isolate import run_twice
 from v2v_server.video.rows import Rows
 

@@ -12,7 +12,7 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import CorpusError, VideoChanged, VideoGone
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.sources.bucket import Bucket
+from v2v_server.corpus.sources.copies import Bucket
 
 pytest.importorskip("fsspec", reason="the extra 'cloud' is not installed")
 

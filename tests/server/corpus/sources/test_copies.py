@@ -23,10 +23,9 @@ from v2v_protocol.errors import (
     VideoGone,
     VideoUnreadable,
 )
-from v2v_server.corpus.sources import bucket as bucket_module
+from v2v_server.corpus.sources import copies as bucket_module
 from v2v_server.corpus.sources import copies as copies_module
-from v2v_server.corpus.sources.bucket import Bucket, is_url
-from v2v_server.corpus.sources.copies import Copies
+from v2v_server.corpus.sources.copies import Bucket, Copies, is_url
 from v2v_server.corpus.sources.source import GONE, SourceOptions, open_source
 from v2v_server.store.quota import PARTIAL, count_bytes, used_bytes
 from v2v_server.video.fingerprint import fingerprint

@@ -17,8 +17,7 @@ from v2v_protocol.programs import printable
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources import source as asking
 from v2v_server.corpus.sources.folder import MOST_PATHS, PSEUDO, Folder, video_files
-from v2v_server.corpus.sources.listfile import ListEntry, left_out_note, read_list
-from v2v_server.corpus.sources.source import answers, by_parts, open_source
+from v2v_server.corpus.sources.source import ListEntry, answers, by_parts, left_out_note, open_source, read_list
 
 STEERING = {
     "red\x1b[31m.mp4": r"red\x1b[31m.mp4",

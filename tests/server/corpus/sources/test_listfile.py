@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from v2v_protocol.errors import CorpusError
-from v2v_server.corpus.sources.listfile import ListEntry, read_list
+from v2v_server.corpus.sources.source import ListEntry, read_list
 
 
 def written(tmp_path: Path, text: str, name: str = "list.txt") -> Path:

@@ -64,7 +64,7 @@ def differences_of(matrix: str, contrast: float) -> npt.NDArray[np.int16]:
     """Return what Cr adds to red, Cb and Cr add to green, and Cb adds to blue: [4, 256], rounded half up.
 
     Args:
-        matrix: see :class:`v2v_server.video.colour.chroma.Chroma`.
+        matrix: see :class:`v2v_server.video.picture.Chroma`.
         contrast: factor of the colour differences, that of the grey levels.
     """
     (kr, kb), values = _MATRICES[matrix], contrast * np.arange(-128.0, 128.0)

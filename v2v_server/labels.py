@@ -1,4 +1,6 @@
-"""Read boxes from the files of three common formats, and masks. All errors are ValueErrors that name the line or entry.
+"""Labels of a video: read boxes from the files of three common formats, and masks; and how a virtual camera sees them.
+
+All errors of reading are ValueErrors that name the line or entry.
 
     .boxes.json  COCO-VID, of one video: ``frame_id`` counts from 0; each image is an annotated frame. Without it the
                  digits at the end of ``file_name`` are the frame. ``attributes`` may hold the track, as CVAT writes it
@@ -16,6 +18,10 @@ Frames count from 0 in presentation order.
                  the end of the name are the frame, from 0
 
 A reader cannot tell everything from the file: :func:`check_labels` compares all labels of a video with the video.
+
+A camera crops, resizes and mirrors boxes and masks like the pictures (:mod:`v2v_server.simulation.view`). cv2 resizes
+by the ratio of the whole sizes, with pixel centres at half coordinates, so a continuous coordinate x becomes
+x width' / width.
 """
 
 from __future__ import annotations
@@ -32,6 +38,10 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.persisted import parse_json
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import SampleParams
+from v2v_server.simulation.draw import resized_size
+from v2v_server.simulation.view import Window
 
 NO_TRACK = -1
 LARGEST_NUMBER = 2**24 - 1
@@ -109,22 +119,23 @@ class BoxTable:
         return self.corners[first:end], self.numbers[first:end]
 
 
-def checked(box: Box) -> Box:
-    """Return the box.
+def checked(where: str, box: Box) -> Box:
+    """Return the box, which lies at ``where``.
 
     Raises:
         ValueError: one of its numbers is outside its limits.
     """
     if not 0 <= box.frame <= _LARGEST_FRAME:
-        raise ValueError(f"frame {box.frame} of a box: give a whole number from 0")
+        raise ValueError(f"{where}: frame {box.frame} of a box: give a whole number from 0")
     if not all(-_LARGEST_PX <= number <= _LARGEST_PX for number in box[1:5]):  # also NaN
-        raise ValueError(f"box {list(box[1:5])}: coordinates are at most {_LARGEST_PX:g} px")
+        raise ValueError(f"{where}: box {list(box[1:5])}: coordinates are at most {_LARGEST_PX:g} px")
     if box.width < 0 or box.height < 0:
-        raise ValueError(f"box {list(box[1:5])}: width and height are at least 0")
+        raise ValueError(f"{where}: box {list(box[1:5])}: width and height are at least 0")
     if not 0 <= box.category <= LARGEST_NUMBER:
-        raise ValueError(f"class {box.category}: give a whole number from 0 to {LARGEST_NUMBER}")
+        raise ValueError(f"{where}: class {box.category}: give a whole number from 0 to {LARGEST_NUMBER}")
     if not NO_TRACK <= box.track <= LARGEST_NUMBER:
-        raise ValueError(f"track {box.track}: give a whole number from 0 to {LARGEST_NUMBER}, or {NO_TRACK} for none")
+        what = f"give a whole number from 0 to {LARGEST_NUMBER}, or {NO_TRACK} for none"
+        raise ValueError(f"{where}: track {box.track}: {what}")
     return box
 
 
@@ -163,7 +174,7 @@ def read_coco(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
         if (image := entry.whole("image_id")) not in frames:
             raise ValueError(f"annotations[{place}]: images has no id {image}")
         box = Box(frames[image], *entry.four("bbox"), entry.whole("category_id"), entry.track())
-        boxes.append(entry.checked(box))
+        boxes.append(checked(f"annotations[{place}]", box))
     return BoxTable.of(boxes, frozenset(numbers))
 
 
@@ -184,7 +195,7 @@ def read_mot(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
             raise ValueError(f"{where}: frame {frame:g}: MOT counts frames from 1")
         # Tools write -1 for the track of a detection.
         box = Box(_whole(where, frame) - 1, left - 1, top - 1, width, height, category, _whole(where, track))
-        boxes.append(_checked(where, box))
+        boxes.append(checked(where, box))
     return BoxTable.of(boxes)
 
 
@@ -228,7 +239,7 @@ def read_yolo(folder: Traversable, picture_px: tuple[int, int]) -> BoxTable:
             )
             track = _whole(where, values[5]) if len(values) == 6 else NO_TRACK
             category = _whole(where, values[0])
-            boxes.append(_checked(where, Box(frame, x - width / 2, y - height / 2, width, height, category, track)))
+            boxes.append(checked(where, Box(frame, x - width / 2, y - height / 2, width, height, category, track)))
     return BoxTable.of(boxes)
 
 
@@ -388,9 +399,6 @@ class _Entry:
             what = f"{self._place} has {stated[0]!r:.20}x{stated[1]!r:.20} px, the video {width}x{height} px"
             raise ValueError(f"{what}: scale its boxes to the video, and state that size")
 
-    def checked(self, box: Box) -> Box:
-        return _checked(self._place, box)
-
 
 def _list(content: Mapping[str, Any], key: str, optional: bool = False) -> list[Any]:
     value = content.get(key, [] if optional else None)
@@ -431,8 +439,69 @@ def _whole(where: str, value: float) -> int:
     return int(value)
 
 
-def _checked(where: str, box: Box) -> Box:
-    try:
-        return checked(box)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+LEAST_SHARE = 0.1
+"""Smallest share of a box in the crop with which the box stays."""
+LEAST_SIDE_PX = 2.0
+"""Smallest width and height in the crop with which a box stays, px."""
+
+
+def view_boxes(
+    corners: npt.NDArray[np.float64], picture: Window, params: SampleParams, recipe: Recipe
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return boxes in the crop, clipped to it, and the share of each box's area that lies in it.
+
+    Args:
+        corners: [n, 4], x0, y0, x1, y1 in the upright picture, px.
+        picture: its usable part.
+        params, recipe: the draw and its recipe.
+
+    Returns:
+        [n, 4] corners in the crop, and [n] shares; 0 for a box without area.
+    """
+    height, width = resized_size(picture.height_px, picture.width_px, params.scale)
+    scale = np.array([width / picture.width_px, height / picture.height_px])
+    shift = np.array([params.crop_left_px, params.crop_top_px])
+    points = (corners.reshape(-1, 2, 2) - (picture.left_px, picture.top_px)) * scale - shift
+    if params.flip:
+        points[:, :, 0] = recipe.crop_width_px - points[:, ::-1, 0]
+    clipped = np.clip(points, 0.0, (recipe.crop_width_px, recipe.crop_height_px))
+    whole, seen = (np.prod(each[:, 1] - each[:, 0], axis=1) for each in (points, clipped))
+    share = np.divide(seen, whole, out=np.zeros_like(seen), where=whole > 0)
+    return clipped.reshape(-1, 4), np.minimum(share, 1.0)
+
+
+def kept_boxes(corners: npt.NDArray[np.float64], share: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    """Return the numbers of the boxes that stay, largest area in the crop first; equal ones keep their order.
+
+    Args:
+        corners, share: [n, 4] and [n], as :func:`view_boxes` returns them.
+    """
+    sides = corners[:, 2:] - corners[:, :2]
+    stays = (share >= LEAST_SHARE) & (sides >= LEAST_SIDE_PX).all(axis=1)
+    (kept,) = np.nonzero(stays)
+    order = np.argsort(-np.prod(sides[kept], axis=1), kind="stable")
+    return np.asarray(kept[order], np.int64)
+
+
+def view_mask(mask: npt.NDArray[Any], picture: Window, params: SampleParams, recipe: Recipe) -> npt.NDArray[Any]:
+    """Return a map of the upright picture as the camera sees it: the value at each pixel's centre.
+
+    Args:
+        mask: [height, width] of the whole upright picture.
+        picture: its usable part.
+        params, recipe: the draw and its recipe.
+
+    Returns:
+        [crop_height_px, crop_width_px].
+    """
+    height, width = resized_size(picture.height_px, picture.width_px, params.scale)
+    rows = _nearest(params.crop_top_px, recipe.crop_height_px, height, picture.height_px) + picture.top_px
+    columns = _nearest(params.crop_left_px, recipe.crop_width_px, width, picture.width_px) + picture.left_px
+    return mask[np.ix_(rows, columns[::-1] if params.flip else columns)]
+
+
+def _nearest(first: int, count: int, resized: int, size: int) -> npt.NDArray[np.int64]:
+    """Return which of ``size`` pixels lies at the centre of each of ``count`` pixels of the resized picture."""
+    # floor((place + 1/2) size / resized) in whole numbers.
+    places: npt.NDArray[np.int64] = (2 * np.arange(first, first + count, dtype=np.int64) + 1) * size // (2 * resized)
+    return places
