@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import stat
-from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -19,7 +18,6 @@ from v2v_server.corpus.sources.source import (
     GONE,
     LIST_SUFFIXES,
     MANIFEST_NAME,
-    NO_STATE,
     UNPRINTABLE,
     FileState,
     ListEntry,
@@ -75,32 +73,19 @@ class Folder(VideoSource):
             yield id
         self._refuse_prepared(folders)
 
-    def states(self, ids: Sequence[str]) -> array[int]:
-        """Return the states of many files, see :meth:`VideoSource.states`."""
-        found = array("q")
-        for id in ids:
-            try:
-                found.extend(self._state(id))
-            except OSError as error:
-                found.extend(GONE if isinstance(error, FileNotFoundError | NotADirectoryError) else NO_STATE)
-        return found
-
     def state(self, id: str) -> FileState:
         """Ask for the state of one file.
 
         Raises:
             VideoUnreadable: the file is missing or cannot be read.
         """
+        path = f"{self.name}/{self.file_of(id)}"
         try:
-            return self._state(id)
+            if path.endswith("/"):
+                return self.state_of_parts(id, [(name, _numbers(status)) for name, status in files_in(path)])
+            size, modified, changed = _numbers(status := os.stat(path))
         except OSError as error:
             raise unreadable(id, error) from error
-
-    def _state(self, id: str) -> FileState:
-        path = f"{self.name}/{self.file_of(id)}"
-        if path.endswith("/"):
-            return self.state_of_parts(id, [(name, _numbers(status)) for name, status in files_in(path)])
-        size, modified, changed = _numbers(status := os.stat(path))
         return (size, modified, changed ^ self.mark(id)) if stat.S_ISREG(status.st_mode) else GONE
 
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
