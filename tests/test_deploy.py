@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from v2v_protocol.errors import UsageError
-from v2v_server.broker.transport import Sockets
+from v2v_protocol.link.router import Sockets
 from v2v_server.commands.quarantine import main as quarantine
 from v2v_server.commands.serve import main as serve
 from v2v_server.config import ServeConfig

@@ -18,7 +18,7 @@ from v2v_protocol.keys import read_key
 from v2v_server.commands import serve as serve_command
 from v2v_server.commands.keys import main as keys_command
 from v2v_server.config import ServeConfig
-from v2v_server.keys.folder import KeyFolder
+from v2v_server.keys import KeyFolder
 
 COMPONENT = KUBERNETES / "keys"
 NOTES = [line.removeprefix("#").strip() for line in (COMPONENT / "kustomization.yaml").read_text().splitlines()]

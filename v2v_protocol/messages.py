@@ -222,7 +222,7 @@ class Status(Persisted):
     """Answer to GetStatus.
 
     Attributes:
-        json: a status as JSON, UTF-8; see :mod:`v2v_server.status.parts`.
+        json: a status as JSON, UTF-8; see :mod:`v2v_server.status.snapshot`.
     """
 
     json: bytes

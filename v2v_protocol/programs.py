@@ -191,3 +191,6 @@ _USAGE = "\n".join([
     ),
     "\nTab completion: eval \"$(v2v completion bash)\", or zsh",
 ])  # fmt: skip
+
+if __name__ == "__main__":
+    sys.exit(v2v())

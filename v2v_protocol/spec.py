@@ -56,7 +56,7 @@ class StreamSpec(Persisted):
         recipe: the virtual cameras and views to draw from.
 
     The K samples of one decode (``samples_per_decode``) have independent cameras like any other samples, but they show
-    the same scene. An epoch has K samples of every sequence, ``sibling_spacing`` apart (``v2v_server.schedule.epoch``).
+    the same scene. An epoch has K samples of every sequence, ``sibling_spacing`` apart (``v2v_server.schedule``).
 
     Raises:
         UsageError: a value outside its choices or limits.

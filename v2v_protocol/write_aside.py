@@ -40,7 +40,7 @@ def write_aside_and_rename(path: Path, *, partial: Path | None = None, durable: 
     try:
         yield partial
         if durable:
-            _flush(partial)
+            flush(partial)
         partial.replace(path)
     finally:
         with contextlib.suppress(OSError):  # as the error that is under way says more
@@ -48,10 +48,11 @@ def write_aside_and_rename(path: Path, *, partial: Path | None = None, durable: 
     if durable:
         # The name is an entry of the folder: without this it can be lost although the content is not.
         with contextlib.suppress(PermissionError):  # a folder without the right to list it
-            _flush(path.parent)
+            flush(path.parent)
 
 
-def _flush(path: Path) -> None:
+def flush(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

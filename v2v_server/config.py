@@ -22,7 +22,7 @@ from v2v_server.video.rows import Rows
 DEFAULT_BIND = "tcp://127.0.0.1:5555"
 MOST_WORKERS = 4096
 ENGINES = {"local": "v2v_server.supervise.local_host", "ray": "v2v_server.supervise.ray_host"}
-"""Where workers can run: the module of each :class:`v2v_server.supervise.host.Host`."""
+"""Where workers can run: the module of each :class:`v2v_server.supervise.pool.Host`."""
 
 
 @dataclass(frozen=True, slots=True)

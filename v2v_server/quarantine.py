@@ -27,9 +27,10 @@ from pathlib import Path
 
 from v2v_protocol.errors import CorpusError, ProtocolError
 from v2v_protocol.persisted import Persisted, parse_json
+from v2v_protocol.write_aside import flush
 from v2v_server.corpus.catalogue import index_path
+from v2v_server.system.log import gauge, short, text
 from v2v_server.system.process import lock, open_private
-from v2v_server.system.status_fields import gauge, short, text
 
 VERDICTS_PER_VIDEO = 2
 _MOST_VERDICTS = 20
@@ -244,17 +245,8 @@ def write_entry(
             out.truncate(kept)
             raise
     if not whole:
-        _sync_folder(file.parent)
+        flush(file.parent)  # with the name of the new file
     return [*lines[known.latest :], numbered]
-
-
-def _sync_folder(folder: Path) -> None:
-    """Flush the folder, so that the name of a new file is on disk too."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _parse(file: Path, whole: bytes) -> Quarantine:

@@ -20,10 +20,13 @@ from typing import Any
 
 from v2v_protocol.arena import give_back_freed_memory
 from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoGone
+from v2v_protocol.link.router import ConsumerGone, FromConsumer, FromWorker, InFlight, Sockets
 from v2v_protocol.link.user import OwnUser
 from v2v_protocol.progress import Progress
 from v2v_protocol.write_aside import write_file
-from v2v_server.broker.actions import (
+from v2v_server.broker.dispatcher import Dispatcher
+from v2v_server.broker.leases import REST_SECONDS, Cause, Loss, Request, clean_name
+from v2v_server.broker.state import (
     Action,
     AddToQuarantine,
     CheckVideo,
@@ -34,26 +37,21 @@ from v2v_server.broker.actions import (
     ToConsumer,
     ToWorker,
 )
-from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.leases import Cause, Loss, Request
-from v2v_server.broker.transport import ConsumerGone, FromConsumer, FromWorker, InFlight, ServerTransport, Sockets
-from v2v_server.broker.worker_registry import REST_SECONDS, clean_name
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.corpus.scenes.picture_check import check_in_background
-from v2v_server.keys.folder import KeyFolder
+from v2v_server.keys import KeyFolder
 from v2v_server.page.child import PageProcess
 from v2v_server.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
-from v2v_server.schedule.sequences import SequenceTable, corpus_summary
-from v2v_server.status.snapshot import Service, StatusPublisher
+from v2v_server.schedule import SequenceTable, corpus_summary
+from v2v_server.status.snapshot import StatusPublisher
 from v2v_server.status.terminal import StatusView, format_shutdown_summary
 from v2v_server.store.cache import make_cache
 from v2v_server.store.pixels import VideosKind
-from v2v_server.supervise.local_host import Standby
+from v2v_server.supervise.local_host import WorkerProcess
 from v2v_server.supervise.pool import Pool, Scaling, make_pool, question_workers
-from v2v_server.system.log import Level, Log, StartTimes
+from v2v_server.system.log import GIB, Level, Log
 from v2v_server.system.process import keep_freed_memory, most_connections, open_many_files, usable_cores
-from v2v_server.system.status_fields import GIB
 from v2v_server.video.rows import Rows
 
 _LONGEST_TURN_SECONDS = 1.0
@@ -101,12 +99,12 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
     return catalogue
 
 
-def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None = None) -> None:
+def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debug: bool = False) -> None:
     """Run a server until SIGINT or SIGTERM.
 
     Args:
-        times: of the start; logged on request once the first sample is sent.
         standbys: see :func:`v2v_server.supervise.pool.make_pool`.
+        debug: whether its workers show the traceback of an error.
 
     Raises:
         CorpusError: the corpus gives no sequence.
@@ -115,7 +113,6 @@ def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None
     """
     keep_freed_memory()
     open_many_files()
-    times.mark("imports")
     log, label = Log(is_json=config.log_format == "json"), f"w{secrets.token_hex(4)}"
     # All that may be refused comes before the videos, which can take minutes to catalogue.
     keys = KeyFolder(Path(config.keys)) if config.keys else None
@@ -138,71 +135,53 @@ def serve(config: ServeConfig, times: StartTimes, standbys: list[Standby] | None
             admits=None if is_open else OwnUser(_OWN_USER_RULE, log.say).admits,
         )
         opened.callback(sockets.close)
-        _serve(config, log, times, standbys, sockets, page, keys, label)
-
-
-def _serve(
-    config: ServeConfig,
-    log: Log,
-    times: StartTimes,
-    standbys: list[Standby] | None,
-    sockets: Sockets,
-    page: PageProcess | None,
-    keys: KeyFolder | None,
-    label: str,
-) -> None:
-    """Open the catalogue and run the loop. Errors: see :func:`serve`."""
-    catalogue = load_catalogue(config)
-    times.mark("catalogue")
-    table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
-    summary = corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused)
-    for line in (*catalogue.notes, *summary):
-        log.say(line)
-    catalogue.fail_fast()
-    if not table.count:
-        raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")
-    quarantine_file = quarantine_path(catalogue.source.name, config.cache_dir or None)
-    quarantine = read_quarantine(quarantine_file)
-    for entry in quarantine.entries(quarantine.latest):
-        log.say(f"in quarantine: {entry}")
-    dispatcher = Dispatcher(
-        catalogue.facts,
-        config.spec,
-        complete=lambda lease, spec: complete_lease(lease, catalogue, spec),
-        quarantine=quarantine,
-        wall_clock=utc_now,
-        lease_deadline_seconds=config.lease_deadline_seconds,
-        session_idle_seconds=config.session_idle_seconds,
-        max_credit_bytes=config.max_credit_bytes,
-        expected_workers=config.workers_in_all,
-        share_bytes=int(config.share_gib * GIB),
-    )
-    # Workers of this host use an address that requires no key.
-    worker_flags = [*(["--keys", ""] if config.engine == "local" else []), "--log-format", config.log_format]
-    if config.cache:
-        worker_flags += ["--cache", str(Path(config.cache).absolute()), "--cache-gib", str(config.cache_gib)]
-    worker_flags += ["--cache-raw"] * config.cache_raw + ["--debug"] * times.is_logged
-    worker_flags += catalogue.source.worker_flags()
-    stop = threading.Event()
-    sockets.has_session = dispatcher.has_session
-    with stop_on_signals(stop):
+        catalogue = load_catalogue(config)
+        table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
+        summary = corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused)
+        for line in (*catalogue.notes, *summary):
+            log.say(line)
+        catalogue.fail_fast()
+        if not table.count:
+            raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")
+        quarantine_file = quarantine_path(catalogue.source.name, config.cache_dir or None)
+        quarantine = read_quarantine(quarantine_file)
+        for entry in quarantine.entries(quarantine.latest):
+            log.say(f"in quarantine: {entry}")
+        dispatcher = Dispatcher(
+            catalogue.facts,
+            config.spec,
+            complete=lambda lease, spec: complete_lease(lease, catalogue, spec),
+            quarantine=quarantine,
+            wall_clock=utc_now,
+            lease_deadline_seconds=config.lease_deadline_seconds,
+            session_idle_seconds=config.session_idle_seconds,
+            max_credit_bytes=config.max_credit_bytes,
+            expected_workers=config.workers_in_all,
+            share_bytes=int(config.share_gib * GIB),
+        )
+        # Workers of this host use an address that requires no key.
+        worker_flags = [*(["--keys", ""] if config.engine == "local" else []), "--log-format", config.log_format]
+        if config.cache:
+            worker_flags += ["--cache", str(Path(config.cache).absolute()), "--cache-gib", str(config.cache_gib)]
+        worker_flags += ["--cache-raw"] * config.cache_raw + ["--debug"] * debug
+        worker_flags += catalogue.source.worker_flags()
+        stop = threading.Event()
+        sockets.has_session = dispatcher.has_session
+        opened.enter_context(stop_on_signals(stop))
         pool = make_pool(config, catalogue.source, label, worker_flags, keys, standbys)
-        server = Server(config, catalogue, dispatcher, sockets, pool, quarantine_file, page=page, times=times, log=log)
-        try:
-            if pool.is_local and (question := question_workers(config.most_workers, usable_cores())):
-                log.say(question, "warning")
-            pool.start(sockets.local_address if pool.is_local else sockets.worker_address)
-            pool.scale(config.least_workers)
-            times.mark("schedule and sockets")
-            check_in_background(catalogue, config.spec, stop, log.say)
-            if page is not None:
-                page.start(sockets.local_address)
-                log.say(f"page: {page.url}")
-            while not stop.is_set() and config.parent_pid in (0, os.getppid()):
-                server.turn(_TURN_SECONDS)
-        finally:
-            server.close()
-            catalogue.close()
+        opened.callback(catalogue.close)
+        server = Server(config, catalogue, dispatcher, sockets, pool, quarantine_file, page=page, log=log)
+        opened.callback(server.close)
+        if pool.is_local and (question := question_workers(config.most_workers, usable_cores())):
+            log.say(question, "warning")
+        pool.start(sockets.local_address if pool.is_local else sockets.worker_address)
+        pool.scale(config.least_workers)
+        check_in_background(catalogue, config.spec, stop, log.say)
+        if page is not None:
+            page.start(sockets.local_address)
+            log.say(f"page: {page.url}")
+        while not stop.is_set() and config.parent_pid in (0, os.getppid()):
+            server.turn(_TURN_SECONDS)
 
 
 class Server:
@@ -210,12 +189,11 @@ class Server:
 
     Args:
         dispatcher: decides what to do.
-        transport: sockets of consumers and workers.
+        sockets: of consumers and workers.
         pool: runs the workers' processes.
         quarantine_file: file that new entries are written to.
         clock: returns the time, seconds; None: a :class:`v2v_server.serve.Clock`.
         page: the status page; None: no page.
-        times: see :func:`serve`.
         log: where other threads write lines too; None: a new one.
     """
 
@@ -224,21 +202,19 @@ class Server:
         config: ServeConfig,
         catalogue: Catalogue,
         dispatcher: Dispatcher,
-        transport: ServerTransport,
+        sockets: Sockets,
         pool: Pool,
         quarantine_file: Path,
         clock: Callable[[], float] | None = None,
         page: PageProcess | None = None,
-        times: StartTimes | None = None,
         log: Log | None = None,
     ) -> None:
         self._page = page
-        self._times = times or StartTimes()
         self._log = log or Log(is_json=config.log_format == "json")
         self._config = config
         self._catalogue = catalogue
         self._dispatcher = dispatcher
-        self._transport = transport
+        self._sockets = sockets
         self._pool = pool
         self._clock = clock or Clock()
         self._quarantine_file = quarantine_file
@@ -248,8 +224,7 @@ class Server:
         is_fixed = config.least_workers == config.most_workers
         self._scaling = None if is_fixed else Scaling(*config.workers, config.scale_seconds)
         self._view = StatusView(self._log, sys.stderr)
-        service = Service(config, catalogue, dispatcher, pool, transport)
-        self._publisher = StatusPublisher(service, self._clock(), utc_now)
+        self._publisher = StatusPublisher(config, catalogue, dispatcher, pool, sockets, self._clock(), utc_now)
         self._announced = False
         self._port_file: Path | None = None
         self._blocked_due: float | None = None
@@ -262,7 +237,7 @@ class Server:
             WorkerCrashLoop: the workers die without finishing anything.
             UsageError: the port file cannot be written.
         """
-        arrivals = self._transport.receive(longest_wait_seconds)
+        arrivals = self._sockets.receive(longest_wait_seconds)
         now = self._clock()
         for arrival in arrivals:
             match arrival:
@@ -306,11 +281,9 @@ class Server:
             if self._log.is_json:
                 self._log.say("the end", totals=status["totals"], uptime_seconds=status["uptime_seconds"])
         for stop in self._dispatcher.stop_workers():
-            self._transport.send(stop)
+            self._sockets.send(stop.identity, stop.frames, to_worker=True)
         self._pool.stop()
-        if self._page is not None:
-            self._page.stop()
-        self._transport.close()
+        self._sockets.close()
         if self._port_file is not None:
             with contextlib.suppress(OSError):  # for instance, its folder is gone; the server cannot repair that
                 self._port_file.unlink(missing_ok=True)
@@ -321,16 +294,17 @@ class Server:
         todo = deque(actions)
         while todo:
             match todo.popleft():
-                case ToConsumer() as message:
-                    if not self._transport.send(message):
-                        dispatcher.consumer_lost(message.identity)
-                case ToWorker() as message:
-                    if message.arena:
-                        self._pool.lend(self._name(message.identity), message.arena)
-                    if not self._transport.send(message) and not self._pool.watches(self._name(message.identity)):
-                        todo.extend(dispatcher.worker_unreachable(message.identity, now()))
+                case ToConsumer(identity, frames):
+                    if not self._sockets.send(identity, frames):
+                        dispatcher.consumer_lost(identity)
+                case ToWorker(identity, frames, arena):
+                    if arena:
+                        self._pool.lend(self._name(identity), arena)
+                    is_sent = self._sockets.send(identity, frames, to_worker=True)
+                    if not is_sent and not self._pool.watches(self._name(identity)):
+                        todo.extend(dispatcher.worker_unreachable(identity, now()))
                 case Disconnect(identity):
-                    self._transport.cut(identity)
+                    self._sockets.cut(identity)
                 case GiveUp() as hopeless:
                     todo.extend(dispatcher.worker_lost(hopeless.identity, self._give_up(hopeless), now()))
                 case AddToQuarantine() as record:
@@ -458,7 +432,7 @@ class Server:
         """Announce once that the server is ready; then update the status."""
         if not self._announced and (self._dispatcher.workers or not self._config.least_workers):
             self._announced = True
-            address, worker_address = self._transport.address, self._transport.worker_address
+            address, worker_address = self._sockets.address, self._sockets.worker_address
             # Workers on other hosts cannot use a private address.
             workers = "" if worker_address.startswith("ipc:") else f", workers to {worker_address}"
             self._say(f"ready: consumers connect to {address}{workers}", address=address)
@@ -466,11 +440,6 @@ class Server:
                 write_file(Path(self._config.port_file), address + "\n", "--port-file")
                 self._port_file = Path(self._config.port_file)
             self._publisher.is_ready = True
-            self._times.mark("first worker")
-        if self._times.is_logged and self._dispatcher.counters.samples:
-            self._times.is_logged = False
-            self._times.mark("first sample")
-            self._say(str(self._times))
         if self._announced and self._view.is_due(now):
             self._view.show(now, self._publisher.status(now))
 

@@ -18,7 +18,7 @@ from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import CHANGES, Defect, hides_motion
 from v2v_server.motion.prediction import SUBSTEP_PX, Prediction, predict
-from v2v_server.schedule.sequences import VideoSequence
+from v2v_server.schedule import VideoSequence
 from v2v_server.simulation.effects import NOISE
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.view import apply_view, without_margin

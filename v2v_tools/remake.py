@@ -21,13 +21,12 @@ from v2v_protocol.progress import Progress
 from v2v_protocol.sample import DEFAULT_ARRAYS, Refusal, RefusalKind, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.write_aside import write_aside_and_rename
-from v2v_server.broker import grants
-from v2v_server.broker.grants import next_candidate
+from v2v_server.broker import dispatcher
+from v2v_server.broker.dispatcher import next_candidate
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
-from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
-from v2v_server.schedule.sequences import SequenceTable, VideoSequence
+from v2v_server.schedule import MOST_CANDIDATES, Schedule, SequenceTable, VideoSequence
 from v2v_server.store.pixels import VIDEOS, VideosKind
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
@@ -79,7 +78,7 @@ class Remaker:
         table = SequenceTable(catalogue.videos, catalogue.rows, spec)
         if not table.count:
             raise CorpusError(f"no video gives a sequence: {'; '.join(map(str, table.refusals[:3]))}")
-        self._schedule = Schedule.of(table, spec)
+        self._schedule = Schedule(table, spec)
         self.count = self._schedule.count
 
     def sequence(self, seed: int, epoch: int, index: int) -> VideoSequence:
@@ -264,12 +263,12 @@ def lease_for(
     number: int = 1,
     siblings: tuple[int, ...] = (),
 ) -> Lease:
-    """Build the lease that a server sends for a request; see :func:`v2v_server.broker.grants.lease_for`.
+    """Build the lease that a server sends for a request; see :func:`v2v_server.broker.dispatcher.lease_for`.
 
     Raises:
         IndexUnreadable, V2VError: as of :func:`v2v_server.corpus.catalogue.complete_lease`.
     """
-    lease = grants.lease_for(
+    lease = dispatcher.lease_for(
         request,
         sequence=sequence,
         facts=catalogue.facts,

@@ -18,7 +18,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.videos import VideoEntry, encoded_pieces
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule import SequenceTable
 from v2v_server.simulation import simulate, simulate_log
 from v2v_server.simulation.precision import warm_up
 from v2v_server.video.rows import Rows

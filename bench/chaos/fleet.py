@@ -25,7 +25,7 @@ from bench.chaos.hostile import TALLY
 from bench.processes import free_ports, last_in_line, workers_of
 from v2v_protocol.errors import UsageError
 from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
-from v2v_server.keys.folder import KeyFolder
+from v2v_server.keys import KeyFolder
 
 MARK = "V2V_CHAOS_RUN"
 _STOP_SECONDS = 30.0

@@ -11,8 +11,6 @@ attacks in turn, eight peers at a time, between two calm stretches.
     peak MiB    most memory of the server's main process above its start, under attack
     after MiB   the same at most 30 s after the attack, once the allocator has returned what is free
 
-Each kind attacks once before memory is compared, so that a leak shows and what is allocated once does not.
-
 The attackers have the lowest priority: on the same cores they would otherwise take time from the honest consumer, which
 peers on other hosts cannot do. ``--urgent`` gives them normal priority; then the server CPU counts, not the rate.
 
@@ -87,9 +85,6 @@ def besiege(
 ) -> list[dict[str, Any]]:
     """Attack with all kinds in turns; return one record for each kind."""
     found: dict[str, list[dict[str, float]]] = {kind: [] for kind in kinds}
-    for kind in kinds:  # what a kind takes once, such as caches and pages of small objects, is no leak
-        with fleet.attacked(kind, last=not urgent):
-            stretch(fleet, seconds)
     start = settled_mib(fleet.server.pid or 0)
     for turn in range(turns):
         for kind in kinds:

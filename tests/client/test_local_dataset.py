@@ -20,7 +20,7 @@ from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.spec import SpecOptions
-from v2v_server.keys.folder import KeyFolder
+from v2v_server.keys import KeyFolder
 
 RECIPE = {"preset": "noise-free", "voxels_per_clip": 2, "crop_height_px": 32, "crop_width_px": 32}
 SCRIPT = """

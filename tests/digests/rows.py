@@ -24,8 +24,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.prepare import prepare
-from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import decode_for, make_sample, open_sidecars
@@ -236,7 +235,7 @@ def _empty_folder(folder: Path) -> Iterator[Path]:
 def samples_of(catalogue: Catalogue, row: Row, cache: Cache | None = None) -> list[Sample]:
     """Make the samples of a row as a worker does, those of one decode together."""
     spec, samples = row.stream, dict[int, Sample]()
-    schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, spec), spec)
+    schedule = Schedule(SequenceTable(catalogue.videos, catalogue.rows, spec), spec)
     views, spacing = spec.samples_per_decode, max(1, spec.sibling_spacing)
     for index in range(row.count):
         if index in samples:

@@ -30,7 +30,7 @@ def main(clips: Path, folder: Path) -> None:
     with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
         epoch = [digest(batch) for batch in epoch_of(server.address)]
         said = server.last_lines()
-    prepare = [sys.executable, "-m", "v2v_server.commands.prepare", str(clips), str(folder / "prepared")]
+    prepare = [sys.executable, "-m", "v2v_protocol.programs", "prepare", str(clips), str(folder / "prepared")]
     settings = ["--workers", "2", "--cache-dir", str(folder / "another cache")]
     status = subprocess.run([*prepare, *settings], stdout=subprocess.DEVNULL, check=False).returncode
     print(json.dumps({"lock": lock, "epoch": epoch, "prepared": status, "said": said}))

@@ -176,7 +176,7 @@ def source(tmp_path: Path) -> Path:
 
 def _preparing(source: Path, out: Path, cache: Path) -> list[str]:
     settings = ["--workers", "2", "--cache-dir", str(cache)]
-    return ["v2v_server.commands.prepare", str(source), str(out), *settings]
+    return ["v2v_protocol.programs", "prepare", str(source), str(out), *settings]
 
 
 def _require_it_goes_on(source: Path, out: Path, cache: Path) -> None:
@@ -217,7 +217,7 @@ def test_preparing_onto_a_full_disk(source: Path, tmp_path: Path, cache: Path, r
     )
     run = f'{sys.executable} -c "{program}" "$@" || echo "ended with status $?"; cp -r "{disk}/out" "{after}"'
     setup = f'mount -t tmpfs -o size={size}k tmpfs "{disk}"; head -c {filler}K /dev/zero > "{disk}/filler"'
-    command = mounted(setup, ["sh", "-c", run, "sh", *_preparing(source, disk / "out", cache)[1:]])
+    command = mounted(setup, ["sh", "-c", run, "sh", *_preparing(source, disk / "out", cache)[2:]])
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if room == "nothing":
         assert "ended with status 2" in done.stdout

@@ -46,7 +46,14 @@ def test_catalogue_and_preparing_without_semaphores(tmp_path: Path) -> None:
     for number in range(2):
         write_clip(tmp_path / "source" / f"{number}.mp4", panned_luma(12 + number))
     environment = os.environ | _without_semaphores() | {"V2V_CACHE_DIR": str(tmp_path / "cache")}
-    command = [sys.executable, "-m", "v2v_server.commands.prepare", str(tmp_path / "source"), str(tmp_path / "out")]
+    command = [
+        sys.executable,
+        "-m",
+        "v2v_protocol.programs",
+        "prepare",
+        str(tmp_path / "source"),
+        str(tmp_path / "out"),
+    ]
     subprocess.run([*command, "--workers", "1"], env=environment, check=True)
     assert len(read_manifest(tmp_path / "out").videos) == 2
     pool = "from concurrent.futures import ProcessPoolExecutor; ProcessPoolExecutor(1)"

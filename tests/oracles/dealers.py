@@ -9,8 +9,7 @@ from contextlib import suppress
 import zmq
 
 from v2v_protocol.keys import PeerKey, key_for
-from v2v_protocol.link.curve import secure
-from v2v_protocol.link.dealer import Dealer
+from v2v_protocol.link.dealer import Dealer, secure
 from v2v_protocol.messages import Frames
 
 _TINY: Mapping[int, int] = {zmq.RCVHWM: 1, zmq.SNDHWM: 1000, zmq.SNDTIMEO: 2000, zmq.LINGER: 0}

@@ -27,7 +27,7 @@ from tests.oracles.hostile_frames import FrameFuzzer
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.keys import read_key
-from v2v_protocol.link.curve import secure
+from v2v_protocol.link.dealer import secure
 from v2v_protocol.messages import (
     Begun,
     Buffer,

@@ -14,8 +14,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.store.cache import Cache
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import decode_for, make_sample
@@ -37,7 +36,7 @@ def open_leases(videos: Path, rows: str, spec: StreamSpec) -> Iterator[tuple[Pat
         table = SequenceTable(catalogue.videos, catalogue.rows, spec)
         if not table.count:
             raise CorpusError(f"--videos {videos}: no video gives a sequence of {spec.recipe.frames_needed} frames")
-        schedule = Schedule.of(table, spec)
+        schedule = Schedule(table, spec)
         spacing = max(1, spec.sibling_spacing)
 
         def leases() -> Iterator[Lease]:

@@ -23,8 +23,7 @@ from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
-from v2v_server.schedule.sequences import SequenceTable, VideoSequence
+from v2v_server.schedule import MOST_CANDIDATES, Schedule, SequenceTable, VideoSequence
 from v2v_server.worker.produce import decode_for, make_sample, open_sidecars
 from v2v_tools.remake import lease_for, remake
 
@@ -75,7 +74,7 @@ class StreamOracle:
         self._catalogue = catalogue
         self._asked = asked
         self._spec = asked.stream_spec
-        self._schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, self._spec), self._spec)
+        self._schedule = Schedule(SequenceTable(catalogue.videos, catalogue.rows, self._spec), self._spec)
         self.sequences = self._schedule.count
 
     def sequence(self, epoch: int, index: int, candidate: int) -> VideoSequence:

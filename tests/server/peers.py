@@ -31,7 +31,9 @@ from v2v_protocol.messages import (
 )
 from v2v_protocol.sample import Refusal, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.actions import (
+from v2v_server.broker.dispatcher import Dispatcher
+from v2v_server.broker.leases import Cause, Loss
+from v2v_server.broker.state import (
     Action,
     AddToQuarantine,
     CheckVideo,
@@ -40,8 +42,6 @@ from v2v_server.broker.actions import (
     ToConsumer,
     ToWorker,
 )
-from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.leases import Cause, Loss
 from v2v_server.corpus.catalogue import Catalogue, complete_lease
 from v2v_server.quarantine import Quarantine, QuarantineEntry
 

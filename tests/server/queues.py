@@ -7,10 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from v2v_protocol.link.router import FromConsumer, FromWorker, ServerInput
 from v2v_protocol.messages import Message, decode, encode
-from v2v_server.broker.actions import ToConsumer, ToWorker
 from v2v_server.broker.leases import Cause, Loss, Stall
-from v2v_server.broker.transport import BrokerInput, FromConsumer, FromWorker
 from v2v_server.supervise.pool import Death
 
 
@@ -26,17 +25,17 @@ class Queues:
     address: str = "queue://consumers"
     worker_address: str = "queue://workers"
     waited_seconds: float = 0.0
-    arrived: deque[BrokerInput] = field(default_factory=deque)
+    arrived: deque[ServerInput] = field(default_factory=deque)
     sent: dict[bytes, deque[Sequence[Any]]] = field(default_factory=dict)
 
-    def receive(self, seconds: float) -> list[BrokerInput]:
+    def receive(self, seconds: float) -> list[ServerInput]:
         return [self.arrived.popleft()] if self.arrived else []
 
-    def send(self, action: ToConsumer | ToWorker) -> bool:
-        there = self.sent.get(action.identity)
+    def send(self, identity: bytes, frames: Sequence[Any], *, to_worker: bool = False) -> bool:
+        there = self.sent.get(identity)
         if there is None:
             return False
-        there.append(action.frames)
+        there.append(frames)
         return True
 
     def cut(self, identity: bytes) -> None:

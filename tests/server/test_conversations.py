@@ -22,6 +22,7 @@ from tests.server.peers import DEADLINE, answer_to
 from tests.server.queues import Queues, ToyPool
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import VideoError
+from v2v_protocol.link.router import FromWorker
 from v2v_protocol.messages import (
     Denied,
     ErrorCode,
@@ -36,7 +37,6 @@ from v2v_protocol.messages import (
 )
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause
-from v2v_server.broker.transport import FromWorker
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import complete_lease
 from v2v_server.quarantine import read_quarantine

@@ -19,10 +19,18 @@ from v2v_protocol.errors import VideoChanged
 from v2v_protocol.messages import Pong, Stop, WorkerHello, encode
 from v2v_protocol.sample import Refusal
 from v2v_server import serve as serve_module
-from v2v_server.broker.actions import Action, AddToQuarantine, CheckVideo, GiveUp, ReportRefusal, ToConsumer, ToWorker
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause, Loss, Request
-from v2v_server.broker.state import Counters
+from v2v_server.broker.state import (
+    Action,
+    AddToQuarantine,
+    CheckVideo,
+    Counters,
+    GiveUp,
+    ReportRefusal,
+    ToConsumer,
+    ToWorker,
+)
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, CorpusPart
 from v2v_server.corpus.sources.folder import Folder

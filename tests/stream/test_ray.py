@@ -22,7 +22,7 @@ from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.keys import read_key
-from v2v_server.keys.folder import KeyFolder
+from v2v_server.keys import KeyFolder
 
 pytest.importorskip("ray", reason="the extra 'ray' is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.filterwarnings("ignore")]

@@ -16,7 +16,7 @@ from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import KeyRefused
 from v2v_protocol.keys import read_key
-from v2v_server.keys.folder import KeyFolder
+from v2v_server.keys import KeyFolder
 
 pytestmark = pytest.mark.slow
 

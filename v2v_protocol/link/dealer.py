@@ -25,12 +25,10 @@ import zmq
 
 from v2v_protocol.errors import KeyRefused, ServerLost, UsageError
 from v2v_protocol.keys import VARIABLE, PeerKey, key_for
-from v2v_protocol.link.curve import secure
 from v2v_protocol.messages import LARGEST_HEADER_BYTES, Frames
 
-HANDSHAKE_EVENTS = 0x0800 | 0x1000 | 0x2000 | 0x4000
-"""Handshake events of a socket monitor: failed without detail, succeeded, protocol error, authentication failed."""
 _SILENT, _SUCCEEDED, _MECHANISM, _AUTHENTICATION = 0x0800, 0x1000, 0x2000, 0x4000
+"""Handshake events of a socket monitor: failed without detail, succeeded, protocol error, authentication failed."""
 _MISMATCH = 0x11000002
 _MOST_SILENT = 5
 """Consecutive handshakes that the server ended without a reply; a server that is stopping may end one or two."""
@@ -96,14 +94,14 @@ class Dealer:
             socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
             socket.setsockopt(zmq.RECONNECT_IVL_MAX, _LONGEST_RECONNECT_MS)
             events = f"inproc://handshakes-{next(_monitors)}"
-            socket.monitor(events, HANDSHAKE_EVENTS)
+            socket.monitor(events, _SILENT | _SUCCEEDED | _MECHANISM | _AUTHENTICATION)
             if self._key is not None:
                 secure(socket, self._key)
             monitor = self._context.socket(zmq.PAIR)
             monitor.setsockopt(zmq.LINGER, 0)
             monitor.connect(events)
             self._socket, self._monitor = socket, monitor
-            self._handshakes.begin()
+            self._handshakes.succeeded = 0
             self._poller = zmq.Poller()
             self._poller.register(socket, zmq.POLLIN)
             self._poller.register(monitor, zmq.POLLIN)
@@ -205,11 +203,21 @@ class Dealer:
         return socket
 
 
+def secure(socket: zmq.Socket[bytes], key: PeerKey) -> None:
+    """Set a peer's key on its socket. Call it before the socket connects."""
+    socket.curve_serverkey = key.server.encode()
+    socket.curve_publickey = key.public.encode()
+    socket.curve_secretkey = key.secret.encode()
+
+
 class Handshakes:
     """Count the handshakes of a socket that connects, from the events of its monitor.
 
     Args:
         address, key, side: of the socket, for messages.
+
+    Attributes:
+        succeeded: how many have succeeded; a new socket begins at 0.
     """
 
     def __init__(self, address: str, key: PeerKey | None, side: str) -> None:
@@ -219,10 +227,6 @@ class Handshakes:
         self._address, self._side = address, side
         self._mine = "no key was given" if key is None else f"{side} key {key.name!r}"
         self._has_key = key is not None
-
-    def begin(self) -> None:
-        """Start again for a new socket."""
-        self.succeeded = 0
 
     def take(self, waiting: Callable[[], int], receive: Callable[[], Sequence[bytes]]) -> None:
         """Process the available events.

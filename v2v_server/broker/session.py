@@ -14,7 +14,7 @@ most its credit, all of them together hold about MOST_IN_FLIGHT_BYTES, and none 
 
 from __future__ import annotations
 
-import heapq
+from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,8 +28,7 @@ from v2v_protocol.messages import MOST_IN_FLIGHT_BYTES
 from v2v_protocol.sample import Form, array_layout
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import LeaseBook, Request, runs_alone
-from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.sequences import VideoSequence
+from v2v_server.schedule import Schedule, VideoSequence
 
 GONE_SECONDS = 10.0
 """Time that a consumer has to return to its session after its connection ended."""
@@ -44,10 +43,8 @@ _SECOND_NS = 1_000_000_000
 _QUANTUM_NS = _SECOND_NS // 20
 _MOST_DEBTS = 4096
 """Number of debts remembered for absent consumers; the oldest is dropped first."""
-_MOST_STALE = 64
-"""Entries that a heap may hold, besides two for each consumer, before it is rebuilt."""
 
-_Place: TypeAlias = tuple[bool, int]  # (whether in debt, key in the heap of such consumers)
+_Place: TypeAlias = tuple[bool, int]  # (whether in debt, key among such consumers)
 
 
 @dataclass(slots=True)
@@ -58,7 +55,7 @@ class _Balance:
 
 
 class FairQueue:
-    """Order in which waiting consumers are served: deficit round robin, at logarithmic cost for each request.
+    """Order in which waiting consumers are served: deficit round robin.
 
     Shreedhar and Varghese, "Efficient fair queuing using deficit round robin", SIGCOMM 1995. The cost of a sample is
     known only once it is made, so a consumer pays afterwards. Consumers that wait are served in turn while their
@@ -66,17 +63,16 @@ class FairQueue:
     is paid. A consumer whose samples take ten times the work therefore gets a tenth of the samples, not ten times the
     time.
 
-        waiting, balance >= 0     heap by turn: the consumer that was served longest ago comes first
-        waiting, balance < 0      heap by the earnings that pay the debt: ``earned`` of the queue minus the balance
-        not waiting               in no heap; earns nothing
+        waiting, balance >= 0     sorted by turn: the consumer that was served longest ago comes first
+        waiting, balance < 0      sorted by the earnings that pay the debt: ``earned`` of the queue minus the balance
+        not waiting               in neither list; earns nothing
 
     Quanta are not added to every balance: the queue counts what each waiting debtor has earned. Balances are whole
-    nanoseconds, so that this sum is exact. Heap entries that no longer hold are skipped when they reach the top, and
-    removed when they outnumber the consumers.
+    nanoseconds, so that this sum is exact.
 
     Attributes:
         debts_ns: of absent consumers.
-        heaps: (key, consumer) of the solvent ones, and of those in debt.
+        waiting: (key, consumer) of the solvent ones, and of those in debt, each sorted.
     """
 
     def __init__(self) -> None:
@@ -84,7 +80,7 @@ class FairQueue:
         self.debts_ns: dict[bytes, int] = {}
         self._turns = count()
         self._earned_ns = 0
-        self.heaps: tuple[list[tuple[int, bytes]], list[tuple[int, bytes]]] = [], []
+        self.waiting: tuple[list[tuple[int, bytes]], list[tuple[int, bytes]]] = [], []
 
     def add(self, identity: bytes, debtors: Iterable[bytes] = ()) -> None:
         """Add a consumer, which does not wait yet.
@@ -98,7 +94,8 @@ class FairQueue:
 
     def remove(self, identity: bytes) -> None:
         """Remove a consumer; its debt is remembered."""
-        balance_ns = self._balance_ns(self._accounts.pop(identity))
+        self.set_waiting(identity, waits=False)
+        balance_ns = self._accounts.pop(identity).balance_ns
         if balance_ns < 0:
             self._remember(identity, -balance_ns)
 
@@ -109,11 +106,13 @@ class FairQueue:
         if account is None:
             self._remember(identity, cost_ns)
         else:
-            self._settle(identity, account, self._balance_ns(account) - cost_ns, waits=account.place is not None)
+            self._settle(identity, self.balance_ns(identity) - cost_ns, waits=account.place is not None)
 
-    def balance_seconds(self, identity: bytes) -> float:
-        """Return what a consumer has earned and not used; negative: its debt."""
-        return self._balance_ns(self._accounts[identity]) / _SECOND_NS
+    def balance_ns(self, identity: bytes) -> int:
+        """Return what a consumer has earned and not used, nanoseconds; negative: its debt."""
+        account = self._accounts[identity]
+        in_debt, key = account.place or (False, 0)
+        return self._earned_ns - key if in_debt else account.balance_ns
 
     def drop_savings(self, identity: bytes) -> None:
         """Drop what an idle consumer has earned and not used.
@@ -126,59 +125,36 @@ class FairQueue:
 
     def set_waiting(self, identity: bytes, *, waits: bool) -> None:
         """Note whether a consumer waits for a worker."""
-        account = self._accounts[identity]
-        if waits != (account.place is not None):
-            self._settle(identity, account, self._balance_ns(account), waits=waits)
+        if waits != (self._accounts[identity].place is not None):
+            self._settle(identity, self.balance_ns(identity), waits=waits)
 
     def next(self) -> bytes | None:
         """Return the consumer to serve, and put its next turn behind those of all others; None if none waits."""
-        if (identity := self._first(in_debt=False)) is None:
-            if self._first(in_debt=True) is None:
+        solvent, debtors = self.waiting
+        if not solvent:
+            if not debtors:
                 return None
-            self._pay_smallest_debt()
-            return self.next()
-        account = self._accounts[identity]
-        account.turn = next(self._turns)
-        self._settle(identity, account, account.balance_ns, waits=True)
+            smallest_ns = debtors[0][0] - self._earned_ns
+            self._earned_ns += (smallest_ns // _QUANTUM_NS + 1) * _QUANTUM_NS
+            while debtors and debtors[0][0] <= self._earned_ns:
+                debtor = debtors[0][1]
+                self._settle(debtor, self.balance_ns(debtor), waits=True)
+        identity = solvent[0][1]
+        self._accounts[identity].turn = next(self._turns)
+        self._settle(identity, self.balance_ns(identity), waits=True)
         return identity
 
-    def _pay_smallest_debt(self) -> None:
-        debt_ns = self.heaps[True][0][0] - self._earned_ns
-        self._earned_ns += (debt_ns // _QUANTUM_NS + 1) * _QUANTUM_NS
-        while (debtor := self._first(in_debt=True)) is not None and self.heaps[True][0][0] <= self._earned_ns:
-            account = self._accounts[debtor]
-            self._settle(debtor, account, self._balance_ns(account), waits=True)
-
-    def _balance_ns(self, account: _Balance) -> int:
-        in_debt, key = account.place or (False, 0)
-        return self._earned_ns - key if in_debt else account.balance_ns
-
-    def _settle(self, identity: bytes, account: _Balance, balance_ns: int, *, waits: bool) -> None:
-        """Set a balance, and move the consumer to the heap where it belongs."""
-        account.balance_ns = balance_ns
-        in_debt = balance_ns < 0
-        place = (in_debt, self._earned_ns - balance_ns if in_debt else account.turn) if waits else None
-        if place == account.place:
-            return
-        account.place = place
-        if place is None:
-            return
-        heap = self.heaps[in_debt]
-        heapq.heappush(heap, (place[1], identity))
-        if len(heap) > 2 * len(self._accounts) + _MOST_STALE:
-            heap[:] = {entry for entry in heap if self._holds(entry, in_debt=in_debt)}
-            heapq.heapify(heap)
-
-    def _first(self, *, in_debt: bool) -> bytes | None:
-        """Return the consumer at the top of a heap; None if the heap is empty."""
-        heap = self.heaps[in_debt]
-        while heap and not self._holds(heap[0], in_debt=in_debt):
-            heapq.heappop(heap)
-        return heap[0][1] if heap else None
-
-    def _holds(self, entry: tuple[int, bytes], *, in_debt: bool) -> bool:
-        account = self._accounts.get(entry[1])
-        return account is not None and account.place == (in_debt, entry[0])
+    def _settle(self, identity: bytes, balance_ns: int, *, waits: bool) -> None:
+        """Set a balance, and move the consumer to where it belongs."""
+        account = self._accounts[identity]
+        if account.place is not None:
+            in_debt, key = account.place
+            queue = self.waiting[in_debt]
+            del queue[bisect_left(queue, (key, identity))]
+        account.balance_ns, account.place = balance_ns, None
+        if waits:
+            account.place = (True, self._earned_ns - balance_ns) if balance_ns < 0 else (False, account.turn)
+            insort(self.waiting[account.place[0]], (account.place[1], identity))
 
     def _remember(self, identity: bytes, debt_ns: int) -> None:
         self.debts_ns[identity] = self.debts_ns.pop(identity, 0) + debt_ns

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.keys import SIDES
 from v2v_protocol.programs import show
-from v2v_server.keys.folder import KeyFolder
+from v2v_server.keys import KeyFolder
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -60,7 +59,3 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def _default_folder() -> Path:
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config", "v2v", "keys")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

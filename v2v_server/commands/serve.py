@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting
 from v2v_protocol.write_aside import check_output
 from v2v_server.config import SERVE_KEYS, ServeConfig
 from v2v_server.supervise.local_host import start_ahead
-from v2v_server.system.log import StartTimes, report_errors
+from v2v_server.system.log import report_errors
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -30,29 +29,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_settings(ServeConfig)
     add_spec(parser)
     parser.group("Videos").add_argument("--config", metavar="FILE", help="YAML file of these flags; a flag wins")
-    return run_command(parser, _run, argv, failures=(V2VError,), interrupted="")
+    return run_command(parser, report_errors(_run), argv, failures=(V2VError,), interrupted="")
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    times = StartTimes(is_logged=arguments.debug)
     flags = {name: getattr(arguments, name) for name in SERVE_KEYS}
     # Without --recipe, --set changes fields of the file's recipe.
     recipe = asked_recipe(arguments)
     settings = arguments.set if recipe is None else []
     if recipe is not None:
         flags["recipe"] = recipe_setting(recipe, arguments.set)
-    with report_errors(lambda: arguments.log_format):
-        config = ServeConfig.load(arguments.config, flags, settings)
-        arguments.log_format = config.log_format  # the file may ask for JSON
-        if config.port_file:
-            port_file = Path(config.port_file)
-            read = [config.videos, config.list, arguments.config or ""]
-            check_output("--port-file", port_file, (port_file.suffix.lower(),), read)
-        with start_ahead(config) as standbys:
-            from v2v_server.serve import serve  # takes as long as the imports of a worker, which run meanwhile
+    config = ServeConfig.load(arguments.config, flags, settings)
+    arguments.log_format = config.log_format  # the file may ask for JSON
+    if config.port_file:
+        port_file = Path(config.port_file)
+        read = [config.videos, config.list, arguments.config or ""]
+        check_output("--port-file", port_file, (port_file.suffix.lower(),), read)
+    with start_ahead(config) as standbys:
+        from v2v_server.serve import serve  # takes as long as the imports of a worker, which run meanwhile
 
-            serve(config, times, standbys)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        serve(config, standbys, arguments.debug)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
@@ -14,9 +13,8 @@ from v2v_server.config import ServeConfig
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_source
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.format import QUICK, RAW
-from v2v_server.system.log import Log, StartTimes, report_errors
+from v2v_server.system.log import GIB, Log, report_errors
 from v2v_server.system.process import die_with_parent
-from v2v_server.system.status_fields import GIB
 from v2v_server.worker.process import run_worker, unshared_name
 from v2v_server.worker.warm_up import warm_up_in_turn
 
@@ -26,15 +24,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     ``--standby PID``, from a server, gets ready and then reads the arguments from standard input.
     """
-    times = StartTimes()
-    times.mark("imports")
     argv = sys.argv[1:] if argv is None else argv
     if argv[:1] == ["--standby"]:
         die_with_parent(int(argv[1]))
         warm_up_in_turn()
-        times.mark("kernels")
         argv = sys.stdin.buffer.read().decode().split("\0")
-        times.mark("arguments")
         if argv == [""]:
             return 0
     parser = Parser(
@@ -54,16 +48,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--arenas-fd", type=int, help=argparse.SUPPRESS)
-    return run_command(parser, partial(_run, times), argv, failures=(V2VError,), interrupted="")
+    return run_command(parser, report_errors(_run), argv, failures=(V2VError,), interrupted="")
 
 
-def _run(times: StartTimes, arguments: argparse.Namespace) -> None:
-    times.is_logged = arguments.debug
-    with report_errors(lambda: arguments.log_format or "text"):
-        _work(times, arguments)
-
-
-def _work(times: StartTimes, arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> None:
     # A server names its own workers, and recognises them by these names.
     name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
     source = open_source(
@@ -81,7 +69,7 @@ def _work(times: StartTimes, arguments: argparse.Namespace) -> None:
         )
     log = Log(is_json=arguments.log_format == "json")
     run_worker(
-        arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log, times,
+        arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log,
         arguments.arenas_fd,
     )  # fmt: skip
 

@@ -63,8 +63,8 @@ from v2v_server.corpus.videos import (
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.store.pixels import VIDEOS, VideosKind
 from v2v_server.store.store_file import STORE_FORMAT
+from v2v_server.system.log import gauge, text
 from v2v_server.system.process import cache_folder, without_collections
-from v2v_server.system.status_fields import gauge, text
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
 

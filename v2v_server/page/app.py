@@ -1,4 +1,5 @@
-"""Answer each path.
+"""The process of the page, which a server starts after binding its port (:mod:`v2v_server.page.child`): the answer for
+each path.
 
 /          the page, for people; /static has its parts
 /healthz   200 if the server answers; for a liveness probe, which restarts it
@@ -14,22 +15,27 @@ addresses, localhost, this host's own name, and names that the operator gives. T
 files and peers): only this server's own scripts may run, and nothing may be sent elsewhere.
 
 Metrics follow Prometheus's convention of names (base units, ``_total`` for counters). Every field with a metric is
-walked (:mod:`v2v_server.system.status_fields`). Consumers and workers have labels. A consumer's label is its display
+walked (:mod:`v2v_server.system.log`). Consumers and workers have labels. A consumer's label is its display
 name, which stays the same in each epoch; consumers with the same name are merged.
 """
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import ipaddress
 import json
 import platform
+import socket
+import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping, MutableMapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from types import SimpleNamespace
+from typing import Any, ClassVar, TypeAlias
 
+import uvicorn
 from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import choose_encoder
@@ -38,10 +44,14 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from v2v_protocol.errors import V2VError
-from v2v_server.status.parts import PARTS, StatusFields, meanings_at, rows_at
-from v2v_server.system.status_fields import GIB, Meaning
+from v2v_protocol.link.user import OwnUser
+from v2v_server.status.client import StatusClient
+from v2v_server.status.snapshot import PARTS, StatusFields, meanings_at, rows_at
+from v2v_server.system.log import GIB, Log, Meaning
+from v2v_server.system.process import die_with_parent
 
 FRESH_SECONDS = 0.4
 """A status of at most this age is reused."""
@@ -72,17 +82,11 @@ _HELP = {
     "v2v_time_ratio": "Shares of time over the last ten seconds: consumers waited, broker busy, workers at each part.",
 }
 """Texts of metrics that several fields share, each under its own label."""
+_RULE = "the page serves only root and the server's user; give --insecure to let every user of this host watch"
 STATIC = Path(__file__).parent / "static"
 EVENT_SECONDS = 0.5
 MOST_EVENT_STREAMS = 64
 """Browsers that receive every status. One that stops reading occupies its connection and the memory of one status."""
-
-
-class GetsStatus(Protocol):
-    """Source of statuses, such as :class:`v2v_server.status.client.StatusClient`."""
-
-    def get_status(self, timeout_seconds: float) -> dict[str, Any]:
-        """See :meth:`v2v_server.status.client.StatusClient.get_status`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +94,7 @@ class LatestStatus:
     """The last answer of the server.
 
     Attributes:
-        status: see :mod:`v2v_server.status.parts`; None if the server did not answer.
+        status: see :mod:`v2v_server.status.snapshot`; None if the server did not answer.
         trouble: why it did not answer; empty if it did.
         at: time of the answer, seconds.
     """
@@ -108,7 +112,7 @@ class Source:
         clock: returns monotonic time, seconds.
     """
 
-    def __init__(self, client: GetsStatus, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, client: StatusClient, clock: Callable[[], float] = time.monotonic) -> None:
         self._client = client
         self._clock = clock
         self._lock = asyncio.Lock()
@@ -198,42 +202,32 @@ def _without_port(host: str) -> str:
     return host.rpartition(":")[0] if ":" in host else host
 
 
-class StatusCollector:
-    """Collector of the metrics of one status.
-
-    Args:
-        status: the status; None if the server does not answer.
-    """
-
-    def __init__(self, status: StatusFields | None) -> None:
-        self._status = status
-
-    def collect(self) -> Iterator[Metric]:
-        """Yield every metric."""
-        yield GaugeMetricFamily("v2v_up", "Whether the server answers.", value=float(self._status is not None))
-        if self._status is None:
-            return
-        info = GaugeMetricFamily("v2v_info", "Versions.", labels=("program", "protocol"))
-        info.add_metric((self._status["program"], str(self._status["protocol"])), 1.0)
-        yield info
-        families: dict[str, Any] = {}
-        for place in PARTS:
-            rows = rows_at(self._status, place)
-            for key, meaning in meanings_at(place).items():
-                if meaning.kind != "text" and meaning.metric != "":
-                    _add(families, place, key, meaning, rows)
-        yield from families.values()
+def metrics_of(status: StatusFields | None) -> Iterator[Metric]:
+    """Yield every metric of a status; None: the server does not answer."""
+    yield GaugeMetricFamily("v2v_up", "Whether the server answers.", value=float(status is not None))
+    if status is None:
+        return
+    info = GaugeMetricFamily("v2v_info", "Versions.", labels=("program", "protocol"))
+    info.add_metric((status["program"], str(status["protocol"])), 1.0)
+    yield info
+    families: dict[str, Any] = {}
+    for place in PARTS:
+        rows = rows_at(status, place)
+        for key, meaning in meanings_at(place).items():
+            if meaning.kind != "text" and meaning.metric != "":
+                _add(families, place, key, meaning, rows)
+    yield from families.values()
 
 
 def exposition(status: StatusFields | None, accept: str = "") -> tuple[bytes, str]:
     """Return the metrics of a status, and their content type.
 
     Args:
-        status: see :class:`StatusCollector`.
+        status: see :func:`metrics_of`.
         accept: the request's Accept header.
     """
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(StatusCollector(status))
+    registry.register(SimpleNamespace(collect=lambda: metrics_of(status)))
     encode, content_type = choose_encoder(accept)
     return encode(registry), content_type
 
@@ -360,3 +354,55 @@ def make_app(source: Source, names: Iterable[str] = ()) -> App:
 
 def _said(trouble: str) -> Response:
     return PlainTextResponse(f"{trouble or 'ok'}\n", 503 if trouble else 200)
+
+
+class OwnUserProtocol(H11Protocol):
+    """Close connections of other users of this host before they send a request."""
+
+    own_user: ClassVar[OwnUser]
+
+    def connection_made(self, transport: Any) -> None:
+        """Check a new connection, see asyncio.Protocol."""
+        super().connection_made(transport)
+        if not self.own_user.admits(transport.get_extra_info("socket")):
+            transport.abort()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Serve until told to stop, or until the server ends."""
+    parser = argparse.ArgumentParser(
+        prog="python -m v2v_server.page.app", description="Answer HTTP for a server, which starts this."
+    )
+    parser.add_argument("--connect", required=True, metavar="ADDRESS", help="address for the server's own workers")
+    parser.add_argument("--fd", required=True, type=int, help="file descriptor of the listening socket")
+    parser.add_argument(
+        "--parent-pid", required=True, type=int, help="process id of the server, with which this process ends"
+    )
+    parser.add_argument("--names", default="", help="host names to accept, separated by commas")
+    parser.add_argument("--log-format", default="text", help="text or json")
+    parser.add_argument("--insecure", action="store_true", help="serve every user")
+    arguments = parser.parse_args(argv)
+    die_with_parent(arguments.parent_pid)
+    # No key: this address admits the server's own user, see v2v_server.page.child.
+    source = Source(StatusClient(arguments.connect, keys=""))
+    is_open = arguments.insecure or sys.platform != "linux"
+    if not is_open:
+        OwnUserProtocol.own_user = OwnUser(_RULE, Log(is_json=arguments.log_format == "json").say)
+    config = uvicorn.Config(
+        make_app(source, filter(None, arguments.names.split(","))),
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        lifespan="off",
+        ws="none",
+        timeout_graceful_shutdown=1,
+        limit_concurrency=256,
+        http=H11Protocol if is_open else OwnUserProtocol,
+    )
+    with socket.socket(fileno=arguments.fd) as listening:
+        uvicorn.Server(config).run(sockets=[listening])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -93,7 +93,7 @@ class PageProcess:
         descriptor = self._socket.fileno()
         return subprocess.Popen(
             [
-                *(sys.executable, "-m", "v2v_server.page", "--connect", self._address, "--fd", str(descriptor)),
+                *(sys.executable, "-m", "v2v_server.page.app", "--connect", self._address, "--fd", str(descriptor)),
                 *("--parent-pid", str(os.getpid()), *self._flags),
             ],
             stdin=subprocess.DEVNULL,

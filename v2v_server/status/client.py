@@ -8,7 +8,7 @@ from typing import Any
 
 from v2v_protocol.errors import ProtocolError, RemoteError, ServerLost, UsageError
 from v2v_protocol.link.dealer import Dealer
-from v2v_protocol.messages import Denied, Frames, GetStatus, Status, decode, encode
+from v2v_protocol.messages import Denied, GetStatus, Status, decode, encode
 from v2v_protocol.persisted import parse_json
 
 _AGAIN_SECONDS = 2.0
@@ -45,7 +45,7 @@ class StatusClient:
         self.close()
 
     def get_status(self, timeout_seconds: float = 10.0) -> dict[str, Any]:
-        """Return the current status, see :mod:`v2v_server.status.parts`.
+        """Return the current status, see :mod:`v2v_server.status.snapshot`.
 
         Raises:
             ServerLost: there is no answer in this time.
@@ -55,6 +55,8 @@ class StatusClient:
         """
         end = time.monotonic() + timeout_seconds
         ask_at = time.monotonic()
+        while self._link.receive(0) is not None:
+            pass  # a late answer to an earlier request
         while (now := time.monotonic()) < end:
             if now >= ask_at:
                 ask_at = now + _AGAIN_SECONDS
@@ -62,28 +64,20 @@ class StatusClient:
             frames = self._link.receive(max(0.0, min(end, ask_at) - now))
             if frames is None:
                 self._link.has_reconnected()  # raises if the server refuses the key
-            elif (latest := self._latest(frames)) is not None:
-                return latest
+                continue
+            match decode(frames[0]):
+                case Denied(code, text):
+                    raise RemoteError(code, f"{self._address} refused: {text}")
+                case Status(encoded):
+                    return self._read(encoded)
         raise ServerLost(
             f"{self._address}: no answer for {timeout_seconds:g} s; is v2v-serve running there? Without keys it serves "
             "its own user only"
         )
 
-    def _latest(self, frames: Frames) -> dict[str, Any] | None:
-        """Return the newest answer that has arrived; skip late answers to earlier requests."""
-        newest = None
-        more: Frames | None = frames
-        while more is not None:
-            message = decode(more[0])
-            if isinstance(message, Denied):
-                raise RemoteError(message.code, f"{self._address} refused: {message.text}")
-            if isinstance(message, Status):
-                newest = message
-            more = self._link.receive(0)
-        if newest is None:
-            return None
+    def _read(self, encoded: bytes) -> dict[str, Any]:
         try:
-            status = parse_json(newest.json)
+            status = parse_json(encoded)
         except ValueError as error:
             raise ProtocolError(f"{self._address} sent a status that is not JSON") from error
         if not isinstance(status, dict) or not isinstance(status.get("version"), int):

@@ -1,136 +1,496 @@
-"""Build the status from the server's parts on request, and answer the requests.
+"""The status of a server: its fields, its bottleneck, how it is built, and who gets it.
 
-Every number has one owner (counters, sessions, the registry of workers, the leases, the history) and is read there. It
-costs a few microseconds for each worker and consumer, of which the first :data:`MOST_SHOWN` are listed. A status is
-built at most a few times a second, whatever the number of clients and requests, and all of them get the same bytes. So
-every request is answered: a client has one at a time, and connections are limited.
+Every number has one owner (counters, sessions, workers, leases, the history) and is read there. :data:`PARTS` says
+where each field is in JSON; all views walk the fields. A field may be added at any time. Raise :data:`STATUS_VERSION`
+if you change or remove one.
+
+Building a status costs a few microseconds for each worker and consumer, of which the first :data:`MOST_SHOWN` are
+listed. It is built at most a few times a second, whatever the number of clients and requests, and all of them get the
+same bytes. So every request is answered: a client has one at a time, and connections are limited.
+
+The bottleneck follows from shares of time, the differences of totals over the last seconds:
+
+    consumers wait     as they report: time in which they needed a batch and had none
+    workers wait       time in which they held no lease
+    workers queue      time in which they could have worked and got no core
+    workers work       decoding, simulating, delivering: each result says how long
+    the broker works   time in which its loop did not wait for a message
+
+If consumers hardly wait, they are the bottleneck. Otherwise the first of these that holds decides: the broker has no
+idle time (the broker); workers have idle time (the network); else the activity that takes most of the workers' time.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import platform
 import time
-from collections.abc import Callable
+from collections import defaultdict, deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 from v2v_protocol import PROTOCOL_VERSION, __version__
-from v2v_protocol.messages import LARGEST_HEADER_BYTES, encode
-from v2v_protocol.messages import Status as StatusMessage
-from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
+from v2v_protocol.link.router import Sockets
+from v2v_protocol.messages import LARGEST_HEADER_BYTES, Status, encode
 from v2v_server.broker.dispatcher import Dispatcher
-from v2v_server.broker.session import Session
-from v2v_server.broker.state import FaultTotal
-from v2v_server.broker.transport import ServerTransport
-from v2v_server.broker.worker_registry import Member, clean_name
+from v2v_server.broker.leases import Member, clean_name
+from v2v_server.broker.session import AWAY_SECONDS, Session
+from v2v_server.broker.state import Counters, FaultTotal, RefusalPart, SendStatus, ToConsumer, ToWorker
 from v2v_server.config import ServeConfig
-from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.status.bottleneck import Bottleneck, History, Shares, TimeWindow, find_bottleneck
-from v2v_server.status.parts import STATUS_VERSION, ConsumerPart, LoadPart, ServerPart, StatusFields, WorkerPart
-from v2v_server.store.quota import cache_part
+from v2v_server.corpus.catalogue import Catalogue, CorpusPart
+from v2v_server.quarantine import QuarantinePart, VerdictPart
+from v2v_server.store.quota import CachePart, cache_part
 from v2v_server.supervise.pool import Pool
-from v2v_server.system.status_fields import GIB, short, values
+from v2v_server.system.log import GIB, Meaning, counter, gauge, meanings, short, states, text, values
 
+STATUS_VERSION = 1
+StatusFields: TypeAlias = Mapping[str, Any]
+"""A whole status as plain values, fit for JSON."""
 ANSWER_SECONDS = 0.4
 LARGEST_SHARE = 0.02
 """Share of the loop's time that building may take; with thousands of workers and consumers it happens less often."""
-
-
 MOST_SHOWN = 1000
 """Largest number of workers listed, and of consumers; the others are only counted."""
 _MOST_SPECS = 8
+WINDOW_SECONDS = 10.0
+NOTE_SECONDS = 1.0
+_LEAST_PRESENT_SECONDS = 1.0
+"""Shortest time that the rates of a new consumer are measured over."""
+NOTICEABLE_SHARE = 0.1
+"""Share of its time that a consumer may wait without being called stalled."""
+_IDLE_SHARE = 0.3
+"""Workers that are idle for a larger share of their time are not the bottleneck."""
+_FULL_SHARE = 0.85
+"""A broker that is busy for a larger share of its time is the bottleneck."""
+_LEAST_SECONDS = 2.0
+"""Shortest window that allows a conclusion."""
+_QUEUED_SHARE = 0.4
+"""If workers wait for a core for a larger share of their time, their host has too few cores."""
+_SPARE_SHARE = 0.5
+"""If workers are idle for a larger share of their time, fewer of them would do."""
 
 
 @dataclass(frozen=True, slots=True)
-class Service:
-    """What the status is read from: the server's parts."""
+class Moment:
+    """The totals at one time.
 
-    config: ServeConfig
-    catalogue: Catalogue
-    dispatcher: Dispatcher
-    pool: Pool
-    transport: ServerTransport
+    Attributes:
+        now: monotonic time, seconds.
+        totals: the counters; and, of the time in which there was a consumer, ``attended``, ``broker`` (the loop did not
+            wait for a message), ``worker`` and ``consumer`` (times their number), ``idle`` (of ``worker``, without a
+            lease), in seconds.
+        peers: totals of each peer, the first of them a clock: ``now`` for a worker, the seconds that it was there for a
+            consumer. Then busy and processor seconds of a worker, by routing id, or samples, seconds waited and indices
+            passed of a consumer, by number.
+    """
 
-    def status(
-        self, window: TimeWindow, time: str, *, uptime_seconds: float, is_ready: bool, is_attended: bool
-    ) -> StatusFields:
-        """Return the status at the end of a window.
+    now: float
+    totals: Mapping[str, float]
+    peers: Mapping[bytes | int, tuple[float, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class TimeWindow:
+    """The time between two moments."""
+
+    before: Moment
+    last: Moment
+
+    @property
+    def seconds(self) -> float:
+        """Return the length of the window, seconds."""
+        return self.last.now - self.before.now
+
+    def change(self, name: str) -> float:
+        """Return by how much a total grew."""
+        return self.last.totals.get(name, 0.0) - self.before.totals.get(name, 0.0)
+
+    def rate(self, name: str) -> float:
+        """Return the same per second; 0 for an empty window."""
+        return self.change(name) / self.seconds if self.seconds > 0.0 else 0.0
+
+    def share(self, part: str, whole: str) -> float:
+        """Return the growth of one total as a share of another's, 0 to 1."""
+        return min(1.0, max(0.0, self.change(part) / self.change(whole))) if self.change(whole) > 0.0 else 0.0
+
+    def rates_of(self, peer: bytes | int) -> list[float]:
+        """Return the rates of a peer's totals: a worker's over the window, a consumer's over its time in the window."""
+        present, *totals = self.last.peers[peer]
+        before_present, *before = self.before.peers.get(peer, (0.0,) * (1 + len(totals)))
+        seconds = min(self.seconds, max(_LEAST_PRESENT_SECONDS, present - before_present))
+        return [(now - then) / seconds if seconds > 0.0 else 0.0 for now, then in zip(totals, before, strict=True)]
+
+
+class History:
+    """The last ten seconds of a dispatcher.
+
+    Args:
+        dispatcher: whose totals are noted.
+        now: monotonic time, seconds.
+    """
+
+    def __init__(self, dispatcher: Dispatcher, now: float) -> None:
+        self._dispatcher = dispatcher
+        self._moments: deque[Moment] = deque()
+        self._noted = self._note_at = now
+        self._clocks: defaultdict[str, float] = defaultdict(float)
+        self._broker_seconds = 0.0
+        self._attended_at = -math.inf
+
+    def note(self, now: float, broker_seconds: float) -> None:
+        """Note the time that passed. Call a few times a second.
 
         Args:
-            window: the last ten seconds.
-            time: time of day, ISO 8601.
-            uptime_seconds: time since the start.
-            is_ready: whether the server has announced that it is ready.
-            is_attended: whether there are consumers, apart from moments between epochs.
+            now: monotonic time, seconds.
+            broker_seconds: time since the start in which the loop did not wait for a message.
         """
-        counters, shares = self.dispatcher.counters, Shares.of(window)
-        cache = cache_part(
-            self.config.cache, self.config.cache_gib, counters.cache_hits, counters.cache_misses, counters.cache_trouble
-        )
-        return {
-            **values(self._server(time, uptime_seconds, is_ready=is_ready)),
-            **values(self.catalogue.part()),
-            **values(self._load(window)),
-            **values(self.dispatcher.quarantine.part()),
-            "waiting": values(self._bottleneck(shares, is_attended=is_attended)) | {"shares": values(shares)},
-            "totals": values(counters) | values(FaultTotal(counters.faults)),
-            "cache": None if cache is None else values(cache),
-            "workers": self._workers(window),
-            "consumers": [values(_consumer(each, window)) for each in list(self.dispatcher.sessions)[:MOST_SHOWN]],
-            "refusals": [values(each) for each in reversed(self.dispatcher.refusals)],
-            "verdicts": [values(each) for each in self.dispatcher.quarantine.verdict_parts()],
+        passed, self._noted = max(0.0, now - self._noted), now
+        busy, self._broker_seconds = broker_seconds - self._broker_seconds, broker_seconds
+        if consumers := self._dispatcher.consumers:
+            # Idle workers matter only while there is a consumer.
+            self._attended_at = now
+            worker = passed * self._dispatcher.workers
+            idle = worker * self._dispatcher.idle_share
+            clocks = {
+                "attended": passed,
+                "broker": busy,
+                "worker": worker,
+                "idle": idle,
+                "consumer": passed * consumers,
+            }
+            for name, seconds in clocks.items():
+                self._clocks[name] += seconds
+        if now >= self._note_at:
+            self._note_at = now + NOTE_SECONDS
+            self._moments.append(self._moment(now))
+            while len(self._moments) > 2 and now - self._moments[1].now >= WINDOW_SECONDS:
+                self._moments.popleft()
+
+    def is_attended(self, now: float) -> bool:
+        """Return whether there is a consumer, or was a moment ago: between epochs they leave and return."""
+        return now - self._attended_at < AWAY_SECONDS or self._dispatcher.consumers > 0
+
+    def window(self, now: float) -> TimeWindow:
+        """Return the last ten seconds, or the time since the start."""
+        last = self._moment(now)
+        return TimeWindow(self._moments[0] if self._moments else last, last)
+
+    def _moment(self, now: float) -> Moment:
+        peers: dict[bytes | int, tuple[float, ...]] = {
+            identity: (now, member.work.busy_seconds, member.work.cpu_seconds)
+            for identity, member in self._dispatcher.registry.members.items()
         }
+        for each in self._dispatcher.sessions.totals():
+            peers[each.number] = each.present(now), each.served, each.waited_seconds, each.passed
+        return Moment(now, values(self._dispatcher.counters) | self._clocks, peers)
 
-    def _server(self, time: str, uptime_seconds: float, *, is_ready: bool) -> ServerPart:
-        return ServerPart(
-            version=STATUS_VERSION,
-            time=time,
-            program=__version__,
-            protocol=PROTOCOL_VERSION,
-            host=platform.node(),
-            uptime_seconds=uptime_seconds,
-            is_ready=is_ready,
-            address=self.transport.address,
-            worker_address=self.transport.worker_address,
-            spec=self.config.spec.to_dict(),
+
+def _share(help: str, part: str, words: str) -> Any:
+    return gauge(help, "time_ratio", unit="0 to 1", part=part, words=words, default=0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Shares:
+    """Shares of the last ten seconds in which there was a consumer."""
+
+    seconds: float = gauge("Seconds of the last ten in which there was a consumer.", unit="s", default=0.0)
+    consumers: float = _share(
+        "Share of the consumers' time in which they waited for batches.", "consumers", "consumers wait"
+    )
+    idle: float = _share("Share of the workers' time in which they held no lease.", "idle", "workers idle")
+    broker: float = _share(
+        "Share of the time in which the server's loop did not wait for a message.", "broker", "server's loop busy"
+    )
+    decode: float = _share("Share of the workers' time that decoding took.", "decode", "workers decode")
+    simulate: float = _share("Share of the workers' time that simulating took.", "simulate", "workers simulate")
+    handover: float = _share("Share of the workers' time that delivering took.", "handover", "workers deliver")
+    queued: float = _share(
+        "Share of all workers' time in which those of this server waited for a core.",
+        "queued",
+        "workers wait for a core",
+    )
+    cores: float = gauge("Processor time of the workers by their time.", unit="cores", default=0.0)
+
+    @classmethod
+    def of(cls, window: TimeWindow) -> Shares:
+        """Compute the shares of a window."""
+        parts = {
+            name: window.share(f"{total}_seconds", "worker")
+            for name, total in (
+                ("decode", "decode"),
+                ("simulate", "simulate"),
+                ("handover", "handover"),
+                ("queued", "queued"),
+                ("cores", "cpu"),
+            )
+        }
+        return cls(
+            seconds=window.change("attended"),
+            consumers=window.share("waited_seconds", "consumer"),
+            idle=window.share("idle", "worker"),
+            broker=window.share("broker", "attended"),
+            **parts,
         )
 
-    def _load(self, window: TimeWindow) -> LoadPart:
-        dispatcher = self.dispatcher
-        specs = {each.spec.digest: each.spec for each in dispatcher.sessions}
-        return LoadPart(
-            specs={digest: spec.to_dict() for digest, spec in list(specs.items())[:_MOST_SPECS]},
-            samples_per_second=window.rate("samples"),
-            batches_per_second=window.rate("batches"),
-            bytes_per_second=window.rate("bytes"),
-            decodes_per_second=window.rate("decodes"),
-            shared_share=window.rate("shared") / max(window.rate("samples"), 1e-9),
-            queue=dispatcher.waiting,
-            queued_share=dispatcher.waiting_share,
-            worker_count=dispatcher.workers,
-            worker_processes=self.pool.running,
-            workers_wanted=self.config.workers,
-            consumer_count=dispatcher.consumers,
-        )
 
-    def _bottleneck(self, shares: Shares, *, is_attended: bool) -> Bottleneck:
-        dispatcher = self.dispatcher
-        return find_bottleneck(
-            shares,
-            is_attended=is_attended,
-            workers=dispatcher.workers,
-            starting=max(0, self.pool.running - dispatcher.workers),
-            trouble=dispatcher.blocked_reason or dispatcher.registry.trouble(self.config.workers_in_all),
-            has_cache=bool(self.config.cache),
-        )
+@dataclass(frozen=True, slots=True)
+class Bottleneck:
+    """The bottleneck of the service."""
 
-    def _workers(self, window: TimeWindow) -> list[dict[str, Any]]:
-        members, restarts = self.dispatcher.registry.members, self.pool.restarts
-        return [
-            values(_worker(self.dispatcher, identity, member, restarts.get(member.name.encode()), window))
-            for identity, member in list(members.items())[:MOST_SHOWN]
-        ]
+    part: str = states(
+        "1 for the part that is the bottleneck.",
+        "slow_part",
+        "no_consumers",  # none is connected
+        "start",  # too early to say
+        "workers",  # none can make a sample
+        "consumers",
+        "cores",  # the workers' host has too few
+        "decode",
+        "simulate",
+        "handover",
+        "broker",
+        "transit",  # requests and samples take long to arrive
+        "even",  # no notable waiting
+    )
+    sentence: str = text("What waits for what.")
+    remedy: str = text("What to do about it; empty if nothing is needed.", default="")
+
+
+def find_bottleneck(
+    shares: Shares,
+    *,
+    is_attended: bool,
+    workers: int,
+    starting: int = 0,
+    trouble: str = "",
+    has_cache: bool = False,
+) -> Bottleneck:
+    """Find the bottleneck.
+
+    Args:
+        shares: shares of the last seconds.
+        is_attended: whether there are consumers.
+        workers: number of connected workers.
+        starting: number of the server's own worker processes that are not connected yet.
+        trouble: why no worker can make a sample; empty if one can.
+        has_cache: whether the server's workers cache decoded clips.
+    """
+    if not is_attended:
+        return Bottleneck("no_consumers", "No consumer is connected.")
+    if trouble:
+        if starting and not workers:
+            return Bottleneck("workers", f"Consumers wait for workers: {starting} are starting.")
+        return Bottleneck("workers", f"Consumers wait for workers: {trouble}.")
+    if shares.seconds < _LEAST_SECONDS:
+        return Bottleneck("start", "It is too early to say what is slow: samples have just begun to flow.")
+    wait = f"{shares.consumers:.0%}"
+    if shares.consumers < NOTICEABLE_SHARE:
+        if shares.idle < _IDLE_SHARE:
+            return Bottleneck(
+                "even", f"Hardly any waiting: consumers {wait} of their time, workers {shares.idle:.0%}.", ""
+            )
+        spare = "fewer workers would do" if shares.idle >= _SPARE_SHARE else ""
+        return Bottleneck(
+            "consumers",
+            f"Workers wait for consumers, which use samples as fast as they can (they wait {wait} of their time); "
+            f"workers are idle {shares.idle:.0%} of theirs.",
+            spare,
+        )
+    if shares.broker >= _FULL_SHARE:
+        return Bottleneck(
+            "broker",
+            f"Consumers wait {wait} of their time for the server's own loop, which is busy {shares.broker:.0%} of its "
+            "time.",
+            "give its host a free core, let consumers on this host use shared memory, or split the consumers between "
+            "two servers",
+        )
+    if shares.idle >= _IDLE_SHARE:
+        return Bottleneck(
+            "transit",
+            f"Consumers wait {wait} of their time although workers are idle {shares.idle:.0%} of theirs: samples take "
+            "long to arrive, or too few are requested ahead.",
+            "check the network between them; raise --max-credit-bytes or --expect-workers so that more samples are "
+            "requested ahead",
+        )
+    if shares.queued >= _QUEUED_SHARE:
+        return Bottleneck(
+            "cores",
+            f"The workers' host is overloaded: consumers wait {wait} of their time for workers, which wait "
+            f"{shares.queued:.0%} of theirs for a core and get {shares.cores:.2f} of a core each.",
+            "stop other programs there, or start v2v-worker on other hosts; more workers on this host would not help",
+        )
+    part = max(("decode", "simulate", "handover"), key=lambda name: getattr(shares, name))
+    activity, remedy = {
+        "decode": (
+            "decode",
+            "start more workers (--workers, v2v-worker on other hosts)"
+            + ("" if has_cache else ", cache decoded clips (--cache)")
+            + ", prepare the videos once (v2v-prepare), or take more samples of each clip (samples_per_decode)",
+        ),
+        "simulate": (
+            "simulate",
+            "start more workers (--workers, v2v-worker on other hosts), or ask for less: a smaller crop, fewer "
+            "voxels_per_clip, fewer effects, no flow",
+        ),
+        "handover": (
+            "deliver samples",
+            "run consumers on the workers' host, where samples are in shared memory, or use a faster network",
+        ),
+    }[part]
+    sentence = (
+        f"Consumers wait {wait} of their time for workers, which {activity} {getattr(shares, part):.0%} of theirs."
+    )
+    return Bottleneck(part, sentence, remedy)
+
+
+@dataclass(frozen=True, slots=True)
+class ServerPart:
+    """The server."""
+
+    version: int = text("Version of this form of the status.")
+    time: str = text("Time of the status, ISO 8601, UTC.")
+    program: str = text("Version of the program.")
+    protocol: int = text("Version of the protocol.")
+    host: str = text("Host of the server.")
+    uptime_seconds: float = gauge("Time since the server was ready to accept consumers.", None, unit="s")
+    is_ready: bool = gauge("Whether workers are connected, or none are to be started.", "ready")
+    address: str = text("Where consumers connect.")
+    worker_address: str = text("Where workers connect.")
+    spec: Mapping[str, Any] = text("The complete default spec of consumers, with the recipe.")
+
+
+@dataclass(frozen=True, slots=True)
+class LoadPart:
+    """What is requested, what is made, and by how many."""
+
+    specs: Mapping[str, Mapping[str, Any]] = text("What consumers requested, by digest; the first few.")
+    samples_per_second: float = gauge("Samples sent, over the last ten seconds.", unit="/s")
+    batches_per_second: float = gauge("Batches sent, over the last ten seconds.", unit="/s")
+    bytes_per_second: float = gauge("Bytes of arrays sent, over the last ten seconds.", unit="bytes/s")
+    decodes_per_second: float = gauge("Clips decoded, over the last ten seconds.", unit="/s")
+    shared_share: float = gauge(
+        "Share of the samples sent over the last ten seconds that were made for another consumer already.",
+        "shared_ratio",
+        unit="0 to 1",
+    )
+    queue: int = gauge("Requested samples that are not leased to a worker.", "queued_samples")
+    queued_share: float = gauge(
+        "Share of connected consumers with requests that are not leased to a worker.", "waiting_share", unit="0 to 1"
+    )
+    worker_count: int = gauge("Workers that have said hello.")
+    worker_processes: int = gauge("Worker processes that the server runs itself.", None)
+    workers_wanted: Sequence[int] = text("Lowest and highest number of the server's own workers.")
+    consumer_count: int = gauge("Consumers that are connected.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerPart:
+    """One worker."""
+
+    name: str = text("Name that it gives itself.")
+    host: str = text("Host that it names.")
+    state: str = states(
+        "Workers that have said hello.",
+        "workers",
+        "working",
+        "idle",  # it holds no lease
+        "resting",  # its host cannot read a video, see unreadable
+        "lost",  # it hangs or is silent, and its process is being ended
+    )
+    clip: str = text("Catalogue id of the video in work; empty if it works on nothing that a consumer waits for.")
+    frame: int | None = text("First frame of the clip in work.")
+    clip_seconds: float = gauge("Time since it began the clip.", unit="s")
+    leases: int = gauge("Leases that it holds.")
+    samples: int = counter("Samples that the worker made.", is_routine=True)
+    busy_share: float = gauge(
+        "Share of the last ten seconds in which the worker made samples.", "busy_ratio", unit="0 to 1"
+    )
+    cpu_share: float = gauge("Processor time, over the last ten seconds.", unit="cores")
+    memory_gib: float = gauge("Resident memory of the worker's process; 0: not known.", "memory_bytes", unit="GiB")
+    silent_seconds: float = gauge("Time since it was last heard.", unit="s")
+    restarts: int | None = gauge("Processes that ended in its place before; None: it is not the server's own.")
+    unreadable: str = text("What its host could not read last; empty if it can read all.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConsumerPart:
+    """One consumer: a session."""
+
+    id: str = text("Names the consumer until the server ends. It is not its routing id.")
+    name: str = text('Name that it gives itself: "rank 0 of 2".')
+    host: str = text("Host that it names.")
+    state: str = states(
+        "Consumers.",
+        "consumers",
+        "stalled",  # it waits for samples most of its time
+        "taking",
+        "idle",  # it has requested nothing
+        "gone",  # its connection has ended; it may return for ten seconds
+    )
+    epoch: int = gauge("Epoch that the consumer is in.", None, merge=max)
+    position: int = gauge("Index after the highest one of the epoch that was answered.")
+    sequences: int = gauge("Sequences of one epoch, of all ranks together.")
+    epoch_share: float = gauge(
+        "Share of the epoch that the consumer has received.", "epoch_ratio", unit="0 to 1", merge=min
+    )
+    eta_seconds: float | None = gauge("Time until the end of the epoch at the rate of the last ten seconds.", unit="s")
+    batch_size: int = gauge("Samples of one of its batches.")
+    credit: int = gauge("Largest number of samples that the consumer may have outstanding.", "credit_samples")
+    in_flight: int = gauge("Samples requested by the consumer and leased to workers.", "in_flight_samples")
+    waiting: int = gauge("Samples requested by the consumer and not leased to a worker.", "queued_samples")
+    served: int = counter("Samples sent to the consumer.", "samples", is_routine=True)
+    samples_per_second: float = gauge("Samples sent to it, over the last ten seconds.", unit="/s")
+    batches_per_second: float = gauge("Batches sent to it, over the last ten seconds.", unit="/s")
+    waiting_share: float = gauge(
+        "Share of the last ten seconds in which the consumer waited for batches.",
+        "waiting_ratio",
+        unit="0 to 1",
+        merge=max,
+    )
+    waited_seconds: float = gauge("Time that it waited for batches, in all of its sessions.", unit="s")
+    silent_seconds: float = gauge("Time since it was last heard.", unit="s")
+    spec: str = text("Digest of the spec that it requested.")
+    seed: int = text("Seed of its stream.")
+    quarantine: int = text("Number of the quarantine snapshot that its samples are made under.")
+
+
+PARTS: Mapping[str, tuple[type, ...]] = {
+    "": (ServerPart, CorpusPart, LoadPart, QuarantinePart),
+    "totals": (Counters, FaultTotal),
+    "waiting": (Bottleneck,),
+    "waiting.shares": (Shares,),
+    "cache": (CachePart,),
+    "workers": (WorkerPart,),
+    "consumers": (ConsumerPart,),
+    "refusals": (RefusalPart,),
+    "verdicts": (VerdictPart,),
+}
+"""Where each part is in the status. "cache" may be null; the last four are lists."""
+
+
+def meanings_at(place: str) -> dict[str, Meaning]:
+    """Return the meaning of each field at a place of :data:`PARTS`."""
+    return {name: meaning for part in PARTS[place] for name, meaning in meanings(part).items()}
+
+
+def rows_at(status: StatusFields, place: str) -> list[StatusFields]:
+    """Return the values at a place of :data:`PARTS`: one row, or those of a list, or none."""
+    found: Any = status
+    for key in filter(None, place.split(".")):
+        found = found[key]
+    return [] if found is None else list(found) if isinstance(found, list | tuple) else [found]
+
+
+def events(status: StatusFields) -> list[str]:
+    """Name the unusual events since the start, those that happened: "2 refused candidates"."""
+    named = meanings_at("totals").items()
+    return [
+        f"{status['totals'][name]} {meaning.words or name.replace('_', ' ')}"
+        for name, meaning in named
+        if meaning.is_event and status["totals"].get(name)
+    ]
 
 
 def to_json(status: StatusFields, most_bytes: int = LARGEST_HEADER_BYTES - 1024) -> bytes:
@@ -210,13 +570,12 @@ def _consumer(session: Session, window: TimeWindow) -> ConsumerPart:
 
 
 class StatusPublisher:
-    """Answer requests for the status of one service.
+    """Build the status of one server, and answer requests for it.
 
     Args:
-        service: what the status is read from.
+        config, catalogue, dispatcher, pool, sockets: what the status is read from.
         now: monotonic time of the server's start, seconds.
         wall_clock: returns the time of day, ISO 8601.
-        processor_clock: returns the processor seconds of this thread.
 
     Attributes:
         is_ready: whether the server has announced that it is ready.
@@ -224,29 +583,94 @@ class StatusPublisher:
 
     def __init__(
         self,
-        service: Service,
+        config: ServeConfig,
+        catalogue: Catalogue,
+        dispatcher: Dispatcher,
+        pool: Pool,
+        sockets: Sockets,
         now: float,
         wall_clock: Callable[[], str],
-        processor_clock: Callable[[], float] = time.thread_time,
     ) -> None:
-        self._service = service
+        self._config, self._catalogue, self._dispatcher = config, catalogue, dispatcher
+        self._pool, self._sockets, self._wall_clock = pool, sockets, wall_clock
         self._started = now
-        self._waited_before = service.transport.waited_seconds
-        self._history = History(service.dispatcher, now)
-        self._wall_clock = wall_clock
-        self._processor_clock = processor_clock
+        self._waited_before = sockets.waited_seconds
+        self._history = History(dispatcher, now)
+        self._processor_clock = time.thread_time
         self._waiting: dict[SendStatus, None] = {}
         self._answer_at = now
         self.is_ready = False
 
     def status(self, now: float) -> StatusFields:
         """Return the current status."""
-        return self._service.status(
-            self._history.window(now),
-            self._wall_clock(),
+        dispatcher, window = self._dispatcher, self._history.window(now)
+        counters, shares = dispatcher.counters, Shares.of(window)
+        cache = cache_part(
+            self._config.cache,
+            self._config.cache_gib,
+            counters.cache_hits,
+            counters.cache_misses,
+            counters.cache_trouble,
+        )
+        restarts = self._pool.restarts
+        return {
+            **values(self._server(now)),
+            **values(self._catalogue.part()),
+            **values(self._load(window)),
+            **values(dispatcher.quarantine.part()),
+            "waiting": values(self._bottleneck(shares, now)) | {"shares": values(shares)},
+            "totals": values(counters) | values(FaultTotal(counters.faults)),
+            "cache": None if cache is None else values(cache),
+            "workers": [
+                values(_worker(dispatcher, identity, member, restarts.get(member.name.encode()), window))
+                for identity, member in list(dispatcher.registry.members.items())[:MOST_SHOWN]
+            ],
+            "consumers": [values(_consumer(each, window)) for each in list(dispatcher.sessions)[:MOST_SHOWN]],
+            "refusals": [values(each) for each in reversed(dispatcher.refusals)],
+            "verdicts": [values(each) for each in dispatcher.quarantine.verdict_parts()],
+        }
+
+    def _server(self, now: float) -> ServerPart:
+        return ServerPart(
+            version=STATUS_VERSION,
+            time=self._wall_clock(),
+            program=__version__,
+            protocol=PROTOCOL_VERSION,
+            host=platform.node(),
             uptime_seconds=now - self._started,
             is_ready=self.is_ready,
+            address=self._sockets.address,
+            worker_address=self._sockets.worker_address,
+            spec=self._config.spec.to_dict(),
+        )
+
+    def _load(self, window: TimeWindow) -> LoadPart:
+        dispatcher = self._dispatcher
+        specs = {each.spec.digest: each.spec for each in dispatcher.sessions}
+        return LoadPart(
+            specs={digest: spec.to_dict() for digest, spec in list(specs.items())[:_MOST_SPECS]},
+            samples_per_second=window.rate("samples"),
+            batches_per_second=window.rate("batches"),
+            bytes_per_second=window.rate("bytes"),
+            decodes_per_second=window.rate("decodes"),
+            shared_share=window.rate("shared") / max(window.rate("samples"), 1e-9),
+            queue=dispatcher.waiting,
+            queued_share=dispatcher.waiting_share,
+            worker_count=dispatcher.workers,
+            worker_processes=self._pool.running,
+            workers_wanted=self._config.workers,
+            consumer_count=dispatcher.consumers,
+        )
+
+    def _bottleneck(self, shares: Shares, now: float) -> Bottleneck:
+        dispatcher = self._dispatcher
+        return find_bottleneck(
+            shares,
             is_attended=self._history.is_attended(now),
+            workers=dispatcher.workers,
+            starting=max(0, self._pool.running - dispatcher.workers),
+            trouble=dispatcher.blocked_reason or dispatcher.registry.trouble(self._config.workers_in_all),
+            has_cache=bool(self._config.cache),
         )
 
     def ask(self, request: SendStatus) -> None:
@@ -255,12 +679,12 @@ class StatusPublisher:
 
     def tick(self, now: float) -> list[ToConsumer | ToWorker]:
         """Return the answers that are due. Call a few times a second."""
-        waited_seconds = self._service.transport.waited_seconds - self._waited_before
+        waited_seconds = self._sockets.waited_seconds - self._waited_before
         self._history.note(now, max(0.0, now - self._started - waited_seconds))
         if not self._waiting or now < self._answer_at:
             return []
         began = self._processor_clock()
         waiting, self._waiting = self._waiting, {}
-        frames = encode(StatusMessage(to_json(self.status(now))))
+        frames = encode(Status(to_json(self.status(now))))
         self._answer_at = now + max(ANSWER_SECONDS, (self._processor_clock() - began) / LARGEST_SHARE)
         return [(ToWorker if each.is_worker_side else ToConsumer)(each.identity, frames) for each in waiting]

@@ -16,9 +16,8 @@ from rich.text import Text
 
 from v2v_protocol.programs import printable
 from v2v_protocol.progress import format_duration
-from v2v_server.status.parts import StatusFields, events, meanings_at
-from v2v_server.system.log import Log, write
-from v2v_server.system.status_fields import GIB
+from v2v_server.status.snapshot import StatusFields, events, meanings_at
+from v2v_server.system.log import GIB, Log, write
 
 _MOST_ROWS = 30
 _COLOURS = {

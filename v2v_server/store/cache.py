@@ -28,7 +28,7 @@ from v2v_server.store.pixels import Pixels
 from v2v_server.store.planes import OPTIONAL, PLANES, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder, delete_unless_read
 from v2v_server.store.store_file import StoreFile, read_clips, write_store
-from v2v_server.system.status_fields import GIB
+from v2v_server.system.log import GIB
 from v2v_server.video.decode import ClipRequest, DecodedClip
 from v2v_server.video.picture import PixelRect
 

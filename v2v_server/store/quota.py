@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from v2v_server.system.log import GIB, counter, gauge, text
 from v2v_server.system.process import lock, open_private
-from v2v_server.system.status_fields import GIB, counter, gauge, text
 
 LEAST_FREE_BYTES = GIB
 """Always keep this much disk space free."""

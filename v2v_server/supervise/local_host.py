@@ -10,7 +10,6 @@ catalogue. The pool then tells them their arguments, in place of starting other 
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import math
 import os
@@ -19,7 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,13 +28,11 @@ from v2v_protocol.keys import PeerKey, nameless_key
 from v2v_protocol.programs import environment
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
-from v2v_server.supervise.host import Exit, ProcessStatus
+from v2v_server.supervise.pool import Exit, ProcessStatus
 from v2v_server.worker.logbook import Logbook
 
-STOPPED = (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
 _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
 PROGRAM = (sys.executable, "-m", "v2v_server.commands.worker")
-_Process = subprocess.Popen[bytes]
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 _MEMORY_SECONDS = 5.0
 """Time after the kernel has killed a process for lack of memory in which a worker's SIGKILL is attributed to that."""
@@ -43,22 +40,42 @@ _SHORTAGES = (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
 _AFTER_SHORTAGE_SECONDS = 5.0
 
 
-class Standby:
-    """One process. It ends if it is not told its arguments before this process ends.
+class WorkerProcess:
+    """The process of one worker on this host, with its logbook. It ends with this process.
+
+    Args:
+        address: where the server listens for workers; "": it gets ready, and is told its arguments later.
+        root: the corpus, a folder or an address.
+        name: unique name of the worker.
+        flags: further flags.
+        key: its key, passed in an unnamed file: neither command line, environment nor disk shows it.
 
     Raises:
         OSError: it cannot be started.
     """
 
-    def __init__(self) -> None:
+    def __init__(
+        self, address: str = "", root: str = "", name: str = "", flags: Sequence[str] = (), key: PeerKey | None = None
+    ) -> None:
         self.logbook = Logbook()
-        flags = ["--standby", str(os.getpid())]
-        self.process = start_program(
-            flags, [self.logbook.descriptor, self.logbook.arenas.fileno()], stdin=subprocess.PIPE
-        )
+        handed = [self.logbook.descriptor, self.logbook.arenas.fileno()]
+        with ExitStack() as opened, ExitStack() as undo:
+            undo.callback(self.logbook.close)
+            if key is not None:
+                handed.append(opened.enter_context(nameless_key(key)).fileno())
+                flags = [*flags, "--keys", f"/dev/fd/{handed[-1]}"]
+            told = arguments(address, root, name, flags, self.logbook) if address else ["--standby", str(os.getpid())]
+            self.process = subprocess.Popen(
+                [*PROGRAM, *told],
+                stdin=subprocess.DEVNULL if address else subprocess.PIPE,
+                pass_fds=handed,
+                env=environment() | _ONE_THREAD,
+                process_group=0,
+            )
+            undo.pop_all()
 
-    def begin(self, arguments: Sequence[str]) -> None:
-        """Tell it the arguments of ``v2v-worker``.
+    def begin(self, told: Sequence[str]) -> None:
+        """Tell one that is ready the :func:`arguments` of ``v2v-worker``.
 
         Raises:
             OSError: it has ended.
@@ -66,73 +83,47 @@ class Standby:
         assert self.process.stdin is not None
         try:
             with self.process.stdin as file:
-                file.write("\0".join(arguments).encode())
+                file.write("\0".join(told).encode())
         except OSError:
-            self.close()
+            self.end()
             raise
 
-    def close(self) -> None:
-        """End it."""
+    def status(self, now: float = 0.0) -> ProcessStatus:
+        """Observe it."""
+        pid, logbook = self.process.pid, self.logbook
+        return ProcessStatus(status_of(pid), queued_seconds(pid), logbook.lease(), logbook.decodes(), now)
+
+    def post_mortem(self, *, short_of_memory: bool) -> Loss:
+        """Return the cause of its end, and what it worked on.
+
+        Only the death of a worker that decoded speaks against the video; otherwise the spec may be to blame.
+        """
+        loss, at = _cause(self.process.returncode, short_of_memory=short_of_memory), self.logbook.lease()
+        return loss if at is None else replace(loss, lease=at, for_all=self.logbook.decodes())
+
+    def end(self) -> None:
+        """End and reap it."""
         self.process.kill()
         self.process.communicate()
         self.logbook.close()
 
 
 @contextmanager
-def start_ahead(config: ServeConfig) -> Iterator[list[Standby]]:
+def start_ahead(config: ServeConfig) -> Iterator[list[WorkerProcess]]:
     """Start the workers of this host that a server begins with; at the end, end those that are left in the list."""
-    standbys: list[Standby] = []
+    standbys: list[WorkerProcess] = []
     try:
         with suppress(OSError):  # the pool starts the others, and reports why if it cannot
             while config.engine == "local" and len(standbys) < config.least_workers:
-                standbys.append(Standby())
+                standbys.append(WorkerProcess())
         yield standbys
     finally:
         for standby in standbys:
-            standby.close()
-
-
-def start_child(
-    address: str, root: str, name: str, flags: Sequence[str], logbook: Logbook, key: PeerKey | None = None
-) -> _Process:
-    """Start a worker in a process of its own, which dies with this one.
-
-    Args:
-        address: where the server listens for workers.
-        root: the corpus, a folder or an address.
-        name: unique name of the worker.
-        flags: further flags.
-        logbook: records the lease in work.
-        key: its key, passed in an unnamed file: neither command line, environment nor disk shows it.
-
-    Raises:
-        OSError: it cannot be started.
-    """
-    with contextlib.ExitStack() as open_here:
-        handed = [logbook.descriptor, logbook.arenas.fileno()]
-        if key is not None:
-            handed.append(open_here.enter_context(nameless_key(key)).fileno())
-            flags = [*flags, "--keys", f"/dev/fd/{handed[-1]}"]
-        return start_program(arguments(address, root, name, flags, logbook), handed)
-
-
-def start_program(arguments: Sequence[str], handed: Sequence[int], stdin: int = subprocess.DEVNULL) -> _Process:
-    """Start the program of a worker with these arguments, which has the descriptors ``handed``.
-
-    Raises:
-        OSError: it cannot be started.
-    """
-    return subprocess.Popen(
-        [*PROGRAM, *arguments],
-        stdin=stdin,
-        pass_fds=handed,
-        env=environment() | _ONE_THREAD,
-        process_group=0,
-    )
+            standby.end()
 
 
 def arguments(address: str, root: str, name: str, flags: Sequence[str], logbook: Logbook) -> list[str]:
-    """Return the arguments of one worker, see :func:`start_child`."""
+    """Return the arguments of one worker, see :class:`WorkerProcess`."""
     return [
         *("--arenas-fd", str(logbook.arenas.fileno())),
         *("--connect", address, "--videos", root, "--name", name),
@@ -140,17 +131,6 @@ def arguments(address: str, root: str, name: str, flags: Sequence[str], logbook:
         *flags,
         *("--logbook-fd", str(logbook.descriptor)),
     ]
-
-
-def post_mortem(returncode: int, logbook: Logbook | None, *, short_of_memory: bool) -> Loss:
-    """Return the cause of a worker's unexpected end, and what it worked on.
-
-    Only the death of a worker that decoded speaks against the video; otherwise the spec may be to blame.
-    """
-    loss = _cause(returncode, short_of_memory=short_of_memory)
-    if logbook is None or (at := logbook.lease()) is None:
-        return loss
-    return replace(loss, lease=at, for_all=logbook.decodes())
 
 
 def _cause(returncode: int, *, short_of_memory: bool) -> Loss:
@@ -166,23 +146,6 @@ def _cause(returncode: int, *, short_of_memory: bool) -> Loss:
     if number in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         return Loss(Cause.KILLED, f"was ended by {name} from outside")
     return Loss(Cause.UNEXPLAINED, f"was ended by {name}")
-
-
-def hung(status: str, reason: str, at: int | None, *, decodes: bool) -> Loss:
-    """Return what it means that a worker is given up.
-
-    Args:
-        status: status of its process, in psutil's words.
-        reason: what it did, in words.
-        at: the lease in work by its logbook.
-        decodes: whether it decodes a video, by its logbook.
-    """
-    if status in STOPPED:
-        return Loss(Cause.KILLED, "was stopped from outside and killed")
-    if status == psutil.STATUS_DISK_SLEEP:
-        # If the server of a network file system is away, every worker waits, each at a sound clip.
-        return Loss(Cause.UNEXPLAINED, f"waited for its storage and {reason}", at, decodes)
-    return Loss(Cause.HUNG, reason, at, decodes)
 
 
 def queued_seconds(pid: int) -> float:
@@ -215,7 +178,12 @@ def out_of_memory_kills() -> int:
 
 
 def make_host(
-    config: ServeConfig, root: str, label: str, flags: Sequence[str], key: PeerKey | None, standbys: list[Standby]
+    config: ServeConfig,
+    root: str,
+    label: str,
+    flags: Sequence[str],
+    key: PeerKey | None,
+    standbys: list[WorkerProcess] | None,
 ) -> LocalHost:
     """Return the host that the configuration asks for."""
     return LocalHost(root, flags, standbys)
@@ -228,16 +196,21 @@ class LocalHost:
         root: the corpus, a folder or an address.
         flags: further flags of each worker.
         standbys: processes to use first.
+        key: of the workers; None: they need none here, or the key that ``V2V_KEYS`` names.
     """
 
     is_local = True
     status_seconds = 1.0
 
     def __init__(
-        self, root: str | os.PathLike[str], flags: Sequence[str] = (), standbys: list[Standby] | None = None
+        self,
+        root: str | os.PathLike[str],
+        flags: Sequence[str] = (),
+        standbys: list[WorkerProcess] | None = None,
+        key: PeerKey | None = None,
     ) -> None:
         self.root = os.fspath(root)
-        self.flags = flags
+        self.flags, self.key = flags, key
         self.standbys = [] if standbys is None else standbys
         self._now = 0.0
         self._memory_kills = out_of_memory_kills()
@@ -285,13 +258,12 @@ class LocalPlace:
     def __init__(self, host: LocalHost) -> None:
         self._host = host
         self._failure: Exit | None = None
-        self.process: subprocess.Popen[bytes] | None = None
-        self.logbook: Logbook | None = None
+        self.child: WorkerProcess | None = None
 
     @property
     def is_running(self) -> bool:
         """Return whether its process runs."""
-        return self.process is not None and self.process.poll() is None
+        return self.child is not None and self.child.process.poll() is None
 
     def start(self, name: str, address: str) -> None:
         """Start a worker that connects to ``address``.
@@ -299,72 +271,57 @@ class LocalPlace:
         A host that has no more processes, files or memory for it does not end the workers that run, and does not count
         towards the crash budget.
         """
+        host = self._host
         try:
-            if self._host.standbys:
-                standby = self._host.standbys.pop()
-                standby.begin(arguments(address, self._host.root, name, self._host.flags, standby.logbook))
-                self.logbook, self.process = standby.logbook, standby.process
+            if host.standbys:
+                standby = host.standbys.pop()
+                standby.begin(arguments(address, host.root, name, host.flags, standby.logbook))
+                self.child = standby
             else:
-                self.logbook = Logbook()
-                self.process = start_child(address, self._host.root, name, self._host.flags, self.logbook)
+                self.child = WorkerProcess(address, host.root, name, host.flags, host.key)
         except OSError as error:
-            self._forget()
             loss = Loss(Cause.KILLED, f"could not be started: {error.strerror or error}")
             is_shortage = error.errno in _SHORTAGES
             self._failure = Exit(loss, retry_seconds=_AFTER_SHORTAGE_SECONDS if is_shortage else None)
 
     def take_exit(self) -> Exit | None:
         """Return once how the worker ended; None while it has not ended."""
-        if self._failure is not None:
-            failure, self._failure = self._failure, None
+        failure, self._failure = self._failure, None
+        if self.child is None or (returncode := self.child.process.poll()) is None:
             return failure
-        returncode = None if self.process is None else self.process.poll()
-        if returncode is None:
-            return None
         # The kernel counts a kill before its victim is gone, so it is included.
-        loss = post_mortem(returncode, self.logbook, short_of_memory=self._host.is_short_of_memory())
-        self._forget()
+        loss = self.child.post_mortem(short_of_memory=self._host.is_short_of_memory())
+        self.release()
         return Exit(loss, returncode)
 
     def status(self, now: float) -> ProcessStatus | None:
         """Observe the worker's process; None without one."""
-        if self.process is None or self.logbook is None:
-            return None
-        pid = self.process.pid
-        return ProcessStatus(status_of(pid), queued_seconds(pid), self.logbook.lease(), self.logbook.decodes(), now)
+        return None if self.child is None else self.child.status(now)
 
     def lend(self, arena: str) -> None:
         """Pass the worker the arena of its next lease."""
-        if self.logbook is not None:
-            self.logbook.lend(arena)
+        if self.child is not None:
+            self.child.logbook.lend(arena)
 
     def leave(self) -> bool:
         """Tell the worker to finish its sample and exit; return False if there is none to tell."""
-        if self.process is not None:
-            self.process.terminate()
-        return self.process is not None
+        self.signal(signal.SIGTERM)
+        return self.child is not None
 
     def signal(self, number: int) -> None:
         """Send the worker's process a signal, if it runs."""
-        if self.process is not None:
-            self.process.send_signal(number)
+        if self.child is not None:
+            self.child.process.send_signal(number)
 
-    def wait(self, seconds: float) -> bool:
-        """Wait for the end of the worker's process; return whether it has ended."""
+    def wait(self, seconds: float | None) -> bool:
+        """Wait for the end of the worker's process, None: however long; return whether it has ended."""
         try:
-            return self.process is None or self.process.wait(seconds) is not None
+            return (child := self.child) is None or child.process.wait(seconds) is not None
         except subprocess.TimeoutExpired:
             return False
 
     def release(self) -> None:
-        """Kill and reap the worker's process, if there is one."""
-        if self.process is not None:
-            self.process.kill()
-            self.process.wait()
-        self._forget()
-
-    def _forget(self) -> None:
-        self.process = None
-        if self.logbook is not None:
-            self.logbook.close()
-            self.logbook = None
+        """End and reap the worker's process, if there is one."""
+        if self.child is not None:
+            self.child.end()
+            self.child = None

@@ -6,6 +6,10 @@
 
 A worker that dies is started again after a delay that doubles with every death in a row. If the workers die repeatedly
 and not one sample is finished, something is wrong that restarting does not repair, and the pool says so.
+
+The pool decides when a worker starts, leaves or is given up. A :class:`Host` knows how: as processes of this host
+(:mod:`v2v_server.supervise.local_host`) or on a Ray cluster (:mod:`v2v_server.supervise.ray_host`). No method waits for
+a worker, except ``wait``, ``release`` and ``close``.
 """
 
 from __future__ import annotations
@@ -13,22 +17,21 @@ from __future__ import annotations
 import math
 import signal
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any
+from typing import Any, Protocol, TypeVar
+
+import psutil
 
 from v2v_protocol.errors import UsageError, WorkerCrashLoop
 from v2v_server.broker.leases import Cause, Loss, Stall
 from v2v_server.config import ENGINES, ServeConfig
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.keys.folder import KeyFolder
-from v2v_server.supervise.host import Exit, Host, ProcessStatus, WorkerPlace
-from v2v_server.supervise.local_host import STOPPED, Standby, hung
+from v2v_server.keys import KeyFolder
 
 _FIRST_BACKOFF_SECONDS = 0.2
 _LONGEST_BACKOFF_SECONDS = 10.0
-
-
 _STALL_SECONDS = 1.0
 """Time from one check for stalled workers to the next."""
 _STALE_SECONDS = 15.0
@@ -40,6 +43,105 @@ _LEFT_BUSY = 0.8
 _GROWTH = 1.5
 _PARTS = 6
 _MANY_WORKERS_A_CORE = 4
+_STOPPED = (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessStatus:
+    """A worker's process, as its host sees it.
+
+    Attributes:
+        status: of the process, in psutil's words.
+        queued_seconds: time that it has waited for a core since it started.
+        lease: the lease in work by its logbook, 0 for no lease; None if it never wrote one.
+        decodes: whether it decodes a video, by its logbook.
+        seen_at: monotonic time of the observation, seconds.
+    """
+
+    status: str = ""
+    queued_seconds: float = 0.0
+    lease: int | None = None
+    decodes: bool = False
+    seen_at: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Exit:
+    """End of a worker's process, or a start that failed.
+
+    Attributes:
+        loss: what it says about the sample in work.
+        returncode: exit status of the process; None if it is not known.
+        retry_seconds: time until the next start; None: the usual delay, which grows with every loss in a row.
+        is_loss: whether a worker was lost; False if it had not started.
+    """
+
+    loss: Loss
+    returncode: int | None = None
+    retry_seconds: float | None = None
+    is_loss: bool = True
+
+
+class WorkerPlace(Protocol):
+    """Where the worker of one slot runs."""
+
+    @property
+    def is_running(self) -> bool:
+        """Return whether its process runs, as far as is known."""
+
+    def start(self, name: str, address: str) -> None:
+        """Start a worker that connects to ``address``. A failure is reported by :meth:`take_exit`."""
+
+    def take_exit(self) -> Exit | None:
+        """Return once how the worker ended; None while it has not ended."""
+
+    def status(self, now: float) -> ProcessStatus | None:
+        """Return the latest observation of the worker's process; None without one."""
+
+    def lend(self, arena: str) -> None:
+        """Pass the worker the arena of its next lease, if it is a process of this host."""
+
+    def leave(self) -> bool:
+        """Tell the worker to finish its sample and exit; return False if there is none to tell."""
+
+    def signal(self, number: int) -> None:
+        """Send the worker's process a signal, if it runs."""
+
+    def release(self) -> None:
+        """End the worker's process, if it runs, and give the place up."""
+
+
+AnyPlace = TypeVar("AnyPlace", bound=WorkerPlace)
+
+
+class Host(Protocol[AnyPlace]):
+    """Runs workers' processes.
+
+    Attributes:
+        is_local: whether all workers run on this host.
+        status_seconds: time from one observation of a process to the next.
+    """
+
+    is_local: bool
+    status_seconds: float
+
+    def place(self, number: int) -> AnyPlace:
+        """Return a place for the worker of a slot."""
+
+    def request(self, workers: int) -> None:
+        """Note how many workers there should be."""
+
+    def refresh(self, now: float) -> None:
+        """Read what has happened since the last call. Called a few times a second."""
+
+    def wait(self, places: Sequence[AnyPlace], seconds: float) -> list[AnyPlace]:
+        """Wait until the workers have ended; return the places of those that have not."""
+
+    def news(self) -> list[str]:
+        """Return lines for the operator since the last call."""
+
+    def close(self) -> None:
+        """Release what the host holds, after its places."""
 
 
 def crash_budget(workers: int) -> int:
@@ -213,7 +315,7 @@ class Pool:
                 continue
             before, slot.seen = slot.seen, seen
             since = seen.seen_at - before.seen_at
-            stopped = min(since, 2 * self._host.status_seconds) if seen.status in STOPPED else 0.0
+            stopped = min(since, 2 * self._host.status_seconds) if seen.status in _STOPPED else 0.0
             queued = max(0.0, min(since - stopped, seen.queued_seconds - before.queued_seconds))
             if stopped or queued:
                 found[slot.name.encode()] = Stall(stopped, queued)
@@ -239,7 +341,12 @@ class Pool:
         slot.place.signal(signal.SIGKILL)
         if seen is None or self._now - seen.seen_at > _STALE_SECONDS:
             return Loss(Cause.UNEXPLAINED, f"{reason}, nor does its node answer", for_all=False)
-        return hung(seen.status, reason, seen.lease, decodes=seen.decodes)
+        if seen.status in _STOPPED:
+            return Loss(Cause.KILLED, "was stopped from outside and killed")
+        if seen.status == psutil.STATUS_DISK_SLEEP:
+            # If the server of a network file system is away, every worker waits, each at a sound clip.
+            return Loss(Cause.UNEXPLAINED, f"waited for its storage and {reason}", seen.lease, seen.decodes)
+        return Loss(Cause.HUNG, reason, seen.lease, seen.decodes)
 
     def news(self) -> list[str]:
         """Return lines for the operator since the last call, such as where workers are placed."""
@@ -295,7 +402,7 @@ def make_pool(
     label: str,
     flags: list[str],
     keys: KeyFolder | None = None,
-    standbys: list[Standby] | None = None,
+    standbys: list[Any] | None = None,
 ) -> Pool:
     """Return the pool that the configuration asks for.
 
@@ -321,7 +428,7 @@ def make_pool(
             f"pip install '.[server,{name}]' in a checkout of v2v-stream, here and on every node of the cluster"
         ) from error
     key = None if keys is None or name == "local" else keys.lend(f"{name}-{label}", "worker")
-    return Pool(engine.make_host(config, source.name, label, flags, key, [] if standbys is None else standbys), label)
+    return Pool(engine.make_host(config, source.name, label, flags, key, standbys), label)
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,10 +470,7 @@ class Scaling:
         self._part_seconds = seconds / _PARTS
         self._target = least
         self._parts: deque[tuple[float, float]] = deque(maxlen=_PARTS)  # shares in each sixth of the time
-        self._since: float | None = None
-        self._calls = 0
-        self._waiting = self._idle = 0.0
-        self._lacking = False
+        self._since, self._lacking = math.nan, False
 
     def decide(self, now: float, waiting: float, idle: float, present: int) -> Decision | None:
         """Return the change to make, if there is one. Call it a few times a second.
@@ -376,8 +480,8 @@ class Scaling:
             waiting, idle: the shares, 0 to 1.
             present: number of workers that are connected.
         """
-        if self._since is None:
-            self._since = now
+        if math.isnan(self._since):
+            self._begin(now)
         self._calls += 1
         self._waiting += waiting
         self._idle += idle if present else 0.0

@@ -14,8 +14,8 @@ import contextlib
 import math
 import signal
 import socket
-import subprocess
 import threading
+import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -29,9 +29,8 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.keys import PeerKey
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
-from v2v_server.supervise.host import Exit, ProcessStatus
-from v2v_server.supervise.local_host import out_of_memory_kills, post_mortem, queued_seconds, start_child, status_of
-from v2v_server.worker.logbook import Logbook
+from v2v_server.supervise.local_host import LocalHost
+from v2v_server.supervise.pool import Exit, ProcessStatus
 
 WORKER_BYTES = 1 << 30
 """Memory that Ray reserves for a worker, besides one CPU."""
@@ -68,57 +67,34 @@ class RayWorker:
     """
 
     def __init__(self, root: str, flags: Sequence[str], key: PeerKey | None = None) -> None:
-        self._key = key
-        self._root, self._flags = root, list(flags)
+        self._host = LocalHost(root, flags, key=key)
         self._lock = threading.Lock()
-        self._child: tuple[str, subprocess.Popen[bytes], Logbook] | None = None
-        self._memory_kills = out_of_memory_kills()
+        self._place, self._name = self._host.place(0), ""
 
-    def run(self, name: str, address: str) -> tuple[int, Loss]:
-        """Run one worker from its start to its end.
-
-        Returns:
-            its exit status, and what that means.
-
-        Raises:
-            OSError: it cannot be started.
-        """
+    def run(self, name: str, address: str) -> Exit:
+        """Run one worker from its start to its end; return how it ended."""
         with self._lock:
-            if self._child is not None:
-                self._child[1].kill()  # the result of the call that started it was lost on its way
-            logbook = Logbook()
-            with contextlib.ExitStack() as undo:
-                undo.callback(logbook.close)
-                process = start_child(address, self._root, name, self._flags, logbook, self._key)
-                undo.pop_all()
-            self._child = name, process, logbook
-        returncode = process.wait()
+            self._place.release()  # the result of the call that started an earlier one was lost on its way
+            place = self._place = self._host.place(0)
+            place.start(name, address)
+            self._name = name
+        place.wait(None)
         with self._lock:
-            short = out_of_memory_kills() > self._memory_kills
-            loss = post_mortem(returncode, logbook, short_of_memory=short)
-            loss = replace(loss, text=f"{loss.text} on {node()}")
-            logbook.close()
-            if self._child is not None and self._child[1] is process:
-                self._child = None
-        return returncode, loss
+            end = place.take_exit() or Exit(Loss(Cause.KILLED, "was replaced"))
+        return replace(end, loss=replace(end.loss, text=f"{end.loss.text} on {node()}"))
 
     def status(self) -> ActorStatus:
         """Observe the worker's process."""
         with self._lock:
-            self._memory_kills = out_of_memory_kills()
-            if self._child is None:
-                return ActorStatus(node())
-            name, process, logbook = self._child
-            seen = ProcessStatus(
-                status_of(process.pid), queued_seconds(process.pid), logbook.lease(), logbook.decodes()
-            )
-            return ActorStatus(node(), name, seen)
+            self._host.refresh(time.monotonic())
+            seen = self._place.status(0.0)
+            return ActorStatus(node()) if seen is None else ActorStatus(node(), self._name, seen)
 
     def signal(self, name: str, number: int) -> None:
         """Send a worker a signal, if it still runs."""
         with self._lock:
-            if self._child is not None and self._child[0] == name:
-                self._child[1].send_signal(number)
+            if self._name == name:
+                self._place.signal(number)
 
 
 def node() -> str:
@@ -331,8 +307,8 @@ class RayPlace:
         """Return how the worker's process ended, or that its actor was lost along with it."""
         node = self.seen.node if self.seen is not None else "the cluster"
         try:
-            returncode, loss = ray.get(self.run)
-            return Exit(loss, returncode)
+            end: Exit = ray.get(self.run)
+            return end
         except ActorUnavailableError:
             # Ray starts the actor again, here or elsewhere.
             loss = Loss(Cause.KILLED, f"was lost with its actor on {node}")

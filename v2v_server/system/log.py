@@ -1,24 +1,31 @@
-"""Log lines of a service: plain text for people, or one JSON object per line for log collectors; and how long the steps
-of its start took.
+"""What a service says: log lines, plain text for people or one JSON object per line for log collectors; and the fields
+of its status.
+
+A part of the server describes its state as a dataclass of such fields. Each field states once what its value means, its
+unit, and its metric. ``/state``, ``/metrics``, page, terminal, log and shutdown summary walk the fields. So a new
+counter is two edits: declare the field, and count.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from argparse import Namespace
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 from typing import Any, Literal, TextIO
-
-import psutil
 
 from v2v_protocol.errors import V2VError
 from v2v_protocol.programs import printable
 
 LOG_FORMATS = ("text", "json")
+GIB = 1 << 30
+_LONGEST_TEXT = 200
 Level = Literal["info", "warning", "error"]
 
 
@@ -67,47 +74,111 @@ class Log:
             write(sys.stderr, printable(text) + "\n")
 
 
-@contextmanager
-def report_errors(log_format: Callable[[], str | None]) -> Iterator[None]:
-    """Write an error that ends a command as a JSON line, instead of the plain text for people.
-
-    Args:
-        log_format: returns the format, once it is known.
+def report_errors(run: Callable[[Namespace], None]) -> Callable[[Namespace], None]:
+    """Return a command's function that writes an error as a JSON line, instead of the plain text for people, if its
+    ``--log-format`` is ``json``.
     """
-    try:
-        yield
-    except V2VError as error:
-        if log_format() == "json":
-            Log(is_json=True).say(" ".join(str(error).split()), "error")
-            error.is_reported = True
-        raise
+
+    def run_and_report(arguments: Namespace) -> None:
+        try:
+            run(arguments)
+        except V2VError as error:
+            if arguments.log_format == "json":
+                Log(is_json=True).say(" ".join(str(error).split()), "error")
+                error.is_reported = True
+            raise
+
+    return run_and_report
 
 
 def _utc_now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
-class StartTimes:
-    """How long each step of a program's start takes, for ``--debug``, from the creation of the process on.
-
-    Args:
-        is_logged: whether the program logs them.
+@dataclass(frozen=True, slots=True)
+class Meaning:
+    """Description of a field.
 
     Attributes:
-        steps: name and seconds of each step, in order.
+        help: what the value is: one sentence.
+        kind: "counter", "gauge", "states" (one of ``states``) or "text".
+        unit: "s", "bytes", "GiB", "cores", "/s", "0 to 1"; empty: a number of what the name says.
+        metric: name of the metric without prefix and suffix; empty: it is no metric, None: the field's name.
+        part: value of the label "part", where fields share a metric.
+        words: what people read in place of the field's name; empty: the name.
+        states: every value that the field can have.
+        merge: makes one value of the values of peers with the same name.
+        is_event: whether it counts unusual events, which one-line views name once there are any.
+        is_fault: whether each event is a fault that the service survived.
     """
 
-    def __init__(self, *, is_logged: bool = False) -> None:
-        self.is_logged = is_logged
-        self.steps: list[tuple[str, float]] = []
-        self._since = psutil.Process().create_time()
+    help: str
+    kind: str = "gauge"
+    unit: str = ""
+    metric: str | None = ""
+    part: str = ""
+    words: str = ""
+    states: tuple[str, ...] = ()
+    merge: Callable[[Iterable[float]], float] = sum
+    is_event: bool = False
+    is_fault: bool = False
 
-    def mark(self, step: str) -> None:
-        """Note the end of a step, which began at the end of the one before."""
-        now = time.time()
-        self.steps.append((step, now - self._since))
-        self._since = now
 
-    def __str__(self) -> str:
-        whole = sum(seconds for _, seconds in self.steps)
-        return f"start: {', '.join(f'{step} {seconds:.2f} s' for step, seconds in self.steps)}; {whole:.2f} s in all"
+def counter(
+    help: str,
+    metric: str | None = None,
+    *,
+    unit: str = "",
+    part: str = "",
+    is_routine: bool = False,
+    is_fault: bool = False,
+) -> Any:
+    """Declare a total since the start, which begins at 0. One that is not routine counts unusual events. See
+    :class:`Meaning`."""
+    meaning = Meaning(help, "counter", unit, metric, part, is_event=not is_routine, is_fault=is_fault)
+    return _field(meaning, default=0)
+
+
+def gauge(
+    help: str,
+    metric: str | None = "",
+    *,
+    unit: str = "",
+    part: str = "",
+    words: str = "",
+    merge: Callable[[Iterable[float]], float] = sum,
+    **options: Any,
+) -> Any:
+    """Declare a value that rises and falls; ``options`` are those of ``dataclasses.field``. See :class:`Meaning`."""
+    return _field(Meaning(help, "gauge", unit, metric, part, words, merge=merge), **options)
+
+
+def states(help: str, metric: str, *values: str) -> Any:
+    """Declare a field that has one of a few values; the metric has a sample for each of them."""
+    return _field(Meaning(help, "states", metric=metric, states=values))
+
+
+def text(help: str, **options: Any) -> Any:
+    """Declare a text, or another value that is no metric; ``options`` are those of ``dataclasses.field``."""
+    return _field(Meaning(help, "text"), **options)
+
+
+@cache
+def meanings(kind: Any) -> dict[str, Meaning]:
+    """Return the meaning of each status field of a dataclass, by the field's name. Other fields are no status."""
+    return {each.name: each.metadata["meaning"] for each in dataclasses.fields(kind) if "meaning" in each.metadata}
+
+
+def values(item: Any) -> dict[str, Any]:
+    """Return the values of an instance's status fields, by name."""
+    kind: Any = type(item)
+    return {name: getattr(item, name) for name in meanings(kind)}
+
+
+def short(text: str) -> str:
+    """Cut a text, for instance the name of a file, to the length that a status holds of it."""
+    return text[:_LONGEST_TEXT]
+
+
+def _field(meaning: Meaning, **options: Any) -> Any:
+    return dataclasses.field(metadata={"meaning": meaning}, **options)

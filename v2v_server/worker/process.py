@@ -10,7 +10,7 @@ A sample is made in its consumer's slot, or in private memory if the slot is not
 mapped for each sample, which takes less than a millisecond. So no mapping keeps the memory of a consumer that is gone,
 and a killed worker leaves nothing to clean up. A confined worker cannot open it, and receives its descriptor from the
 server (:func:`v2v_server.worker.logbook.take_arena`). An arena with one slot, such as the server's
-(:mod:`v2v_server.sharing.ring`), is new memory as a rule. Writing a finished sample to it takes less than half the time
+(:mod:`v2v_server.sharing`), is new memory as a rule. Writing a finished sample to it takes less than half the time
 of mapping it, because its pages need no zeros and no faults.
 """
 
@@ -35,18 +35,25 @@ import numpy.typing as npt
 import zstandard
 
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.arena import NO_SLOT, ArenaName, Slot, array_offsets, find_memory, open_memory
+from v2v_protocol.arena import (
+    NO_SLOT,
+    ArenaName,
+    Slot,
+    array_offsets,
+    find_memory,
+    open_memory,
+)
 from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.keys import key_for, leaves_host
 from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Buffer, Frames, Lease, Result, WorkerHello, encode_sample
 from v2v_protocol.sample import Form, Layout, new_arrays
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.schedule.sequences import MOST_LEASE_BYTES
+from v2v_server.schedule import MOST_LEASE_BYTES
 from v2v_server.simulation.precision import USUAL
 from v2v_server.store.cache import Cache
 from v2v_server.system.compile_cache import compile_cache
-from v2v_server.system.log import Log, StartTimes
+from v2v_server.system.log import Log
 from v2v_server.system.process import (
     die_with_parent,
     give_way,
@@ -590,7 +597,6 @@ def run_worker(
     cache: Cache | None = None,
     keys: str | None = None,
     log: Log | None = None,
-    times: StartTimes | None = None,
     arenas: int | None = None,
 ) -> None:
     """Run one worker in this process until the server stops it.
@@ -604,7 +610,6 @@ def run_worker(
         cache: cache of decoded clips for later epochs; None stores nothing.
         keys: file of its key; None reads the file that ``V2V_KEYS`` names, "" uses no key.
         log: log for people.
-        times: completed and perhaps logged once the worker is connected.
         arenas: descriptor of its end of the socket pair for arenas if a server started it, see
             :mod:`v2v_server.worker.logbook`; not used for a server on another host.
 
@@ -614,7 +619,6 @@ def run_worker(
     """
     if parent_pid is not None:
         die_with_parent(parent_pid)
-    times = times or StartTimes()
     key_for(address, "worker", keys)  # reports a wrong key at once
     keep_freed_memory()
     limit_memory(LARGEST_MEMORY_BYTES)
@@ -622,7 +626,6 @@ def run_worker(
     os.environ["OPENCV_FOR_THREADS_NUM"] = "1"
     # Compile or load the kernels first, so that a worker that says hello works at full speed.
     warm_up_in_turn()
-    times.mark("kernels")
     # Exclude objects that exist by now from collections, which then take a fraction of a millisecond.
     gc.collect()
     gc.freeze()
@@ -638,7 +641,4 @@ def run_worker(
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # After ZeroMQ's threads have started, which should run without delay.
     take_long_turns()
-    times.mark("sandbox and socket")
-    if times.is_logged:
-        (log or Log()).say(f"worker {name}: {times}")
     worker.run()

@@ -16,12 +16,10 @@ its own memory.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
@@ -32,10 +30,9 @@ from v2v_server.motion import load as load_motion
 from v2v_server.simulation.pixel import simulate_pixels
 from v2v_server.simulation.precision import Variant, load, warm_up
 from v2v_server.system.compile_cache import sources_digest
-from v2v_server.system.process import die_with_parent
+from v2v_server.system.process import die_with_parent, lock
 
 _LONGEST_WAIT_SECONDS = 300.0
-_POLL_SECONDS = 0.1
 
 
 def warm_up_in_turn() -> None:
@@ -131,36 +128,16 @@ def one_compiles(folder: Path, key: str, longest_wait_seconds: float = _LONGEST_
     complete = _mark(folder, key)
     with ExitStack() as turn:
         if not complete.exists():
-            turn.enter_context(_lock(folder / f"{key}.lock", longest_wait_seconds))
+            # A folder of another user, a file system without locks, or a wait that is over: compile without one.
+            with suppress(OSError):
+                file = turn.enter_context((folder / f"{key}.lock").open("ab"))
+                lock(file.fileno(), longest_wait_seconds, file.name)
         is_first = not complete.exists()
         if not is_first:
             turn.close()
         yield is_first
         with suppress(OSError):  # full disk or folder of another user: the next process takes the lock again
             complete.touch()
-
-
-@contextmanager
-def _lock(path: Path, longest_wait_seconds: float) -> Iterator[None]:
-    """Hold a lock on the file; continue without it after the wait, or if the file system has no locks."""
-    try:
-        file = path.open("ab")
-    except OSError:
-        yield
-        return
-    with file:
-        give_up = time.monotonic() + longest_wait_seconds
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                if time.monotonic() < give_up:
-                    time.sleep(_POLL_SECONDS)
-                    continue
-            except OSError:
-                pass  # no locks on this file system
-            break
-        yield
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import look_at_pictures, name_all
 from v2v_server.corpus.sources.source import open_sidecar, sidecar_id
 from v2v_server.labels import READERS
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule import SequenceTable
 from v2v_server.store.pixels import VideosKind
 from v2v_server.video.rows import Rows
 from v2v_server.video.source import clean_aperture

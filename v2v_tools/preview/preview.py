@@ -29,7 +29,7 @@ from v2v_protocol.write_aside import check_output, write_file
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import defects_of_video
 from v2v_server.motion.prediction import Prediction
-from v2v_server.schedule.sequences import SequenceTable, VideoSequence
+from v2v_server.schedule import SequenceTable, VideoSequence
 from v2v_server.simulation.intensity import tone_table
 from v2v_server.store.pixels import VIDEOS, VideosKind, signal_of
 from v2v_server.video.decode import ClipRequest, Cut

@@ -16,7 +16,7 @@ from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.prepare import prepare
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule import SequenceTable
 from v2v_server.video.rows import Rows
 
 SOURCE, BESIDE = "source", "beside"

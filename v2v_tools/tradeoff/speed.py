@@ -21,8 +21,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.worker.produce import decode_for, make_sample
 from v2v_tools.remake import lease_for
 
@@ -82,7 +81,7 @@ def leases_of(catalogue: Catalogue, spec: StreamSpec, places: int) -> tuple[Leas
     """Return the leases of at most ``places`` places, spread over the corpus in its order; seed 0, epoch 0."""
     spec = dataclasses.replace(spec, samples_per_decode=VIEWS, sibling_spacing=1, shuffle=False)
     table = SequenceTable(catalogue.videos, catalogue.rows, spec)
-    schedule = Schedule.of(table, spec)
+    schedule = Schedule(table, spec)
     count = min(places, table.count)
     made = []
     for place in (number * table.count // count for number in range(count)):

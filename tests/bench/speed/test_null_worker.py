@@ -12,17 +12,16 @@ from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from v2v_client import V2VStreamDataset
 from v2v_protocol.messages import decode_map, decode_sample
 from v2v_protocol.sample import DEFAULT_ARRAYS, Form, Provenance, SampleId, array_layout
-from v2v_server.broker.grants import check_result
+from v2v_server.broker.dispatcher import check_result
 from v2v_server.broker.leases import Request
-from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule import Schedule, SequenceTable
 from v2v_tools.remake import lease_for
 
 
 @pytest.mark.parametrize("arrays", [DEFAULT_ARRAYS, ("frames",), ("voxels", "flow", "flow_valid")])
 def test_an_answer_passes_every_check_of_server_and_client(arrays: tuple[str, ...]) -> None:
     catalogue = corpus(video("a.mp4"), video("b.mp4"))
-    schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, SMALL_SPEC), SMALL_SPEC)
+    schedule = Schedule(SequenceTable(catalogue.videos, catalogue.rows, SMALL_SPEC), SMALL_SPEC)
     request = Request(b"consumer", 3, 1, snapshot=2)
     lease = lease_for(
         request, number=7, sequence=schedule.candidate(5, 3, 1, 0), catalogue=catalogue, spec=SMALL_SPEC,

@@ -20,11 +20,9 @@ import pytest
 import zmq
 
 from tests.waiting import until
-from v2v_protocol.link import guard
-from v2v_protocol.link.router import MOST_MESSAGE_FRAMES
+from v2v_protocol.link import router as guard
+from v2v_protocol.link.router import MOST_MESSAGE_FRAMES, ConsumerGone, FromConsumer, FromWorker, ServerInput, Sockets
 from v2v_protocol.messages import Ping, Pong, encode
-from v2v_server.broker.actions import ToConsumer, ToWorker
-from v2v_server.broker.transport import BrokerInput, ConsumerGone, FromConsumer, FromWorker, Sockets
 from v2v_server.system.process import most_connections
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a connection guard")
@@ -89,8 +87,8 @@ def is_ended(peer: socket.socket) -> bool:
     return True
 
 
-def next_from(sockets: Sockets, kind: type) -> BrokerInput:
-    came: list[BrokerInput] = []
+def next_from(sockets: Sockets, kind: type) -> ServerInput:
+    came: list[ServerInput] = []
 
     def there() -> bool:
         came.extend(one for one in sockets.receive(0.05) if isinstance(one, kind))
@@ -180,7 +178,7 @@ def test_a_last_message_is_handled_after_its_connection_has_ended(
     peer.send_multipart(encode(Ping()))
     peer.close(linger=-1)
     until(lambda: not watched._connections)
-    came: list[BrokerInput] = []
+    came: list[ServerInput] = []
     until(lambda: came.extend(sockets.receive(0.05)) or ConsumerGone(b"c") in came)
     until(lambda: came.extend(sockets.receive(0.05)) or came[-1] == ConsumerGone(b"c"))
     assert [one.identity for one in came if isinstance(one, FromConsumer)] == [b"c"]
@@ -208,7 +206,7 @@ def test_a_late_message_is_not_taken_for_one_of_the_next_connection_with_its_des
     honest = consumer(sockets, b"honest")
     until(lambda: list(connections) == descriptors)
     honest.send_multipart(encode(Ping()))
-    came: list[BrokerInput] = []
+    came: list[ServerInput] = []
 
     def is_heard() -> bool:
         came.extend(sockets.receive(0.05))
@@ -218,7 +216,7 @@ def test_a_late_message_is_not_taken_for_one_of_the_next_connection_with_its_des
     sockets.cut(b"early")
     assert {one.identity for one in came if isinstance(one, FromConsumer)} == {b"honest"}
     assert ConsumerGone(b"honest") not in came
-    assert sockets.send(ToConsumer(b"honest", encode(Pong())))
+    assert sockets.send(b"honest", encode(Pong()))
     assert honest.poll(60_000)
 
 
@@ -279,7 +277,7 @@ def test_a_message_of_a_refused_connection_gets_no_user_of_the_next_one_with_its
     with raw(sockets.address) as honest:
         assert list(connections) == [descriptor]
         honest.sendall(b"\0\x06honest")
-        came: list[BrokerInput] = []
+        came: list[ServerInput] = []
         until(lambda: came.extend(sockets.receive(0.05)) or [one for one in came if isinstance(one, FromConsumer)])
         came += sockets.receive(0.2)
     assert [bytes(one.frames[0]) for one in came if isinstance(one, FromConsumer)] == [b"honest"]
@@ -288,9 +286,9 @@ def test_a_message_of_a_refused_connection_gets_no_user_of_the_next_one_with_its
 # --- how many there are -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("kind", "to"), [(FromConsumer, ToConsumer), (FromWorker, ToWorker)])
+@pytest.mark.parametrize("kind", [FromConsumer, FromWorker])
 def test_the_oldest_connection_without_a_session_makes_room(
-    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]], kind: type, to: type
+    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]], kind: type
 ) -> None:
     """Otherwise idle connections take every descriptor that the process may open, and end it."""
     sockets = serve(most_connections=4, has_session=lambda identity: identity == b"honest")
@@ -303,7 +301,7 @@ def test_the_oldest_connection_without_a_session_makes_room(
     newcomer = consumer(sockets, b"newcomer", address)
     newcomer.send_multipart(encode(Ping()))
     assert next_from(sockets, kind).identity == b"newcomer"
-    assert sockets.send(to(b"honest", encode(Pong())))
+    assert sockets.send(b"honest", encode(Pong()), to_worker=kind is FromWorker)
     for each in idle:
         each.close()
 
@@ -334,7 +332,7 @@ def test_connections_with_a_session_make_no_room(
         next_from(sockets, FromConsumer)
     with raw(sockets.address) as newcomer:
         assert is_ended(newcomer)
-    assert all(sockets.send(ToConsumer(name, encode(Pong()))) for name in (b"a", b"b"))
+    assert all(sockets.send(name, encode(Pong())) for name in (b"a", b"b"))
 
 
 CONNECT_MANY = f"""
@@ -377,7 +375,7 @@ def test_five_thousand_connections_with_few_descriptors_do_not_stop_a_newcomer(
             newcomer = consumer(sockets, b"newcomer")
             newcomer.send_multipart(encode(Ping()))
             assert next_from(sockets, FromConsumer).identity == b"newcomer"
-            assert sockets.send(ToConsumer(b"honest", encode(Pong())))
+            assert sockets.send(b"honest", encode(Pong()))
             many.stdin.close()
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))

@@ -15,12 +15,12 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import CorpusError, UsageError, V2VError
 from v2v_protocol.messages import Hello
 from v2v_protocol.spec import StreamSpec
+from v2v_server import schedule as sequences
 from v2v_server.broker.dispatcher import MOST_BATCH_SIZE, Dispatcher, admit
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.scene import Flag
 from v2v_server.corpus.videos import CorpusFacts, encoded_pieces
 from v2v_server.quarantine import Quarantine, QuarantineEntry
-from v2v_server.schedule import sequences
 from v2v_server.video.rows import Rows
 
 SAMPLE_BYTES = 2 * 2 * 8 * 8

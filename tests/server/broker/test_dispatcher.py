@@ -45,14 +45,12 @@ from v2v_protocol.messages import (
 from v2v_protocol.recipe import preset
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker import dispatcher as dispatcher_module
-from v2v_server.broker.actions import AddToQuarantine, Disconnect, GiveUp, ToConsumer
-from v2v_server.broker.dispatcher import MOST_BATCH_SIZE, MOST_FAULTS, MOST_TABLES
-from v2v_server.broker.grants import work_seconds
-from v2v_server.broker.leases import Cause, Loss
+from v2v_server.broker.dispatcher import MOST_BATCH_SIZE, MOST_FAULTS, MOST_TABLES, work_seconds
+from v2v_server.broker.leases import REST_SECONDS, SILENCE_SECONDS, Cause, Loss
 from v2v_server.broker.session import GONE_SECONDS, SILENT_SECONDS
-from v2v_server.broker.worker_registry import REST_SECONDS, SILENCE_SECONDS
+from v2v_server.broker.state import AddToQuarantine, Disconnect, GiveUp, ToConsumer
 from v2v_server.quarantine import Quarantine, QuarantineEntry
-from v2v_server.schedule.epoch import MOST_CANDIDATES
+from v2v_server.schedule import MOST_CANDIDATES
 from v2v_server.video.frame_index import FrameIndex
 
 

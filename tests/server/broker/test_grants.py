@@ -8,7 +8,7 @@ import pytest
 from v2v_protocol.errors import ProtocolError
 from v2v_protocol.messages import encode_sample
 from v2v_protocol.sample import Form
-from v2v_server.broker.grants import check_result
+from v2v_server.broker.dispatcher import check_result
 from v2v_server.broker.leases import Request
 
 SIZE = 1000

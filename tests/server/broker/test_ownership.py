@@ -12,6 +12,7 @@ import zmq
 from tests.server.broker.test_dispatcher import refused
 from tests.server.peers import Peers, peers
 from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.link.router import FromConsumer, FromWorker, Sockets
 from v2v_protocol.messages import (
     Denied,
     ErrorCode,
@@ -25,8 +26,7 @@ from v2v_protocol.messages import (
     decode,
     encode,
 )
-from v2v_server.broker.actions import ToConsumer, ToWorker
-from v2v_server.broker.transport import FromConsumer, FromWorker, Sockets
+from v2v_server.broker.state import ToConsumer, ToWorker
 
 OURS, THEIRS = b"o" * 32, b"t" * 32
 
@@ -60,7 +60,7 @@ def test_the_secret_moves_a_session_to_a_new_connection_with_its_debt() -> None:
     (welcome,) = at.consumer_says(b"after", hello(OURS))
     assert isinstance(welcome, Welcome)
     (session,) = at.dispatcher.sessions
-    assert (session.identity, at.dispatcher.sessions.queue.balance_seconds(b"after")) == (b"after", -3.0)
+    assert (session.identity, at.dispatcher.sessions.queue.balance_ns(b"after")) == (b"after", -3_000_000_000)
 
 
 def test_consumers_without_a_secret_stay_apart() -> None:
@@ -165,7 +165,7 @@ def sockets() -> Iterator[Sockets]:
 
 @pytest.mark.parametrize("side", ["consumer", "worker"])
 def test_a_second_connection_with_a_routing_id_in_use_gets_nothing(sockets: Sockets, side: str) -> None:
-    kind, to = (FromConsumer, ToConsumer) if side == "consumer" else (FromWorker, ToWorker)
+    kind = FromConsumer if side == "consumer" else FromWorker
     address = sockets.address if side == "consumer" else sockets.worker_address
 
     def dealer(context: zmq.Context[zmq.Socket[bytes]]) -> zmq.Socket[bytes]:
@@ -191,7 +191,7 @@ def test_a_second_connection_with_a_routing_id_in_use_gets_nothing(sockets: Sock
             assert shaken_hands.poll(30_000)
             for _ in range(3):
                 thief.send_multipart(encode(Goodbye(0.0)))
-            assert sockets.send(to(b"\x01honest", [b"sample"]))
+            assert sockets.send(b"\x01honest", [b"sample"], to_worker=side == "worker")
             assert honest.recv() == b"sample"
             honest.send_multipart(encode(Ping()))
             assert arrived() == [Ping()]

@@ -15,7 +15,7 @@ from v2v_client.memory import open_sample
 from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.messages import Hello, Lease, SampleHeader, Want, encode
 from v2v_protocol.sample import Form, array_layout
-from v2v_server.sharing.ring import SampleRing
+from v2v_server.sharing import SampleRing
 from v2v_server.worker.process import slot_arrays
 
 ARENA = f"17:9:12:{'0123456789abcdef' * 2}"

@@ -15,8 +15,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.messages import ErrorCode, Hello
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Cause
-from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.video.rows import Rows
 
 BATCH = 4
@@ -27,7 +26,7 @@ SIBLINGS = replace(SMALL_SPEC, samples_per_decode=VIEWS)
 def schedule(frames: int, views: int, spacing: int) -> Schedule:
     videos = corpus(*(video(f"v{number}.mp4", frames=frames) for number in range(5))).videos
     spec = replace(SMALL_SPEC, samples_per_decode=views, sibling_spacing=spacing if views > 1 else 0)
-    return Schedule.of(SequenceTable(videos, Rows.parse("full"), spec), spec)
+    return Schedule(SequenceTable(videos, Rows.parse("full"), spec), spec)
 
 
 @given(
@@ -83,7 +82,7 @@ def test_substitutes_are_shared_too() -> None:
 def test_a_schedule_needs_the_spacing() -> None:
     videos = corpus(video("a.mp4", frames=30)).videos
     with pytest.raises(UsageError, match="sibling_spacing = 0: set sibling_spacing to the number"):
-        Schedule.of(SequenceTable(videos, Rows.parse("full"), SIBLINGS), SIBLINGS)
+        Schedule(SequenceTable(videos, Rows.parse("full"), SIBLINGS), SIBLINGS)
 
 
 # --- through the dispatcher -------------------------------------------------------------------------------------------

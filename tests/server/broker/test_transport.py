@@ -16,9 +16,8 @@ import zmq
 
 from tests.waiting import until
 from v2v_protocol.link import router
+from v2v_protocol.link.router import ConsumerGone, FromConsumer, FromWorker, InFlight, ServerInput, Sockets
 from v2v_protocol.messages import Ping, Pong, Stop, encode
-from v2v_server.broker.actions import ToConsumer, ToWorker
-from v2v_server.broker.transport import BrokerInput, ConsumerGone, FromConsumer, FromWorker, InFlight, Sockets
 
 
 @pytest.fixture
@@ -74,8 +73,8 @@ def test_another_user_of_the_host_is_no_worker() -> None:
 
 
 def test_sending_to_an_unknown_peer_returns_false(sockets: Sockets) -> None:
-    assert not sockets.send(ToWorker(b"w", encode(Stop())))
-    assert not sockets.send(ToConsumer(b"c", encode(Pong())))
+    assert not sockets.send(b"w", encode(Stop()), to_worker=True)
+    assert not sockets.send(b"c", encode(Pong()))
 
 
 def test_one_message_of_each_side_comes_at_a_time_the_workers_first(sockets: Sockets) -> None:
@@ -86,8 +85,8 @@ def test_one_message_of_each_side_comes_at_a_time_the_workers_first(sockets: Soc
             peer.connect(address)
             for number in range(2):
                 peer.send_multipart([*encode(Ping()), bytes([number])])
-        until(lambda: len(dict(sockets._routers._poller.poll(0))) == 2)
-        came: list[BrokerInput] = []
+        until(lambda: len(dict(sockets._poller.poll(0))) == 2)
+        came: list[ServerInput] = []
         while len(came) < 4:
             both = sockets.receive(60.0)
             assert [type(one) for one in both] in ([FromWorker, FromConsumer], [FromWorker], [FromConsumer])
@@ -95,8 +94,8 @@ def test_one_message_of_each_side_comes_at_a_time_the_workers_first(sockets: Soc
         assert sockets.receive(0.0) == []
         for kind in (FromWorker, FromConsumer):
             assert [bytes(one.frames[1]) for one in came if isinstance(one, kind)] == [b"\0", b"\1"]
-        assert sockets.send(ToWorker(b"w", encode(Stop())))
-        assert sockets.send(ToConsumer(b"c", encode(Pong())))
+        assert sockets.send(b"w", encode(Stop()), to_worker=True)
+        assert sockets.send(b"c", encode(Pong()))
 
 
 MIB = 1 << 20
@@ -127,7 +126,7 @@ def counts(sockets: Sockets, found: dict[bytes, int]) -> dict[bytes, int]:
 def test_bytes_are_in_flight_until_their_consumer_takes_them(sockets: Sockets) -> None:
     with consumers(sockets, b"deaf", b"reads") as (deaf, reads):
         for name in (b"deaf", b"reads"):
-            assert all(sockets.send(ToConsumer(name, [b"", bytes(4 * MIB)])) for _ in range(30))
+            assert all(sockets.send(name, [b"", bytes(4 * MIB)]) for _ in range(30))
         found: dict[bytes, int] = {}
         found = counts(sockets, found)
         assert max(found.values()) <= 120 * MIB
@@ -144,14 +143,14 @@ def test_small_messages_are_in_flight_too(sockets: Sockets) -> None:
     with consumers(sockets, b"deaf"):
         found: dict[bytes, int] = {b"deaf": 0}
         for _ in range(400):
-            assert sockets.send(ToConsumer(b"deaf", [bytes(60_000)]))
+            assert sockets.send(b"deaf", [bytes(60_000)])
             found = counts(sockets, found)
         assert 10 * MIB < found[b"deaf"] <= 24 * MIB
 
 
 def test_a_consumer_that_never_reads_is_disconnected_at_the_limit_of_messages(sockets: Sockets) -> None:
     with consumers(sockets, b"deaf"):
-        until(lambda: not sockets.send(ToConsumer(b"deaf", [bytes(60_000)])))
+        until(lambda: not sockets.send(b"deaf", [bytes(60_000)]))
         until(lambda: ConsumerGone(b"deaf") in sockets.receive(0.01))
 
 
@@ -164,10 +163,10 @@ def test_those_that_take_nothing_are_disconnected_if_there_is_too_much_in_all(mo
         with consumers(sockets, b"reads", *(b"deaf %d" % number for number in range(8))) as (reads, *_):
             for number in range(8):
                 for _ in range(10):
-                    assert sockets.send(ToConsumer(b"deaf %d" % number, [b"", bytearray(sample)]))
+                    assert sockets.send(b"deaf %d" % number, [b"", bytearray(sample)])
 
             def is_bounded() -> bool:
-                assert sockets.send(ToConsumer(b"reads", [b"", bytearray(sample)]))
+                assert sockets.send(b"reads", [b"", bytearray(sample)])
                 reads.recv_multipart()
                 gone.update(each.identity for each in sockets.receive(0.01) if isinstance(each, ConsumerGone))
                 queues = sockets._consumers._in_flight.values()
@@ -188,6 +187,6 @@ def test_a_failed_call_costs_only_the_answer(sockets: Sockets, monkeypatch: pyte
     with consumers(sockets, b"c") as (peer,):
         with monkeypatch.context() as patch:
             patch.setattr(sockets._consumers, "socket", Broken())
-            assert not sockets.send(ToConsumer(b"c", encode(Pong())))
+            assert not sockets.send(b"c", encode(Pong()))
         until(lambda: ConsumerGone(b"c") in sockets.receive(0.01))
         assert not peer.poll(0)

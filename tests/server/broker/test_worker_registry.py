@@ -7,8 +7,16 @@ from hypothesis import strategies as st
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.messages import WorkerHello
-from v2v_server.broker.leases import ALONE_AFTER, LeaseBook, Request, runs_alone
-from v2v_server.broker.worker_registry import MOST_WORKER_CREDIT, REST_SECONDS, SILENCE_SECONDS, Workers
+from v2v_server.broker.leases import (
+    ALONE_AFTER,
+    MOST_WORKER_CREDIT,
+    REST_SECONDS,
+    SILENCE_SECONDS,
+    LeaseBook,
+    Request,
+    Workers,
+    runs_alone,
+)
 
 DEADLINE = 60.0
 
@@ -110,14 +118,14 @@ def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int
             and table.book.held_by(identity) < worker.credit
             and not lonely(table, identity)
         )
-        assert table.workers._lightest(99) == expected
+        assert table.workers.with_room() == expected
         names = [identity for _, identity in expected]
         assert table.workers.for_lone_request() == next((name for held, name in expected if not held), None)
         for kept in (False, True):
             assert table.next(keep_one_empty=kept) == next(iter(names[kept:]), None)
             others = [name for name in names[kept:] if name != identity]
             assert table.next(keep_one_empty=kept, other_than=identity) == next(iter(others), None)
-    assert len(table.workers._heap) <= 4 * 5
+    assert len(table.workers.with_room()) <= 4
 
 
 def test_workers_that_left_are_not_remembered() -> None:
@@ -129,7 +137,7 @@ def test_workers_that_left_are_not_remembered() -> None:
         assert table.next() == b"a0"
         table.workers.remove(name)
     assert table.next() == b"a0"
-    assert len(table.workers._heap) == len(table.workers._in_heap) < 100
+    assert len(table.workers.with_room()) == 3
 
 
 def lonely(table: Table, identity: bytes) -> bool:

@@ -49,7 +49,7 @@ def test_every_line_of_a_run_is_an_object(tmp_path: Path) -> None:
         *("--page", str(free_port()), "--cache-dir", str(tmp_path / "cache"), "--port-file", str(tmp_path / "port")),
         *("--set", "crop_height_px=48", "--set", "crop_width_px=64", "--set", "voxels_per_clip=4"),
     ]
-    command_line = [sys.executable, "-m", "v2v_server.commands.serve", *flags]
+    command_line = [sys.executable, "-m", "v2v_protocol.programs", "serve", *flags]
     with subprocess.Popen(command_line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server:
         until((tmp_path / "port").exists)
         server.terminate()

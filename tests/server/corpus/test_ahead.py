@@ -92,7 +92,17 @@ def test_parts_of_three_hosts_are_the_catalogue_of_one(corpus: Path, tmp_path: P
     assert len(digests(whole)) == 2
     assert "10 videos can be used" in whole
     assert "  broken.mp4" in whole
-    program = [sys.executable, "-m", "v2v_server.commands.catalogue", "--videos", str(corpus), *scene, "--workers", "1"]
+    program = [
+        sys.executable,
+        "-m",
+        "v2v_protocol.programs",
+        "catalogue",
+        "--videos",
+        str(corpus),
+        *scene,
+        "--workers",
+        "1",
+    ]
     hosts = [
         subprocess.Popen(
             [*program, "--cache-dir", str(tmp_path / f"host {number}"), "--shard", f"{number}/3", "--out", parts],

@@ -19,13 +19,11 @@ from tests.protocol.link.test_guard import next_from
 from tests.waiting import until
 from v2v_protocol.errors import KeyRefused, UsageError, V2VError
 from v2v_protocol.keys import is_key, key_for, read_key
-from v2v_protocol.link.curve import secure
-from v2v_protocol.link.dealer import Dealer, Handshakes, mechanism_of
+from v2v_protocol.link.dealer import Dealer, Handshakes, mechanism_of, secure
+from v2v_protocol.link.router import FromConsumer, FromWorker, ServerInput, Sockets
 from v2v_protocol.messages import Ping, Pong, encode, largest_frame_bytes
-from v2v_server.broker.actions import ToConsumer
-from v2v_server.broker.transport import BrokerInput, FromConsumer, FromWorker, Sockets
 from v2v_server.commands.keys import main
-from v2v_server.keys.folder import KeyFolder
+from v2v_server.keys import KeyFolder
 from v2v_server.worker.process import pack
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a connection guard")
@@ -74,9 +72,9 @@ def refusal(link: Dealer) -> str:
     raise AssertionError("it was not told")
 
 
-def arrivals(sockets: Sockets, seconds: float) -> list[BrokerInput]:
+def arrivals(sockets: Sockets, seconds: float) -> list[ServerInput]:
     ends = time.monotonic() + seconds
-    found: list[BrokerInput] = []
+    found: list[ServerInput] = []
     while time.monotonic() < ends:
         found += [each for each in sockets.receive(0.05) if isinstance(each, FromConsumer | FromWorker)]
     return found
@@ -86,7 +84,7 @@ def test_who_has_a_key_is_served(sockets: Sockets, consumer: Callable[..., Deale
     link = consumer(tmp_path / "gpu1.key")
     arrival = next_from(sockets, FromConsumer)
     assert isinstance(arrival, FromConsumer)
-    assert sockets.send(ToConsumer(arrival.identity, encode(Pong())))
+    assert sockets.send(arrival.identity, encode(Pong()))
     until(lambda: link.receive(0.1))
 
 
@@ -99,7 +97,7 @@ def test_the_largest_array_passes_encrypted(sockets: Sockets, tmp_path: Path, fr
         link.send(encode(Ping()))
         arrival = next_from(sockets, FromConsumer)
         assert isinstance(arrival, FromConsumer)
-        assert sockets.send(ToConsumer(arrival.identity, [*encode(Pong()), frame]))
+        assert sockets.send(arrival.identity, [*encode(Pong()), frame])
         until(lambda: link.receive(0.1))
     finally:
         link.close()
@@ -140,7 +138,7 @@ def test_a_revoked_key_loses_its_open_connection(
     link, other = consumer(tmp_path / "gpu1.key"), consumer(tmp_path / "gpu2.key")
     assert len({next_from(sockets, FromConsumer).identity for _ in range(2)}) == 2  # type: ignore[union-attr]
     folder.revoke("gpu1")
-    gate = sockets._routers.gate
+    gate = sockets._gate
     assert gate is not None
     until(lambda: list(gate._allowed["consumer"].values()) == ["gpu2"])  # the server looks twice a second
     link.send(encode(Ping()))
@@ -245,12 +243,12 @@ def test_who_says_nothing_until_its_key_is_revoked_is_not_heard(
         assert monitor.poll(60_000)
         monitor.recv_multipart()
         folder.revoke("gpu1")
-        gate = sockets._routers.gate
+        gate = sockets._gate
         assert gate is not None
         public = read_key(tmp_path / "gpu1.key").public
         until(lambda: not gate.admits("consumer", public))
         peer.send_multipart(encode(Ping()))
-        heard: list[BrokerInput] = []
+        heard: list[ServerInput] = []
 
         def is_cut_off() -> bool:
             heard.extend(one for one in sockets.receive(0.05) if isinstance(one, FromConsumer))
@@ -264,7 +262,7 @@ def test_who_says_nothing_until_its_key_is_revoked_is_not_heard(
 
 def test_without_an_authentication_thread_no_peer_connects(folder: KeyFolder, sockets: Sockets, tmp_path: Path) -> None:
     """ZAP_ENFORCE_DOMAIN is set; without it every peer would connect."""
-    gate = sockets._routers.gate
+    gate = sockets._gate
     assert gate is not None
     gate.close()
     with zmq.Context() as context, context.socket(zmq.DEALER) as peer:

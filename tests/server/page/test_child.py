@@ -47,7 +47,7 @@ def got(port: int, path: str, host: str | None = None) -> tuple[int, str]:
 def page_of(pid: int) -> psutil.Process | None:
     for child in psutil.Process(pid).children():
         try:
-            if "v2v_server.page" in child.cmdline():
+            if "v2v_server.page.app" in child.cmdline():
                 return child
         except (psutil.NoSuchProcess, psutil.ZombieProcess):
             continue
@@ -192,7 +192,9 @@ def test_the_page_ends_with_its_server_even_when_that_is_killed(clips: Path) -> 
 @pytest.mark.slow
 def test_with_keys_the_page_needs_none(clips: Path, tmp_path: Path) -> None:
     keys, port = tmp_path / "keys", free_port()
-    made = subprocess.run([sys.executable, "-m", "v2v_server.commands.keys", "init", "--dir", str(keys)], check=False)
+    made = subprocess.run(
+        [sys.executable, "-m", "v2v_protocol.programs", "keys", "init", "--dir", str(keys)], check=False
+    )
     assert made.returncode == 0
     flags = [*SMALL, "--page", str(port), "--keys", str(keys), "--worker-bind", "tcp://127.0.0.1:*"]
     with LocalServer(clips, workers=1, flags=flags):

@@ -12,7 +12,7 @@ from tests.server.peers import peers
 from tests.server.status.services import published
 from v2v_protocol.messages import Hello
 from v2v_server.page.app import exposition
-from v2v_server.status.parts import meanings_at
+from v2v_server.status.snapshot import meanings_at
 
 
 def values(state: dict[str, Any] | None) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:

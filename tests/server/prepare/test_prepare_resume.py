@@ -380,7 +380,8 @@ def test_killed_at_a_random_moment(source: Path, tmp_path: Path, turn: int) -> N
     command = [
         sys.executable,
         "-m",
-        "v2v_server.commands.prepare",
+        "v2v_protocol.programs",
+        "prepare",
         str(source),
         str(out),
         "--workers",

@@ -20,7 +20,7 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
 from v2v_server.corpus.sources.source import MANIFEST_NAME
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule import SequenceTable
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
 from v2v_server.video.rows import Rows
 from v2v_tools.remake import remake

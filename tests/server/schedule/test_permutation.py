@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from v2v_server.schedule.epoch import Permutation, hashed_below
+from v2v_server.schedule import Permutation, hashed_below
 
 seeds = st.integers(0, 2**64 - 1)
 epochs = st.integers(0, 2**32 - 1)

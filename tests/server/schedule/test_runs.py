@@ -17,7 +17,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import DEFECTS, StreamSpec
 from v2v_server.corpus.scenes.scene import NO_BARS, Flag, Pieces, Sides
 from v2v_server.corpus.videos import SplitVideos, VideoEntry, encoded_pieces
-from v2v_server.schedule.sequences import Cleaning, Runs, SequenceTable
+from v2v_server.schedule import Cleaning, Runs, SequenceTable
 from v2v_server.video.rows import Rows
 
 RECIPE = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=32)

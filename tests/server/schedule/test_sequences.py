@@ -20,11 +20,10 @@ from tests.pieces import pieces
 from tests.server.named_corpus import SMALL, SMALL_SPEC, video
 from v2v_protocol.recipe import MOST_STEPS_PER_GRID, Recipe, preset
 from v2v_protocol.spec import StreamSpec
+from v2v_server import schedule as sequences
 from v2v_server.corpus.scenes.scene import Flag
 from v2v_server.corpus.videos import VideoEntry, encoded_pieces
-from v2v_server.schedule import sequences
-from v2v_server.schedule.epoch import MOST_CANDIDATES, Schedule
-from v2v_server.schedule.sequences import MOST_CLIP_BYTES, MOST_LEASE_BYTES, SequenceTable
+from v2v_server.schedule import MOST_CANDIDATES, MOST_CLIP_BYTES, MOST_LEASE_BYTES, Schedule, SequenceTable
 from v2v_server.video.rows import Rows
 from v2v_server.worker.process import LARGEST_MEMORY_BYTES
 
@@ -340,7 +339,8 @@ def test_rows_that_one_picture_does_not_have_reject_only_that_video() -> None:
 
 
 def schedule(*lengths: int, shuffle: bool = True) -> Schedule:
-    return Schedule(table(*(video(f"v{number}", frames) for number, frames in enumerate(lengths))), shuffle=shuffle)
+    videos = (video(f"v{number}", frames) for number, frames in enumerate(lengths))
+    return Schedule(table(*videos), StreamSpec(recipe=SMALL, shuffle=shuffle))
 
 
 def epoch_order(of: Schedule, seed: int, epoch: int, candidate: int = 0) -> list[tuple[str, int]]:

@@ -16,7 +16,7 @@ from tests.server.peers import frames_of
 from v2v_client.memory import open_sample
 from v2v_protocol.arena import ArenaName, Slot, open_memory
 from v2v_protocol.messages import Frames, SampleHeader, decode
-from v2v_server.sharing.ring import SampleRing, mappings
+from v2v_server.sharing import SampleRing, mappings
 from v2v_server.worker.process import slot_arrays
 
 LAYOUT = {"voxels": ("int8", (3, 5)), "frames": ("uint8", (7,))}

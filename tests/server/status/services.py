@@ -11,10 +11,9 @@ from tests.server.peers import Peers
 from tests.server.queues import Queues, ToyPool
 from v2v_protocol.messages import Status as StatusMessage
 from v2v_protocol.messages import decode
-from v2v_server.broker.actions import Action, SendStatus, ToConsumer, ToWorker
+from v2v_server.broker.state import Action, SendStatus, ToConsumer, ToWorker
 from v2v_server.config import ServeConfig
-from v2v_server.status.parts import StatusFields
-from v2v_server.status.snapshot import Service, StatusPublisher, to_json
+from v2v_server.status.snapshot import StatusFields, StatusPublisher, to_json
 
 WALL = "2024-02-29T12:00:00+00:00"
 
@@ -80,8 +79,7 @@ def published(at: Peers, **settings: Any) -> Published:
     config = ServeConfig.load(None, {"videos": "videos"} | settings)
     transport, pool = Queues(), ToyPool(lambda name, address: None)
     catalogue = corpus(*(video(f"v{number}.mp4") for number in range(5)))
-    service = Service(config, catalogue, at.dispatcher, pool, transport)
-    publisher = StatusPublisher(service, at.now, lambda: WALL)
+    publisher = StatusPublisher(config, catalogue, at.dispatcher, pool, transport, at.now, lambda: WALL)
     publisher._processor_clock = lambda: 0.0  # a slow host builds a status less often
     publisher.tick(at.now)
     return Published(at, publisher, transport, pool)

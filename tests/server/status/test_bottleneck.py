@@ -10,7 +10,7 @@ from tests.server.peers import answer_to, peers
 from tests.server.status.services import published
 from v2v_protocol.messages import Goodbye, Result, Want
 from v2v_server.broker.leases import Stall
-from v2v_server.status.bottleneck import Shares, find_bottleneck
+from v2v_server.status.snapshot import Shares, find_bottleneck
 
 FULL = {"seconds": 10.0, "consumers": 0.8, "idle": 0.02, "broker": 0.2}
 CASES: list[tuple[dict[str, Any], str, str, str]] = [

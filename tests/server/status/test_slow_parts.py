@@ -13,8 +13,8 @@ from tests.clips import panned_luma, write_clip
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import V2VError
-from v2v_server.status.bottleneck import WINDOW_SECONDS
 from v2v_server.status.client import StatusClient
+from v2v_server.status.snapshot import WINDOW_SECONDS
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone]
 

@@ -14,13 +14,11 @@ from tests.server.status.services import WALL, Published, View, json_of, publish
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
 from v2v_protocol.messages import GetStatus, Goodbye, Hello, Result, Want, WorkerHello, encode
 from v2v_protocol.sample import Refusal
-from v2v_server.broker.actions import SendStatus, ToConsumer, ToWorker
 from v2v_server.broker.leases import Cause
 from v2v_server.broker.session import RETURN_SECONDS
-from v2v_server.broker.state import RefusalPart
+from v2v_server.broker.state import RefusalPart, SendStatus, ToConsumer, ToWorker
 from v2v_server.quarantine import QuarantineEntry
-from v2v_server.status.parts import STATUS_VERSION
-from v2v_server.status.snapshot import ANSWER_SECONDS, MOST_SHOWN, to_json
+from v2v_server.status.snapshot import ANSWER_SECONDS, MOST_SHOWN, STATUS_VERSION, to_json
 
 
 def finish(at: Peers, worker: bytes = b"w", **took: float) -> None:

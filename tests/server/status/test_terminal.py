@@ -13,7 +13,7 @@ import pytest
 from tests.server.peers import peers
 from tests.server.status.services import published
 from v2v_server.broker.state import Counters
-from v2v_server.status.parts import StatusFields
+from v2v_server.status.snapshot import StatusFields
 from v2v_server.status.terminal import StatusView
 from v2v_server.system.log import Log
 

@@ -88,7 +88,7 @@ def test_beside_a_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         # On a terminal: again and again, until Ctrl-C.
         ours, theirs = pty.openpty()
         program = subprocess.Popen(
-            [sys.executable, "-m", "v2v_server.commands.top", "--connect", server.address],
+            [sys.executable, "-m", "v2v_protocol.programs", "top", "--connect", server.address],
             stdin=theirs,
             stdout=theirs,
             stderr=theirs,

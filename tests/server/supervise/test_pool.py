@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import psutil
@@ -58,7 +59,7 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, str], Pool
 
 def pids_of(pool: Pool) -> list[int]:
     """Process ids of the workers that are alive."""
-    return [slot.place.process.pid for slot in pool._slots if slot.place.is_running]
+    return [slot.place.child.process.pid for slot in pool._slots if slot.place.is_running]
 
 
 def all_dead(pool: Pool) -> None:
@@ -352,8 +353,7 @@ def test_it_says_how_long_a_worker_waited_for_a_core(start: Callable[[int, str],
 def test_one_that_hangs_in_a_decoder_speaks_against_the_video(start: Callable[[int, str], Pool]) -> None:
     pool = start(1, SLEEPS)
     pool.watch(0.0, 0)
-    book = pool._slots[0].place.logbook
-    assert book is not None
+    book = pool._slots[0].place.child.logbook
     with open(f"/proc/self/fd/{book.descriptor}", "r+b") as worker:
         note(worker.fileno(), 7, decodes=True)
     assert pool.give_up(b"label-0.1", "slept") == Loss(Cause.HUNG, "slept", 7, for_all=True)
@@ -403,7 +403,9 @@ def test_the_wait_is_bounded_however_large_the_pool() -> None:
     pool._restarts._deaths_in_a_row = crash_budget(1000) - 1
     dead = subprocess.Popen([sys.executable, "-S", "-E", "-c", LEAVES])
     dead.wait()
-    pool._slots[0].place.process = dead
+    pool._slots[0].place.child = SimpleNamespace(
+        process=dead, post_mortem=lambda **_: Loss(Cause.UNEXPLAINED, "exited"), end=lambda: None
+    )
     pool._slots[0].is_started, pool._slots[0].name = True, "label-0.1"
     (death,) = pool.watch(100.0, 0)
     assert death.identity == b"label-0.1"
@@ -476,11 +478,13 @@ def test_stop_after_a_crash_leaves_no_zombie_and_may_come_twice(start: Callable[
 
 @pytest.mark.parametrize("decodes", [True, False])
 def test_only_a_death_while_decoding_speaks_against_the_video(decodes: bool) -> None:
-    logbook = Logbook()
-    note(logbook.descriptor, 7, decodes=decodes)
-    loss = child_module.post_mortem(-signal.SIGSEGV, logbook, short_of_memory=False)
-    assert loss == Loss(Cause.CRASHED, "was ended by SIGSEGV", 7, for_all=decodes)
-    logbook.close()
+    child = child_module.WorkerProcess()
+    with open(f"/proc/self/fd/{child.logbook.descriptor}", "r+b") as worker:
+        note(worker.fileno(), 7, decodes=decodes)
+    child.process.send_signal(signal.SIGSEGV)
+    child.process.wait()
+    assert child.post_mortem(short_of_memory=False) == Loss(Cause.CRASHED, "was ended by SIGSEGV", 7, for_all=decodes)
+    child.end()
 
 
 def test_the_programs_of_real_workers() -> None:

@@ -10,7 +10,7 @@ import pytest
 from v2v_protocol.errors import CorpusError
 from v2v_server.config import ServeConfig
 from v2v_server.supervise import local_host as child
-from v2v_server.supervise.local_host import LocalHost, Standby, start_ahead
+from v2v_server.supervise.local_host import LocalHost, WorkerProcess, start_ahead
 from v2v_server.supervise.pool import Pool
 
 WRITES = "import os, sys; open(sys.argv[1], 'wb').write(sys.stdin.buffer.read())"
@@ -40,12 +40,12 @@ def test_the_pool_takes_standbys_first_and_tells_them_the_arguments_of_a_worker(
 
 
 def test_standbys_that_are_not_used_end_with_the_start(told: Path) -> None:
-    def fail(config: ServeConfig, started: list[Standby]) -> None:
+    def fail(config: ServeConfig, started: list[WorkerProcess]) -> None:
         with start_ahead(config) as standbys:
             started += standbys
             raise CorpusError("no videos")
 
-    started: list[Standby] = []
+    started: list[WorkerProcess] = []
     with pytest.raises(CorpusError):
         fail(ServeConfig(videos="videos", workers=(2, 2)), started)
     assert len(started) == 2
@@ -54,7 +54,7 @@ def test_standbys_that_are_not_used_end_with_the_start(told: Path) -> None:
 
 def test_a_standby_that_has_ended_is_a_failed_start_and_leaves_no_zombie(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(child, "PROGRAM", (sys.executable, "-S", "-E", "-c", "raise SystemExit(3)"))
-    standby = Standby()
+    standby = WorkerProcess()
     standby.process.wait()
     pool = Pool(LocalHost("/corpus", (), [standby]), "label")
     pool.start("tcp://127.0.0.1:1")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from v2v_server.broker.leases import Cause, Loss
-from v2v_server.supervise.host import Exit, ProcessStatus
+from v2v_server.supervise.pool import Exit, ProcessStatus
 
 
 class ToyPlace:

@@ -18,7 +18,6 @@ from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.serve import load_catalogue, serve
 from v2v_server.system import process
-from v2v_server.system.log import StartTimes
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux only")
 
@@ -138,7 +137,7 @@ def test_a_server_may_have_more_connections_than_the_thousand_of_a_service(monke
     monkeypatch.setattr("v2v_server.serve.open_many_files", lambda: done.append("files"))
     monkeypatch.setattr("v2v_server.serve.load_catalogue", load)
     with pytest.raises(CorpusError):
-        serve(ServeConfig(videos="videos"), StartTimes())
+        serve(ServeConfig(videos="videos"))
     assert done == ["memory", "files"]
 
 

@@ -24,8 +24,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.prepare import prepare
-from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.store_file import StoreFile
 from v2v_server.video.rows import Rows
@@ -163,7 +162,7 @@ def test_the_cache_keeps_colour_once_a_stream_needs_it(tmp_path: Path) -> None:
     spec = StreamSpec(recipe=RECIPE)
     origins = []
     with closing(open_catalogue(folder, processes=0)) as catalogue:
-        schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, spec), spec)
+        schedule = Schedule(SequenceTable(catalogue.videos, catalogue.rows, spec), spec)
         for arrays in (("frames",), ("frames", "frames_rgb"), ("frames", "frames_rgb"), ("frames",)):
             lease = lease_for(
                 Request(b"", 0, 1), sequence=schedule.candidate(0, 0, 1, 0), catalogue=catalogue, spec=spec, seed=0,

@@ -20,8 +20,7 @@ from v2v_protocol.sample import Provenance
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
-from v2v_server.schedule.epoch import Schedule
-from v2v_server.schedule.sequences import SequenceTable
+from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.worker import process as clips
 from v2v_server.worker import produce
 from v2v_server.worker.produce import Decoded, decode_for, make_sample
@@ -41,7 +40,7 @@ def catalogue(tmp_path: Path) -> Iterator[Catalogue]:
 
 @pytest.fixture
 def lease(catalogue: Catalogue) -> Lease:
-    schedule = Schedule.of(SequenceTable(catalogue.videos, catalogue.rows, SMALL_SPEC), SMALL_SPEC)
+    schedule = Schedule(SequenceTable(catalogue.videos, catalogue.rows, SMALL_SPEC), SMALL_SPEC)
     return lease_for(
         Request(b"", 0, 2),
         sequence=schedule.candidate(0, 0, 2, 0),

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
@@ -54,7 +55,7 @@ def test_the_first_process_holds_the_lock_and_later_ones_need_none(tmp_path: Pat
 def test_the_second_waits_and_then_holds_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     order: list[Any] = []
     waits = threading.Event()
-    monkeypatch.setattr(module.time, "sleep", lambda seconds: waits.set())
+    monkeypatch.setattr(time, "sleep", lambda seconds: waits.set())
 
     def second() -> None:
         with one_compiles(tmp_path, KEY) as is_first:
@@ -125,7 +126,7 @@ def test_without_locks_all_compile_at_once(monkeypatch: pytest.MonkeyPatch, tmp_
     def flock(*_: Any) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    monkeypatch.setattr(module.fcntl, "flock", flock)
+    monkeypatch.setattr(fcntl, "flock", flock)
     with one_compiles(tmp_path, KEY) as one, one_compiles(tmp_path, KEY) as other:
         assert one
         assert other

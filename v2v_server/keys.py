@@ -18,7 +18,7 @@ from pathlib import Path
 
 from v2v_protocol.errors import KeyRefused, UsageError
 from v2v_protocol.keys import SIDES, PeerKey, is_key, read_private, write_key, write_private
-from v2v_protocol.link.curve import new_key_pair
+from v2v_protocol.link.router import new_key_pair
 from v2v_protocol.persisted import parse_json
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -126,17 +126,6 @@ class KeyFolder:
         for side in sides:
             (self.path / side / name).unlink(missing_ok=True)
         return sides
-
-    def changed(self) -> tuple[int, ...]:
-        """Return a value that differs after a key was created or removed. A missing folder has no keys."""
-        return tuple(self._stamp(self.path / side) for side in SIDES)
-
-    @staticmethod
-    def _stamp(folder: Path) -> int:
-        try:
-            return folder.stat().st_mtime_ns
-        except OSError:
-            return 0
 
     def allowed(self) -> dict[str, dict[str, str]]:
         """Return the allowed keys of each side: names by public key."""
