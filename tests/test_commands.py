@@ -21,7 +21,7 @@ MODULES = {
     "v2v-serve": "v2v_server.commands.serve",
     "v2v-worker": "v2v_server.commands.worker",
     "v2v-simulate": "v2v_tools.simulate",
-    "v2v-preview": "v2v_tools.preview.command",
+    "v2v-preview": "v2v_tools.preview",
     "v2v-prepare": "v2v_server.commands.prepare",
     "v2v-catalogue": "v2v_server.commands.catalogue",
     "v2v-quarantine": "v2v_server.commands.quarantine",

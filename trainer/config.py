@@ -233,7 +233,11 @@ class TrainConfig:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
-        """Build a configuration from nested plain values; missing keys have their default."""
+        """Build a configuration from nested plain values; missing keys have their default.
+
+        Raises:
+            UsageError: an unknown key, or a value of the wrong type or outside its limits.
+        """
         sections = {item.name: typing.get_type_hints(cls)[item.name] for item in dataclasses.fields(cls)}
         network = values.get("network")
         name = network.get("name", "e2vid") if isinstance(network, Mapping) else "e2vid"

@@ -69,6 +69,9 @@ def held_out_batch(config: TrainConfig, asked: Asked, address: str) -> Iterator[
 
     It has ``run.judge_samples`` samples, or fewer if an epoch has fewer. With ``run.judge_videos``, they come from a
     server on those videos, which is stopped afterwards.
+
+    Raises:
+        UsageError: ``run.judge_videos`` cannot be served.
     """
     if not config.run.judge_videos:
         yield from _held_out(config, asked, address)

@@ -186,7 +186,7 @@ def learning_rate(config: OptimizerConfig, run: RunConfig, step: int, epoch: int
 
 @torch.no_grad()
 def gradient_norm(parameters: Iterable[nn.Parameter], longest: float) -> Tensor:
-    """Return the norm of the gradient of all parameters, and clip the gradient to ``longest`` (0: no clipping)."""
+    """Return the norm, [], of the gradient of all parameters, and clip the gradient to ``longest`` (0: no clipping)."""
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norm: Tensor = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
     if longest:

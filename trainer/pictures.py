@@ -29,6 +29,7 @@ EVENTS = "events"
 _TITLE_PX, _NAMES_PX, _TIME_PX, _SMALL_PT = 40, 42, 44, 13
 
 Image = npt.NDArray[np.uint8]
+"""[..., h, w, 3] uint8, RGB."""
 
 
 def draw_events(voxels: npt.NDArray[np.generic]) -> Image:
@@ -44,7 +45,7 @@ def draw_grey(pictures: npt.NDArray[np.floating]) -> Image:
 
 
 def flow_scale(flow: npt.NDArray[np.floating]) -> float:
-    """Return the length that is drawn in full colour, in px, at least 0.1."""
+    """Return the length of flow, [..., 2, H, W], that is drawn in full colour, in px, at least 0.1."""
     return max(float(np.quantile(np.hypot(flow[..., 0, :, :], flow[..., 1, :, :]), FULL_COLOUR_QUANTILE)), 0.1)
 
 

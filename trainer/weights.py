@@ -199,7 +199,7 @@ def load_network(
     """
     found = read_weights(weights, ema=ema).recognise(name)
     if found is None:
-        raise UsageError(f"{weights}: the network is none of {', '.join(NETWORKS)}; name it with --model")
+        raise UsageError(f"{weights}: the network is none of {', '.join(NETWORKS)}; a CONFIG can name it")
     name, arguments = found
     try:
         network = NETWORKS[name](**(arguments | dict(options or {})))

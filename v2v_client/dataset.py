@@ -66,7 +66,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
             it continues with another: no sample is lost or repeated.
         batch_size: samples in one rank's batch.
         arrays: names in ``v2v_protocol.sample.ARRAYS`` to receive. The choice does not affect their content.
-        recipe: the virtual cameras: name of a preset, a mapping of fields, or a Recipe; None takes the server's.
+        recipe: the virtual cameras: name of a recipe, a mapping of fields, or a Recipe; None takes the server's.
         seed: determines all random draws and the order of the samples.
         epoch: the first epoch.
         rank: rank of this process; None: that of torch.distributed if it is initialised, else 0.

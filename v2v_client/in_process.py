@@ -61,7 +61,7 @@ class V2VDataset(Dataset[Sample]):
 
     Args:
         videos: folder tree of videos, a single video, or a list file.
-        recipe: the virtual cameras: name of a preset, a mapping of fields, or a Recipe.
+        recipe: the virtual cameras: name of a recipe, a mapping of fields, or a Recipe.
         arrays: names in ``v2v_protocol.sample.ARRAYS`` to make.
         seed: the stream's seed, which determines all draws and the order.
         epoch: the stream's epoch, which selects other cameras and another order.

@@ -85,6 +85,11 @@ class Camera:
     ) -> Camera:
         """Create a camera from the arrays of one sample, without lead frames and lead voxels.
 
+        Args:
+            arrays: see ``v2v_protocol.sample.ARRAYS``.
+            recipe: of the sample; None: every bin is a step.
+            whole: [rows, columns], the picture that the crop was taken from, or None.
+
         Raises:
             UsageError: see :func:`check_drawable`.
         """

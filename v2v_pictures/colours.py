@@ -28,7 +28,7 @@ def full_colour(counts: Iterable[npt.NDArray[np.generic]]) -> float:
     A percentile keeps one hot pixel from making everything else pale. One scale for a page makes its panels comparable.
 
     Args:
-        counts: signed event counts, any shapes.
+        counts: arrays [...] of signed event counts, of any shapes.
     """
     there = [np.abs(each[each != 0], dtype=np.float32) for each in map(np.asarray, counts) if np.any(each)]
     return max(1.0, float(np.quantile(np.concatenate(there), _QUANTILE))) if there else 1.0

@@ -51,7 +51,7 @@ class UsageError(V2VError):
 
 
 class RecipeError(UsageError):
-    """A recipe names an unknown key or preset, or a value outside its limits."""
+    """A recipe names an unknown key or recipe, or a value outside its limits."""
 
 
 class KeyRefused(UsageError):

@@ -156,7 +156,7 @@ def v2v() -> int | None:
 
 _GROUPS: dict[str, dict[str, tuple[str, str, str]]] = {
     "Look at videos": {
-        "preview": ("v2v_tools.preview.command", "server", "draw what a recipe makes of videos"),
+        "preview": ("v2v_tools.preview", "server", "draw what a recipe makes of videos"),
         "simulate": ("v2v_tools.simulate", "server", "write one sample to a file, its events too"),
         "doctor": ("v2v_tools.doctor.command", "server", "check installation, machine and videos"),
         "fit": ("v2v_tools.fit.command", "server", "fit a virtual camera to a recording, or measure one"),

@@ -1,7 +1,7 @@
 """The recipe: the ranges a virtual event camera and its view of a video are drawn from.
 
 A :class:`Recipe` holds everything that shapes a sample besides the video itself. One draw from it, keyed by (seed,
-epoch, index), is a :class:`v2v_protocol.sample.SampleParams`. Values of the default preset, ``paper``, are those of the
+epoch, index), is a :class:`v2v_protocol.sample.SampleParams`. Values of the default recipe, ``paper``, are those of the
 training configurations released with "V2V: Scaling Event-Based Vision through Efficient Video-to-Voxel Simulation"
 (Lou et al., NeurIPS 2025, arXiv 2505.16797).
 
@@ -502,10 +502,10 @@ class Recipe(Persisted):
         """Build a recipe from plain values.
 
         Args:
-            values: fields by name; missing ones take the value of ``values["preset"]``, by default ``paper``.
+            values: fields by name; missing ones are those of the recipe that ``preset`` names, by default ``paper``.
 
         Raises:
-            RecipeError: an unknown key (the nearest known one is named), an unknown preset, a bad value.
+            RecipeError: an unknown key (the nearest known one is named), an unknown recipe, a bad value.
         """
         rest = dict(values)
         base = preset(rest.pop("preset", DEFAULT_PRESET))
@@ -531,10 +531,10 @@ PRESETS: dict[str, Recipe] = {name: Recipe(**fields) for name, fields in PRESET_
 
 
 def preset(name: object) -> Recipe:
-    """Return the preset with this name.
+    """Return the recipe with this name.
 
     Raises:
-        RecipeError: there is no such preset; the message lists them.
+        RecipeError: there is no such recipe; the message lists them.
     """
     if not isinstance(name, str) or name not in PRESETS:
         near, known = nearest(name, PRESETS), ", ".join(PRESETS)

@@ -152,7 +152,7 @@ class Light:
         return cls("linear" if gamma == 1.0 else f"{gamma:g}" if gamma else "srgb", gamma)
 
     def of(self, grey: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-        """Return light, 0 (black) to 1 (white), of grey levels 0 .. 255."""
+        """Return light, [...], 0 (black) to 1 (white), of grey levels 0 .. 255."""
         share = np.asarray(grey, np.float64) / 255.0
         if self.gamma:
             return np.asarray(share**self.gamma)
@@ -234,7 +234,7 @@ NS_PER_UNIT = {"s": 1e9, "us": 1e3, "ns": 1.0}
 
 
 def to_ns(times: npt.NDArray[Any], where: str, ns_per_unit: float = 1e9) -> npt.NDArray[np.int64]:
-    """Convert times to int64 nanoseconds: integers exactly, others as float64, rounded to the nearest.
+    """Convert times, [n], to int64 nanoseconds: integers exactly, others as float64, rounded to the nearest.
 
     Args:
         where: beginning of the error message.

@@ -69,7 +69,7 @@ def read_texts(
 def read_text_events(
     stream: IO[bytes], name: str, *, time_unit: str | None = None
 ) -> Iterator[SensorSize | EventChunk | Note]:
-    """Yield the sensor's size, if the file states it, and chunks of events. A last line that was cut is left out.
+    """Yield the sensor's size, if the file states it, and chunks of events. A last line that is truncated is left out.
 
     Args:
         stream: the file's bytes; read in blocks of 4 MiB.

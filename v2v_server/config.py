@@ -61,7 +61,6 @@ class ServeConfig:
         metavar="DIR",
     )
     cache_gib: float = number(100.0, 0.0, 1e6, "size limit of --cache", unit="GiB", metavar="N")
-    cache_raw: bool = switch(False, "store frames in --cache without compression: about twice the size, faster to read")
     copies: str = text(
         "", "folder for videos fetched from object storage (default: in the user's cache folder)", metavar="DIR"
     )

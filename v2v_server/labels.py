@@ -108,7 +108,7 @@ class BoxTable:
         return cls(frames, corners, numbers, annotated)
 
     def at(self, frame: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-        """Return corners and numbers of the boxes of one frame.
+        """Return corners, [n, 4], and numbers, [n, 2], of the boxes of one frame.
 
         Raises:
             ValueError: the frame has no labels.
@@ -140,7 +140,11 @@ def checked(where: str, box: Box) -> Box:
 
 
 def read_coco(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
-    """Read a COCO-VID file."""
+    """Read a COCO-VID file.
+
+    Raises:
+        ValueError: it is malformed, or describes another video.
+    """
     content = parse_json(_content(file))
     if not isinstance(content, dict):
         raise ValueError("is not a JSON object with images and annotations")
@@ -175,7 +179,11 @@ def read_coco(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
 
 
 def read_mot(file: Traversable, picture_px: tuple[int, int]) -> BoxTable:
-    """Read a MOT Challenge text."""
+    """Read a MOT Challenge text.
+
+    Raises:
+        ValueError: a line is malformed.
+    """
     boxes = []
     for where, line in _lines(file):
         values = _numbers(where, line.split(","), _MOT_COLUMNS, 6, 10)
@@ -214,6 +222,9 @@ def read_yolo(folder: Traversable, picture_px: tuple[int, int]) -> BoxTable:
     Args:
         folder: the files.
         picture_px: height and width of the picture, which the coordinates are shares of.
+
+    Raises:
+        ValueError: a line is malformed.
     """
     boxes = []
     height_px, width_px = picture_px
@@ -460,7 +471,11 @@ def view_boxes(
 
 
 def kept_boxes(corners: npt.NDArray[np.float64], share: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """Return the numbers of the boxes that stay, largest area in the crop first; equal ones keep their order."""
+    """Return the numbers of the boxes that stay, largest area in the crop first; equal ones keep their order.
+
+    Args:
+        corners, share: [n, 4] and [n], as :func:`view_boxes` returns them.
+    """
     sides = corners[:, 2:] - corners[:, :2]
     stays = (share >= LEAST_SHARE) & (sides >= LEAST_SIDE_PX).all(axis=1)
     (kept,) = np.nonzero(stays)

@@ -132,13 +132,13 @@ class Runs:
         self._piece_begin = self.ends - lengths
 
     def frame(self, place: _Int64) -> _Int64:
-        """Return which frames of their videos usable frames are, by their places among all."""
+        """Return which frames of their videos usable frames are, [n], by their places among all, [n]."""
         piece = self.ends.searchsorted(place, side="right")
         frames: _Int64 = self.piece_first[piece] + place - self._piece_begin[piece]
         return frames
 
     def flagged(self, flag: int, first: _Int64, count: _Int64) -> _Int64:
-        """Return how many of ``count`` usable frames from each place on have a flag."""
+        """Return how many of ``count`` usable frames from each place ``first`` on have a flag, [n] all three."""
         has = (self.piece_flags & flag) != 0
         lengths = np.where(has, self.ends - self._piece_begin, 0)
         before = np.cumsum(lengths) - lengths
@@ -216,7 +216,7 @@ class SplitSequences:
         return int(self._whole.sum() - in_place.sum())
 
     def too_short(self) -> tuple[npt.NDArray[np.integer], _Int64]:
-        """Return the videos that have no sequence because they are divided, and the frames of their longest runs."""
+        """Return the videos without a sequence because they are divided, [n], and the frames of their longest runs."""
         longest = np.zeros(len(self._split), np.int64)
         np.maximum.at(longest, self._runs.owners, self._runs.frames)
         short = (self._whole > 0) & (self.counts == 0)
@@ -403,7 +403,7 @@ class Refusals(Sequence[Refusal]):
     """Reasons why videos give no sequence.
 
     Args:
-        places: positions of these videos in the catalogue.
+        places: [n] positions of these videos in the catalogue.
         videos: all entries of the catalogue.
         rows, spec: rows and spec that the videos do not suit.
     """
@@ -635,6 +635,9 @@ class Permutation:
         n: size of the domain, at least 1.
         seed: 0 .. 2**64 - 1.
         epoch: 0 .. 2**32 - 1.
+
+    Raises:
+        ValueError: ``n`` is below 1.
     """
 
     def __init__(self, n: int, seed: int, epoch: int) -> None:

@@ -75,7 +75,7 @@ def start_events(made: RemadeSample) -> npt.NDArray[np.float64]:
 
 
 def describe_start(events: npt.NDArray[np.float64]) -> str:
-    """Return one line for the user about the events that starts make, from the sum of :func:`start_events`."""
+    """Return one line for the user about the events that starts make, from the sum of :func:`start_events`, [2]."""
     share = max(0.0, events[0] - events[1]) / max(events[0], 1.0)
     return f"the start of a clip makes {share:.0%} of its events without noise"
 

@@ -1,40 +1,25 @@
-"""Any sample of any stream, made in this process: `v2v-simulate`, tests, and bug reports about a trainer's sample."""
+"""Make any sample of any stream in this process: for `v2v-simulate`, `V2VDataset`, tests and bug reports."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from v2v_pictures.camera import Camera, check_drawable
-from v2v_pictures.files import write_png
-from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError, VideoUnreadable
 from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
-from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
 from v2v_protocol.sample import DEFAULT_ARRAYS, Refusal, RefusalKind, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.broker import dispatcher
 from v2v_server.broker.dispatcher import next_candidate
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
-from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
+from v2v_server.quarantine import Quarantine
 from v2v_server.schedule import MOST_CANDIDATES, Schedule, SequenceTable, VideoSequence
-from v2v_server.store.pixels import VIDEOS, VideosKind
+from v2v_server.store.pixels import VideosKind
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample, open_sidecars
-from v2v_tools.event_files import check_event_file, write_events
-
-_MOMENTS = 4
-"""Voxel grids that a picture shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,78 +163,6 @@ def remake(
 def _is_left_out(catalogue: Catalogue, video: str) -> bool:
     """Return whether the video could not be prepared, so that a prepared folder has no file for it."""
     return catalogue.prepared is not None and not catalogue.path(video).exists()
-
-
-def simulate_to_file(
-    source: str,
-    *,
-    out: Path,
-    picture: Path | None,
-    list_file: str | None,
-    rows: str,
-    spec: Mapping[str, Any],
-    arrays: tuple[str, ...],
-    seed: int,
-    epoch: int,
-    index: int,
-    snapshot: int = 0,
-    cache_dir: str | None = None,
-    kind: VideosKind = VIDEOS,
-    events: Path | None = None,
-) -> None:
-    """Make one sample and write it as .npz: the requested arrays and ``provenance``, a JSON text.
-
-    Args:
-        source, list_file, rows: the corpus, as for a server.
-        out: the .npz file.
-        picture: a .png file for a picture of the sample, or None.
-        spec: fields of the StreamSpec; None in any takes the default.
-        arrays, seed, epoch, index: see :func:`remake`.
-        snapshot: number of the quarantine snapshot to make it under.
-        cache_dir: folder of the catalogue index and the quarantine; None: the user's cache.
-        kind: what a video is.
-        events: a file for the sample's events (``event_files.py``), or None. Their clock is that of the video's frames.
-
-    Raises:
-        UsageError, CorpusError, SampleUnavailable, VideoUnreadable: see :func:`remake`; or a file cannot be written, or
-            there is no such snapshot.
-    """
-    stream = StreamSpec.from_dict(spec)
-    if picture is not None:
-        check_drawable(arrays)
-    if events is not None:
-        check_event_file(events)
-    scene = stream.scene != "off"
-    catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir, kind=kind)
-    quarantine = read_quarantine(quarantine_path(catalogue.source.name, cache_dir)) if snapshot else Quarantine()
-    quarantine.entries(snapshot)  # before any work: whether there is such a snapshot
-    for refusal in catalogue.refusals:
-        show(f"cannot be used: {refusal}")
-    remade = Remaker(catalogue, stream, arrays, quarantine, snapshot).made(seed, epoch, index)
-    sample = remade.sample
-    provenance = sample.provenance.to_dict()
-    content: Mapping[str, Any] = {**sample.arrays, "provenance": json.dumps(provenance)}
-    try:
-        with write_aside_and_rename(out) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, **content)
-        if picture is not None:
-            camera = Camera.of(sample.arrays, sample.provenance, f"index {index}", stream.recipe)
-            write_png(picture, draw_sheet([camera], f"seed {seed}, epoch {epoch}", moments=_MOMENTS))
-        if events is not None:
-            made = list_sample_events(remade.lease, remade.decoded)
-            write_events(events, made)
-            show(f"{len(made)} events written to {events}")
-    except OSError as error:
-        raise UsageError(f"{error.filename or out}: {error.strerror}") from error
-    for name, why in sample.provenance.unlabelled.items():
-        show(f"no {name}: {why}")
-    params = sample.provenance.params
-    show(
-        f"{sample.provenance.video} from frame {sample.provenance.start_frame}: "
-        + ", ".join(f"{name} {array.dtype}{list(array.shape)}" for name, array in sample.arrays.items())
-        + f"; thresholds +{params.threshold_pos:.3f} -{params.threshold_neg:.3f}, noise {params.noise_sigma:.3f}, "
-        f"{params.hot_pixel_count} hot pixels, {sample.provenance.saturated_bins} bins saturated; written to {out}"
-    )
 
 
 def lease_for(

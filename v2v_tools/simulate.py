@@ -1,19 +1,34 @@
-"""`v2v-simulate`: arguments -> call."""
+"""`v2v-simulate`: make one sample of a stream, and write it as .npz, with its picture and its events."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
+
+from v2v_pictures.camera import Camera, check_drawable
+from v2v_pictures.files import write_png
+from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.command import Parser, run_command
-from v2v_protocol.errors import V2VError
+from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.programs import show
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
+from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting, spec_fields
+from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.config import ServeConfig
+from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
 from v2v_server.store.pixels import VideosKind
-from v2v_tools.event_files import EVENT_WRITERS
-from v2v_tools.remake import simulate_to_file
+from v2v_server.worker.produce import list_sample_events
+from v2v_tools.event_files import EVENT_WRITERS, check_event_file, write_events
+from v2v_tools.remake import Remaker, open_shown
+
+_MOMENTS = 4
+"""Voxel grids that a picture shows."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -60,22 +75,47 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
 
 
-def _run(arguments: argparse.Namespace) -> None:
-    simulate_to_file(
-        arguments.video,
-        out=arguments.out,
-        picture=arguments.picture,
-        events=arguments.events,
-        list_file=arguments.list,
-        rows=arguments.rows or "full",
-        spec=spec_fields(arguments) | {"recipe": recipe_setting(asked_recipe(arguments), arguments.set)},
-        arrays=tuple(arguments.arrays.split(",")),
-        seed=arguments.seed,
-        epoch=arguments.epoch,
-        index=arguments.index,
-        snapshot=arguments.quarantine,
-        cache_dir=arguments.cache_dir,
-        kind=VideosKind.of(vars(arguments)),
+def _run(asked: argparse.Namespace) -> None:
+    """Make one sample, and write it: the requested arrays and ``provenance``, a JSON text."""
+    spec = StreamSpec.from_dict(spec_fields(asked) | {"recipe": recipe_setting(asked_recipe(asked), asked.set)})
+    arrays = tuple(asked.arrays.split(","))
+    if asked.picture is not None:
+        check_drawable(arrays)
+    if asked.events is not None:
+        check_event_file(asked.events)
+    catalogue = open_shown(
+        asked.video, list_file=asked.list, rows=asked.rows or "full", scene=spec.scene != "off",
+        cache_dir=asked.cache_dir, kind=VideosKind.of(vars(asked)),
+    )  # fmt: skip
+    path = quarantine_path(catalogue.source.name, asked.cache_dir)
+    quarantine = read_quarantine(path) if asked.quarantine else Quarantine()
+    quarantine.entries(asked.quarantine)  # before any work: whether there is such a snapshot
+    for refusal in catalogue.refusals:
+        show(f"cannot be used: {refusal}")
+    remaker = Remaker(catalogue, spec, arrays, quarantine, asked.quarantine)
+    remade = remaker.made(asked.seed, asked.epoch, asked.index)
+    sample, provenance = remade.sample, remade.sample.provenance
+    content: dict[str, Any] = {**sample.arrays, "provenance": json.dumps(provenance.to_dict())}
+    try:
+        with write_aside_and_rename(asked.out) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **content)
+        if asked.picture is not None:
+            camera = Camera.of(sample.arrays, provenance, f"index {asked.index}", spec.recipe)
+            write_png(asked.picture, draw_sheet([camera], f"seed {asked.seed}, epoch {asked.epoch}", moments=_MOMENTS))
+        if asked.events is not None:
+            events = list_sample_events(remade.lease, remade.decoded)
+            write_events(asked.events, events)
+            show(f"{len(events)} events written to {asked.events}")
+    except OSError as error:
+        raise UsageError(f"{error.filename or asked.out}: {error.strerror}") from error
+    for name, why in provenance.unlabelled.items():
+        show(f"no {name}: {why}")
+    params = provenance.params
+    show(
+        f"{provenance.video} from frame {provenance.start_frame}: "
+        + ", ".join(f"{name} {array.dtype}{list(array.shape)}" for name, array in sample.arrays.items())
+        + f"; thresholds +{params.threshold_pos:.3f} -{params.threshold_neg:.3f}, noise {params.noise_sigma:.3f}, "
+        f"{params.hot_pixel_count} hot pixels, {provenance.saturated_bins} bins saturated; written to {asked.out}"
     )
 
 

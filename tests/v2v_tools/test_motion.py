@@ -20,8 +20,8 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.simulation import simulate
 from v2v_server.video.rows import Rows
 from v2v_tools import motion
+from v2v_tools import preview as command
 from v2v_tools.motion import WholePictures, describe_start, moving_seeds, noise_rate, quiet_voxels, start_events
-from v2v_tools.preview import command
 from v2v_tools.remake import Remaker
 
 RECIPE = {"voxels_per_clip": 3, "bins": 2, "crop_height_px": 48, "crop_width_px": 48, "frame_stride": 2}
@@ -116,7 +116,7 @@ def _drawn(clip: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *flags: st
         wholes.append(whole)
         return np.zeros((8, 8, 3), np.uint8)
 
-    monkeypatch.setattr("v2v_tools.preview.preview.draw_sheet", keep)
+    monkeypatch.setattr("v2v_tools.preview.draw_sheet", keep)
     sets = [f"--set={name}={value}" for name, value in RECIPE.items()]
     out = ["--out", str(folder / "p.png"), "--cache-dir", str(folder), "--no-flow"]
     assert command.main([str(clip), *out, *sets, *flags]) == 0

@@ -18,8 +18,8 @@ from tests.oracles.rendered import rendered_scene
 from v2v_pictures.camera import Camera
 from v2v_pictures.sheet import class_colour
 from v2v_protocol.errors import CorpusError, UsageError
-from v2v_tools.preview import command
-from v2v_tools.preview.preview import Shot, preview
+from v2v_tools import preview as command
+from v2v_tools.preview import PreviewCamera, preview
 
 TINY = {"voxels_per_clip": 3, "crop_height_px": 48, "crop_width_px": 64}
 
@@ -30,10 +30,10 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_each_kind_of_file_is_what_its_name_says(clip: Path, tmp_path: Path) -> None:
-    two = [Shot("a", TINY, 0), Shot("b", TINY, 1)]
-    for kind, shots in (("png", two), ("mp4", two[:1]), ("gif", two[:1]), ("html", two[:1])):
+    two = [PreviewCamera("a", TINY, 0), PreviewCamera("b", TINY, 1)]
+    for kind, wanted in (("png", two), ("mp4", two[:1]), ("gif", two[:1]), ("html", two[:1])):
         preview(
-            str(clip), tmp_path / f"preview.{kind}", shots, {}, title="t", cache_dir=str(tmp_path),
+            str(clip), tmp_path / f"preview.{kind}", wanted, {}, title="t", cache_dir=str(tmp_path),
             with_flow=kind == "png", say=lambda line: None,
         )  # fmt: skip
     with Pictures.open(tmp_path / "preview.png") as picture:
@@ -54,7 +54,7 @@ def test_a_single_video_is_shown_with_the_boxes_beside_it(clip: Path, tmp_path: 
             boxes.write_text(text)
         out = tmp_path / "p.png"
         preview(
-            str(tmp_path / clip.name), out, [Shot("", TINY, 0)], {}, title="t", cache_dir=str(tmp_path),
+            str(tmp_path / clip.name), out, [PreviewCamera("", TINY, 0)], {}, title="t", cache_dir=str(tmp_path),
             with_flow=False, say=lambda line: None,
         )  # fmt: skip
         with Pictures.open(out) as picture:
@@ -66,8 +66,8 @@ def test_a_single_video_is_shown_with_the_boxes_beside_it(clip: Path, tmp_path: 
 
 def test_a_video_too_short_or_too_small_is_shown_all_the_same_and_said(clip: Path, tmp_path: Path) -> None:
     said: list[str] = []
-    looks = [Shot("paper", "paper", 0)]
-    preview(str(clip), tmp_path / "p.png", looks, {}, title="t", cache_dir=str(tmp_path), say=said.append)
+    wanted = [PreviewCamera("paper", "paper", 0)]
+    preview(str(clip), tmp_path / "p.png", wanted, {}, title="t", cache_dir=str(tmp_path), say=said.append)
     # 40 frames: 7 grids of 5 bins; 96 rows: a crop of 128 shrinks by quarters.
     assert "all cameras: shown with 7 voxel grids of 96 x 96 instead of 40 of 128 x 128" in said[0]
     assert said[-1] == f"{tmp_path / 'p.png'}: 1 camera"
@@ -76,7 +76,7 @@ def test_a_video_too_short_or_too_small_is_shown_all_the_same_and_said(clip: Pat
 def test_a_video_of_one_frame_is_refused(tmp_path: Path) -> None:
     still = write_clip(tmp_path / "still.mp4", panned_luma(1, 64, 64))
     with pytest.raises(CorpusError, match=r"still\.mp4"):
-        preview(str(still), tmp_path / "p.png", [Shot("", "paper", 0)], {}, title="t", cache_dir=str(tmp_path))
+        preview(str(still), tmp_path / "p.png", [PreviewCamera("", "paper", 0)], {}, title="t", cache_dir=str(tmp_path))
     assert not (tmp_path / "p.png").exists()
 
 
@@ -86,9 +86,9 @@ def test_the_command_compares_recipes_on_one_clip(
     seen: list[tuple[str, int]] = []
     drawn = command.preview
 
-    def spy(source: str, out: Path, looks: list[Shot], *rest: object, **named: object) -> None:
-        seen.extend((look.title, look.seed) for look in looks)
-        drawn(source, out, looks, *rest, **named)  # type: ignore[arg-type]
+    def spy(source: str, out: Path, wanted: list[PreviewCamera], *rest: object, **named: object) -> None:
+        seen.extend((each.title, each.seed) for each in wanted)
+        drawn(source, out, wanted, *rest, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(command, "preview", spy)
     sets = [f"--set={name}={value}" for name, value in TINY.items()]
@@ -146,8 +146,8 @@ def test_what_is_wrong_is_one_line_and_leaves_no_file(
 def test_recipes_of_other_sizes_are_not_compared(clip: Path, tmp_path: Path) -> None:
     """A sheet needs equal bins, a film also equal clips."""
     more: dict[str, Any] = {"title": "t", "with_flow": False, "cache_dir": str(tmp_path / "cache")}
-    bins = [Shot(f"b{number}", {**TINY, "bins": number}, 0) for number in (2, 3)]
-    clips = [Shot(f"c{number}", {**TINY, "voxels_per_clip": number}, 0) for number in (2, 3)]
+    bins = [PreviewCamera(f"b{number}", {**TINY, "bins": number}, 0) for number in (2, 3)]
+    clips = [PreviewCamera(f"c{number}", {**TINY, "voxels_per_clip": number}, 0) for number in (2, 3)]
     with pytest.raises(UsageError, match=r"b2 has 3 frames of 2 bins here, b3 has 3 .*: give recipes of equal bins"):
         preview(str(clip), tmp_path / "p.png", bins, {}, **more)
     with pytest.raises(UsageError, match=r"c2 has 2 frames of 5 bins here, c3 has 3 "):
@@ -159,15 +159,15 @@ def test_recipes_of_other_sizes_are_not_compared(clip: Path, tmp_path: Path) -> 
 
 def test_the_error_of_the_library_is_typed(clip: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="ends in"):
-        preview(str(clip), tmp_path / "p.tiff", [Shot("", "paper", 0)], {}, title="t")
+        preview(str(clip), tmp_path / "p.tiff", [PreviewCamera("", "paper", 0)], {}, title="t")
 
 
 def test_many_cameras_and_a_film_show_their_progress(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("v2v_protocol.progress.LOG_SECONDS", 0.0)
-    shots = [Shot(str(seed), TINY, seed) for seed in range(4)]
-    preview(str(clip), tmp_path / "p.gif", shots, {}, title="t", cache_dir=str(tmp_path), with_flow=False)
+    wanted = [PreviewCamera(str(seed), TINY, seed) for seed in range(4)]
+    preview(str(clip), tmp_path / "p.gif", wanted, {}, title="t", cache_dir=str(tmp_path), with_flow=False)
     said = capsys.readouterr().err.splitlines()
     cameras = [line for line in said if line.startswith("simulating: ")]
     assert [line.split(" cameras")[0] for line in cameras] == [f"simulating: {number} of 4" for number in range(1, 5)]
@@ -184,9 +184,9 @@ def _shares(
         cameras.extend(shown)
         return np.zeros((8, 8, 3), np.uint8)
 
-    monkeypatch.setattr("v2v_tools.preview.preview.draw_sheet", keep)
-    shots = [Shot("a", TINY | recipe, 0)]
-    preview(str(source), tmp_path / "a.png", shots, {}, title="t", cache_dir=str(tmp_path), with_flow=False)
+    monkeypatch.setattr("v2v_tools.preview.draw_sheet", keep)
+    wanted = [PreviewCamera("a", TINY | recipe, 0)]
+    preview(str(source), tmp_path / "a.png", wanted, {}, title="t", cache_dir=str(tmp_path), with_flow=False)
     return [camera.noise_share([0, 1, 2]) for camera in cameras]
 
 
@@ -200,8 +200,10 @@ def test_the_share_of_noise_is_measured(clip: Path, tmp_path: Path, monkeypatch:
 
 def _said(source: Path, tmp_path: Path) -> str:
     said: list[str] = []
-    shots = [Shot("a", {"preset": "noise-free", "voxels_per_clip": 3, "crop_height_px": 64, "crop_width_px": 64}, 0)]
-    preview(str(source), tmp_path / "a.png", shots, {}, title="t", cache_dir=str(tmp_path), say=said.append)
+    wanted = [
+        PreviewCamera("a", {"preset": "noise-free", "voxels_per_clip": 3, "crop_height_px": 64, "crop_width_px": 64}, 0)
+    ]
+    preview(str(source), tmp_path / "a.png", wanted, {}, title="t", cache_dir=str(tmp_path), say=said.append)
     return said[-2]
 
 

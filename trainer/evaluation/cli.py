@@ -26,7 +26,6 @@ from trainer.evaluation.reconstruct import Stretch
 from trainer.evaluation.score import SequenceScore
 from trainer.evaluation.tables import records, table, write_frames
 from trainer.evaluation.voxelise import Kind, Span, VoxelSettings
-from trainer.models import NETWORKS
 from trainer.weights import SHIPPED, load_network
 from v2v_protocol.command import JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
@@ -83,7 +82,6 @@ def _parser() -> Parser:
         "of any form that v2v-convert reads",
     )  # fmt: skip
     what.add_argument("--ema", action="store_true", help="take the averaged weights of a checkpoint of v2v-train")
-    what.add_argument("--model", choices=tuple(NETWORKS), help="network of the weights (default: recognised)")
     how.add_argument(
         "--normalize-voxels", action="store_true", help="normalise every voxel grid, as the published FireNet requires"
     )
@@ -237,9 +235,7 @@ def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[R
     options: dict[str, Any] = dict(config.model_options)
     if arguments.normalize_voxels:
         options["normalize_voxels"] = True
-    network, model = load_network(
-        arguments.weights, name=arguments.model or config.model, options=options, ema=arguments.ema
-    )
+    network, model = load_network(arguments.weights, name=config.model, options=options, ema=arguments.ema)
     voxels = config.voxels or VoxelSettings(bins=network.bins)
     changed = {"kind": arguments.voxels, "span": arguments.span, "truncate": arguments.as_published or None}
     voxels = dataclasses.replace(voxels, **{name: value for name, value in changed.items() if value is not None})

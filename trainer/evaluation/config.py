@@ -84,7 +84,11 @@ def read_config(name: str) -> EvaluationConfig:
 
 
 def parse_config(content: Any, where: str) -> EvaluationConfig:
-    """Check parsed YAML as :func:`read_config` does; ``where`` names it in messages."""
+    """Check parsed YAML as :func:`read_config` does; ``where`` names it in messages.
+
+    Raises:
+        UsageError: see :func:`read_config`.
+    """
     top = _mapping(content, where, KEYS)
     model = _mapping(top.get("model", {}), f"{where}: model", ("name", "options"))
     voxels = _mapping(top.get("voxels", {}), f"{where}: voxels", ("kind", "bins", "span"))
@@ -104,7 +108,11 @@ def parse_config(content: Any, where: str) -> EvaluationConfig:
 
 
 def folder_config(path: Path) -> EvaluationConfig:
-    """Return a configuration for all recordings of a folder, or a single file, as one data set without time ranges."""
+    """Return a configuration for all recordings of a folder, or a single file, as one data set without time ranges.
+
+    Raises:
+        UsageError: the folder has no recordings.
+    """
     files = [path] if path.is_file() else sorted(file for file in path.glob("*") if file.suffix.lower() in SUFFIXES)
     if not files:
         raise UsageError(f"{path} has no recordings ({', '.join(SUFFIXES)}); convert raw ones with v2v-convert")

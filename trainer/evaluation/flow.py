@@ -39,6 +39,7 @@ from trainer.precision import ieee_products
 from v2v_protocol.errors import UsageError
 
 FlowImage = npt.NDArray[np.float32]
+"""[2, H, W], (x, y) px."""
 
 HOOD_ROW = 190
 LARGE_PX = 3.0

@@ -34,6 +34,7 @@ from trainer.losses.lpips import LPIPS
 from v2v_protocol.errors import UsageError
 
 GreyImage = npt.NDArray[np.float64]
+"""[H, W]."""
 Metric = Callable[[GreyImage, GreyImage], float]
 
 LpipsFiles = Mapping[str, tuple[str | Path, str | Path]]

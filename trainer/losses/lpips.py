@@ -33,7 +33,7 @@ SMALLEST_SQUARE = 1e-30
 
 
 def unit_length(features: Tensor) -> Tensor:
-    """Divide features by their length over the channels, as LPIPS defines it. Zero stays zero.
+    """Divide features, [B, C, H, W], by their length over the channels, as LPIPS defines it. Zero stays zero.
 
     The published |f| = sqrt(sum f^2) has an infinite derivative where all channels are 0, and infinity times the
     squares' derivative of 0 is NaN. A single such position, common after a ReLU, makes the whole gradient NaN.

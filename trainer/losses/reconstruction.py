@@ -11,7 +11,7 @@ from v2v_protocol.errors import UsageError
 
 
 def l1_loss(prediction: Tensor, target: Tensor) -> Tensor:
-    """Return the mean absolute difference over all elements, in float32 or wider.
+    """Return the mean absolute difference over all elements of two tensors [...], in float32 or wider.
 
     Raises:
         UsageError: the shapes differ; broadcasting would hide that.

@@ -39,6 +39,7 @@ class ConvLayer(nn.Module):
         self.relu = relu
 
     def forward(self, x: Tensor) -> Tensor:
+        """Apply the layer to a sequence [T*B, C, H, W]."""
         x = self.conv2d(x)
         if self.norm:
             x = self.norm_layer(x)
@@ -49,6 +50,7 @@ class UpsampleConvLayer(ConvLayer):
     """Apply bilinear upsampling by 2 (``align_corners=False``), then :class:`ConvLayer`."""
 
     def forward(self, x: Tensor) -> Tensor:
+        """Apply the layer to a sequence [T*B, C, H, W]; the result has [T*B, C', 2 H, 2 W]."""
         return super().forward(F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False))
 
 
@@ -65,6 +67,7 @@ class TransposedConvLayer(nn.Module):
         self.norm = norm
 
     def forward(self, x: Tensor) -> Tensor:
+        """Apply the layer to a sequence [T*B, C, H, W]; the result has [T*B, C', 2 H, 2 W]."""
         x = self.transposed_conv2d(x)
         return F.relu(self.norm_layer(x) if self.norm else x)
 
@@ -82,6 +85,7 @@ class ResidualBlock(nn.Module):
         self.norm = norm
 
     def forward(self, x: Tensor) -> Tensor:
+        """Apply the block to a sequence [T*B, C, H, W]."""
         out = self.conv1(x)
         out = F.relu(self.bn1(out) if self.norm else out)
         out = self.conv2(out)

@@ -164,12 +164,16 @@ class E2VID(VoxelNetwork):
 
     @classmethod
     def own_tensor(cls, name: str, tensor: Tensor) -> Tensor:
-        """Keep channel 0, the picture, of E2VID+'s prediction layer, which also predicts flow."""
+        """Keep channel 0, the picture, of E2VID+'s prediction layer, [3, ...], which also predicts flow."""
         return tensor[:1].clone() if PREDICTION.fullmatch(name) and len(tensor) == 3 else tensor
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], settings: Settings) -> dict[str, Any]:
-        """Derive sizes, norm and upsampling from the tensors, and the first release's sigmoid from the settings."""
+        """Derive sizes, norm and upsampling from the tensors, and the first release's sigmoid from the settings.
+
+        Raises:
+            UsageError: see :meth:`VoxelNetwork.from_state`.
+        """
         for name, built in (("skip_type", "sum"), ("recurrent_block_type", "convlstm")):
             if settings.get(name, built) != built:
                 raise UsageError(f"E2VID with {name} = {settings[name]!r} is not implemented, only {built!r}")

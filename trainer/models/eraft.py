@@ -42,6 +42,9 @@ class ERAFT(VoxelNetwork):
             the published code does, instead of over all windows of the batch.
         normalize_voxels: see :class:`VoxelNetwork`; True for the published network.
         padding: see :class:`VoxelNetwork`.
+
+    Raises:
+        UsageError: ``bins`` is below 1.
     """
 
     task = "flow"

@@ -50,7 +50,7 @@ def fourier_bessel(reach: int, bandwidth: float) -> npt.NDArray[np.float64]:
         bandwidth: a zero counts if the next one of its J_k is at most pi R bandwidth.
 
     Returns:
-        [(2 reach + 1)^2 - 1, 2 reach + 1, 2 reach + 1], with a mean square norm of 1 over the functions.
+        [n, 2 reach + 1, 2 reach + 1], n at most (2 reach + 1)^2 - 1, with a mean square norm of 1 over the functions.
     """
     radius = reach + 0.5
     places = np.arange(-reach - 1, reach + 2) / radius

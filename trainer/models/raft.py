@@ -262,7 +262,7 @@ class RAFT(Loop, nn.Module):
         return flow + correction.to(flow.dtype), hidden
 
     def upsample(self, flow: Tensor, hidden: Tensor) -> Tensor:
-        """Return the flow of :meth:`refine` at full size."""
+        """Return the flow of :meth:`refine` at full size, [N, 2, H, W], px."""
         if self.mask_predictor is None:
             shape = [DOWNSCALE * side for side in flow.shape[2:]]
             return DOWNSCALE * functional.interpolate(flow, shape, mode="bilinear", align_corners=True)
@@ -344,7 +344,15 @@ def forward_splat(flow: Tensor) -> Tensor:
 
 
 def convex_upsampling(flow: Tensor, weights: Tensor) -> Tensor:
-    """Upsample flow by 8: fine pixels are convex combinations of 3 x 3 coarse neighbours (paper, section 3.3)."""
+    """Upsample flow by 8: fine pixels are convex combinations of 3 x 3 coarse neighbours (paper, section 3.3).
+
+    Args:
+        flow: [N, 2, h, w], px of that size.
+        weights: [N, 9 * 8 * 8, h, w], before softmax.
+
+    Returns:
+        [N, 2, 8 h, 8 w], px.
+    """
     count, _, height, width = flow.shape
     share = weights.view(count, 1, 9, DOWNSCALE, DOWNSCALE, height, width).softmax(dim=2)
     near = functional.unfold(DOWNSCALE * flow, 3, padding=1).view(count, 2, 9, 1, 1, height, width)

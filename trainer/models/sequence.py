@@ -50,11 +50,11 @@ class VoxelNetwork(nn.Module):
     """Map sequences of voxel grids to sequences of pictures or flow. Subclasses implement :meth:`unroll`.
 
     The memory is a value: it is passed in as ``state`` and returned, and the module keeps no state between calls. None
-    is the state after a reset (zeros). Calls on consecutive pieces of a sequence, each with the state returned by the
+    is the state after a reset (zeros). Calls on consecutive parts of a sequence, each with the state returned by the
     previous call, give the same result as one call on the whole.
 
     ``forward`` takes the whole sequence, so that wrappers of it (DistributedDataParallel) see one call per training
-    step. Memory of the activations is proportional to T: evaluate long recordings in short pieces.
+    step. Memory of the activations is proportional to T: evaluate long recordings in short parts.
 
     A subclass sets these class attributes:
         task: name of its task in :data:`trainer.tasks.TASKS`.
@@ -68,6 +68,9 @@ class VoxelNetwork(nn.Module):
         padding: position of the padding: bottom and right (V2V), all sides (E2VID and its successors; the odd pixel
             goes to the top and the left), or top and left (E-RAFT). Near the border the outputs depend on it.
         normalizes: whether every voxel grid is passed through :func:`normalize_voxels` first.
+
+    Raises:
+        UsageError: ``padding`` is unknown.
     """
 
     task: ClassVar[str] = "reconstruction"
@@ -98,7 +101,7 @@ class VoxelNetwork(nn.Module):
 
     @classmethod
     def own_tensor(cls, _name: str, tensor: Tensor) -> Tensor:
-        """Return the part of a published tensor that this network uses. ``_name`` is its name here."""
+        """Return the part of a published tensor [...] that this network uses. ``_name`` is its name here."""
         return tensor
 
     @classmethod
@@ -115,7 +118,7 @@ class VoxelNetwork(nn.Module):
         raise NotImplementedError
 
     def unroll(self, x: Tensor, state: Any, steps: int, guide: Guide | None) -> tuple[Tensor, Any]:
-        """Run the network over a piece of a sequence.
+        """Run the network over a part of a sequence.
 
         Args:
             x: voxel grids [T*B, bins, H, W], time-major, H and W multiples of ``size_multiple``.
@@ -130,12 +133,12 @@ class VoxelNetwork(nn.Module):
         raise NotImplementedError
 
     def forward(self, voxels: Tensor, state: Any = None, guide: Guide | None = None) -> tuple[Tensor, Any]:
-        """Compute the outputs for a piece of a sequence.
+        """Compute the outputs for a part of a sequence.
 
         Args:
             voxels: [B, T, bins, H, W], any dtype (the stream's int8 counts are converted here, on the device), not
                 normalised.
-            state: the state returned for the previous piece, or None at the start of a sequence.
+            state: the state returned for the previous part, or None at the start of a sequence.
             guide: in training, true pictures to mix in.
 
         Returns:
@@ -194,7 +197,10 @@ class VoxelNetwork(nn.Module):
 
 
 def predict(layer: nn.Module, x: Tensor) -> Tensor:
-    """Apply the last, 1x1 convolution outside autocast: a bfloat16 picture would have steps of 1/256 near white."""
+    """Apply the last, 1x1 convolution to features [N, C, H, W].
+
+    It runs outside autocast: a bfloat16 picture would have steps of 1/256 near white.
+    """
     with torch.autocast(x.device.type, enabled=False):
         picture: Tensor = layer(x.to(next(layer.parameters()).dtype))
         return picture

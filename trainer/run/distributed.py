@@ -49,7 +49,7 @@ class Ranks:
         return bool(votes.item())
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the mean over the ranks; all ranks call it."""
+        """Return the mean over the ranks of tensors [...] of equal shape; all ranks call it."""
         if self.world_size == 1:
             return values
         values = values.clone()
@@ -73,7 +73,7 @@ class Ranks:
         return values
 
     def copy_from_first(self, tensors: Iterable[Tensor]) -> None:
-        """Overwrite tensors with those of the first rank; all ranks call it with equally many of equal shapes."""
+        """Overwrite tensors [...] with those of the first rank; all ranks call it with equally many of equal shapes."""
         if self.world_size > 1:
             for tensor in tensors:
                 dense = tensor.contiguous()  # exchanges refuse other memory formats

@@ -139,7 +139,7 @@ class Flow(Task):
         return FlowScorer(FlowRun(network, voxels, str(self.device)))
 
     def film(self, voxels: Tensor, prediction: Tensor, work: Work, sample: int) -> pictures.Image:
-        """Draw events, target and estimate; both flows in the colours of one scale."""
+        """See :meth:`Task.film`: events, target and estimate; both flows in the colours of one scale."""
         truth, found = (x[sample].cpu().numpy() for x in (work.truth["flow"], prediction))
         events = pictures.draw_events(voxels[sample, -len(truth) :].cpu().numpy())
         scale = pictures.flow_scale(truth)

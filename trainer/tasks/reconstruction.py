@@ -153,7 +153,7 @@ class Reconstruction(Task):
         return losses
 
     def film(self, voxels: Tensor, prediction: Tensor, work: Work, sample: int) -> pictures.Image:
-        """Draw events, target and reconstruction."""
+        """See :meth:`Task.film`: events, target and reconstruction."""
         truth = work.truth["frames"][sample]
         seen, found = (_at_frames(each[sample], truth, 0).cpu().numpy() for each in (voxels, prediction))
         grey = (pictures.draw_grey(each[:, 0]) for each in (truth.cpu().numpy(), found))

@@ -144,7 +144,8 @@ class Task(abc.ABC):
         """Compute the loss without copying anything to the host.
 
         Args:
-            prediction: output of the network for the voxels of ``work``.
+            prediction: output of the network for the voxels of ``work``, [B, T, C, H, W], or with more
+                dimensions in front (:meth:`VoxelNetwork.unroll`).
 
         Returns:
             The weighted terms by name, detached, and their sum as "total", which is not detached.
@@ -152,7 +153,7 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def film(self, voxels: Tensor, prediction: Tensor, work: Work, sample: int) -> Image:
-        """Draw input, target and output of one sample: [T, height, width, 3] uint8 RGB."""
+        """Draw input, [B, T, bins, H, W], target and output of one sample: [T, height, width, 3] uint8 RGB."""
 
     def recording_scorer(self, network: VoxelNetwork, voxels: VoxelSettings) -> RecordingScorer:
         """Return a scorer of recordings; each call scores the weights that ``network`` has then.

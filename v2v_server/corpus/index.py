@@ -141,7 +141,7 @@ def _insert(table: str, columns: Sequence[str]) -> str:
 
 
 class Store:
-    """An open index.
+    """The open index of a catalogue; a *store* elsewhere is the lossless clip store (``v2v_server/store``).
 
     Args:
         path: the SQLite file, made if missing; None keeps the index in memory.

@@ -46,7 +46,7 @@ _ASKED = 16
 
 
 class StringColumn(Sequence[str]):
-    """Strings in one piece of memory.
+    """Strings in one block of memory.
 
     Args:
         utf8: their UTF-8 one after the other, which sorts as the strings do; or bytes that are never read as strings.
@@ -63,7 +63,7 @@ class StringColumn(Sequence[str]):
         return np.diff(self._ends)
 
     def where(self, mask: npt.NDArray[np.bool_]) -> StringColumn:
-        """Return the strings at which the mask is set."""
+        """Return the strings at which the mask, [n], is set."""
         if mask.all():
             return self
         return StringColumn(self.utf8[np.repeat(mask, self.lengths)].data, self.lengths[mask])
@@ -160,7 +160,7 @@ class VideoTable:
         return cls(ids, fingerprints, *numbers, codec, remark, problem, summaries), np.stack((size, mtime, ctime), 1)
 
     def where(self, mask: npt.NDArray[np.bool_]) -> VideoTable:
-        """Return the rows at which the mask is set."""
+        """Return the rows at which the mask, [n], is set."""
         if mask.all():
             return self
         columns: list[Any] = [getattr(self, name) for name in self.__slots__]
@@ -234,7 +234,7 @@ def _columns(rows: list[tuple[Any, ...]]) -> tuple[Any, ...]:
 
 
 def _utf8(strings: Sequence[str]) -> tuple[bytes, array[int]]:
-    """Return strings as UTF-8 in one piece, and the bytes of each."""
+    """Return strings as UTF-8 in one block, and the bytes of each."""
     text = "".join(strings)
     if text.isascii():
         return text.encode(), array("i", map(len, strings))

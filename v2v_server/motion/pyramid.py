@@ -15,6 +15,7 @@ from v2v_server.motion.lanes import CELL_PX
 from v2v_server.video.picture import PixelRect
 
 GreyPicture = npt.NDArray[np.uint8]
+"""[h, w] uint8."""
 PAD_PX = 16
 """Border of a level: its edge repeated."""
 _LEVELS = 4

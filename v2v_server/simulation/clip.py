@@ -218,8 +218,11 @@ def simulate_log(
     Args:
         log_frames: [n, H, W] floating point, natural log of intensity; rounded to ``precision`` first.
 
-    Other arguments, result and errors are those of :func:`simulate`. There are no effects beyond the paper's model:
-    some depend on the brightness of a pixel relative to white, which a logarithm of unknown scale does not give.
+    Other arguments and the result are those of :func:`simulate`. There are no effects beyond the paper's model: some
+    depend on the brightness of a pixel relative to white, which a logarithm of unknown scale does not give.
+
+    Raises:
+        UsageError: see :func:`simulate`.
     """
     log_frames = np.asarray(log_frames)
     if log_frames.ndim != 3 or log_frames.dtype.kind != "f":

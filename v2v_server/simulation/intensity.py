@@ -122,7 +122,7 @@ def tone_table(gamma: float, signal: Signal) -> npt.NDArray[np.uint8]:
 
 
 def eight_bits(frames: npt.NDArray[Any], signal: Signal) -> npt.NDArray[np.uint8]:
-    """Return levels in 8 bits: rounded, with the same transfer. Levels of 8 bits are returned as they are."""
+    """Return levels, [n, H, W], in 8 bits: rounded, with the same transfer. Levels of 8 bits are returned unchanged."""
     return frames if signal.bits == 8 else tone_table(1.0, Signal(signal.bits))[frames]
 
 
@@ -167,7 +167,7 @@ def _power(base: Doubles, exponent: float) -> Doubles:
 
 
 def logarithm(x: Doubles) -> Doubles:
-    """Return ln x of positive numbers to a few units in the last place.
+    """Return ln x of positive numbers, [...], to a few units in the last place.
 
     x = 2 ** n m, sqrt(1/2) <= m < sqrt(2), and ln m = 2 artanh((m - 1) / (m + 1)), its series truncated below 1e-18.
     """
@@ -183,7 +183,7 @@ def logarithm(x: Doubles) -> Doubles:
 
 
 def exponential(x: Doubles) -> Doubles:
-    """Return e ** x to a few units in the last place.
+    """Return e ** x, [...], to a few units in the last place.
 
     x = n ln 2 + r, |r| <= ln 2 / 2, and the Taylor series of e ** r (degree 14, truncated below 1e-18).
     """

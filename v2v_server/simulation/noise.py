@@ -68,7 +68,7 @@ COS_COEFFICIENTS = tuple(
 
 
 def box_muller(x: Words, y: Words) -> tuple[Reals, Reals]:
-    """Return two independent standard normals of each pair of words: (r cos, r sin), float32."""
+    """Return two independent standard normals of each pair of words, [...]: (r cos, r sin), float32."""
     value = ((x & np.uint32(0x7FFFFFFF)) | np.uint32(1)).astype(np.int32).astype(np.float32)
     bits = value.view(np.int32)
     exponent = (bits - SQRT_HALF_BITS) >> np.int32(23)

@@ -95,7 +95,12 @@ def check_thresholds(threshold_pos: float, threshold_neg: float) -> None:
 
 
 def noise_sum(noise_sigma: float, hot_pixel_sigma: float, step_seconds: npt.NDArray[np.float64]) -> float:
-    """Return the standard deviations of noise and hot drift, summed over the steps, log units."""
+    """Return the standard deviations of noise and hot drift, summed over the steps, log units.
+
+    Args:
+        noise_sigma, hot_pixel_sigma: log units, of a second.
+        step_seconds: [steps].
+    """
     first = float(step_seconds[0])
     if (step_seconds == first).all():
         return len(step_seconds) * (noise_sigma * math.sqrt(first) + hot_pixel_sigma * first)

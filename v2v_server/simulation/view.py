@@ -24,7 +24,7 @@ FrameArray = npt.NDArray[Any]
 
 
 class Window(NamedTuple):
-    """A rectangle of the upright video picture."""
+    """A rectangle of the upright video picture; a window of ``trainer/evaluation`` is a time."""
 
     top_px: int
     left_px: int
@@ -92,7 +92,7 @@ def without_margin(
 
 
 def resized(frame: FrameArray, size: tuple[int, int], scale: float) -> FrameArray:
-    """Return a picture resized to (height, width)."""
+    """Return a picture, [H, W], resized to (height, width); ``scale`` is the factor."""
     method = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
     whole: FrameArray = np.asarray(cv2.resize(frame, (size[1], size[0]), interpolation=method), frame.dtype)
     return whole

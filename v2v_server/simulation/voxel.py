@@ -188,7 +188,7 @@ def rounding_tolerance(threshold_pos: float, threshold_neg: float) -> float:
 
 
 def new_array(dtype: str, shape: tuple[int, ...], out: npt.NDArray[Any] | None = None) -> npt.NDArray[Any]:
-    """Return an uninitialised array, or ``out`` if it is given.
+    """Return an uninitialised array [*shape], or ``out`` if it is given.
 
     Raises:
         UsageError: ``out`` is not such an array.

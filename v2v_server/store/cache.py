@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.errors import CorpusError, VideoError, VideoUnreadable
-from v2v_server.store.format import PIECE_FRAMES, QUICK, RAW, Packing
+from v2v_server.store.format import PIECE_FRAMES, QUICK
 from v2v_server.store.pixels import Pixels
 from v2v_server.store.planes import OPTIONAL, PLANES, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder, delete_unless_read
@@ -35,7 +35,7 @@ from v2v_server.video.picture import PixelRect
 _LOCK_SECONDS = 0.06
 """Longest wait for the lock of the folder; a sample does without the cache rather than wait."""
 _LARGE_PICTURE_PX = 1 << 20
-_EXPECTED_BITS = {QUICK: 4, RAW: 8}
+_EXPECTED_BITS = 4
 """Largest size of a packed pixel; the real size is known only after writing."""
 _REST_SECONDS = 60.0
 """Time without writing to a cache after a write failed."""
@@ -58,18 +58,14 @@ class Cache:
         folder: created by :func:`make_cache`.
         most_bytes: largest size of the folder, bytes.
         least_free_bytes: disk space to keep free, bytes.
-        packing: of the pieces that it stores, QUICK or RAW; it reads all.
 
     Attributes:
         on_wait: called with True before this waits for other processes, and with False when it goes on.
         trouble: the last problem, for people: why nothing more is stored, or a damaged piece; empty if there is none.
     """
 
-    def __init__(
-        self, folder: Path, most_bytes: int, least_free_bytes: int = LEAST_FREE_BYTES, packing: Packing = QUICK
-    ) -> None:
+    def __init__(self, folder: Path, most_bytes: int, least_free_bytes: int = LEAST_FREE_BYTES) -> None:
         self.folder = folder
-        self._packing = packing
         self._quota = QuotaFolder(folder, most_bytes, _LOCK_SECONDS, least_free_bytes)
         self._rest_until, self._rest_reason = 0.0, ""
         self.trouble = ""
@@ -168,7 +164,7 @@ class Cache:
         except OSError as error:
             self._rest(f"is gone: {error.strerror or error}")
             return False
-        expected = pixels * _EXPECTED_BITS[self._packing] // 8
+        expected = pixels * _EXPECTED_BITS // 8
         used = self._quota.used_bytes
         if used + expected > self._quota.most_bytes:
             self.trouble = f"full: {used / GIB:.2f} of {self._quota.most_bytes / GIB:g} GiB"
@@ -206,7 +202,7 @@ class Cache:
             try:
                 write_store(
                     partial, frames, index, usable, piece.first, piece.end - piece.first, video=video,
-                    fingerprint=fingerprint, packing=self._packing, planes=planes, is_private=True,
+                    fingerprint=fingerprint, packing=QUICK, planes=planes, is_private=True,
                 )  # fmt: skip
                 with self._waiting():
                     self._quota.add(partial, piece.path)

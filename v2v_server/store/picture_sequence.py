@@ -64,7 +64,11 @@ class PictureSequence(VideoFile):
         self._at: tuple[int | None, str] = None, ""  # frame and file in errors
 
     def facts(self) -> VideoFacts:
-        """Read all files; decode the first picture, and the heads of the others."""
+        """Read all files; decode the first picture, and the heads of the others.
+
+        Raises:
+            VideoError: a file cannot be read, or differs from the first one in size or format.
+        """
         stored, looks = xxhash.xxh3_128(), list[str]()
         with self._opened() as (files, read):
             pictures = self._pictures(files)

@@ -213,7 +213,11 @@ class StoreFile(BlockReader, AbstractContextManager["StoreFile"]):
             raise
 
     def facts(self) -> VideoFacts:
-        """Return the facts of the source."""
+        """Return the facts of the source.
+
+        Raises:
+            VideoError: the file is damaged.
+        """
         head = self.head
         try:
             index = FrameIndex.from_bytes(head.index)
@@ -323,7 +327,7 @@ class StoreFile(BlockReader, AbstractContextManager["StoreFile"]):
         return kind.from_pictures(pictures if wanted is None else pictures[wanted], cells)
 
     def arrays(self, name: str) -> Iterator[npt.NDArray[Any]]:
-        """Yield the arrays of a plane, one for each frame. Errors: :meth:`plane`."""
+        """Yield the arrays of a plane, [values, rows, columns] for each frame. Errors: :meth:`plane`."""
         head = self.head
         _, rows, columns = PLANES[name].shape(head.rows, head.width_px)
         for number in range(head.groups):

@@ -136,26 +136,30 @@ def usable_cores() -> int:
     return max(1, min(cores, math.ceil(min(_granted_cores(), cores))))
 
 
-def _granted_cores(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> float:
+def control_groups(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> Iterator[Path]:
+    """Yield the folders of this process's control group and those above it, the topmost first (Linux, version 2)."""
+    with suppress(OSError, ValueError):
+        (path,) = (line[3:] for line in own.read_text(encoding="utf-8").splitlines() if line.startswith("0::"))
+        for part in ("", *path.strip("/").split("/")):
+            groups = groups / part
+            yield groups
+
+
+def _granted_cores(*where: Path) -> float:
     """Return the processor time that this process and its siblings may use per second. It is the strictest limit of its
-    control group (Linux, version 2) and of those above it: ``docker run --cpus``, a pod's limit, CPUQuota of systemd.
+    control groups: ``docker run --cpus``, a pod's limit, CPUQuota of systemd.
+
+    Args:
+        where: see :func:`control_groups`.
 
     Returns:
         seconds per second; infinite without a limit.
     """
-    try:
-        (path,) = (line[3:] for line in own.read_text(encoding="utf-8").splitlines() if line.startswith("0::"))
-    except (OSError, ValueError):
-        return math.inf
-    least, folder = math.inf, groups
-    for part in ("", *path.strip("/").split("/")):
-        folder = folder / part
-        try:
-            quota, period = (folder / "cpu.max").read_text(encoding="utf-8").split()
-        except (OSError, ValueError):
-            continue  # the root group has no limit
-        if quota != "max":
-            least = min(least, int(quota) / int(period))
+    least = math.inf
+    for folder in control_groups(*where):
+        with suppress(OSError, ValueError):  # "max", or the topmost group, which has no limit
+            quota, period = map(int, (folder / "cpu.max").read_text(encoding="utf-8").split())
+            least = min(least, quota / period)
     return least
 
 

@@ -61,7 +61,7 @@ MPEG-1, 2, 4 and MJPEG: their standards leave the precision of the inverse trans
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """What one sample takes of a clip.
+    """What one sample takes of a clip: a number of frames, and a part of the picture. No shot boundary, which is CUTS.
 
     Attributes:
         count: number of frames, at least 1; with a stride, of those that are taken.
@@ -114,7 +114,7 @@ class ClipRequest:
         return top, 0, bottom - top, self.index.width_px
 
     def seconds(self, cut: Cut) -> npt.NDArray[np.float64]:
-        """Return the presentation times of the frames of a cut."""
+        """Return the presentation times of the frames of a cut, [count], seconds."""
         return self.index.seconds(self.start, (cut.count - 1) * self.stride + 1)[:: self.stride]
 
     def window(self, cut: Cut) -> PixelRect:
@@ -183,7 +183,7 @@ class DecodedFrame(NamedTuple):
     codec: str
 
     def raw(self, window: PixelRect) -> npt.NDArray[np.unsignedinteger]:
-        """Return a window of the upright picture as the decoder stores it, without a copy."""
+        """Return a window of the upright picture as the decoder stores it, [rows, columns], without a copy."""
         top, left, height, width = self.orientation.stored_window(window, self.height_px, self.width_px)
         return self.samples[top : top + height, left : left + width]
 

@@ -306,7 +306,7 @@ class ChromaCut:
 
     @property
     def places(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Return the row of :attr:`cells` of each row of the window, and the column of each column."""
+        """Return the row of :attr:`cells` of each row of the window, [height], and likewise the columns, [width]."""
         rows, columns = self._places
         return rows - rows[0], columns - columns[0]
 
@@ -358,7 +358,11 @@ class ChromaStack:
         self._count += 1
 
     def cells_of(self, frame: VideoFrame) -> tuple[npt.NDArray[np.int8], str]:
-        """Return Cb and Cr of one frame, [2, rows, columns], and the matrix."""
+        """Return Cb and Cr of one frame, [2, rows, columns], and the matrix.
+
+        Raises:
+            BeyondBits: a sample has more bits than the format states.
+        """
         planes, table, matrix = _planes_of(frame)
         cells = np.zeros(self._cells.shape[1:], np.int8)
         for plane, (samples, down, across) in enumerate(planes):

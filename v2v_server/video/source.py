@@ -1,7 +1,7 @@
 """Open a video file for sequential, single-threaded reading of its picture track; read what containers state and PyAV
 does not report: their size, tracks that begin late, and the form of the picture.
 
-Sources: ISO/IEC 14496-12, 4.2 (boxes) and 12.1.4 (clean aperture); Dolby Vision Streams within the ISO Base Media File
+Sources: ISO/IEC 14496-12, 4.2 (boxes); Dolby Vision Streams within the ISO Base Media File
 Format, 3.2; RFC 8794, 4 (EBML); RFC 9559, 5 (Matroska); ISO/IEC 13818-1, 2.4.3 (transport stream).
 """
 
@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from fractions import Fraction
 from itertools import chain, islice
-from pathlib import Path
 from typing import BinaryIO
 
 import av
@@ -210,7 +209,6 @@ _WAY = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
 _STSD_HEAD_BYTES = 8
 _ENTRY_HEAD_BYTES = 78
 """Of a visual sample entry, in front of its boxes; width and height lie at 24."""
-_CLAP_BYTES = 32
 _MOST_BOXES = 10_000
 _ANY_END = 1 << 62
 _ISO_KINDS = frozenset({b"ftyp", b"styp", b"moov", b"mdat", b"moof", b"free", b"skip", b"wide"})
@@ -231,28 +229,6 @@ _NOT_LUMA_PROFILES = frozenset({5, 10, 20})
 """Profiles of Dolby Vision whose pictures are of IPT-PQ where no base layer is compatible with anything else."""
 
 
-def clean_aperture(path: Path) -> tuple[Fraction, Fraction] | None:
-    """Return width and height in pixels of the clean aperture of an MP4 or QuickTime file, the part that its ``clap``
-    box asks to show, if it is smaller than the picture.
-
-    Returns:
-        None if it is the whole picture, or if the file has another format or is damaged.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
-    with path.open("rb") as file:
-        for head, kind, at in _boxes_of_entries(file):
-            picture = Fraction(int.from_bytes(head[24:26], "big")), Fraction(int.from_bytes(head[26:28], "big"))
-            file.seek(at)
-            values = [int.from_bytes(file.read(4), "big") for _ in range(_CLAP_BYTES // 4)]
-            if kind == b"clap" and values[1] and values[3]:
-                width, height = Fraction(values[0], values[1]), Fraction(values[2], values[3])
-                if 0 < width <= picture[0] and 0 < height <= picture[1] and (width, height) != picture:
-                    return width, height
-    return None
-
-
 def dolby_vision_profile(path: str) -> int | None:
     """Return the profile of Dolby Vision that an MP4, QuickTime or Matroska file states, if its luma is not luma.
 
@@ -261,7 +237,7 @@ def dolby_vision_profile(path: str) -> int | None:
     """
     with open(path, "rb") as file:
         records = [found[1] for found in _MATROSKA_DOLBY.finditer(file.read(_HEAD_BYTES))]
-        for _, kind, at in _boxes_of_entries(file):
+        for kind, at in _boxes_of_entries(file):
             if kind in _DOLBY_KINDS:
                 file.seek(at)
                 records.append(file.read(5))
@@ -320,8 +296,8 @@ def _transport_bytes(head: bytes) -> int:
     return 0
 
 
-def _boxes_of_entries(file: BinaryIO) -> Iterator[tuple[bytes, bytes, int]]:
-    """Yield (head of the sample entry, type, first byte of the content) of each box in a visual sample entry."""
+def _boxes_of_entries(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
+    """Yield (type, first byte of the content) of each box in a visual sample entry."""
     end = os.fstat(file.fileno()).st_size
     spans = [(0, end)]
     for kind in _WAY:
@@ -329,10 +305,8 @@ def _boxes_of_entries(file: BinaryIO) -> Iterator[tuple[bytes, bytes, int]]:
         boxes = chain.from_iterable(list(_boxes(file, *span)) for span in spans)
         spans = [(at + skipped, until) for found, at, until in boxes if found == kind]
     for _, begin, until in [box for span in spans for box in _boxes(file, *span)]:
-        file.seek(begin)
-        head = file.read(_ENTRY_HEAD_BYTES)
         for kind, at, _ in list(_boxes(file, begin + _ENTRY_HEAD_BYTES, until)):
-            yield head, kind, at
+            yield kind, at
 
 
 def _boxes(

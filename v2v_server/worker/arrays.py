@@ -180,7 +180,7 @@ def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Vox
 
 
 def simulated(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in all arrays of the kernel together, the first time."""
+    """Fill in all arrays of the kernel together, the first time; ``out`` is one of them, [T, ..., H, W]."""
     if context.saturated is None:
         asked = {name: context.into[name] for name in NAMES if name in context.into and context.can_time(name)}
         made = simulate(context, asked)
@@ -193,13 +193,13 @@ ARRAY_BUILDERS.update(dict.fromkeys(NAMES, simulated))
 
 @makes("frames")
 def frames(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in the frame at the end of each voxel, and the lead frame, tone mapped (``intensity.py``)."""
+    """Fill in the frame at the end of each voxel grid, and the lead frame, tone mapped: [T, 1, H, W]."""
     _shown(context, context.source[context.target_steps], out)
 
 
 @makes("frames_u16")
 def frames_u16(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in the same frames with the levels that the video stores, 0 .. 65535, without tone mapping."""
+    """Fill in the frames of ``frames``, [T, 1, H, W], with the levels that the video stores, 0 .. 65535."""
     white = context.signal.white
     table = ((2 * 65535 * np.arange(white + 1) + white) // (2 * white)).astype(np.uint16)
     np.take(table, context.view[context.source[context.target_steps]], out=out[:, 0], mode="clip")
@@ -207,7 +207,7 @@ def frames_u16(context: SampleContext, out: npt.NDArray[Any]) -> None:
 
 @makes("frames_all")
 def frames_all(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in the frame at the beginning of the clip and at the end of each step, tone mapped."""
+    """Fill in the frame at the beginning of the clip and at the end of each step, tone mapped: [steps + 1, 1, H, W]."""
     _shown(context, context.source, out)
 
 
@@ -221,13 +221,13 @@ def _shown(context: SampleContext, numbers: npt.NDArray[np.int64], out: npt.NDAr
 
 @makes("flow")
 def flow(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in the flow over each voxel."""
+    """Fill in the flow over each voxel grid, [T, 2, H, W], px."""
     if context.flow is not None:
         out[...] = context.flow.flow
 
 
 @makes("flow_valid")
 def flow_valid(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in where the flow is reliable."""
+    """Fill in where the flow is reliable, [T, 1, H, W]."""
     if context.flow is not None and context.flow.valid is not None:
         out[...] = context.flow.valid

@@ -59,7 +59,7 @@ _PING_SECONDS = 5.0
 _LONGEST_PING_SECONDS = 320.0
 """A server that is away needs no new connection every few seconds: the waits double."""
 _RECONNECT_SECONDS = 10.0
-"""Silence after which a ping goes over a new connection. The server may hold the old one although the network cut it,
+"""Silence after which a ping goes over a new connection. The server may hold the old one after the network dropped it,
 and then ignores what ZeroMQ sends under the same routing id after it connected again."""
 _TOLD_SECONDS = 20.0
 """Silence of the server after which the worker logs it."""

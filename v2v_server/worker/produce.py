@@ -81,7 +81,11 @@ _LONGEST_REASON = 500
 
 @makes("frames_rgb")
 def frames_rgb(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in the delivered frames, [T, 3, H, W]: the grey levels of ``frames`` and the colour of the video."""
+    """Fill in the delivered frames, [T, 3, H, W]: the grey levels of ``frames`` and the colour of the video.
+
+    Raises:
+        VideoError: the clip was read without its colour.
+    """
     if context.clip.colour is None:
         raise VideoError(context.video, None, "was read without its colour")
     (cells, matrix), cut = context.clip.colour
@@ -108,7 +112,7 @@ def frames_rgb(context: SampleContext, out: npt.NDArray[Any]) -> None:
 def chroma_cut(
     lease: Lease, params: SampleParams, spec: StreamSpec, frames: CleanFrames, source: npt.NDArray[np.int64]
 ) -> ChromaCut:
-    """Return which colour to decode: that of the delivered frames, in the crop."""
+    """Return which colour to decode: that of the delivered frames, in the crop. ``source``: [steps + 1]."""
     delivered = np.unique(source[params.ends(spec.recipe)[spec.recipe.first_frame :]])
     if not frames.stride:
         delivered = frames.numbers[delivered] - frames.numbers[0]

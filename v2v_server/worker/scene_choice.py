@@ -145,6 +145,9 @@ def within_rows(lease: Lease, sides: Sides) -> Window:
 def most_frames(lease: Lease, spec: StreamSpec) -> int:
     """Return how many frames a sample may use, those in between included: the same for every server, whose index of a
     lease may hold more.
+
+    Raises:
+        VideoError: the recipe needs a frame rate, and the video's is unknown.
     """
     recipe, rate = spec.recipe, lease.frames_per_second
     if not recipe.is_timed:

@@ -1,7 +1,6 @@
 """`v2v-doctor`: what is in the way, and what to change.
 
-command         the command line
-machine         the installation and the machine
+command         the command line; the installation and the machine
 corpus          the videos and their labels
 motion          what a corpus loses between its frames
 """

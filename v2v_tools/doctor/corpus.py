@@ -25,7 +25,6 @@ from v2v_server.labels import READERS
 from v2v_server.schedule import SequenceTable
 from v2v_server.store.pixels import VideosKind
 from v2v_server.video.rows import Rows
-from v2v_server.video.source import clean_aperture
 from v2v_tools.doctor.motion import look_at_motion
 from v2v_tools.motion import describe_start, start_events
 from v2v_tools.remake import Remaker, open_shown
@@ -37,12 +36,12 @@ _VIDEOS_OPENED = 10_000
 """Most videos of which more is read than their line of the index."""
 
 
-def look_at_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, kind: VideosKind) -> Iterator[Line]:
+def check_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, kind: VideosKind) -> Iterator[Line]:
     """Check a corpus and yield lines of the report.
 
     Args:
         videos, rows, cache_dir, kind: as of :func:`v2v_server.corpus.catalogue.open_catalogue`.
-        recipe: name of a preset, or a YAML file.
+        recipe: name of a recipe, or a YAML file.
 
     Raises:
         UsageError: wrong recipe or rows.
@@ -138,16 +137,6 @@ def _how_videos_are_stored(catalogue: Catalogue) -> Iterator[Line]:
             "them is decoded from the beginning of its file"
         )
         yield "note", "corpus", text, "run v2v-prepare once: all frames of a prepared corpus are quick to read"
-    if not catalogue.source.is_local:
-        return
-    shown = {id: clean_aperture(catalogue.path(id)) for id in ids}
-    if cropped := [f"{id}: {float(size[0]):g}x{float(size[1]):g} px" for id, size in shown.items() if size]:
-        text = (
-            f"{len(cropped)} videos state a clean aperture, a part of the picture for players to show "
-            f"({name_all(cropped)}): it is not applied, the whole stored picture is served"
-        )
-        change = "crop such videos once (ffmpeg -i IN -vf crop=W:H OUT) if their borders hold no picture"
-        yield "note", "corpus", text, change
 
 
 def _labels(catalogue: Catalogue) -> Iterator[Line]:

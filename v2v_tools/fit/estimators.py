@@ -32,7 +32,7 @@ def mismatch(fitted: Regression, given: Increments, blocks: npt.NDArray[np.int64
     """Estimate the spread of the thresholds over pixels, as a share.
 
     A pixel that sees the same edge again and again repeats its errors in both polarities, while its two thresholds are
-    independent: products of residuals of opposite changes are subtracted.
+    independent: products of residuals of opposite changes are subtracted. ``blocks``: [P], block of each pixel.
     """
     if not fitted.positive.told or not fitted.negative.told:
         return unknown("needs the thresholds")
@@ -76,7 +76,10 @@ def mismatch(fitted: Regression, given: Increments, blocks: npt.NDArray[np.int64
 def noise_rates(
     still: Still, blocks: npt.NDArray[np.int64], is_hot: npt.NDArray[np.bool_], static: bool = False
 ) -> tuple[Estimate, Estimate]:
-    """Estimate shot noise (of a black pixel, both polarities) and the surplus of brighter events, Hz."""
+    """Estimate shot noise (of a black pixel, both polarities) and the surplus of brighter events, Hz.
+
+    ``blocks`` and ``is_hot`` are [P], of each pixel.
+    """
     seconds = float(still.seconds[~is_hot].sum())
     if seconds < LEAST_SECONDS:
         remedy = "record for longer" if static else "hold the camera still"
@@ -105,7 +108,7 @@ def noise_rates(
 
 
 def refractory(gaps_us: Doubles) -> Estimate:
-    """Estimate the refractory period, s, from intervals between events of a pixel.
+    """Estimate the refractory period, s, from intervals between events of a pixel, [2, n] (``intervals_us``).
 
     Near the end r of the distribution, P(interval < x) = (x - r) ** a, r and a unknown: likelihood of the smallest.
     """
@@ -154,7 +157,10 @@ def hot_pixels(
     still: Still, is_hot: npt.NDArray[np.bool_], thresholds: tuple[float, float], refractory_seconds: float,
     blocks: npt.NDArray[np.int64],
 ) -> tuple[Estimate, Estimate]:  # fmt: skip
-    """Estimate the share of hot pixels and the deviation of their drift, log units a second."""
+    """Estimate the share of hot pixels and the deviation of their drift, log units a second.
+
+    ``is_hot`` and ``blocks`` are [P], of each pixel.
+    """
     seconds = still.seconds.sum(axis=1)
     seen = seconds >= 0.3
     if seen.sum() < 500:
@@ -200,7 +206,7 @@ def _untruncated(root_mean_square: float, least: float) -> float:
 
 
 def dead_pixels(recording: Recorded, blocks: npt.NDArray[np.int64]) -> Estimate:
-    """Estimate the share of pixels that never fire, among those whose neighbours do."""
+    """Estimate the share of pixels that never fire, among those whose neighbours do. ``blocks``: [P], of each pixel."""
     import cv2
 
     counts = recording.counts.sum(axis=0)

@@ -54,7 +54,7 @@ class Increments(NamedTuple):
     slope: Doubles
 
     def take(self, which: npt.NDArray[Any]) -> Increments:
-        """Return some of the increments, by a mask or by places."""
+        """Return some of the increments, by a mask, [M], or by places, [n]."""
         return Increments(*(column[..., which] for column in self))  # type: ignore[arg-type]
 
 

@@ -74,7 +74,7 @@ class Recorded:
         return min(times)
 
     def blocks(self, side: int = 8) -> Longs:
-        """Return the block of each pixel, 0 .. side * side - 1: the sensor in rows and columns of equal parts."""
+        """Return the block of each pixel, [P], 0 .. side * side - 1: the sensor in rows and columns of equal parts."""
         y, x = np.divmod(self.pixels, self.width_px)
         return np.asarray((y * side // self.height_px) * side + x * side // self.width_px)
 
@@ -90,7 +90,7 @@ class Recorded:
 
 
 def chosen_pixels(height_px: int, width_px: int, most: int | None = None) -> Longs:
-    """Return the pixels that a fit looks at: tiles spread over the sensor, fewer of them being a part of more.
+    """Return the pixels that a fit looks at, [P]: tiles spread over the sensor, fewer of them being a part of more.
 
     Args:
         most: number of pixels; None: MOST_PIXELS.

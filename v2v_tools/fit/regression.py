@@ -151,7 +151,7 @@ def _sample(given: Increments, count: int) -> Increments:
 
 
 def summit(grid: Doubles, total: Doubles) -> float:
-    """Return the place of the maximum of a function on a grid of even steps, between its points by a parabola."""
+    """Return the place of the maximum of a function, [n], on a grid of even steps, [n], between them by a parabola."""
     k = int(np.clip(np.argmax(total), 1, len(grid) - 2))
     left, middle, right = total[k - 1 : k + 2]
     bend = left - 2 * middle + right
@@ -181,6 +181,7 @@ def refractory_by_change(
     """Estimate the refractory period, s, by the change that is lost in it: the likelihood of the frames.
 
     Args:
+        blocks: [P], block of each pixel.
         bound: estimate whose upper end is the shortest interval between events.
     """
     grid = np.linspace(0.0, bound.high, 11)

@@ -24,7 +24,7 @@ _DIGITS = 4
 
 
 def recipe_fields(fitted: FittedCamera) -> dict[str, Any]:
-    """Return the fields of the recipe that differ from the preset ``paper``; ranges are the intervals.
+    """Return the fields of the recipe that differ from the recipe ``paper``; ranges are the intervals.
 
     A clip starts as in a running camera. A parameter that the recording cannot tell is off; thresholds that it cannot
     tell stay those of ``paper``.

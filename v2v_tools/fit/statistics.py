@@ -75,7 +75,7 @@ def simulate_recording(
 
 
 def panels_of(recording: Recorded, light: Doubles, begin_us: int, end_us: int) -> Panels:
-    """Measure the events between two times."""
+    """Measure the events between two times, microseconds. ``light``: [256], of each grey level."""
     count = len(recording.pixels)
     owner = np.repeat(np.arange(count), np.diff(recording.first))
     inside = (recording.t_us >= begin_us) & (recording.t_us < end_us)

@@ -6,9 +6,7 @@ import argparse
 import math
 import sys
 import tempfile
-import time
 from collections.abc import Mapping, Sequence
-from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -16,23 +14,29 @@ import cv2
 
 from v2v_protocol.command import FAILED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
+from v2v_protocol.programs import show
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_recipe, recipe_setting
 from v2v_protocol.write_aside import write_file, write_json
-from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, Prediction
+from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors
 from v2v_server.simulation.precision import warm_up
 from v2v_server.system.process import keep_freed_memory
 from v2v_server.video.rows import Rows
-from v2v_tools.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, Places, accuracy, parts, predicted_loss
-from v2v_tools.tradeoff.diversity import diversity
-from v2v_tools.tradeoff.forms import BESIDE, DEFAULT_FORMS, SOURCE, STORES, CorpusForm, forms
-from v2v_tools.tradeoff.front import best
-from v2v_tools.tradeoff.report import ERROR_KEY, error_fields, name_dominated, plot, tables
-from v2v_tools.tradeoff.settings import ServeSetting, axes, full_model, planes_for, settings
-from v2v_tools.tradeoff.speed import leases_of, making, measure
+from v2v_tools.tradeoff.measures import (
+    DRAW_ROW,
+    NOISE_ROW,
+    accuracy,
+    cpu_seconds,
+    diversity,
+    leases_of,
+    making,
+    predicted_loss,
+)
+from v2v_tools.tradeoff.report import ERROR_KEY, best, error_fields, name_dominated, tables
+from v2v_tools.tradeoff.settings import BESIDE, SOURCE, STORES, ServeSetting, axes, full_model, open_forms, settings
 
-_FORMS_SHARE, _ACCURACY_SHARE, _DIVERSITY_SHARE = 0.5, 0.7, 0.8
-"""Shares of the budget at which preparing, comparing and the diversity end; timing has the rest."""
+_DEFAULT_FORMS = ("lossless dense", "lossless fast")
 
 
 def _parser() -> Parser:
@@ -43,7 +47,7 @@ def _parser() -> Parser:
         "the values of some fields. A setting is dominated when another one is at least as good in everything and "
         "better in one thing. Name the best setting for a wish, and write it for v2v-serve --config.",
         [
-            "v2v-tradeoff --videos clips/ --json tradeoff.json --plot tradeoff.png",
+            "v2v-tradeoff --videos clips/ --json tradeoff.json",
             "v2v-tradeoff --videos clips/ --target-rate 20 --vary samples_per_decode=1,2 --preset-out chosen.yaml",
             "v2v-tradeoff --videos clips/ --beside smaller/ --forms 'lossless dense'",
             "v2v-tradeoff --videos clips/ --recipe my_camera.yaml --vary tolerance=0,0.01 --max-error 0.02",
@@ -57,8 +61,10 @@ def _parser() -> Parser:
         help="also compare the videos of this folder, with the same names and frames in another encoding",
     )  # fmt: skip
     videos.add_argument("--rows", default="top:0.54", help="rows to use (default top:0.54, as for WebVid)")
-    videos.add_argument("--clips", type=int, default=4, metavar="N", help="different clips to take (default 4)")
-    videos.add_argument("--places", type=int, default=8, metavar="N", help="sequences to sample (default 8)")
+    videos.add_argument(
+        "--clips", type=int, default=4, metavar="N",
+        help="different clips to take, two sequences of each (default 4); the time that everything takes grows with it",
+    )  # fmt: skip
     add_recipe(parser, "Videos")
     work = parser.group("Work")
     work.add_argument(
@@ -67,21 +73,15 @@ def _parser() -> Parser:
         "of the recipe such as voxel_seconds; may be repeated",
     )  # fmt: skip
     work.add_argument(
-        "--forms", default=",".join(DEFAULT_FORMS), metavar="FORM,FORM",
-        help=f"ways to prepare the clips, from {', '.join(STORES)} (default {', '.join(DEFAULT_FORMS)})",
-    )  # fmt: skip
-    work.add_argument(
-        "--budget-minutes", type=float, default=8.0, metavar="X",
-        help="minutes for everything (default 8): forms that do not fit are left out, then places, then rounds; "
-        "the source, one place and one round are always measured",
+        "--forms", default=",".join(_DEFAULT_FORMS), metavar="FORM,FORM",
+        help=f"ways to prepare the clips, from {', '.join(STORES)} (default {', '.join(_DEFAULT_FORMS)})",
     )  # fmt: skip
     wishes = parser.group("Wish")
     wish = wishes.add_mutually_exclusive_group()
     wish.add_argument("--target-rate", type=float, metavar="X", help="least number of samples a second of one core")
     wish.add_argument("--max-error", type=float, metavar="X", help="largest voxel error, as a share: 0.05 is 5 %%")
-    parser.add_output("Output", "--preset-out", (".yaml", ".yml"), "write the best setting for v2v-serve (.yaml)")
+    parser.add_output("Output", "--preset-out", (".yaml", ".yml"), "write the best setting for v2v-serve --config")
     parser.add_output("Output", "--json", JSON, "write the records")
-    parser.add_output("Output", "--plot", (".png", ".pdf", ".svg"), "draw speed against error (needs matplotlib)")
     return parser
 
 
@@ -89,11 +89,8 @@ def _check(asked: argparse.Namespace) -> None:
     wishes = [wish for wish in (asked.target_rate, asked.max_error) if wish is not None]
     if asked.preset_out is not None and not wishes:
         raise UsageError("--preset-out without a wish: give --target-rate or --max-error too")
-    if not 0 < asked.budget_minutes < math.inf:
-        raise UsageError(f"--budget-minutes {asked.budget_minutes:g}: give a finite number above 0")
-    for flag, value in (("--places", asked.places), ("--clips", asked.clips)):
-        if value < 1:
-            raise UsageError(f"{flag} {value}: give 1 or more")
+    if asked.clips < 1:
+        raise UsageError(f"--clips {asked.clips}: give 1 or more")
     for wish in wishes:
         if not 0 <= wish < math.inf:
             raise UsageError(f"{wish:g}: --target-rate and --max-error are finite numbers from 0 on")
@@ -104,9 +101,7 @@ def _check(asked: argparse.Namespace) -> None:
 
 
 def _run(asked: argparse.Namespace) -> int:
-    begun = time.monotonic()
     _check(asked)
-    budget = 60.0 * asked.budget_minutes
     rows = Rows.parse(asked.rows)
     spec = StreamSpec.from_dict({"recipe": recipe_setting(asked.recipe or "paper", asked.set)})
     named = asked.forms if asked.beside is None else [BESIDE, *asked.forms]
@@ -114,99 +109,72 @@ def _run(asked: argparse.Namespace) -> int:
     cv2.setNumThreads(1)
     keep_freed_memory()
     warm_up()
-    with tempfile.TemporaryDirectory(prefix="v2v-tradeoff-") as folder, forms(
-        asked.videos, rows, spec, asked.forms, beside=asked.beside,
-        planes=planes_for(setting.spec for setting in compared), most_clips=asked.clips, folder=Path(folder),
-        until=begun + _FORMS_SHARE * budget, tell=_tell,
+    with tempfile.TemporaryDirectory(prefix="v2v-tradeoff-") as folder, open_forms(
+        asked.videos, rows, compared, beside=asked.beside, most_clips=asked.clips, folder=Path(folder),
     ) as corpus:  # fmt: skip
-        compared = [setting for setting in compared if setting.form in corpus]
-        records = _measured(corpus, compared, asked.places, begun, budget)
+        records = _measured(corpus, compared)
     print(tables(records))
-    print(f"{(time.monotonic() - begun) / 60:.1f} minutes; the budget was {asked.budget_minutes:g}")
     if asked.json is not None:
         write_json(asked.json, records)
-    if asked.plot is not None:
-        plot(records, asked.plot)
     return 0 if asked.target_rate is asked.max_error is None else choose(records, compared, asked)
 
 
-def _measured(
-    corpus: Mapping[str, CorpusForm], compared: Sequence[ServeSetting], places: int, begun: float, budget: float
-) -> list[dict[str, Any]]:
-    """Return the records of all settings, of the two rows that give the scale, of the parts, and of the diversity."""
+def _measured(corpus: Mapping[str, Catalogue], compared: Sequence[ServeSetting]) -> list[dict[str, Any]]:
+    """Return the records of all settings, of the two rows that give the scale, and of the diversity."""
     models = {setting: full_model(setting, compared) for setting in compared}
-    sources = {
-        setting: Places(corpus[setting.form].clips.folder, leases_of(corpus[setting.form].clips, setting.spec, places))
+    leases = {
+        setting: leases_of(setting, corpus[setting.form])
         for setting in dict.fromkeys((*(setting.single for setting in compared), *models.values()))
     }
-    for setting, source in sources.items():  # longer grids may give fewer places
-        if not source.leases:
-            raise UsageError(f"{setting.name}: none of the clips is long enough for a sequence")
-    records, scale = [], []
-    for number, model in enumerate(dict.fromkeys(models.values())):
+    show(f"timing {len(compared)} settings", sys.stderr)
+    works = {each.name: making(leases[each.single], each.spec.samples_per_decode) for each in compared}
+    seconds = cpu_seconds(works, max(len(each.each) for each in leases.values()))
+    records, scale = list[dict[str, Any]](), list[dict[str, Any]]()
+    for model in dict.fromkeys(models.values()):  # one for each recipe
         mine = [setting for setting in compared if models[setting] == model]
-        singles = {setting.single.name: sources[setting.single] for setting in mine}
-        _tell(f"comparing {len(singles)} ways to make samples")
-        tallies = accuracy(sources[model], singles, until=begun + _ACCURACY_SHARE * budget)
-        loss = predicted_loss(sources[model])
+        show(f"comparing {len(mine)} settings with {model.way}", sys.stderr)
+        sums = accuracy(leases[model], {setting.way: leases[setting.single] for setting in mine})
+        loss = predicted_loss(leases[model])
+        predicted = {}
+        if loss.can_be_followed or loss.is_slow:
+            predicted = {0.0: loss.errors("linear"), SUBSTEP_PX: loss.errors("divided")}
+        found = []
         for setting in mine:
-            records.append(_record(setting, corpus, loss) | error_fields(tallies[setting.single.name]))
-        if not number:
-            scale = [{"measure": "scale", "way": name, **error_fields(tallies[name])} for name in (NOISE_ROW, DRAW_ROW)]
-    _tell("measuring diversity and the parts of a sample")
-    first = sources[compared[0].single]
-    alike = diversity(first, until=begun + _DIVERSITY_SHARE * budget)
-    taken = [
-        {"measure": "parts", "way": setting.way} | parts(source, until=begun + _DIVERSITY_SHARE * budget)
-        for setting, source in sources.items()
-        if setting.form == SOURCE and setting in {each.single for each in compared}
-    ]
-    _tell(f"timing {len(compared)} settings")
-    count = max(len(source.leases) for source in sources.values())
-    works = {}
-    for setting in compared:
-        root, leases = sources[setting.single]
-        works[setting.name] = making(root, list(islice(cycle(leases), count)), setting.spec.samples_per_decode)
-    speeds = measure(works, until=begun + budget)
-    for record in records:
-        speed, exact = speeds[record["name"]], speeds[compared[0].name]
-        record |= {
-            "samples_per_core_second": 1.0 / speed.fastest, "cpu_seconds_per_sample": speed.fastest,
-            "median_cpu_seconds_per_sample": speed.median, "speed_ratio": exact.fastest / speed.fastest,
-            "rounds": speed.rounds,
-        }  # fmt: skip
-    for recipe in {setting.spec.recipe for setting in compared}:
-        same = {setting.name for setting in compared if setting.spec.recipe == recipe}
-        name_dominated([record for record in records if record["name"] in same])
-    return records + scale + taken + alike
+            spec, clips, source = setting.spec, corpus[setting.form], corpus[SOURCE]
+            errors, taken = predicted.get(spec.substep_px), seconds[setting.name]
+            found.append({
+                "measure": "setting", "name": setting.name, "way": setting.way, "form": setting.form,
+                "samples_per_decode": spec.samples_per_decode, "substep_px": spec.substep_px,
+                "tolerance": spec.tolerance, "bytes_ratio": _nbytes(clips) / _nbytes(source),
+                "bytes_per_video_second": _nbytes(clips) / _seconds(source), "px_per_frame": loss.px_per_frame,
+                **{f"predicted_{name}": errors and getattr(errors, name) for name in PredictedErrors._fields},
+                "samples_per_core_second": 1.0 / taken, "cpu_seconds_per_sample": taken,
+                "speed_ratio": seconds[compared[0].name] / taken, **error_fields(sums[setting.way]),
+            })  # fmt: skip
+        name_dominated(found)
+        scale = scale or [{"measure": "scale", "way": row, **error_fields(sums[row])} for row in (NOISE_ROW, DRAW_ROW)]
+        records += found
+    show("measuring diversity", sys.stderr)
+    return records + scale + diversity(leases[compared[0].single])
 
 
-def _record(setting: ServeSetting, corpus: Mapping[str, CorpusForm], loss: Prediction) -> dict[str, Any]:
-    form, spec = corpus[setting.form], setting.spec
-    predicted = {0.0: loss.errors("linear"), SUBSTEP_PX: loss.errors("divided")}.get(spec.substep_px)
-    known = predicted if loss.can_be_followed or loss.is_slow else None
-    return {
-        "measure": "setting", "name": setting.name, "way": setting.way, "form": setting.form,
-        "samples_per_decode": spec.samples_per_decode, "substep_px": spec.substep_px, "tolerance": spec.tolerance,
-        "bytes_ratio": form.nbytes / corpus[SOURCE].nbytes, "bytes_per_video_second": form.nbytes / form.seconds,
-        "px_per_frame": loss.px_per_frame,
-        **{f"predicted_{name}": None if known is None else getattr(known, name) for name in PredictedErrors._fields},
-    }  # fmt: skip
+def _nbytes(clips: Catalogue) -> int:
+    return sum(clips.path(video.id).stat().st_size for video in clips.videos)
 
 
-def _tell(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+def _seconds(clips: Catalogue) -> float:
+    return sum(video.frames / video.frames_per_second for video in clips.videos if video.frames_per_second)
 
 
 def choose(records: Sequence[Mapping[str, Any]], compared: Sequence[ServeSetting], asked: argparse.Namespace) -> int:
     """Print the best setting and write it to ``--preset-out``; return 1 where no setting fulfils the wish."""
     fit = [record for record in records if record["measure"] == "setting"]
     try:
-        record = best(fit, error_key=ERROR_KEY, target_rate=asked.target_rate, max_error=asked.max_error)
+        record = best(fit, target_rate=asked.target_rate, max_error=asked.max_error)
     except UsageError as error:
-        _tell(f"v2v-tradeoff: {error}")
+        show(f"v2v-tradeoff: {error}", sys.stderr)
         return FAILED
-    why = f"{record['samples_per_core_second']:.3g} samples a core second, {ERROR_KEY} {record[ERROR_KEY]:.3g}"
+    why = f"{record['samples_per_core_second']:.3g} samples a core second, {ERROR_KEY} {record[ERROR_KEY] or 0.0:.3g}"
     print(f"best: {record['name']}: {why}")
     if asked.preset_out is not None:
         (chosen,) = (setting for setting in compared if setting.name == record["name"])

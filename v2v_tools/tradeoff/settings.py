@@ -1,20 +1,34 @@
-"""The ways to serve a corpus that are compared: every form of it, with all values of some fields."""
+"""The ways to serve a corpus that are compared: every form of it, with all values of some fields.
+
+The forms are the corpus as it is, as another folder has it, and as stores. Everything is in a temporary folder: links
+to a few different clips of the corpus and of the other folder, and stores, made by the functions of ``v2v-prepare``.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import CorpusError, UsageError
+from v2v_protocol.programs import show
 from v2v_protocol.safe_yaml import format_yaml, parse_yaml
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
+from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.prepare import prepare
+from v2v_server.schedule import SequenceTable
 from v2v_server.store.planes import OPTIONAL, PLANES
-from v2v_tools.tradeoff.forms import BESIDE, SOURCE, STORES
+from v2v_server.video.rows import Rows
 
+SOURCE, BESIDE = "source", "beside"
+STORES = {"lossless dense": "dense", "lossless fast": "fast", "lossless raw": "raw"}
+"""Sizes of stores, by form."""
 SAMPLES_PER_DECODE = (1, 2, 4)
 DEFAULT_AXES = {"samples_per_decode": ("1", "2", "4"), "substep_px": ("0", "1")}
 """Values of each field that are compared unless the user names others."""
@@ -60,20 +74,20 @@ class ServeSetting:
             planes = "".join(f" --planes {name}" for name in planes_for([self.spec]))
             flags = f"--rows {rows} --size {STORES[self.form]}{planes}"
             lines += [f"# Prepare the corpus first: v2v-prepare SOURCE PREPARED {flags}", "# and serve PREPARED."]
-        plain, usual = self.spec.to_dict(), StreamSpec().to_dict()
-        recipe = _different(plain.pop("recipe"), usual.pop("recipe"))
-        chosen = {"rows": rows, "samples_per_decode": self.spec.samples_per_decode, **_different(plain, usual)}
-        return "\n".join([*lines, format_yaml(chosen | ({"recipe": recipe} if recipe else {}))])
+        chosen = {"rows": rows, "samples_per_decode": self.spec.samples_per_decode}
+        return "\n".join([*lines, format_yaml(chosen | _changes(self.spec.to_dict(), StreamSpec().to_dict()))])
+
+
+def _changes(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that differ from the usual ones; of a mapping those in it."""
+    changed = {name: value for name, value in values.items() if usual.get(name) != value}
+    return {name: _changes(value, usual[name]) if name == "recipe" else value for name, value in changed.items()}
 
 
 def planes_for(specs: Iterable[StreamSpec]) -> tuple[str, ...]:
     """Return the planes of a store that these streams read."""
     specs = tuple(specs)
     return tuple(name for name in OPTIONAL if any(getattr(spec, PLANES[name].serves, 0) for spec in specs))
-
-
-def _different(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if name not in usual or value != usual[name]}
 
 
 def axes(texts: Iterable[str]) -> Axes:
@@ -122,3 +136,82 @@ def _changed(spec: StreamSpec, key: str, value: str) -> StreamSpec:
     if changed.samples_per_decode not in SAMPLES_PER_DECODE:
         raise UsageError(f"--vary {key}={value}: choose from {', '.join(map(str, SAMPLES_PER_DECODE))}")
     return changed
+
+
+@contextlib.contextmanager
+def open_forms(
+    videos: Path, rows: Rows, compared: Sequence[ServeSetting], *, beside: Path | None, most_clips: int, folder: Path
+) -> Iterator[dict[str, Catalogue]]:
+    """Yield the clips in every form of some settings, by its name; equal indices give equal draws in all of them.
+
+    Args:
+        videos: the corpus, not a prepared one.
+        rows: rows of the pictures to use.
+        compared: the settings. The first one decides which clips are long and large enough.
+        beside: a folder that has each clip under the same name, in another encoding; None: there is none.
+        most_clips: number of clips to take: the first different ones.
+        folder: an empty folder for all files.
+
+    Raises:
+        CorpusError: there is no clip, one could not be prepared, or ``beside`` lacks one or has it with other frames.
+        UsageError: the corpus is a prepared one.
+    """
+    with contextlib.ExitStack() as stack:
+
+        def opened(path: Path, of: Rows | None = None) -> Catalogue:
+            catalogue = open_catalogue(path, rows=of, cache_dir=folder / "cache", processes=0)
+            stack.callback(catalogue.close)
+            return catalogue
+
+        chosen = _chosen(opened(videos, rows), compared[0].spec, most_clips)
+        source = opened(_link(videos, chosen, folder / "clips"), rows)
+        made = {SOURCE: source}
+        for name in dict.fromkeys(setting.form for setting in compared):
+            if name == BESIDE and beside is not None:
+                made[name] = opened(_link(beside, chosen, folder / BESIDE), rows)
+                _require_alike(source, made[name], beside)
+            elif name in STORES:
+                show(f"preparing {len(source.videos)} clips as {name}", sys.stderr)
+                into, planes = folder / STORES[name], planes_for(setting.spec for setting in compared)
+                if failed := prepare(source, into, STORES[name], processes=0, planes=planes).failed:
+                    raise CorpusError(f"{failed[0].id} could not be prepared as {name}: {failed[0].problem}")
+                made[name] = opened(into)
+        yield made
+
+
+def _chosen(catalogue: Catalogue, spec: StreamSpec, most: int) -> list[str]:
+    """Return the ids of the first different clips."""
+    if catalogue.prepared is not None:
+        raise UsageError(f"--videos {catalogue.folder}: a prepared corpus; give its source")
+    table = SequenceTable(catalogue.videos, catalogue.rows, spec)
+    if not table.count:
+        raise CorpusError(f"--videos {catalogue.folder}: no video gives a sequence: {table.refusals[0]}")
+    unusable = {refusal.video for refusal in table.refusals}
+    distinct = {video.fingerprint: video for video in reversed(catalogue.videos) if video.id not in unusable}
+    return sorted(video.id for video in distinct.values())[:most]
+
+
+def _link(videos: Path, ids: Sequence[str], folder: Path) -> Path:
+    """Link some videos of a folder, or of the folder of a list file, under names that tell them apart."""
+    root = videos if videos.is_dir() else videos.parent
+    folder.mkdir(parents=True)
+    for number, id in enumerate(ids):
+        if not (root / id).exists():
+            raise CorpusError(f"{root / id}: there is no such file: give a folder with each clip under its own name")
+        (folder / f"{number:03d}_{Path(id).name}").symlink_to((root / id).resolve())
+    return folder
+
+
+def _require_alike(source: Catalogue, other: Catalogue, folder: Path) -> None:
+    """Check that both have the same videos, with equal numbers and sizes of frames."""
+    for video in source.videos:
+        found = other.videos.find(video.id)
+        if found is None:
+            raise CorpusError(f"{folder}: {video.id[4:]} cannot be used")
+        wanted, has = (
+            f"{each.frames} frames of {each.width_px}x{each.height_px} px" for each in (video, other.videos[found])
+        )
+        if has != wanted:
+            raise CorpusError(
+                f"{folder}: {video.id[4:]} has {has} instead of {wanted}: encode it again with all frames in their size"
+            )

@@ -102,9 +102,11 @@ def test_first_a_miss_then_hits(source: Path, folder: Path, changes: dict[str, A
     assert not list((folder / "partial").iterdir())
 
 
-def test_raw_pieces_are_added_to_compressed_ones_and_all_are_read(source: Path, folder: Path) -> None:
+def test_raw_pieces_of_earlier_releases_are_read(source: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     epoch(source, Cache(folder, 1 << 30, 0), 2)
-    epoch(source, Cache(folder, 1 << 30, 0, RAW), 8)
+    with monkeypatch.context() as earlier:
+        earlier.setattr("v2v_server.store.cache.QUICK", RAW)
+        epoch(source, Cache(folder, 1 << 30, 0), 8)
     assert epoch(source, Cache(folder, 1 << 30, 0), 8) == ["hit"] * 8
     found = set()
     for path in pieces(folder):

@@ -33,9 +33,9 @@ from v2v_server.video.picture import Signal, range_table
 from v2v_server.worker.process import Clips
 from v2v_server.worker.produce import make_sample
 from v2v_tools.motion import WholePictures, predicted_loss
-from v2v_tools.preview.preview import _signal_note
+from v2v_tools.preview import _signal_note
 from v2v_tools.remake import Remaker
-from v2v_tools.tradeoff.accuracy import Places, seen, simulated
+from v2v_tools.tradeoff.measures import Leases, seen, simulated
 
 SDR = preset("noise-free").replace(
     voxels_per_clip=2,
@@ -164,9 +164,9 @@ def test_deep_clips_offline(tmp_path: Path) -> None:
         made = remaker.made(0, 0, 0)
         assert predicted_loss(made).errors("linear").lost >= 0
         whole = WholePictures(catalogue, spec).camera(remaker.sequence(0, 0, 0))
-        (view,) = seen(Places(tmp_path / "clips", [replace(made.lease, indices=(0, 1))]), 0)
+        (view,) = seen(Leases(tmp_path / "clips", [replace(made.lease, indices=(0, 1))]), 0)
     assert whole.voxels.any()
-    voxels = simulated(view, made.sample.provenance.params).voxels
+    voxels = simulated(view, made.sample.provenance.params)
     np.testing.assert_array_equal(voxels, made.sample.arrays["voxels"])
 
 

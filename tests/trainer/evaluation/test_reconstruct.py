@@ -121,7 +121,7 @@ def test_own_checkpoints_name_their_network(tmp_path: Path) -> None:
 
 def test_unknown_networks_are_refused(tmp_path: Path) -> None:
     torch.save({"a": torch.zeros(1)}, tmp_path / "a.pth")
-    with pytest.raises(UsageError, match=r"is none of e2vid, .*--model"):
+    with pytest.raises(UsageError, match=r"the network is none of e2vid, "):
         load_network(tmp_path / "a.pth")
     with pytest.raises(UsageError, match="model 'unet': give one of"):
         load_network(tmp_path / "a.pth", name="unet")

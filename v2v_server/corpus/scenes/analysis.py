@@ -232,7 +232,7 @@ def analyse(pictures: Iterable[GreyPicture]) -> Scene:
 
 
 def block_sums(picture: GreyPicture) -> npt.NDArray[np.int64]:
-    """Return the means of the 8 x 8 blocks of a picture in 1/64 grey level, without partial blocks."""
+    """Return the means of the whole 8 x 8 blocks of a picture, [h // 8, w // 8], in 1/64 grey level."""
     height, width = picture.shape
     if height < _BLOCK_PX or width < _BLOCK_PX:
         picture = np.pad(picture, ((0, max(0, _BLOCK_PX - height)), (0, max(0, _BLOCK_PX - width))), mode="edge")

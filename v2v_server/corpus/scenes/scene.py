@@ -183,7 +183,7 @@ class Scene:
         return np.where(part == UNKNOWN, np.nan, part / _UNITS)
 
     def frames_from(self, start: int, count: int) -> npt.NDArray[np.int64]:
-        """Return the ordinals of ``count`` frames from ``start`` on, without those that repeat the one before."""
+        """Return the ordinals of frames from ``start`` on, [count], without those that repeat the one before."""
         repeats = np.repeat(self.pieces["flags"] & Flag.REPEAT, self.pieces["end"] - firsts_of(self.pieces, self.first))
         dropped = self.first + np.flatnonzero(repeats)
         dropped = dropped[dropped >= start]

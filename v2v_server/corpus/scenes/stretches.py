@@ -98,7 +98,7 @@ def change_of(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> in
     """Return the change from one picture to the next, (1/64 grey level)^2.
 
     Args:
-        before, after: means of their blocks, 1/64 grey level.
+        before, after: [rows, columns] means of their blocks, 1/64 grey level.
     """
     difference = after - before
     return int(np.square(difference, where=np.abs(difference) > _NOISE, out=np.zeros_like(difference)).sum())
@@ -274,13 +274,13 @@ def common_bars(found: Sequence[Sides], height: int, width: int) -> Sides:
 
 
 def is_still(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> bool:
-    """Return whether two pictures show the same, from the means of their blocks, 1/64 grey level."""
+    """Return whether two pictures show the same, from the means of their blocks, [rows, columns], 1/64 grey level."""
     moved = int(np.count_nonzero(np.abs(after - before) > _STILL_CHANGE))
     return moved * _STILL_SHARE <= after.size
 
 
 def is_flat(blocks: npt.NDArray[np.int64]) -> bool:
-    """Return whether a picture shows nothing, from the means of its blocks, 1/64 grey level."""
+    """Return whether a picture shows nothing, from the means of its blocks, [rows, columns], 1/64 grey level."""
     mean = int(blocks.sum()) // blocks.size
     return int(np.count_nonzero(np.abs(blocks - mean) > _FLAT_SPREAD)) * _FLAT_SHARE <= blocks.size
 

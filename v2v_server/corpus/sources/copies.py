@@ -259,7 +259,11 @@ class Copies(VideoSource):
         return sorted(self._objects)
 
     def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
-        """List the objects that a folder would list as videos, see :meth:`VideoSource.videos`."""
+        """List the objects that a folder would list as videos, see :meth:`VideoSource.videos`.
+
+        Raises:
+            CorpusError: it is a prepared corpus.
+        """
         for name in self._objects:
             if name.rpartition("/")[2] == MANIFEST_NAME:
                 raise CorpusError(f"{self}: {name} makes it a prepared corpus: copy that to a disk")

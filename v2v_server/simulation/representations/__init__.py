@@ -91,7 +91,7 @@ def new_memory(array: npt.NDArray[Any], pixels: int) -> npt.NDArray[Any]:
 
 
 def fill_array(array: npt.NDArray[Any], memory: npt.NDArray[Any]) -> int:
-    """Fill an array from the memory that the kernel wrote; return how many values were clipped."""
+    """Fill an array, [T, ..., H, W], from the memory that the kernel wrote; return how many values were clipped."""
     if array.dtype != np.float16:
         return 0
     within = np.clip(memory, -_LARGEST_FLOAT16, _LARGEST_FLOAT16)

@@ -81,7 +81,7 @@ class Plane:
         return cut
 
     def maker(self) -> Callable[[DecodedPicture], npt.NDArray[Any]]:
-        """Return a function that gets one usable picture after the other, and returns its array."""
+        """Return a function of one usable picture after the other that returns its array, [values, rows, columns]."""
         raise NotImplementedError
 
     def read(self, files: Files, request: ClipRequest) -> Sequence[Any]:

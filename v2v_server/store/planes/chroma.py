@@ -26,7 +26,7 @@ class Colour(Plane):
         return replace(cut, chroma=ChromaCut((), cut.window, (cut.window[0], cut.window[2])))
 
     def maker(self) -> Callable[[DecodedPicture], npt.NDArray[np.int8]]:
-        """Return a function that returns the colour of a picture."""
+        """Return a function that returns the colour of a picture: Cb and Cr of its cells, [2, rows, columns]."""
 
         def colour(picture: DecodedPicture) -> npt.NDArray[np.int8]:
             assert picture.colour is not None

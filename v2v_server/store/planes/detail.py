@@ -30,7 +30,7 @@ class Detail(Plane):
         return signal.bits > SDR.bits
 
     def maker(self) -> Callable[[DecodedPicture], npt.NDArray[np.int8]]:
-        """Return a function that takes a picture's levels and greys."""
+        """Return a function that returns the detail of a picture, [1, h, w], from its levels and greys."""
         return lambda picture: detail_of(picture.luma, picture.grey, picture.signal)
 
     def read(self, files: Files, request: ClipRequest) -> list[npt.NDArray[np.int8]]:
@@ -49,7 +49,7 @@ class Detail(Plane):
         return found
 
     def added(self, clip: DecodedClip, value: npt.NDArray[np.int8]) -> DecodedClip:
-        """Return the clip with the levels of its greys and this detail."""
+        """Return the clip with the levels of its greys and this detail, [n, h, w]."""
         return replace(clip, frames=levels_of(clip.frames, value, clip.signal))
 
 
@@ -62,7 +62,7 @@ def detail_of(levels: npt.NDArray[np.uint16], grey: npt.NDArray[np.uint8], signa
 
 
 def levels_of(grey: npt.NDArray[np.uint8], detail: npt.NDArray[np.int8], signal: Signal) -> npt.NDArray[np.uint16]:
-    """Return the levels of grey and detail of equal shape, within the signal's limits whatever a file holds."""
+    """Return the levels of grey and detail, [n, h, w] both, within the signal's limits whatever a file holds."""
     levels: npt.NDArray[np.uint16] = np.clip(_nearest(signal)[grey] + detail, 0, signal.white).astype(np.uint16)
     return levels
 

@@ -7,7 +7,9 @@ with shorter clips or smaller crops, and the output says so.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +22,15 @@ from v2v_pictures.camera import Camera
 from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes
 from v2v_pictures.film import FRAMES_PER_SECOND, draw_film
 from v2v_pictures.sheet import draw_sheet
-from v2v_protocol.errors import CorpusError, UsageError
+from v2v_protocol.command import Parser, run_command
+from v2v_protocol.errors import CorpusError, UsageError, V2VError
 from v2v_protocol.progress import Progress
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, sidecar_endings
 from v2v_protocol.spec import StreamSpec
+from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting, spec_fields
 from v2v_protocol.write_aside import check_output, write_file
+from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import defects_of_video
 from v2v_server.motion.prediction import Prediction
@@ -51,15 +56,16 @@ LABELS = ("boxes", "masks")
 PICTURE_SUFFIXES = (".png", ".mp4", ".gif", ".html")
 _SMALLEST_CROP_PX = 16
 _GIF_EVERY = 2  # every other bin: half the size
+_MOST_CAMERAS = 32
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class PreviewCamera:
     """One camera of a preview.
 
     Attributes:
         title: written beside the camera; "" writes the seed.
-        recipe: fields or a preset's name.
+        recipe: its name, or fields.
         seed: of the sample.
     """
 
@@ -71,7 +77,7 @@ class Shot:
 def preview(
     source: str,
     out: Path,
-    shots: Sequence[Shot],
+    wanted: Sequence[PreviewCamera],
     spec: Mapping[str, Any],
     *,
     title: str,
@@ -89,10 +95,10 @@ def preview(
     Args:
         source, list_file, rows: the corpus, as for a server.
         out: .png (a sheet), .mp4 or .gif (a film), or .html (both in one file).
-        shots: the cameras.
+        wanted: the cameras.
         spec: other fields of the StreamSpec; None in any takes the default.
         title: of the page.
-        find_motion: take other seeds than those of ``shots``, whose crops show motion. Equal seeds stay equal.
+        find_motion: take other seeds than those of ``wanted``, whose crops show motion. Equal seeds stay equal.
         with_flow: show optical flow too.
         moments: voxel grids to show of each camera on a sheet.
         cache_dir: folder of the catalogue index; None: the user's cache.
@@ -105,23 +111,23 @@ def preview(
         SampleUnavailable, VideoUnreadable: see :func:`v2v_tools.remake.remake`.
     """
     check_output("--out", out, PICTURE_SUFFIXES, [source])  # before any work
-    scene = StreamSpec.from_dict({**spec, "recipe": shots[0].recipe}).scene != "off"
+    scene = StreamSpec.from_dict({**spec, "recipe": wanted[0].recipe}).scene != "off"
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir, kind=kind)
     cameras: list[Camera] = []
     loss, started, notes = Prediction(), np.zeros(2), dict[str, list[str]]()
     try:
-        first = _fitted_stream(catalogue, spec, shots[0].recipe)
+        first = _fitted_stream(catalogue, spec, wanted[0].recipe)
         wholes = WholePictures(catalogue, first)
         if find_motion:
-            shots, note = _moving(shots, Remaker(catalogue, first), wholes)
+            wanted, note = _moving(wanted, Remaker(catalogue, first), wholes)
             say(note)
         with Progress("simulating", "cameras") as progress:
-            for shot in shots:
-                camera, lost, events = _camera(catalogue, shot, spec, with_flow, notes)
+            for each in wanted:
+                camera, lost, events = _camera(catalogue, each, spec, with_flow, notes)
                 cameras.append(camera)
                 loss += lost
                 started = started + events
-                progress(len(cameras), len(shots))  # the first may include compiling; the estimate begins after it
+                progress(len(cameras), len(wanted))  # the first may include compiling; the estimate begins after it
         whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
         shown = sorted({camera.provenance.video for camera in cameras}) if first.scene == "off" else ()
         defects = [each for id in shown for each in defects_of_video(catalogue, id)]
@@ -129,7 +135,7 @@ def preview(
         catalogue.close()
     _check_sizes(cameras, out.suffix.lower())
     for note, titles in notes.items():
-        say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
+        say(f"{', '.join(titles) if len(titles) < len(wanted) else 'all cameras'}: {note}")
     say(f"{describe_start(started)} (recipe field start)")
     say(describe_loss(loss, defects))
     write_file(out, _content(out.suffix.lower(), whole, cameras, title, moments))
@@ -155,9 +161,11 @@ def _check_sizes(cameras: Sequence[Camera], kind: str) -> None:
         )
 
 
-def _moving(shots: Sequence[Shot], remaker: Remaker, wholes: WholePictures) -> tuple[list[Shot], str]:
+def _moving(
+    wanted: Sequence[PreviewCamera], remaker: Remaker, wholes: WholePictures
+) -> tuple[list[PreviewCamera], str]:
     """Return the same cameras with seeds that show motion, and a note for the user."""
-    asked = sorted({shot.seed for shot in shots})
+    asked = sorted({each.seed for each in wanted})
     chosen, moving = moving_seeds(remaker, wholes, len(asked))
     seeds = dict(zip(asked, chosen, strict=True))
     names = f"seed{'s' if len(chosen) > 1 else ''} {', '.join(map(str, chosen))}"
@@ -165,7 +173,7 @@ def _moving(shots: Sequence[Shot], remaker: Remaker, wholes: WholePictures) -> t
         note = f"{names}: chosen because their crops show motion; --seed 0 takes what chance gives"
     else:
         note = f"{names}: {moving} of {len(chosen)} crops show more motion than noise, no more were found"
-    return [dataclasses.replace(shot, seed=seeds[shot.seed]) for shot in shots], note
+    return [dataclasses.replace(each, seed=seeds[each.seed]) for each in wanted], note
 
 
 def _sequence_of(catalogue: Catalogue, provenance: Provenance) -> VideoSequence:
@@ -190,14 +198,15 @@ def _content(kind: str, whole: Camera, cameras: Sequence[Camera], title: str, mo
 
 
 def _camera(
-    catalogue: Catalogue, shot: Shot, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
+    catalogue: Catalogue, wanted: PreviewCamera, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
 ) -> tuple[Camera, Prediction, npt.NDArray[np.float64]]:
     """Make one camera's clip; predict what it loses between frames, and count what its start makes.
 
     Adds the titles of the cameras that a note is about to ``notes``, by its text.
     """
-    title = shot.title or f"seed {shot.seed}"
-    asked, stream = StreamSpec.from_dict({**spec, "recipe": shot.recipe}), _fitted_stream(catalogue, spec, shot.recipe)
+    title = wanted.title or f"seed {wanted.seed}"
+    asked = StreamSpec.from_dict({**spec, "recipe": wanted.recipe})
+    stream = _fitted_stream(catalogue, spec, wanted.recipe)
     if stream != asked:
         fitted, recipe = stream.recipe, asked.recipe
         note = (
@@ -209,7 +218,7 @@ def _camera(
     sidecars = catalogue.sidecars
     labels = [name for name in LABELS if any(sidecars[each].fingerprints for each in sidecar_endings((name,)))]
     arrays = ("voxels", "frames", *(("flow",) if with_flow else ()), *labels)
-    made = Remaker(catalogue, stream, arrays).made(shot.seed, 0, 0)
+    made = Remaker(catalogue, stream, arrays).made(wanted.seed, 0, 0)
     provenance = made.sample.provenance
     remark = f"{provenance.video} {provenance.remark}" if provenance.remark else ""
     for note in filter(None, (remark, _signal_note(catalogue, provenance, stream.recipe))):
@@ -249,24 +258,103 @@ def _whole_picture(catalogue: Catalogue, provenance: Provenance, recipe: Recipe)
 
 
 def _fitted_stream(catalogue: Catalogue, spec: Mapping[str, Any], recipe: Any) -> StreamSpec:
-    """Return the stream of a recipe that :func:`_fitted` has made fit."""
-    stream = StreamSpec.from_dict({**spec, "recipe": recipe})
-    return StreamSpec.from_dict({**spec, "recipe": _fitted(catalogue, stream)})
-
-
-def _fitted(catalogue: Catalogue, stream: StreamSpec) -> Recipe:
-    """Return the recipe, with shorter clips or smaller crops if the videos admit no others."""
-    recipe = stream.recipe
+    """Return the stream of a recipe, with shorter clips or smaller crops if the videos admit no others."""
     while True:
-        table = SequenceTable(catalogue.videos, catalogue.rows, stream)
+        stream = StreamSpec.from_dict({**spec, "recipe": recipe})
+        table, recipe = SequenceTable(catalogue.videos, catalogue.rows, stream), stream.recipe
         if table.count:
-            return recipe
-        longest = max(table.longest_clips, default=0)
+            return stream
+        longest, sides = max(table.longest_clips, default=0), (recipe.crop_height_px, recipe.crop_width_px)
         if longest:
             recipe = recipe.replace(voxels_per_clip=longest)
-        elif min(recipe.crop_height_px, recipe.crop_width_px) * 3 // 4 >= _SMALLEST_CROP_PX:
-            smaller = (side * 3 // 4 for side in (recipe.crop_height_px, recipe.crop_width_px))
-            recipe = recipe.replace(**dict(zip(("crop_height_px", "crop_width_px"), smaller, strict=True)))
+        elif min(sides) * 3 // 4 >= _SMALLEST_CROP_PX:
+            recipe = recipe.replace(crop_height_px=sides[0] * 3 // 4, crop_width_px=sides[1] * 3 // 4)
         else:
             raise CorpusError(f"no video can be shown: {table.refusals[0]}")
-        stream = StreamSpec.from_dict({**stream.to_dict(), "recipe": recipe})
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit status."""
+    parser = Parser(
+        "v2v-preview", "VIDEO|DIR [VIDEO ...] --out FILE [flags]",
+        "Show the effect of a recipe on your videos: frames, events, flow, activity.",
+        [
+            "v2v-preview clips/ --out sheet.png --recipe davis346",
+            "v2v-preview clip.mp4 --out compared.html --compare paper clean davis346",
+        ],
+    )  # fmt: skip
+    cameras = parser.group("Virtual cameras")
+    cameras.add_argument("--seeds", type=int, metavar="N", help="virtual cameras to draw (default 4)")
+    cameras.add_argument(
+        "--seed", type=int, metavar="S",
+        help="seed of the first camera; the others have the next seeds (default: seeds whose crops show motion)",
+    )  # fmt: skip
+    cameras.add_argument(
+        "--compare", nargs="+", metavar="NAME", help="show the same clip under these recipes instead, one camera each"
+    )
+    videos = parser.group("Videos")
+    videos.add_argument(
+        "sources", nargs="+", metavar="VIDEO|DIR",
+        help="a video, a folder of videos, or a list file; with several, each gets a FILE-NAME of its own",
+    )  # fmt: skip
+    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "cache_dir")
+    out = parser.group("Output")
+    parser.add_output(
+        "Output", "--out", PICTURE_SUFFIXES, f"picture, film or page: {', '.join(PICTURE_SUFFIXES)}", required=True
+    )
+    out.add_argument(
+        "--moments", type=int, default=1, metavar="N", help="number of voxel grids of each camera (default 1)"
+    )
+    out.add_argument("--no-flow", action="store_true", help="leave optical flow out")
+    add_spec(parser)
+    return run_command(parser, _run, argv, failures=(V2VError,), interrupted="interrupted; nothing was written")
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    count = 4 if arguments.seeds is None else arguments.seeds
+    for flag, value in (("--seeds", count), ("--moments", arguments.moments)):
+        if not 1 <= value <= _MOST_CAMERAS:
+            raise UsageError(f"{flag} {value}: give 1 to {_MOST_CAMERAS}")
+    first = arguments.seed or 0
+    if arguments.compare:
+        if arguments.recipe is not None:
+            raise UsageError("--compare names the recipes: leave --recipe out")
+        if arguments.seeds is not None:
+            raise UsageError("--compare shows each recipe with one seed: leave --seeds out")
+        wanted = [
+            PreviewCamera(Path(name).stem, recipe_setting(name, arguments.set), first) for name in arguments.compare
+        ]
+        what = "the same clip under " + ", ".join(each.title for each in wanted)
+    else:
+        name = asked_recipe(arguments) or "paper"
+        recipe = recipe_setting(name, arguments.set)
+        wanted = [PreviewCamera("", recipe, seed) for seed in range(first, first + count)]
+        what = f'virtual cameras drawn from the recipe "{Path(name).stem}"'
+    if arguments.seed is None:
+        what += ", chosen where something moves"
+    stem, names = arguments.out.stem, [Path(source).stem for source in arguments.sources]
+    named = {
+        arguments.out.with_stem(f"{stem}-{name}"): source for name, source in zip(names, arguments.sources, strict=True)
+    }
+    if len(named) < len(names):
+        raise UsageError(f"two of the videos are named {max(names, key=names.count)}: preview them one at a time")
+    for path, source in named.items():
+        preview(
+            source,
+            path if len(named) > 1 else arguments.out,
+            wanted,
+            # Recipes are compared on one clip, so the order must not depend on how many sequences each admits.
+            spec_fields(arguments) | ({"shuffle": False} if arguments.compare else {}),
+            title=f"{Path(source).name}: {what}",
+            find_motion=arguments.seed is None,
+            list_file=arguments.list,
+            rows=arguments.rows or "full",
+            with_flow=not arguments.no_flow,
+            moments=arguments.moments,
+            cache_dir=arguments.cache_dir,
+            kind=VideosKind.of(vars(arguments)),
+        )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
