@@ -431,6 +431,11 @@ A = TypeVar("A")
 Notice = Callable[..., None]
 """Progress callback: a line of text; with ``is_urgent=True`` it is shown at once."""
 
+
+def silent(*_: object, **__: object) -> None:
+    """Report no progress."""
+
+
 _AT_ONCE = 16
 _TOGETHER, _MOST_TOGETHER = 64, 1024
 """Files per task of a thread: passing them one by one takes longer than a local disk's answer."""
