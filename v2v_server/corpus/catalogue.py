@@ -49,6 +49,7 @@ from v2v_server.corpus.sources.source import (
     left_out_note,
     open_source,
     sidecar_id,
+    silent,
 )
 from v2v_server.corpus.videos import (
     NO_THRESHOLDS,
@@ -95,7 +96,7 @@ class Corpus:
     left_out: str = ""
 
 
-def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice | None) -> Corpus:
+def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice) -> Corpus:
     """List the files of a source.
 
     Args:
@@ -115,7 +116,7 @@ def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice | None) -
     for id in source.videos(refused, left_out):
         if [id] != ids[-1:]:  # a folder of pictures may be named by each
             ids.append(id)
-        if notice is not None and is_said(len(ids)):
+        if is_said(len(ids)):
             notice(f"looking for videos in {source}: {len(ids)} so far")
     note = left_out_note(left_out)
     if not ids:
@@ -158,8 +159,8 @@ def refresh_index(
     path: Path,
     scenes: SceneCollection | None,
     processes: int,
-    progress: VideoProgress | None,
-    notice: Notice | None,
+    progress: VideoProgress,
+    notice: Notice,
 ) -> tuple[Store, VideoTable, list[str]]:
     """Return an open index that knows every id, its table, and notes for the user.
 
@@ -181,7 +182,7 @@ def refresh_index(
             "probes every video again. Make room or give write access, delete the file if it is damaged, or choose "
             "another place with V2V_CACHE_DIR"
         )
-        if notice is not None and "locked" in str(error):  # the outcome of a wait that was said
+        if "locked" in str(error):  # the outcome of a wait that was said
             notice(f"the catalogue's index {path} cannot be used ({error}): probing every video again", is_urgent=True)
         return *_refreshed(None, source, ids, scenes, processes, progress, notice), [note]
     if store.replaced_version is None:
@@ -199,8 +200,8 @@ def _refreshed(
     ids: list[str],
     scenes: SceneCollection | None,
     processes: int,
-    progress: VideoProgress | None,
-    notice: Notice | None,
+    progress: VideoProgress,
+    notice: Notice,
 ) -> tuple[Store, VideoTable]:
     store = Store(path, notice)
     try:
@@ -233,26 +234,24 @@ def _table(store: Store, ids: list[str], kind: FigureKind | None) -> VideoTable:
     return table
 
 
-def _changed(source: VideoSource, ids: list[str], states: npt.NDArray[np.int64], notice: Notice | None) -> list[int]:
+def _changed(source: VideoSource, ids: list[str], states: npt.NDArray[np.int64], notice: Notice) -> list[int]:
     """Ask for size and times of every file; return the places of those that differ from the known [N, 3] states."""
     changed, done = list[int](), 0
     for part, answer in by_parts(source.states, ids):
         found, known = np.asarray(answer).reshape(-1, 3), states[done : done + len(part)]
         changed += (np.flatnonzero((found != known).any(1) | (found[:, 0] < 0)) + done).tolist()
         done += len(part)
-        if notice is not None:
-            notice(f"looking at files in {source}: {done} of {len(ids)}, {len(changed)} of them new or changed")
+        notice(f"looking at files in {source}: {done} of {len(ids)}, {len(changed)} of them new or changed")
     return changed
 
 
-def _gone(source: VideoSource, ids: Sequence[str], notice: Notice | None) -> list[str]:
+def _gone(source: VideoSource, ids: Sequence[str], notice: Notice) -> list[str]:
     """Return the ids whose file does not exist any more. One that cannot be asked about today is not gone."""
     gone, done = list[str](), 0
     for part, states in by_parts(source.states, ids):
         done += len(part)
         gone += [id for id, size in zip(part, states[::3], strict=True) if size == GONE[0]]
-        if notice is not None:
-            notice(f"looking for files that are gone from {source}: {done} of {len(ids)} that are not listed")
+        notice(f"looking for files that are gone from {source}: {done} of {len(ids)} that are not listed")
     return gone
 
 
@@ -492,8 +491,8 @@ def open_catalogue(
     kind: VideosKind = VIDEOS,
     scene: bool = False,
     processes: int = 1,
-    progress: VideoProgress | None = None,
-    notice: Notice | None = None,
+    progress: VideoProgress = silent,
+    notice: Notice = silent,
 ) -> Catalogue:
     """Open a corpus: probe what is new or changed, forget what is gone.
 
@@ -539,7 +538,7 @@ def _snapshot(
     store: Store,
     scenes: SceneCollection | None,
     processes: int,
-    notice: Notice | None,
+    notice: Notice,
 ) -> Catalogue:
     source, manifest, table = corpus.source, corpus.source.manifest, on_disk
     problems, absent = dict(corpus.refused), frozenset[str]()

@@ -26,7 +26,7 @@ import xxhash
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.persisted import Int64, Persisted
 from v2v_protocol.write_aside import write_aside_and_rename
-from v2v_server.corpus.sources.source import Notice
+from v2v_server.corpus.sources.source import Notice, silent
 from v2v_server.system.process import make_private
 
 SCHEMA_VERSION = 6
@@ -157,12 +157,12 @@ class Store:
     Every method may also raise UnicodeDecodeError for a damaged file: SQLite's message then quotes what is not UTF-8.
     """
 
-    def __init__(self, path: Path | None, notice: Notice | None = None) -> None:
+    def __init__(self, path: Path | None, notice: Notice = silent) -> None:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             make_private(path)  # SQLite gives its other files the mode of this one
         self.path = path
-        self._notice = notice or (lambda text, **how: None)
+        self._notice = notice
         self.replaced_version: int | None = None
         self._database = sqlite3.connect(
             ":memory:" if path is None else path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False

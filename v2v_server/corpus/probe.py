@@ -183,7 +183,7 @@ def _culprit(source: VideoSource, id: str, death: Died) -> IndexRow:
 
 
 def batches(
-    items: Iterable[T], total: int, progress: VideoProgress | None, clock: Callable[[], float] = time.monotonic
+    items: Iterable[T], total: int, progress: VideoProgress, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[list[T]]:
     """Yield items in batches that are written to the index at once: a kill loses at most one.
 
@@ -195,8 +195,7 @@ def batches(
     begun = clock()
     for done, item in enumerate(items, 1):
         batch.append(item)
-        if progress is not None:
-            progress(done, total)
+        progress(done, total)
         if len(batch) == _MOST_TOGETHER or clock() - begun > _MOST_SECONDS:
             yield batch
             batch, begun = [], clock()
@@ -230,8 +229,8 @@ class SceneCollection:
         source: VideoSource,
         table: VideoTable,
         processes: int,
-        progress: VideoProgress | None,
-        notice: Notice | None,
+        progress: VideoProgress,
+        notice: Notice,
     ) -> bool:
         """Analyse each usable video without a scene in the index, and store the scene unless the analysis fails.
 
@@ -242,7 +241,7 @@ class SceneCollection:
             sqlite3.Error: the index cannot be written.
         """
         missing = np.flatnonzero((table.summaries.lengths == 0) & (table.problem == np.array(None))).tolist()
-        if missing and notice is not None and store.has_other_versions(self.kind.name, _ENDING):
+        if missing and store.has_other_versions(self.kind.name, _ENDING):
             notice(f"analysing {len(missing)} videos again: this release finds more in pictures than earlier ones")
         with closing(self._found(store, source, table, missing, processes)) as found:
             for batch in batches(found, len(missing), progress):
@@ -415,7 +414,7 @@ def collect_sidecars(
     shape: Shape,
     endings: Sequence[str],
     processes: int,
-    notice: Notice | None,
+    notice: Notice,
 ) -> tuple[dict[str, Sidecars], list[str]]:
     """Return the sidecars of each ending, and notes for the user. Only new and changed ones are read.
 
@@ -458,7 +457,7 @@ def collect_sidecars(
     return sidecars, notes
 
 
-def _states(source: VideoSource, ending: str, ids: Sequence[str], notice: Notice | None) -> dict[str, str | OSError]:
+def _states(source: VideoSource, ending: str, ids: Sequence[str], notice: Notice) -> dict[str, str | OSError]:
     """Return the state of each video's sidecar, or why it cannot be told."""
 
     def states(part: Sequence[str]) -> list[str | OSError]:
@@ -468,8 +467,7 @@ def _states(source: VideoSource, ending: str, ids: Sequence[str], notice: Notice
     with closing(by_parts(states, ids)) as answered:
         for part, those in answered:
             found.update(zip(part, those, strict=True))
-            if notice is not None:
-                notice(f"looking for sidecars {ending} in {source}: {len(found)} of {len(ids)} videos")
+            notice(f"looking for sidecars {ending} in {source}: {len(found)} of {len(ids)} videos")
     return found
 
 
@@ -491,7 +489,7 @@ def _read(
     states: Mapping[str, str],
     videos: Mapping[str, str],
     processes: int,
-    notice: Notice | None,
+    notice: Notice,
 ) -> Iterator[tuple[str, list[str]]]:
     """Read new and changed sidecars, put what is found into the index, and yield it: (video, facts)."""
     isolated = run_isolated(
@@ -505,8 +503,7 @@ def _read(
     fresh = list[Figures]()
     try:
         for done, ((video, id, *_), result) in enumerate(isolated, 1):
-            if notice is not None:
-                notice(f"read {id}, {done} of {len(jobs)} new or changed sidecars {ending}")
+            notice(f"read {id}, {done} of {len(jobs)} new or changed sidecars {ending}")
             died = (
                 f"reading it took too much time or memory, or crashed ({result.how})"
                 if isinstance(result, Died)

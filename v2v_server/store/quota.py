@@ -41,17 +41,6 @@ MOST_GIB = 1e6
 """Largest limit of a folder that a flag may give."""
 
 
-@dataclass(slots=True)
-class Used:
-    """Count the folder's bytes. Only the holder of the lock may use it."""
-
-    bytes: int
-
-    def add(self, more: int) -> None:
-        """Add to the number of bytes."""
-        self.bytes = max(0, self.bytes + more)
-
-
 class QuotaFolder:
     """A folder with a limit. Can be pickled.
 
@@ -67,7 +56,7 @@ class QuotaFolder:
         self, folder: Path, most_bytes: int, wait_seconds: float, least_free_bytes: int = LEAST_FREE_BYTES
     ) -> None:
         self.folder, self.most_bytes, self.least_free_bytes = folder, most_bytes, least_free_bytes
-        self._wait_seconds = wait_seconds
+        self._wait_seconds, self._bytes = wait_seconds, 0  # counted by the holder of the lock
 
     def make(self) -> None:
         """Create the folder if it is missing, and recount its bytes: a killed process may have counted a file that it
@@ -77,8 +66,8 @@ class QuotaFolder:
             OSError: the folder cannot be created, read or written.
         """
         (self.folder / PARTIAL).mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(BlockingIOError), self.locked() as used:
-            used.bytes = count_bytes(self.folder)
+        with contextlib.suppress(BlockingIOError), self.locked():
+            self._bytes = count_bytes(self.folder)
 
     @property
     def used_bytes(self) -> int:
@@ -95,7 +84,7 @@ class QuotaFolder:
         return shutil.disk_usage(self.folder).free
 
     @contextlib.contextmanager
-    def locked(self) -> Iterator[Used]:
+    def locked(self) -> Iterator[None]:
         """Lock the byte count, and write it back at the end.
 
         Raises:
@@ -107,10 +96,10 @@ class QuotaFolder:
         with open(open_private(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW), "r+b") as file:
             lock(file.fileno(), self._wait_seconds, path)
             text = file.read(64)
-            used = Used(int(text) if text.isdigit() else count_bytes(self.folder))
-            yield used
+            self._bytes = int(text) if text.isdigit() else count_bytes(self.folder)
+            yield
             file.seek(0)
-            file.write(b"%020d" % used.bytes)
+            file.write(b"%020d" % max(0, self._bytes))
             file.truncate()
 
     def add(self, partial: Path, path: Path, *, evicts: bool = False) -> bool:
@@ -126,14 +115,14 @@ class QuotaFolder:
             OSError: it cannot be renamed; BlockingIOError: see :meth:`locked`.
         """
         size = partial.stat().st_size
-        with self.locked() as used:
-            if evicts and (used.bytes + size > self.most_bytes or self.free_bytes < self.least_free_bytes):
-                self._evict(used, size)
-            if used.bytes + size > self.most_bytes:
+        with self.locked():
+            if evicts and (self._bytes + size > self.most_bytes or self.free_bytes < self.least_free_bytes):
+                self._evict(size)
+            if self._bytes + size > self.most_bytes:
                 return False
             path.parent.mkdir(exist_ok=True)
             # Count before renaming: a process killed in between has counted too much, not too little.
-            used.add(size - (path.stat().st_size if path.exists() else 0))
+            self._bytes += size - (path.stat().st_size if path.exists() else 0)
             partial.replace(path)
         return True
 
@@ -143,15 +132,15 @@ class QuotaFolder:
         Raises:
             OSError: see :meth:`locked`.
         """
-        with self.locked() as used:
-            used.add(-delete_unless_read(path))
+        with self.locked():
+            self._bytes -= delete_unless_read(path)
 
-    def _evict(self, used: Used, size: int) -> None:
+    def _evict(self, size: int) -> None:
         enough = max(0, int(self.most_bytes * _KEPT_SHARE) - size)
         for oldest in _oldest_first(self.folder):
-            if used.bytes <= enough and self.free_bytes >= self.least_free_bytes:
+            if self._bytes <= enough and self.free_bytes >= self.least_free_bytes:
                 return
-            used.add(-delete_unless_read(oldest))
+            self._bytes -= delete_unless_read(oldest)
 
 
 def used_bytes(folder: Path) -> int:

@@ -26,7 +26,7 @@ from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
 from v2v_server.corpus.index import SCHEMA_VERSION
 from v2v_server.corpus.probe import ProbeFile, probe_files
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.corpus.sources.source import MANIFEST_NAME
+from v2v_server.corpus.sources.source import MANIFEST_NAME, silent
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint, is_same_file
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
@@ -412,7 +412,7 @@ def test_a_full_disk(corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(sqlite3, "connect", small)
     for number in range(60):
         shutil.copy(corpus / "a.mp4", corpus / f"{'long name ' * 15}{number}.mp4")
-    catalogue = opener(corpus, progress=None)
+    catalogue = opener(corpus, progress=silent)
     assert len(catalogue.videos) == 63
     assert "full" in catalogue.notes[0]
 

@@ -12,6 +12,7 @@ from v2v_server.corpus import probe
 from v2v_server.corpus import videos as columns
 from v2v_server.corpus.catalogue import index_path, open_catalogue
 from v2v_server.corpus.index import IndexRow, Store
+from v2v_server.corpus.sources.source import silent
 
 VIDEOS = 2000
 MOST_BYTES = 820
@@ -90,5 +91,5 @@ def test_what_stays_is_not_looked_through_again_and_again(corpus: Path, tmp_path
 def test_what_was_probed_is_written_down_after_a_while_even_if_it_is_little() -> None:
     """A kill may not cost the hours that a few long videos took."""
     seconds = iter(range(0, 1000, 4))
-    batches = probe.batches(range(10), 10, None, lambda: next(seconds))
+    batches = probe.batches(range(10), 10, silent, lambda: next(seconds))
     assert [len(batch) for batch in batches] == [3, 3, 3, 1]

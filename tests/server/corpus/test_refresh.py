@@ -13,6 +13,7 @@ import pytest
 from v2v_server.corpus import catalogue as refresh
 from v2v_server.corpus.index import IndexRow, Store
 from v2v_server.corpus.sources.folder import Folder
+from v2v_server.corpus.sources.source import silent
 
 COUNT = 700
 
@@ -57,7 +58,7 @@ def test_a_record_that_another_process_removes_meanwhile_is_no_video(
             other.forget([ids[0]])
 
     monkeypatch.setattr(Store, "put", put_and_lose)
-    store, table, notes = refresh.refresh_index(Folder(tmp_path), ids[:3], index, None, 0, None, None)
+    store, table, notes = refresh.refresh_index(Folder(tmp_path), ids[:3], index, None, 0, silent, silent)
     store.close()
     assert notes == []
     assert table.problem[0] == "the index lost its record; start again to probe it"
@@ -77,7 +78,7 @@ def test_the_index_is_read_once_if_nothing_changed(tmp_path: Path, ids: list[str
     index = tmp_path / "index"
     for expected in (2, 1):
         reads.clear()
-        store, table, _ = refresh.refresh_index(Folder(tmp_path), ids[:3], index, None, 0, None, None)
+        store, table, _ = refresh.refresh_index(Folder(tmp_path), ids[:3], index, None, 0, silent, silent)
         store.close()
         assert len(table) == 3
         assert len(reads) == expected

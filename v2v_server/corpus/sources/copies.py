@@ -302,19 +302,15 @@ class Copies(VideoSource):
         """Return the states of many objects, from the listing."""
         found = array("q")
         for id in ids:
-            found.extend(self._state(id, self._objects))
+            found.extend(self.state(id, self._objects))
         return found
 
-    def state(self, id: str) -> FileState:
-        """Ask the store for the state of one object.
+    def state(self, id: str, listed: Mapping[str, FileState] | None = None, tries: int = TRIES) -> FileState:
+        """Return the state of one video, from the listing or else from the store.
 
         Raises:
             VideoUnreadable: the store does not answer, or has no such object.
         """
-        return self._state(id)
-
-    def _state(self, id: str, listed: Mapping[str, FileState] | None = None, tries: int = TRIES) -> FileState:
-        """Return the state of one video, from the listing or else from the store."""
         if id.endswith("/"):
             return self.state_of_parts(id, self._parts(id, listed, tries))
         size, content, _ = self.bucket.state(id, tries) if listed is None else listed.get(id, GONE)
@@ -348,7 +344,7 @@ class Copies(VideoSource):
                 found = self.bucket.find(id, tries=1) if id.endswith("/") else {"": self.bucket.state(id, tries=1)}
                 changed = state_text(sorted(found.items())) != state and state is not None
             else:
-                changed = self._state(id, tries=1) != state and state is not None
+                changed = self.state(id, tries=1) != state and state is not None
         except VideoGone:
             raise
         except VideoUnreadable:

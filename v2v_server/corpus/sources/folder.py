@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import stat
-from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -19,7 +18,6 @@ from v2v_server.corpus.sources.source import (
     GONE,
     LIST_SUFFIXES,
     MANIFEST_NAME,
-    NO_STATE,
     UNPRINTABLE,
     FileState,
     ListEntry,
@@ -75,32 +73,19 @@ class Folder(VideoSource):
             yield id
         self._refuse_prepared(folders)
 
-    def states(self, ids: Sequence[str]) -> array[int]:
-        """Return the states of many files, see :meth:`VideoSource.states`."""
-        found = array("q")
-        for id in ids:
-            try:
-                found.extend(self._state(id))
-            except OSError as error:
-                found.extend(GONE if isinstance(error, FileNotFoundError | NotADirectoryError) else NO_STATE)
-        return found
-
     def state(self, id: str) -> FileState:
         """Ask for the state of one file.
 
         Raises:
             VideoUnreadable: the file is missing or cannot be read.
         """
+        path = f"{self.name}/{self.file_of(id)}"
         try:
-            return self._state(id)
+            if path.endswith("/"):
+                return self.state_of_parts(id, [(name, _numbers(status)) for name, status in files_in(path)])
+            size, modified, changed = _numbers(status := os.stat(path))
         except OSError as error:
             raise unreadable(id, error) from error
-
-    def _state(self, id: str) -> FileState:
-        path = f"{self.name}/{self.file_of(id)}"
-        if path.endswith("/"):
-            return self.state_of_parts(id, [(name, _numbers(status)) for name, status in files_in(path)])
-        size, modified, changed = _numbers(status := os.stat(path))
         return (size, modified, changed ^ self.mark(id)) if stat.S_ISREG(status.st_mode) else GONE
 
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
@@ -263,23 +248,9 @@ def video_files(
         left_out: counts, by suffix, files that may be videos of other endings.
         kind: what a video is; the id of a folder of pictures ends with a slash.
     """
-    walk = _Walk(refused, left_out, kind)
-    return chain.from_iterable(walk.below(root, "", frozenset(), 0))
+    id_of, pseudo, paths_of = kind.form.id_of, pseudo_devices(), Counter[tuple[int, int]]()
 
-
-class _Walk:
-    """One search of a folder for videos.
-
-    Args:
-        refused, left_out, kind: as in :func:`video_files`.
-    """
-
-    def __init__(self, refused: dict[str, str], left_out: Counter[str], kind: VideosKind) -> None:
-        self._refused, self._left_out, self._id_of = refused, left_out, kind.form.id_of
-        self._pseudo = pseudo_devices()
-        self._paths = Counter[tuple[int, int]]()
-
-    def below(self, folder: Path, prefix: str, above: frozenset[tuple[int, int]], links: int) -> Iterator[list[str]]:
+    def below(folder: Path, prefix: str, above: frozenset[tuple[int, int]], links: int) -> Iterator[list[str]]:
         """Yield the videos below a folder, some at a time.
 
         Args:
@@ -287,19 +258,18 @@ class _Walk:
             above: identities (device, inode) of the folders that it lies in.
             links: of the path that leads here.
         """
-        refused = self._refused
         name = printable(prefix.rstrip("/") or ".")
         try:
             here = folder.stat()
-            if here.st_dev in self._pseudo:
+            if here.st_dev in pseudo:
                 refused[name] = PSEUDO
                 return
             identity = (here.st_dev, here.st_ino)
             if identity in above:
                 return
             if links > 1:
-                self._paths[identity] += 1
-                if (paths := self._paths[identity]) > MOST_PATHS:
+                paths_of[identity] += 1
+                if (paths := paths_of[identity]) > MOST_PATHS:
                     if paths == MOST_PATHS + 1:
                         refused[name] = f"links lead to this folder by more than {MOST_PATHS} paths: remove some links"
                     return
@@ -316,7 +286,7 @@ class _Walk:
             try:
                 is_file = entry.is_file()
                 is_folder = not is_file and entry.is_dir()
-                is_pseudo = is_file and entry.is_symlink() and entry.stat().st_dev in self._pseudo
+                is_pseudo = is_file and entry.is_symlink() and entry.stat().st_dev in pseudo
             except OSError as error:  # a link that leads in a circle, or where this user may not look
                 refused[printable(relative)] = f"cannot be read: {error.strerror or error}"
                 continue
@@ -324,8 +294,8 @@ class _Walk:
                 yield found
                 found = []
                 more = links + entry.is_symlink()
-                yield from self.below(folder / entry.name, f"{relative}/", above | {identity}, more)
-            elif id := self._id_of(relative):
+                yield from below(folder / entry.name, f"{relative}/", above | {identity}, more)
+            elif id := id_of(relative):
                 if printable(relative) != relative:
                     refused[printable(relative)] = UNPRINTABLE
                 elif not is_file:
@@ -335,8 +305,10 @@ class _Walk:
                 else:
                     found.append(id)
             elif is_file:
-                count_left_out(entry.name, self._left_out)
+                count_left_out(entry.name, left_out)
         yield found
+
+    return chain.from_iterable(below(root, "", frozenset(), 0))
 
 
 def pseudo_devices() -> frozenset[int]:

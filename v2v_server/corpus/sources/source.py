@@ -47,7 +47,7 @@ from zipfile import ZipFile
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoGone
+from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoGone, VideoUnreadable
 from v2v_protocol.programs import printable
 from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_server.labels import frame_of
@@ -431,6 +431,11 @@ A = TypeVar("A")
 Notice = Callable[..., None]
 """Progress callback: a line of text; with ``is_urgent=True`` it is shown at once."""
 
+
+def silent(*_: object, **__: object) -> None:
+    """Report no progress."""
+
+
 _AT_ONCE = 16
 _TOGETHER, _MOST_TOGETHER = 64, 1024
 """Files per task of a thread: passing them one by one takes longer than a local disk's answer."""
@@ -610,11 +615,17 @@ class VideoSource(ABC):
             CorpusError: the source cannot be listed, or cannot be served.
         """
 
-    @abstractmethod
     def states(self, ids: Sequence[str]) -> array[int]:
         """Return the states of many files, three numbers each. States from a listing suffice. A file without a state
         has :data:`GONE` or :data:`NO_STATE`. Called in threads.
         """
+        found = array("q")
+        for id in ids:
+            try:
+                found.extend(self.state(id))
+            except VideoUnreadable as error:
+                found.extend(GONE if isinstance(error, VideoGone) else NO_STATE)
+        return found
 
     @abstractmethod
     def state(self, id: str) -> FileState:
