@@ -61,7 +61,6 @@ class ServeConfig:
         metavar="DIR",
     )
     cache_gib: float = number(100.0, 0.0, 1e6, "size limit of --cache", unit="GiB", metavar="N")
-    cache_raw: bool = switch(False, "store frames in --cache without compression: about twice the size, faster to read")
     copies: str = text(
         "", "folder for videos fetched from object storage (default: in the user's cache folder)", metavar="DIR"
     )
@@ -115,9 +114,6 @@ class ServeConfig:
         False, "serve every user of this host, and allow addresses that other machines can reach, without keys"
     )
     port_file: str = text("", "file that the bound address is written to once the server is ready", metavar="FILE")
-    session_idle_seconds: float = number(
-        600.0, 0.001, 1e6, "a consumer that is silent for longer is forgotten; it can reconnect", unit="s", metavar="S"
-    )
     max_credit_bytes: int = whole(2 << 30, 1, 1 << 40, "largest number of bytes in flight to one consumer")
     share_gib: float = number(
         0.0, 0.0, 1e6,

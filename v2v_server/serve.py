@@ -154,7 +154,6 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
             quarantine=quarantine,
             wall_clock=utc_now,
             lease_deadline_seconds=config.lease_deadline_seconds,
-            session_idle_seconds=config.session_idle_seconds,
             max_credit_bytes=config.max_credit_bytes,
             expected_workers=config.workers_in_all,
             share_bytes=int(config.share_gib * GIB),
@@ -163,7 +162,7 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
         worker_flags = [*(["--keys", ""] if config.engine == "local" else []), "--log-format", config.log_format]
         if config.cache:
             worker_flags += ["--cache", str(Path(config.cache).absolute()), "--cache-gib", str(config.cache_gib)]
-        worker_flags += ["--cache-raw"] * config.cache_raw + ["--debug"] * debug
+        worker_flags += ["--debug"] * debug
         worker_flags += catalogue.source.worker_flags()
         stop = threading.Event()
         sockets.has_session = dispatcher.has_session

@@ -12,7 +12,6 @@ from v2v_protocol.errors import V2VError
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_source
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.packing import QUICK, RAW
 from v2v_server.system.log import GIB, Log, report_errors
 from v2v_server.system.process import die_with_parent
 from v2v_server.worker.process import run_worker, unshared_name
@@ -44,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     work.add_argument(
         "--keys", metavar="FILE", help="its key file, see v2v-keys (default: the file that V2V_KEYS names)"
     )
-    parser.add_settings(ServeConfig, "cache", "cache_gib", "cache_raw", "copies", "copies_gib", "log_format")
+    parser.add_settings(ServeConfig, "cache", "cache_gib", "copies", "copies_gib", "log_format")
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--arenas-fd", type=int, help=argparse.SUPPRESS)
@@ -63,10 +62,7 @@ def _run(arguments: argparse.Namespace) -> None:
         folder = Path(arguments.cache)
         if arguments.logbook_fd is None:  # a server has already made the name of its own workers unique
             make_cache(folder)
-        packing = RAW if arguments.cache_raw else QUICK
-        cache = Cache(
-            folder, int((100.0 if arguments.cache_gib is None else arguments.cache_gib) * GIB), packing=packing
-        )
+        cache = Cache(folder, int((100.0 if arguments.cache_gib is None else arguments.cache_gib) * GIB))
     log = Log(is_json=arguments.log_format == "json")
     run_worker(
         arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log,
