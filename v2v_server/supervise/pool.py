@@ -471,6 +471,7 @@ class Scaling:
         self._target = least
         self._parts: deque[tuple[float, float]] = deque(maxlen=_PARTS)  # shares in each sixth of the time
         self._since = math.nan
+        self._lacking = False
 
     def decide(self, now: float, waiting: float, idle: float, present: int) -> Decision | None:
         """Return the change to make, if there is one. Call it a few times a second.
@@ -502,7 +503,7 @@ class Scaling:
         self._since = now
         self._calls = 0
         self._waiting = self._idle = 0.0
-        self._lacking: bool = False
+        self._lacking = False
 
     def _more(self, waiting: float, idle: float) -> Decision | None:
         if self._target >= self._most or waiting < _WAITING or idle > _BUSY:
