@@ -114,9 +114,6 @@ class ServeConfig:
         False, "serve every user of this host, and allow addresses that other machines can reach, without keys"
     )
     port_file: str = text("", "file that the bound address is written to once the server is ready", metavar="FILE")
-    session_idle_seconds: float = number(
-        600.0, 0.001, 1e6, "a consumer that is silent for longer is forgotten; it can reconnect", unit="s", metavar="S"
-    )
     max_credit_bytes: int = whole(2 << 30, 1, 1 << 40, "largest number of bytes in flight to one consumer")
     share_gib: float = number(
         0.0, 0.0, 1e6,

@@ -154,7 +154,6 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
             quarantine=quarantine,
             wall_clock=utc_now,
             lease_deadline_seconds=config.lease_deadline_seconds,
-            session_idle_seconds=config.session_idle_seconds,
             max_credit_bytes=config.max_credit_bytes,
             expected_workers=config.workers_in_all,
             share_bytes=int(config.share_gib * GIB),

@@ -277,10 +277,10 @@ class Broker:
     _: KW_ONLY
     complete: Callable[[Lease, StreamSpec], Lease]
     lease_deadline_seconds: float
-    session_idle_seconds: float
     max_credit_bytes: int
     quarantine: Quarantine
     wall_clock: Callable[[], str]
+    session_idle_seconds: float = 600.0
     expected_workers: int = 0
     share_bytes: int = 0
 

@@ -32,7 +32,6 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, ClassVar, TypeAlias
 
 import uvicorn
@@ -202,32 +201,42 @@ def _without_port(host: str) -> str:
     return host.rpartition(":")[0] if ":" in host else host
 
 
-def metrics_of(status: StatusFields | None) -> Iterator[Metric]:
-    """Yield every metric of a status; None: the server does not answer."""
-    yield GaugeMetricFamily("v2v_up", "Whether the server answers.", value=float(status is not None))
-    if status is None:
-        return
-    info = GaugeMetricFamily("v2v_info", "Versions.", labels=("program", "protocol"))
-    info.add_metric((status["program"], str(status["protocol"])), 1.0)
-    yield info
-    families: dict[str, Any] = {}
-    for place in PARTS:
-        rows = rows_at(status, place)
-        for key, meaning in meanings_at(place).items():
-            if meaning.kind != "text" and meaning.metric != "":
-                _add(families, place, key, meaning, rows)
-    yield from families.values()
+class StatusCollector:
+    """Collector of the metrics of one status.
+
+    Args:
+        status: the status; None if the server does not answer.
+    """
+
+    def __init__(self, status: StatusFields | None) -> None:
+        self._status = status
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield every metric."""
+        yield GaugeMetricFamily("v2v_up", "Whether the server answers.", value=float(self._status is not None))
+        if self._status is None:
+            return
+        info = GaugeMetricFamily("v2v_info", "Versions.", labels=("program", "protocol"))
+        info.add_metric((self._status["program"], str(self._status["protocol"])), 1.0)
+        yield info
+        families: dict[str, Any] = {}
+        for place in PARTS:
+            rows = rows_at(self._status, place)
+            for key, meaning in meanings_at(place).items():
+                if meaning.kind != "text" and meaning.metric != "":
+                    _add(families, place, key, meaning, rows)
+        yield from families.values()
 
 
 def exposition(status: StatusFields | None, accept: str = "") -> tuple[bytes, str]:
     """Return the metrics of a status, and their content type.
 
     Args:
-        status: see :func:`metrics_of`.
+        status: see :class:`StatusCollector`.
         accept: the request's Accept header.
     """
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(SimpleNamespace(collect=lambda: metrics_of(status)))
+    registry.register(StatusCollector(status))
     encode, content_type = choose_encoder(accept)
     return encode(registry), content_type
 

@@ -17,6 +17,7 @@ its own memory.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -48,14 +49,7 @@ def load_in_turn(variant: Variant) -> None:
     with one_compiles(*_place(variant)) as is_to_compile:
         if is_to_compile:
             print(f"compiling the kernel for {variant}, once on this host", file=sys.stderr, flush=True)
-            kind = (
-                variant.voxel_dtype,
-                int(variant.is_general),
-                variant.precision,
-                int(variant.is_divided),
-                variant.bits,
-            )
-            _compile_apart(*map(str, kind))
+            _compile_apart(json.dumps(variant))
         _load(variant)
 
 
@@ -143,6 +137,6 @@ def one_compiles(folder: Path, key: str, longest_wait_seconds: float = _LONGEST_
 if __name__ == "__main__":
     die_with_parent(int(sys.argv[1]))
     if asked := sys.argv[2:]:
-        _load(Variant(asked[0], asked[1] == "1", asked[2], asked[3] == "1", int(asked[4])))
+        _load(Variant(*json.loads(asked[0])))
     else:
         load_kernels()
