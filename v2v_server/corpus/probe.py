@@ -45,7 +45,7 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
         before = source.state(id)
         with source.open_local(id, "") as path:
             mark = fingerprint(path)
-            facts = _at_rate(_facts(path, source.kind.videos_kind), source.rate(id))
+            facts = _timed(_facts(path, source.kind.videos_kind), source, id)
         name = facts.made_of or (f"{mark}-{facts.content}" if facts.content else mark)
         if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
@@ -80,12 +80,16 @@ def facts_of(path: Path, kind: str = "videos") -> VideoFacts:
         return pixels.facts()
 
 
-def _at_rate(facts: VideoFacts, rate: float) -> VideoFacts:
-    """Return the facts of pictures that follow each other at a rate, Hz, if they do not state their times."""
+def _timed(facts: VideoFacts, source: VideoSource, id: str) -> VideoFacts:
+    """Return the facts of pictures that follow each other at a rate that the user states, if they state no times; those
+    of a photograph, of all frames that it is shown for.
+    """
+    rate, frames = source.rate(id), source.kind.frames if source.kind.is_rendered else facts.frames
     if not rate or facts.index.seekable:
         return facts
-    index = facts.index.timed(np.rint(np.arange(facts.frames) * 1e9 / rate).astype(np.int64))
-    return replace(facts, frames_per_second=rate, index=index, content=f"{facts.content}@{rate:g}")
+    index = facts.index.timed(np.rint(np.arange(frames) * 1e9 / rate).astype(np.int64))
+    content = f"{facts.content}@{rate:g}"
+    return replace(facts, frames=frames, frames_per_second=rate, index=index, content=content)
 
 
 def _facts(path: Path, kind: str) -> VideoFacts:
