@@ -19,13 +19,13 @@ import xxhash
 
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.store.picture_sequence import (
-    LARGEST_FILE_BYTES,
+    LARGEST_PICTURE_FILE_BYTES,
     ORIENTATION,
     PICTURE_CODECS,
     decode_picture,
     errors_of_pictures,
 )
-from v2v_server.store.pixels import PICTURE_SUFFIXES
+from v2v_server.store.pixels import IMAGE_SUFFIXES
 from v2v_server.video.collect import BIT_EXACT_CODECS, ClipRequest, Cut, DecodedFrame, DecodedPicture
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.fingerprint import check_fingerprint
@@ -38,7 +38,7 @@ from v2v_server.video.source import LARGEST_PICTURE_PX
 if TYPE_CHECKING:
     from v2v_server.worlds.render import PhotoPyramid
 
-LOOKED_FOR = " ".join(sorted(PICTURE_SUFFIXES))
+LOOKED_FOR = " ".join(sorted(IMAGE_SUFFIXES))
 _LEAST_SIDE_PX = 16
 _MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16", "I;16B"})
 """Pillow's names of the pixels that are read: grey, palettes and RGB."""
@@ -55,7 +55,7 @@ _KEPT_BYTES = 256 << 20
 
 def id_of(path: str) -> str:
     """Return the id of the photograph in a file, its path; "" for other files."""
-    return path if PurePosixPath(path).suffix.lower() in PICTURE_SUFFIXES else ""
+    return path if PurePosixPath(path).suffix.lower() in IMAGE_SUFFIXES else ""
 
 
 class _Still(NamedTuple):
@@ -120,7 +120,7 @@ class Photograph:
 
     def _read(self) -> bytes:
         with open(self._path, "rb") as file:
-            return file.read(min(os.fstat(file.fileno()).st_size, LARGEST_FILE_BYTES))
+            return file.read(min(os.fstat(file.fileno()).st_size, LARGEST_PICTURE_FILE_BYTES))
 
     def _decoded(self, request: ClipRequest) -> _Still:
         """Return the photograph of an index, which may be kept.

@@ -26,7 +26,7 @@ from v2v_protocol.errors import VideoError
 from v2v_protocol.programs import printable
 from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_server.labels.formats import frame_of
-from v2v_server.store.pixels import PICTURE_SUFFIXES
+from v2v_server.store.pixels import IMAGE_SUFFIXES
 from v2v_server.store.video_file import VideoFile
 from v2v_server.video.collect import Stack
 from v2v_server.video.fingerprint import TIMES, files_in, unreadable
@@ -36,7 +36,7 @@ from v2v_server.video.orientation import Orientation
 from v2v_server.video.probe import VideoFacts
 from v2v_server.video.source import LARGEST_PICTURE_PX, reason
 
-LOOKED_FOR = f"folders and .zip archives of numbered {' '.join(sorted(PICTURE_SUFFIXES))}"
+LOOKED_FOR = f"folders and .zip archives of numbered {' '.join(sorted(IMAGE_SUFFIXES))}"
 PICTURE_CODECS = {
     b"\x89PNG": "png", b"\xff\xd8\xff": "mjpeg", b"II*\0": "tiff", b"MM\0*": "tiff", b"RIFF": "webp", b"BM": "bmp",
 }  # fmt: skip
@@ -45,7 +45,7 @@ ORIENTATION = 0x0112
 """Exif's tag of the orientation."""
 _MIRRORED = (2, 4, 5, 7)
 """Orientations that PyAV cannot tell from turned ones."""
-LARGEST_FILE_BYTES = 8 * LARGEST_PICTURE_PX + (1 << 20)
+LARGEST_PICTURE_FILE_BYTES = 8 * LARGEST_PICTURE_PX + (1 << 20)
 """Most bytes that are read of a file: a picture of the most pixels and 16 bits without compression."""
 
 
@@ -55,7 +55,7 @@ def id_of(path: str) -> str:
     """
     suffix, folder = PurePosixPath(path).suffix.lower(), f"{posixpath.dirname(path)}/"
     is_sidecar = any(ending in folder for ending in sidecar_endings(tuple(ARRAYS)) if ending.endswith("/"))
-    return path if suffix == ".zip" else folder if suffix in PICTURE_SUFFIXES and not is_sidecar else ""
+    return path if suffix == ".zip" else folder if suffix in IMAGE_SUFFIXES and not is_sidecar else ""
 
 
 class PictureSequence(VideoFile):
@@ -125,8 +125,8 @@ class PictureSequence(VideoFile):
             def read(name: str) -> bytes:
                 with packed.open(name) if packed else Path(path, name).open("rb") as file:
                     # Memory for all bytes that are asked for is allocated first, except by zipfile.
-                    size = LARGEST_FILE_BYTES if packed else os.fstat(file.fileno()).st_size
-                    return file.read(min(size, LARGEST_FILE_BYTES))
+                    size = LARGEST_PICTURE_FILE_BYTES if packed else os.fstat(file.fileno()).st_size
+                    return file.read(min(size, LARGEST_PICTURE_FILE_BYTES))
 
             yield packed.namelist() if packed else [name for name, _ in files_in(path)], read
 

@@ -31,7 +31,7 @@ PIXEL_KINDS: Mapping[str, tuple[str, ...]] = {
 """What a video of a corpus is, by ``--videos-kind``: the files here, in the order in which they are asked. The last one
 takes any path. It has ``id_of(path)``, the id of the video that a file belongs to, and ``LOOKED_FOR``, for people."""
 
-PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+IMAGE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 HIGHEST_RATE_HZ = 1e6
 LONGEST_PHOTOGRAPH_FRAMES = 2**17
 
@@ -61,8 +61,8 @@ class VideosKind:
             what = f"--videos-kind {self.videos_kind}, --rate {self.rate:g}"
             what += f", --photograph-seconds {self.photograph_seconds:g}" * (self.photograph_seconds != 0)
             raise UsageError(
-                f"{what}: choose one of {', '.join(PIXEL_KINDS)}; sequences and photographs can have a rate up to "
-                f"{HIGHEST_RATE_HZ:g} Hz, and photographs a duration"
+                f"{what}: choose one of {', '.join(PIXEL_KINDS)}; sequences can have a rate up to "
+                f"{HIGHEST_RATE_HZ:g} Hz, and photographs a rate and a duration"
             )
         if self.is_rendered and not 2 <= self.frames <= LONGEST_PHOTOGRAPH_FRAMES:
             raise UsageError(
@@ -150,7 +150,7 @@ def kind_of(id: str) -> str:
     lower = id.lower()
     if lower.endswith(("/", ".zip")):
         return "sequences"
-    return "photographs" if lower.endswith(tuple(PICTURE_SUFFIXES)) else "videos"
+    return "photographs" if lower.endswith(tuple(IMAGE_SUFFIXES)) else "videos"
 
 
 @contextmanager

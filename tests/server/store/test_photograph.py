@@ -112,7 +112,7 @@ def test_lengths_and_rates_are_checked(seconds: float, rate: float) -> None:
 
 def test_only_photographs_have_a_length() -> None:
     for kind in ("videos", "sequences"):
-        with pytest.raises(UsageError, match="photographs a duration"):
+        with pytest.raises(UsageError, match="photographs a rate and a duration"):
             VideosKind(kind, 0.0, 10.0)
 
 
