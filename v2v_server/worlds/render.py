@@ -24,7 +24,8 @@ from v2v_server.worlds.world import Doubles, World
 
 WHITEST = 4095
 """The highest level of a rendered picture."""
-_SMALLEST_SIDE_PX = 2
+LEAST_DEPTH = 2.0**-6
+"""A place that is farther away, or behind the camera, counts as that far: only what is never seen can be."""
 compiled: Any = numba.njit(nogil=True, cache=True, error_model="numpy")
 """Decorator of this folder's compiled functions."""
 
@@ -33,12 +34,12 @@ class PhotoPyramid(NamedTuple):
     """A photograph from fine to coarse.
 
     Attributes:
-        grey: [pixels of all levels] uint16, one level after the other, 0 .. WHITEST.
+        grey: [pixels of all levels] float32, one level after the other, whole numbers from 0 to WHITEST.
         first: [levels] int64, where each begins.
-        size: [levels, 2] int64, height and width of each.
+        size: [levels, 2] int64, height and width of each, at least 2.
     """
 
-    grey: npt.NDArray[np.uint16]
+    grey: npt.NDArray[np.float32]
     first: npt.NDArray[np.int64]
     size: npt.NDArray[np.int64]
 
@@ -46,25 +47,27 @@ class PhotoPyramid(NamedTuple):
 def pyramid_of(grey: npt.NDArray[Any]) -> PhotoPyramid:
     """Return the pyramid of a photograph, [H, W] uint8 or uint16 grey levels from black to white of their type."""
     white = np.iinfo(grey.dtype).max
-    levels = [((grey.astype(np.uint32) * (2 * WHITEST) + white) // (2 * white)).astype(np.uint16)]
-    while min(levels[-1].shape) >= 2 * _SMALLEST_SIDE_PX:
+    table = ((np.arange(white + 1, dtype=np.uint64) * (2 * WHITEST) + white) // (2 * white)).astype(np.float32)
+    levels = [np.pad(table[grey], [(0, max(0, 2 - side)) for side in grey.shape], "edge")]
+    while min(levels[-1].shape) > 2:
         levels.append(_halved(levels[-1]))
-    sizes = np.array([level.shape for level in levels])
-    ends = np.cumsum([level.size for level in levels])
-    return PhotoPyramid(np.concatenate([level.ravel() for level in levels]), np.concatenate(([0], ends[:-1])), sizes)
+    first = np.cumsum([0, *(level.size for level in levels)])[:-1]
+    return PhotoPyramid(
+        np.concatenate([level.ravel() for level in levels]), first, np.array([each.shape for each in levels])
+    )
 
 
 @compiled
 def _halved(picture):
-    """Return rounded means of 2 x 2; an odd last row or column is repeated."""
+    """Return rounded means of 2 x 2; an odd last row or column counts twice."""
     height, width = picture.shape
-    half = np.empty(((height + 1) // 2, (width + 1) // 2), np.uint16)
+    half = np.empty(((height + 1) // 2, (width + 1) // 2), np.float32)
     for y in range(half.shape[0]):
         above, below = picture[2 * y], picture[min(2 * y + 1, height - 1)]
         for x in range(half.shape[1]):
             right = min(2 * x + 1, width - 1)
-            total = np.int64(above[2 * x]) + above[right] + below[2 * x] + below[right]
-            half[y, x] = (total + 2) >> 2
+            total = (above[2 * x] + above[right]) + (below[2 * x] + below[right])
+            half[y, x] = np.floor((total + np.float32(2)) * np.float32(0.25))
     return half
 
 
@@ -75,17 +78,33 @@ def render(
 
     Args:
         pyramid: of its photograph.
+        world: the draw.
         seconds: [n] moments.
-        window: the part to render, px of the picture (:mod:`v2v_server.worlds.world`), which it may leave; None: the
-            crop.
+        window: the part to render, px of the picture (``world.py``), which it may leave; None: the crop.
 
     Returns:
         [n, h, w] uint16, 0 .. WHITEST, not mirrored.
     """
     top, left, height, width = world.crop if window is None else window
     out = np.empty((len(seconds), height, width), np.uint16)
-    places = world.places(seconds)
-    _render(*pyramid, places, _pixels_shown(places, world), patches_of(world), top, left, out)
+    places, outlines = world.places(seconds), world.outlines
+    back = inverse(places)
+    middle = world.crop.left_px + world.crop.width_px / 2, world.crop.top_px + world.crop.height_px / 2
+    depth = places[..., 2, 0] * middle[0] + places[..., 2, 1] * middle[1] + places[..., 2, 2]
+    shown = np.sqrt(_determinant(places) / (depth * depth * depth))
+    shown[:, 0] = np.maximum(shown[:, 0], 1 << world.focus)
+    boxes = np.full((*shown.shape, 4), (0, height, 0, width))
+    for layer, outline in enumerate(outlines, 1):
+        reach = outline[2] * (1.0 + 1.0 / (6.0 * outline[-1])) * np.array([-1.0, 1.0])
+        x, y = (part.ravel() for part in np.meshgrid(outline[0] + reach, outline[1] + reach))
+        x, y = taken(back[:, layer, None], x, y)
+        for side, (place, first, size) in enumerate(((y, top, height), (x, left, width))):
+            ends = np.floor(place.min(axis=1) - first), np.ceil(place.max(axis=1) - first)
+            boxes[:, layer, 2 * side : 2 * side + 2] = np.clip(np.stack(ends, axis=1), 0, size)
+    _render(
+        *pyramid, places, shown, boxes, outlines, top + 0.5, left + 0.5, np.empty((3, width)),
+        np.empty((4, width), np.float32), np.empty((2, width), np.int32), np.empty((height, width), np.float32), out,
+    )  # fmt: skip
     return out
 
 
@@ -100,6 +119,7 @@ def levels_between(
     """Return the levels between the frames of a sample, rendered at their times.
 
     Args:
+        pyramid, world: the photograph and the draw.
         seconds: [n], moment of each frame.
         source_index: [steps + 1], which frame each position of the clip shows.
         substep_px: longest motion of a sub-step, above 0.
@@ -111,12 +131,11 @@ def levels_between(
     top, left, height, width = world.crop
     x, y = (part.ravel() for part in np.meshgrid(left + width * np.arange(3) / 2, top + height * np.arange(3) / 2))
     places = world.places(seconds)
-    there = moved(places[:-1, :, None], inverse(places[1:])[:, :, None], x, y)
-    longest = np.sqrt(((there[0] - x) ** 2 + (there[1] - y) ** 2).max(axis=(1, 2)))
-    counts = 1 + np.minimum(longest / substep_px, most_substeps - 1).astype(np.int64)
+    to_x, to_y = taken(inverse(places[1:])[:, :, None], *taken(places[:-1, :, None], x, y))
+    longest = np.sqrt(((to_x - x) * (to_x - x) + (to_y - y) * (to_y - y)).max(axis=(1, 2)))
     step = np.flatnonzero(np.diff(source_index))
     shown = source_index[step]
-    more = counts[shown] - 1
+    more = np.minimum(longest[shown] / substep_px, most_substeps - 1).astype(np.int64)
     if not more.any():
         return None
     share = np.concatenate([np.arange(1, count + 1) / (count + 1) for count in more])
@@ -128,6 +147,13 @@ def levels_between(
 def inverse(places: Doubles) -> Doubles:
     """Return the inverse homographies, [..., 3, 3]."""
     return _adjugate(places) / _determinant(places)[..., None, None]
+
+
+def taken(places: Doubles, x: Doubles, y: Doubles) -> tuple[Doubles, Doubles]:
+    """Return x and y of places through homographies."""
+    across, down, depth = (places[..., row, 0] * x + places[..., row, 1] * y + places[..., row, 2] for row in range(3))
+    depth = np.maximum(depth, LEAST_DEPTH)
+    return across / depth, down / depth
 
 
 def _adjugate(places: Doubles) -> Doubles:
@@ -144,99 +170,90 @@ def _determinant(places: Doubles) -> Doubles:
     return total
 
 
-def moved(places: Doubles, back: Doubles, x: Doubles, y: Doubles) -> tuple[Doubles, Doubles]:
-    """Return where the points that places of the picture show are in another picture, by its inverse homography."""
-    for matrix in (places, back):
-        across, down, below = (
-            matrix[..., row, 0] * x + matrix[..., row, 1] * y + matrix[..., row, 2] for row in range(3)
-        )
-        x, y = across / below, down / below
-    return x, y
-
-
-def patches_of(world: World) -> Doubles:
-    """Return the patches' places, radii and outlines, [patches, 11]."""
-    rows = [(*patch.place_px, patch.radius_px, *patch.outline) for patch in world.patches]
-    return np.array(rows, np.float64).reshape(-1, 11)
-
-
-def _pixels_shown(places: Doubles, world: World) -> Doubles:
-    """Return how many pixels of the photograph one of the picture shows in each direction, [n, layers], at the middle
-    of the crop.
-    """
-    across = world.crop.left_px + world.crop.width_px / 2
-    down = world.crop.top_px + world.crop.height_px / 2
-    below = places[..., 2, 0] * across + places[..., 2, 1] * down + places[..., 2, 2]
-    area = _determinant(places) / (below * below * below)
-    shown: Doubles = np.sqrt(np.abs(area))
-    shown[:, 0] = np.maximum(shown[:, 0], 1 << world.focus)
-    return shown
-
-
 @compiled
-def cover(patch, x, y):
-    """Return the share of what is behind a patch that it covers at a place of the photograph (``world.Patch``)."""
-    a, b = (x - patch[0]) / patch[2], (y - patch[1]) / patch[2]
+def cover(outline, x, y):
+    """Return the share of what is behind a patch that it covers at a place of the photograph (``world.Layer``)."""
+    a, b = (x - outline[0]) / outline[2], (y - outline[1]) / outline[2]
     real, imaginary = a * a - b * b, 2.0 * a * b
     square = a * a + b * b
-    q = patch[3] * square * square + (patch[4] * real + patch[5] * imaginary) * square
-    q += patch[6] * (a * real - b * imaginary) + patch[7] * (a * imaginary + b * real)
-    q += patch[8] * (real * real - imaginary * imaginary) + patch[9] * (2.0 * real * imaginary)
-    u = min(max(patch[10] * (1.0 - q) + 0.5, 0.0), 1.0)
+    q = (outline[3] * square + outline[4] * real + outline[5] * imaginary) * square
+    q += outline[6] * (a * real - b * imaginary) + outline[7] * (a * imaginary + b * real)
+    q += outline[8] * (real * real - imaginary * imaginary) + outline[9] * (2.0 * real * imaginary)
+    u = min(max(outline[10] * (1.0 - q) + 0.5, 0.0), 1.0)
     return u * u * (3.0 - 2.0 * u)
 
 
 @compiled
-def _read(grey, first, height, width, x, y):
-    """Return the level between four pixels, at a place in px of this level."""
-    x, y = min(max(x - 0.5, 0.0), width - 1.0), min(max(y - 0.5, 0.0), height - 1.0)
-    column, row = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
-    right, down = min(column + 1, width - 1) - column, (min(row + 1, height - 1) - row) * width
-    x, y = np.float32(x - column), np.float32(y - row)
-    at = first + row * width + column
-    a, b = np.float32(grey[at]), np.float32(grey[at + right])
-    c, d = np.float32(grey[at + down]), np.float32(grey[at + down + right])
-    above, below = a + (b - a) * x, c + (d - c) * x
-    return above + (below - above) * y
+def _along(place, x, y, across, down, count):
+    """Write the places of the photograph that a row shows."""
+    across_y = place[0, 1] * y + place[0, 2]
+    down_y, depth_y = place[1, 1] * y + place[1, 2], place[2, 1] * y + place[2, 2]
+    for i in range(count):
+        column = x + np.float64(np.int32(i))
+        share = 1.0 / (place[2, 0] * column + depth_y)
+        across[i] = (place[0, 0] * column + across_y) * share
+        down[i] = (place[1, 0] * column + down_y) * share
 
 
 @compiled
-def _folded(x, size):
-    """Return the place in a picture that is mirrored at its borders."""
-    x -= 2.0 * size * np.floor(x / (2.0 * size))
-    return min(x, 2.0 * size - x)
+def _split(places, side, scale, pixels, whole, part, count):
+    """Write number and fraction of the first of the two pixels of a level between which the places of an axis lie."""
+    twice, share, most = 2.0 * side, 1.0 / (2.0 * side), np.float64(pixels - 1)
+    for i in range(count):
+        x = places[i] - twice * np.floor(places[i] * share)
+        x = min(max(min(x, twice - x) * scale - 0.5, 0.0), most)
+        first = np.floor(min(x, most - 1.0))
+        whole[i], part[i] = np.int32(first), np.float32(x - first)
 
 
 @compiled
-def _render(grey, first, size, places, shown, patches, top, left, out):
-    height, width = size[0]
+def _read(grey, first, pitch, columns, rows, x, y, found, count):
+    """Write the levels between four pixels each."""
+    pitch, first = np.int32(pitch), np.int64(first)
+    for i in range(count):
+        at = np.uint64(first + np.int64(rows[i] * pitch + columns[i]))
+        a, b = grey[at], grey[at + np.uint64(1)]
+        at += np.uint64(pitch)
+        c, d = grey[at], grey[at + np.uint64(1)]
+        above, below = a + (b - a) * x[i], c + (d - c) * x[i]
+        found[i] = above + (below - above) * y[i]
+
+
+@compiled
+def _render(grey, first, size, places, shown, boxes, outlines, top, left, doubles, singles, wholes, picture, out):
+    """Render in memory of the caller; ``top`` and ``left`` are the middle of the first pixel."""
+    across, down, share = doubles[0], doubles[1], doubles[2]
+    x, y, found, coarse = singles[0], singles[1], singles[2], singles[3]
+    columns, rows = wholes[0], wholes[1]
     for number in range(len(out)):
+        for layer in range(places.shape[1]):
+            level, part = 0, shown[number, layer]
+            while part >= 2.0 and level < len(size) - 1:
+                level, part = level + 1, part * 0.5
+            blends = part > 1.0 and level < len(size) - 1
+            begin, end = boxes[number, layer, 2], boxes[number, layer, 3]
+            count = max(end - begin, 0)
+            for row in range(boxes[number, layer, 0], boxes[number, layer, 1]):
+                _along(places[number, layer], left + begin, top + row, across, down, count)
+                for finer in range(level + blends, level - 1, -1):
+                    scale = 1.0 / (1 << finer)
+                    _split(across, size[0, 1], scale, size[finer, 1], columns, x, count)
+                    _split(down, size[0, 0], scale, size[finer, 0], rows, y, count)
+                    into = coarse if finer > level else found
+                    _read(grey, first[finer], size[finer, 1], columns, rows, x, y, into, count)
+                if blends:
+                    weight = np.float32(part - 1.0)
+                    for i in range(count):
+                        found[i] += (coarse[i] - found[i]) * weight
+                if layer == 0:
+                    for i in range(count):
+                        picture[row, i] = found[i]
+                    continue
+                for i in range(count):
+                    share[i] = cover(outlines[layer - 1], across[i], down[i])
+                for i in range(count):
+                    behind = picture[row, begin + i]
+                    picture[row, begin + i] = behind + (found[i] - behind) * np.float32(share[i])
         for row in range(out.shape[1]):
-            y = top + row + 0.5
-            for column in range(out.shape[2]):
-                x = left + column + 0.5
-                value = np.float32(0)
-                for layer in range(places.shape[1]):
-                    h = places[number, layer]
-                    below = 1.0 / (h[2, 0] * x + h[2, 1] * y + h[2, 2])
-                    across = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) * below
-                    down = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) * below
-                    share = np.float32(1)
-                    if layer:
-                        share = np.float32(cover(patches[layer - 1], across, down))
-                        if share == 0:
-                            continue
-                    across, down = _folded(across, width), _folded(down, height)
-                    level, part = 0, shown[number, layer]
-                    while part >= 2.0 and level < len(size) - 1:
-                        level += 1
-                        part *= 0.5
-                    scale = 1.0 / (1 << level)
-                    found = _read(grey, first[level], size[level, 0], size[level, 1], across * scale, down * scale)
-                    if part > 1.0 and level < len(size) - 1:
-                        scale *= 0.5
-                        level += 1
-                        coarse = _read(grey, first[level], size[level, 0], size[level, 1], across * scale, down * scale)
-                        found += (coarse - found) * np.float32(part - 1.0)
-                    value += (found - value) * share
-                out[number, row, column] = np.uint16(value + np.float32(0.5))
+            for i in range(out.shape[2]):
+                out[number, row, i] = np.uint16(np.int32(picture[row, i] + np.float32(0.5)))

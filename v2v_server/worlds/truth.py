@@ -8,14 +8,13 @@ half of it there. All of it is float64 until the result is rounded.
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.worlds.render import compiled, cover, inverse, patches_of
+from v2v_server.worlds.render import LEAST_DEPTH, compiled, cover, inverse
 from v2v_server.worlds.world import Doubles, World
-
-_LEAST = 2.0**-6
-"""Least share of the size at which a point is shown: those farther away or behind the camera count as that far."""
 
 
 def flow_of(
@@ -24,90 +23,92 @@ def flow_of(
     """Return the exact flow of the crop from one moment to another.
 
     Args:
+        world: the draw.
         seconds: the moment on whose grid it is.
-        other_seconds: the moment it leads to.
+        other_seconds: the moment that it leads to.
 
     Returns:
         [2, H, W], (x, y), px of the crop; [1, H, W], 1 where the point is seen at the other moment.
     """
-    _, _, height, width = world.crop
-    flow, valid = np.empty((2, height, width), np.float32), np.empty((1, height, width), np.uint8)
-    places = world.places(np.array([seconds, other_seconds]))
-    _flow(places[0], places[1], inverse(places[1]), patches_of(world), *world.crop[:2], flow, valid[0])
-    if world.flip:
-        flow, valid = np.ascontiguousarray(flow[:, :, ::-1]), np.ascontiguousarray(valid[:, :, ::-1])
-        np.negative(flow[0], out=flow[0])
-    return flow, valid
+    grid = _grid(world)
+    _, (there,) = _follow(world, np.zeros(1) + seconds, grid, np.array([other_seconds]))
+    flow, valid = there[:, :2] - grid, there[:, 2] > 0.0
+    flow[:, 0] *= -1.0 if world.flip else 1.0
+    return _picture(world, flow.astype(np.float32)), _picture(world, valid[:, None].astype(np.uint8))
 
 
 def masks_of(world: World, seconds: float) -> npt.NDArray[np.uint8]:
     """Return which layer each pixel of the crop shows, [1, H, W]: 0 the photograph, 1 the first patch."""
-    mask = np.empty((1, world.crop.height_px, world.crop.width_px), np.uint8)
-    _masks(world.places(np.array([seconds]))[0], patches_of(world), *world.crop[:2], mask[0])
-    return np.ascontiguousarray(mask[:, :, ::-1]) if world.flip else mask
+    return _picture(world, _follow(world, np.zeros(1) + seconds, _grid(world), np.empty(0))[0][:, None])
 
 
 def tracks_of(world: World, seconds: Doubles) -> npt.NDArray[np.float32]:
     """Return the paths of the world's points, [n, N, 3]: x and y in px of the crop, and 1 where the point is seen."""
-    top, left, height, width = world.crop
-    start, end = world.seconds
-    at = world.places(start + world.points[:, 2] * (end - start))
-    first = world.points[:, :2] * (width, height) + (left, top)
-    tracks = np.empty((len(seconds), len(first), 3), np.float32)
-    places = world.places(seconds)
-    _tracks(at, first, places, inverse(places), patches_of(world), *world.crop, tracks)
+    (start, end), (_, _, height, width) = world.seconds, world.crop
+    first = world.points[:, :2] * (float(width), float(height))
+    tracks = _follow(world, start + world.points[:, 2] * (end - start), first, seconds)[1]
     if world.flip:
         tracks[..., 0] = width - tracks[..., 0]
-    return tracks
+    return tracks.astype(np.float32)
+
+
+def _grid(world: World) -> Doubles:
+    """Return the middles of the crop's pixels, [pixels, 2]."""
+    _, _, height, width = world.crop
+    return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
+
+
+def _picture(world: World, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return values of the crop's pixels, [pixels, k], as arrays [k, H, W], mirrored if the crop is."""
+    planes = values.T.reshape(-1, world.crop.height_px, world.crop.width_px)
+    return np.ascontiguousarray(planes[:, :, ::-1] if world.flip else planes)
+
+
+def _follow(world: World, at: Doubles, points: Doubles, seconds: Doubles) -> tuple[npt.NDArray[np.uint8], Doubles]:
+    """Follow what is in front at places of the crop.
+
+    Args:
+        world: the draw.
+        at: [N] or [1], moment of each point.
+        points: [N, 2], its place then, px of the crop.
+        seconds: [n] moments.
+
+    Returns:
+        [N], its layer; [n, N, 3], its place, and 1 where it is seen.
+    """
+    layers, tracks = np.empty(len(points), np.uint8), np.empty((len(seconds), len(points), 3))
+    places = world.places(seconds)
+    _walk(world.places(at), points, places, inverse(places), world.outlines, *world.crop, layers, tracks)
+    return layers, tracks
 
 
 @compiled
 def _taken(place, x, y):
-    """Return a place through a homography."""
-    below = max(place[2, 0] * x + place[2, 1] * y + place[2, 2], _LEAST)
+    """Return a place through a homography (``render.taken``)."""
+    depth = max(place[2, 0] * x + place[2, 1] * y + place[2, 2], LEAST_DEPTH)
     across = place[0, 0] * x + place[0, 1] * y + place[0, 2]
-    return across / below, (place[1, 0] * x + place[1, 1] * y + place[1, 2]) / below
+    return across / depth, (place[1, 0] * x + place[1, 1] * y + place[1, 2]) / depth
 
 
 @compiled
-def _front(places, patches, x, y, behind):
+def _front(places, outlines, x, y, behind):
     """Return the frontmost layer at a place of the picture; ``behind`` if none in front of that layer covers it."""
-    for layer in range(len(patches), behind, -1):
+    for layer in range(len(outlines), behind, -1):
         across, down = _taken(places[layer], x, y)
-        if cover(patches[layer - 1], across, down) >= 0.5:
+        if cover(outlines[layer - 1], across, down) >= 0.5:
             return layer
     return behind
 
 
 @compiled
-def _masks(places, patches, top, left, mask):
-    for row in range(mask.shape[0]):
-        for column in range(mask.shape[1]):
-            mask[row, column] = _front(places, patches, left + column + 0.5, top + row + 0.5, 0)
-
-
-@compiled
-def _flow(places, others, back, patches, top, left, flow, valid):
-    height, width = valid.shape
-    for row in range(height):
-        for column in range(width):
-            x, y = left + column + 0.5, top + row + 0.5
-            layer = _front(places, patches, x, y, 0)
-            across, down = _taken(places[layer], x, y)
-            across, down = _taken(back[layer], across, down)
-            flow[0, row, column], flow[1, row, column] = across - x, down - y
-            is_inside = left <= across < left + width and top <= down < top + height
-            valid[row, column] = is_inside and _front(others, patches, across, down, layer) == layer
-
-
-@compiled
-def _tracks(at, first, places, back, patches, top, left, height, width, tracks):
-    for point in range(len(first)):
-        x, y = first[point]
-        layer = _front(at[point], patches, x, y, 0)
-        across, down = _taken(at[point, layer], x, y)
+def _walk(at, points, places, back, outlines, top, left, height, width, layers, tracks):
+    for point in range(len(points)):
+        start = at[min(point, len(at) - 1)]
+        x, y = points[point, 0] + left, points[point, 1] + top
+        layers[point] = layer = _front(start, outlines, x, y, 0)
+        across, down = _taken(start[layer], x, y)
         for moment in range(len(tracks)):
             x, y = _taken(back[moment, layer], across, down)
             is_inside = left <= x < left + width and top <= y < top + height
             tracks[moment, point, 0], tracks[moment, point, 1] = x - left, y - top
-            tracks[moment, point, 2] = is_inside and _front(places[moment], patches, x, y, layer) == layer
+            tracks[moment, point, 2] = is_inside and _front(places[moment], outlines, x, y, layer) == layer
