@@ -322,7 +322,7 @@ class Recipe(Persisted):
         (0.0, 0.0), 0.0, 10.0, "speed at which they zoom, in or out, as a share of the size a second", is_later=True
     )
     world_tilt: Range = span(
-        (0.0, 0.0), 0.0, 0.4, "most tilt of the camera: share by which the crop's edges are larger or smaller",
+        (0.0, 0.0), 0.0, 0.25, "most tilt of the camera: share by which the crop's edges are larger or smaller",
         is_later=True,
     )  # fmt: skip
     world_shake_px: Range = span(
