@@ -17,9 +17,16 @@ from v2v_server.simulation.view import apply_view, contrast_table
 from v2v_server.video.collect import BIT_EXACT_CODECS, SampleView
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import MOST_BITS, Signal
-from v2v_server.worlds.render import PhotoPyramid, levels_between, pyramid_of, render
+from v2v_server.worlds.render import (
+    PhotoPyramid,
+    flow_of,
+    levels_between,
+    masks_of,
+    pyramid_of,
+    render,
+    tracks_of,
+)
 from v2v_server.worlds.world import Doubles, World, draw_world
-from v2v_server.worlds.truth import flow_of, masks_of, tracks_of
 
 TRUTH = ("flow", "flow_valid", "masks", "tracks")
 """Arrays of a sample that are known exactly."""
