@@ -72,7 +72,7 @@ class _Still(NamedTuple):
     codec: str
 
 
-_kept = dict[tuple[Any, ...], _Still]()
+kept_photographs = dict[tuple[Any, ...], _Still]()
 
 
 class Photograph:
@@ -132,14 +132,14 @@ class Photograph:
         with errors_of_pictures(self._path, lambda: (None, "")):
             status = os.stat(self._path)
             key = self._path, status.st_size, status.st_mtime_ns, status.st_ino, request.rows
-            if key not in _kept:
-                _kept[key] = _decoded(self._read(), index, request.usable)
-            found = _kept[key] = _kept.pop(key)  # the latest is the last one
+            if key not in kept_photographs:
+                kept_photographs[key] = _decoded(self._read(), index, request.usable)
+            found = kept_photographs[key] = kept_photographs.pop(key)  # the latest is the last one
             while (
-                len(_kept) > 1
-                and sum(each.grey.nbytes + each.pyramid.grey.nbytes for each in _kept.values()) > _KEPT_BYTES
+                len(kept_photographs) > 1
+                and sum(each.grey.nbytes + each.pyramid.grey.nbytes for each in kept_photographs.values()) > _KEPT_BYTES
             ):
-                del _kept[next(iter(_kept))]
+                del kept_photographs[next(iter(kept_photographs))]
         return found
 
 

@@ -222,7 +222,7 @@ def test_photographs_are_decoded_once_within_a_bound(
 ) -> None:
     decoded, decode = list[int](), photograph.decode_picture
     monkeypatch.setattr(photograph, "decode_picture", lambda data: decoded.append(len(data)) or decode(data))
-    monkeypatch.setattr(photograph, "_kept", {})
+    monkeypatch.setattr(photograph, "kept_photographs", {})
     for name in ("a.png", "b.jpg", "a.png", "b.jpg"):
         still(folder / name, catalogue)
     assert len(decoded) == 2
@@ -230,7 +230,7 @@ def test_photographs_are_decoded_once_within_a_bound(
     for name in ("c.webp", "c.webp", "a.png", "c.webp"):
         still(folder / name, catalogue)
     assert len(decoded) == 5
-    assert len(photograph._kept) == 1
+    assert len(photograph.kept_photographs) == 1
 
 
 @pytest.mark.parametrize("direction", ["forward", "backward"])
