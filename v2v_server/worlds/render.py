@@ -5,8 +5,8 @@ photograph in one of the picture (the root of the area, at the middle of the cro
 2^(l+1) and l + 1, each bilinearly, in the ratio 2 - f / 2^l to f / 2^l - 1: a zoom has no moment at which the picture
 gets sharper at once. Below f = 1 level 0 is read alone. Beyond its border the photograph is mirrored.
 
-Everything has the same bytes on every host. It is compiled without fast-math and without contraction to fused multiply-add: the instruction set changes the speed, never
-a bit.
+Everything has the same bytes on every host: it is compiled without fast-math and without contraction to fused
+multiply-add, so the instruction set changes the speed, never a bit.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls
@@ -178,8 +178,8 @@ def _follow(world: World, at: Doubles, points: Doubles, seconds: Doubles) -> tup
     """Follow what is in front at places of the crop.
 
     A place shows the frontmost layer that covers at least half of what is behind it. Its point is the place of the
-    photograph on that layer. It is seen at another moment if it lies in the crop then, and no layer in front covers half
-    of it there.
+    photograph on that layer. It is seen at another moment if it lies in the crop then, and no layer in front covers
+    half of it there.
 
     Args:
         world: the draw.
