@@ -15,7 +15,7 @@ import numpy as np
 from v2v_protocol.errors import VideoError, VideoUnreadable
 from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.pixels import open_pixels
+from v2v_server.store.pixels import kind_of, open_pixels
 from v2v_server.system.isolate import Died, run_twice
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.probe import VideoFacts
@@ -41,6 +41,8 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
 
     A file that cannot be read gets the size -1, which no file has: it is probed again at the next start.
     """
+    if kind_of(id) == "photographs" and not source.kind.is_rendered:
+        return IndexRow(id, -1, problem="is a picture: add --videos-kind photographs")
     try:
         before = source.state(id)
         with source.open_local(id, "") as path:

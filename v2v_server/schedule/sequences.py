@@ -389,8 +389,6 @@ def _check_kind(spec: StreamSpec, kind: str) -> None:
         )
     if kind == "photographs" and not spec.recipe.is_world:
         raise UsageError("photographs stand still under this recipe: set world fields, as --preset worlds does")
-    if kind == "photographs" and spec.scene != "off":
-        raise UsageError(f'scene = "{spec.scene}" leaves out defects of videos, which photographs do not have: set off')
 
 
 class Refusals(Sequence[Refusal]):

@@ -66,14 +66,14 @@ class VideosKind:
             )
         if self.is_rendered and not 2 <= self.frames <= LONGEST_PHOTOGRAPH_FRAMES:
             raise UsageError(
-                f"--photograph-seconds {self.seconds:g} at --rate {self.rendered_hz:g} gives {self.frames} frames: "
+                f"--photograph-seconds {self.photograph_seconds or 10:g} at --rate {self.rendered_hz:g} gives {self.frames} frames: "
                 f"give 2 to {LONGEST_PHOTOGRAPH_FRAMES}"
             )
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> VideosKind:
         """Return the kind of a command's flags; None stands for a default."""
-        return cls(given["videos_kind"] or "videos", given["rate"] or 0.0, given.get("photograph_seconds") or 0.0)
+        return cls(given["videos_kind"] or "videos", given["rate"] or 0.0, given["photograph_seconds"] or 0.0)
 
     @property
     def has_parts(self) -> bool:
@@ -86,11 +86,6 @@ class VideosKind:
         return self.videos_kind == "photographs"
 
     @property
-    def seconds(self) -> float:
-        """Return for how long a photograph is shown."""
-        return self.photograph_seconds or 10.0
-
-    @property
     def rendered_hz(self) -> float:
         """Return the rate of photographs."""
         return self.rate or 60.0
@@ -98,7 +93,7 @@ class VideosKind:
     @property
     def frames(self) -> int:
         """Return the number of frames of a photograph, those at the beginning and the end included."""
-        return 1 + math.floor(min(self.seconds * self.rendered_hz, 1e15) + 0.5)
+        return 1 + math.floor(min((self.photograph_seconds or 10.0) * self.rendered_hz, 1e15) + 0.5)
 
     @property
     def form(self) -> Any:

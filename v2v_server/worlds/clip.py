@@ -28,7 +28,8 @@ from v2v_server.worlds.render import (
 )
 from v2v_server.worlds.world import Doubles, World, draw_world
 
-TRUTH = ("flow", "flow_valid", "masks", "tracks")
+_FLOW = "flow", "flow_valid"
+TRUTH = (*_FLOW, "masks", "tracks")
 """Arrays of a sample that are known exactly."""
 
 
@@ -65,34 +66,30 @@ def render_clip(
         table = contrast_table(params.contrast, signal.white)
         levels = levels._replace(grey=np.stack([table[level] for level in levels.grey]))
     frames = apply_view(render(pyramid, world, seconds), seen, recipe, signal)
-    arrays = _truth(world, seconds[source[ends]], spec, view.arrays)
+    known = tuple(name for name in TRUTH if name in view.arrays)
+    arrays = _truth(world, seconds[source[ends]], spec, known) if known else {}
     return DecodedClip(
         frames, times, codec, codec in BIT_EXACT_CODECS, signal=signal, arrays=arrays, is_view=True, levels=levels
     )
 
 
 def _truth(world: World, ends: Doubles, spec: StreamSpec, names: tuple[str, ...]) -> dict[str, npt.NDArray[Any]]:
-    """Return the requested arrays that are known.
+    """Return arrays of :data:`TRUTH`.
 
     Args:
         ends: [spans + 1] moments from one delivered frame to the next, the first of all included.
     """
-    layout = array_layout(spec.recipe, spec.voxel_dtype, names)
-    arrays = new_arrays({name: layout[name] for name in TRUTH if name in names})
+    arrays, shown = new_arrays(array_layout(spec.recipe, spec.voxel_dtype, names)), ends[spec.recipe.first_frame :]
     if "tracks" in arrays:
-        arrays["tracks"][:] = tracks_of(world, ends[spec.recipe.first_frame :])
-    for target, moment in zip(arrays.get("masks", ()), ends[spec.recipe.first_frame :], strict=False):
-        target[:] = masks_of(world, moment)
-    if arrays.keys().isdisjoint(("flow", "flow_valid")):
-        return arrays
-    flow, valid = (arrays.get(name) for name in ("flow", "flow_valid"))
-    for voxel, (earlier, later) in enumerate(pairwise(ends[spec.recipe.lead_voxels :].tolist())):
-        pair = (earlier, later) if spec.flow_direction == "forward" else (later, earlier)
-        found, is_seen = flow_of(world, *pair)
-        if flow is not None:
-            flow[voxel] = 0.0 if earlier == later or voxel < spec.flow_from else found
-        if valid is not None:
-            valid[voxel] = is_seen * (voxel >= spec.flow_from)
+        arrays["tracks"][:] = tracks_of(world, shown)
+    if "masks" in arrays:
+        arrays["masks"][:] = [masks_of(world, moment) for moment in shown]
+    if not arrays.keys().isdisjoint(_FLOW):
+        order = 1 if spec.flow_direction == "forward" else -1
+        for voxel, span in enumerate(pairwise(ends[spec.recipe.lead_voxels :].tolist())):
+            found = dict(zip(_FLOW, flow_of(world, *span[::order]) if voxel >= spec.flow_from else (0, 0), strict=True))
+            for name in arrays.keys() & found.keys():
+                arrays[name][voxel] = found[name]
     return arrays
 
 

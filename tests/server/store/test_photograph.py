@@ -309,7 +309,7 @@ WORLDS, PAPER = StreamSpec.from_dict({"preset": "worlds"}), StreamSpec()
         ("a.mp4", {"recipe": "paper"}, ("tracks",), "tracks needs --videos-kind photographs"),
         ("a.mp4", {"preset": "worlds"}, ("voxels",), "world fields are for photographs, these are videos"),
         ("a.jpg", {"recipe": "paper"}, ("voxels",), "photographs stand still under this recipe"),
-        ("a.jpg", {"recipe": "worlds", "scene": "auto"}, ("voxels",), "which photographs do not have"),
+        ("a.jpg", {"recipe": "worlds", "scene": "auto"}, ("voxels",), "needs statistics of the videos"),
         ("a.jpg", {"recipe": "worlds"}, ("frames_rgb",), "frames_rgb needs the colour of a video"),
         ("a.jpg", {"recipe": "worlds"}, ("boxes",), "boxes needs labels beside a video"),
     ],
@@ -356,6 +356,13 @@ def test_photographs_of_a_bucket_are_as_on_a_disk(folder: Path, samples: list[Sa
             assert all(map(same, samples_of(bucket, ROW), samples))
     finally:
         store.rm("/photos", recursive=True)
+
+
+def test_a_picture_is_no_video(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(CorpusError, match="is a picture: add --videos-kind photographs"):
+        open_catalogue(folder / "b.jpg", cache_dir=tmp_path, processes=0)
+    with closing(open_catalogue(folder / "b.jpg", cache_dir=tmp_path, kind=PHOTOGRAPHS, processes=0)) as one:
+        assert list(one.videos.ids) == ["b.jpg"]
 
 
 def test_a_list_names_photographs(folder: Path, tmp_path: Path) -> None:
