@@ -66,10 +66,11 @@ def labelled_panel(
         recent = camera.tracks[max(0, grid - _TRAIL_FRAMES) : grid + 1] * (scale, scale, 1) + (left, top, 0)
         for number in np.flatnonzero(recent[-1, :, 2]):
             colour = class_colour(int(number))
-            for (x0, y0, was_seen), (x1, y1, is_seen) in pairwise(recent[:, number]):
+            for (*before, was_seen), (*after, is_seen) in pairwise(recent[:, number]):
                 if was_seen and is_seen:
-                    page.line(x0, y0, x1, y1, colour, 2)
-            page.box(x1 - 2, y1 - 2, x1 + 2, y1 + 2, colour)
+                    page.line(*before, *after, colour, 2)
+            x0, y0, _ = recent[-1, number]
+            page.box(x0 - 2, y0 - 2, x0 + 2, y0 + 2, colour)
     if camera.boxes is None:
         return
     for x0, y0, x1, y1, category, *_ in camera.boxes[grid]:
