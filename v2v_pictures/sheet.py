@@ -114,6 +114,8 @@ _COLOURS: tuple[Rgb, ...] = (
 """Colours of the classes, in turn: none is the red or blue of events."""
 _TINT = 0.45
 _NO_OBJECT = (0, 255)
+_TRAIL_FRAMES = 4
+"""Frames before the shown one that the trail of a point goes through."""
 _TEXT_PT = 12
 
 
@@ -136,18 +138,27 @@ def tint(image: Image, mask: npt.NDArray[np.uint8]) -> Image:
 def labelled_panel(
     page: Canvas, camera: Camera, grid: int, x: int, y: int, image: Image, tile_px: int, *, with_text: bool = False
 ) -> None:
-    """Draw a panel with the boxes and the mask of one voxel grid's frame.
+    """Draw a panel with the boxes, the mask and the tracks of one voxel grid's frame.
 
     Args:
         camera: has the labels; without any, this is only the panel.
         grid: number of the voxel grid.
         x, y, tile_px: place and side of the panel, px.
         image: [H, W, 3], as large as the camera's frames.
-        with_text: write the class of each box.
+        with_text: write the class of each box, and draw the tracks.
     """
     if camera.masks is not None:
         image = tint(image, camera.masks[grid])
     left, top, scale = page.panel(x, y, image, tile_px, tile_px)
+    if camera.tracks is not None and with_text:
+        recent = camera.tracks[max(0, grid - _TRAIL_FRAMES) : grid + 1] * (scale, scale, 1) + (left, top, 0)
+        for number in np.flatnonzero(recent[-1, :, 2]):
+            colour = class_colour(int(number))
+            for before, after in pairwise(recent[:, number]):
+                if before[2] and after[2]:
+                    page.line(before[0], before[1], after[0], after[1], colour, 2)
+            x0, y0, _ = recent[-1, number]
+            page.box(x0 - 2, y0 - 2, x0 + 2, y0 + 2, colour)
     if camera.boxes is None:
         return
     for x0, y0, x1, y1, category, *_ in camera.boxes[grid]:
@@ -447,7 +458,9 @@ def _legend(page: Canvas, cameras: Sequence[Camera], scale: Scale, top: int) -> 
     said = "threshold: the change of log brightness that makes an event, brighter / darker"
     page.text(x, y + 56, said, colour=canvas.SOFT)
     said = "pale bars of the strip: noise; a bar is as long as the square root of the events"
-    if any(camera.boxes is not None or camera.masks is not None for camera in cameras):
+    if any(camera.tracks is not None for camera in cameras):
+        said = "tints in a panel: patches; trails: points that are followed; pale bars of the strip: noise"
+    elif any(camera.boxes is not None or camera.masks is not None for camera in cameras):
         said += "; boxes and tints in a panel: labels, a colour a class"
     page.text(x, y + 80, said, colour=canvas.SOFT)
     if cameras[0].flow is not None:

@@ -118,7 +118,7 @@ def preview(
     try:
         first = _fitted_stream(catalogue, spec, wanted[0].recipe)
         wholes = WholePictures(catalogue, first)
-        if find_motion:
+        if find_motion and not kind.is_rendered:
             wanted, note = _moving(wanted, Remaker(catalogue, first), wholes)
             say(note)
         with Progress("simulating", "cameras") as progress:
@@ -128,8 +128,10 @@ def preview(
                 loss += lost
                 started = started + events
                 progress(len(cameras), len(wanted))  # the first may include compiling; the estimate begins after it
-        whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
-        shown = sorted({camera.provenance.video for camera in cameras}) if first.scene == "off" else ()
+        # A photograph stands still, apart from what each camera sees of it.
+        whole = None if kind.is_rendered else wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
+        looks = first.scene == "off" and not kind.is_rendered
+        shown = sorted({camera.provenance.video for camera in cameras}) if looks else ()
         defects = [each for id in shown for each in defects_of_video(catalogue, id)]
     finally:
         catalogue.close()
@@ -137,7 +139,8 @@ def preview(
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(wanted) else 'all cameras'}: {note}")
     say(f"{describe_start(started)} (recipe field start)")
-    say(describe_loss(loss, defects))
+    if not kind.is_rendered:
+        say(describe_loss(loss, defects))
     write_file(out, _content(out.suffix.lower(), whole, cameras, title, moments))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
 
@@ -181,7 +184,7 @@ def _sequence_of(catalogue: Catalogue, provenance: Provenance) -> VideoSequence:
     return VideoSequence(video, provenance.start_frame)
 
 
-def _content(kind: str, whole: Camera, cameras: Sequence[Camera], title: str, moments: int) -> bytes | str:
+def _content(kind: str, whole: Camera | None, cameras: Sequence[Camera], title: str, moments: int) -> bytes | str:
     if kind == ".png":
         return png_bytes(draw_sheet(cameras, title, moments=moments, whole=whole))
     grids, bins = cameras[0].voxels.shape[:2]
@@ -217,6 +220,8 @@ def _camera(
         notes.setdefault(note, []).append(title)
     sidecars = catalogue.sidecars
     labels = [name for name in LABELS if any(sidecars[each].fingerprints for each in sidecar_endings((name,)))]
+    if catalogue.kind == "photographs":
+        labels = ["masks", "tracks"]
     arrays = ("voxels", "frames", *(("flow",) if with_flow else ()), *labels)
     made = Remaker(catalogue, stream, arrays).made(wanted.seed, 0, 0)
     provenance = made.sample.provenance
@@ -297,7 +302,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "sources", nargs="+", metavar="VIDEO|DIR",
         help="a video, a folder of videos, or a list file; with several, each gets a FILE-NAME of its own",
     )  # fmt: skip
-    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "cache_dir")
+    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "photograph_seconds", "cache_dir")
     out = parser.group("Output")
     parser.add_output(
         "Output", "--out", PICTURE_SUFFIXES, f"picture, film or page: {', '.join(PICTURE_SUFFIXES)}", required=True
@@ -330,7 +335,8 @@ def _run(arguments: argparse.Namespace) -> None:
         recipe = recipe_setting(name, arguments.set)
         wanted = [PreviewCamera("", recipe, seed) for seed in range(first, first + count)]
         what = f'virtual cameras drawn from the recipe "{Path(name).stem}"'
-    if arguments.seed is None:
+    kind = VideosKind.of(vars(arguments))
+    if arguments.seed is None and not kind.is_rendered:
         what += ", chosen where something moves"
     stem, names = arguments.out.stem, [Path(source).stem for source in arguments.sources]
     named = {
@@ -352,7 +358,7 @@ def _run(arguments: argparse.Namespace) -> None:
             with_flow=not arguments.no_flow,
             moments=arguments.moments,
             cache_dir=arguments.cache_dir,
-            kind=VideosKind.of(vars(arguments)),
+            kind=kind,
         )
 
 

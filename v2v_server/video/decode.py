@@ -30,6 +30,8 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.sample import SampleParams
+from v2v_protocol.spec import StreamSpec
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex
 from v2v_server.video.packets import is_unreferenced, length_bytes
 from v2v_server.video.picture import (
@@ -78,6 +80,19 @@ class Cut:
     still: PixelRect | None = None
 
 
+class SampleView(NamedTuple):
+    """What a cut is for, where its frames are rendered.
+
+    Attributes:
+        spec, params: the stream's spec and the sample's draw.
+        arrays: requested arrays, by name.
+    """
+
+    spec: StreamSpec
+    params: SampleParams
+    arrays: tuple[str, ...]
+
+
 @dataclass(frozen=True, slots=True)
 class ClipRequest:
     """What is wanted of the frames of a video.
@@ -92,6 +107,7 @@ class ClipRequest:
             whatever the file states.
         samples: (seed, epoch, index) of the sample of each cut, for pixels that differ from sample to sample; empty
             where no sample is made.
+        views: what they are for, for pixels that render the camera's view and know what moves in it.
     """
 
     index: FrameIndex
@@ -101,6 +117,7 @@ class ClipRequest:
     rows: tuple[int, int] | None = None
     most_bits: int | None = None
     samples: tuple[tuple[int, int, int], ...] = ()
+    views: tuple[SampleView, ...] = ()
 
     @property
     def count(self) -> int:
@@ -363,6 +380,8 @@ class DecodedClip:
         motion: [count, 2, rows, columns] int16, the motion to each frame from the one before in the cells of its cut
             (:mod:`v2v_server.motion`), zero for the first; None if it was not asked for.
         arrays: arrays of the sample that come with the pixels, by name, as they are delivered.
+        is_view: whether the frames are what the camera of the sample sees, so that its view is not applied.
+        levels: :class:`v2v_server.simulation.voxel.Levels` between these frames; None without.
     """
 
     frames: npt.NDArray[Any]
@@ -374,6 +393,8 @@ class DecodedClip:
     signal: Signal = SDR
     motion: npt.NDArray[np.int16] | None = None
     arrays: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+    is_view: bool = False
+    levels: Any = None  # of a package above this one
 
 
 Way = Callable[[Stack], Generator[VideoFrame, None, None]]

@@ -32,6 +32,7 @@ from v2v_server.simulation.pixel import simulate_pixels
 from v2v_server.simulation.precision import Variant, load, warm_up
 from v2v_server.system.compile_cache import sources_digest
 from v2v_server.system.process import die_with_parent, lock
+from v2v_server.worlds.clip import load as load_worlds
 
 _LONGEST_WAIT_SECONDS = 300.0
 
@@ -63,6 +64,8 @@ def _load(variant: Variant) -> None:
     load(variant)
     if variant.is_divided:
         load_motion()
+    if variant.is_rendered:
+        load_worlds()
 
 
 def load_kernels() -> None:
