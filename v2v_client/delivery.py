@@ -164,6 +164,7 @@ def deliver(
     buffers.shape(connection.layout, plan.batch_size, spare=most_partial + 1)
     partial: dict[int, _PartialBatch] = {}
     quarantine, lend = 0, shared_memory
+    recipe = connection.stream.resolved.recipe
 
     def ask() -> None:
         asked, slots = window.ask(), {}
@@ -214,5 +215,6 @@ def deliver(
             wait_seconds=clock() - began,
             cpu_seconds=sum(header.cpu_seconds for header in headers),
             decodes=sum(header.decoded for header in headers),
+            recipe=recipe,
         )
         del batch, tensors

@@ -186,7 +186,7 @@ def _open_remaker(
     )  # fmt: skip
 
 
-def _collate(samples: Sequence[Sample], *, collate_fn_map: Any) -> Batch:
+def _collate(samples: Sequence[ShownSample], *, collate_fn_map: Any) -> Batch:
     tensors = {
         name: torch.stack([torch.from_numpy(sample.arrays[name]) for sample in samples]) for name in samples[0].arrays
     }
@@ -199,8 +199,9 @@ def _collate(samples: Sequence[Sample], *, collate_fn_map: Any) -> Batch:
         wait_seconds=0.0,
         cpu_seconds=0.0,
         decodes=len(samples),
+        recipe=samples[0].recipe,
     )
 
 
 # PyTorch's registry of collate functions for custom types.
-default_collate_fn_map[Sample] = _collate
+default_collate_fn_map[ShownSample] = _collate

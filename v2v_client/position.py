@@ -33,6 +33,8 @@ from v2v_protocol.spec import StreamSpec
 
 STATE_VERSION = 1
 Count: TypeAlias = Annotated[int, Limits(0, LARGEST_INDEX)]
+Snapshot: TypeAlias = Count | tuple[Count | None, ...] | None
+"""Number of the quarantine snapshot to continue with; of a mixture, that of each member. None: the server's newest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +151,7 @@ class ResumeState(Persisted):
         origin, position, world_size: see the module.
         share: progress of a loader worker since ``position``; None for the state of a rank, which is valid for any
             number of loader workers.
-        quarantine: number of the quarantine snapshot to continue with; None for the server's newest.
+        quarantine: the quarantine snapshot to continue with.
     """
 
     stream: StreamIdentity | None
@@ -159,7 +161,7 @@ class ResumeState(Persisted):
     position: Count
     world_size: Annotated[int, Limits(1, LARGEST_INDEX)]
     share: LoaderShare | None = None
-    quarantine: Count | None = None
+    quarantine: Snapshot = None
 
     @property
     def place(self) -> tuple[int, int, int]:
@@ -311,7 +313,7 @@ class Consumer:
         """Return the batches of an epoch from ``state`` on."""
         return EpochPlan(stream.sequences, self.world_size, self.rank, self.batch_size, state.origin, state.position)
 
-    def after(self, state: ResumeState, plan: EpochPlan, batch: int, quarantine: int | None) -> ResumeState:
+    def after(self, state: ResumeState, plan: EpochPlan, batch: int, quarantine: Snapshot) -> ResumeState:
         """Return the rank's state after a batch. After the last one, it is the beginning of the next epoch.
 
         Args:
