@@ -10,15 +10,15 @@ import warnings
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING, Any, Never, Self, Unpack
+from typing import TYPE_CHECKING, Any, Never, Self
 
 from torch.utils.data import IterableDataset, get_worker_info
 
 from v2v_client.batch import Batch
-from v2v_client.connection import Connection, Connector, ConsumerId, addresses
+from v2v_client.connection import Connection, Connector, addresses
 from v2v_client.delivery import deliver
 from v2v_client.loaders import distributed_rank, end_with_parent, send_before_exit
-from v2v_client.local_server import LocalServer, recipe_flags
+from v2v_client.local_server import LocalServer, server_flags
 from v2v_client.memory import BatchBuffers
 from v2v_client.options import Labels, Options, Patience, check_labels, require_arguments, require_labels
 from v2v_client.passes import Iteration, Position
@@ -28,7 +28,7 @@ from v2v_protocol.keys import leaves_host
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, html_table
 from v2v_protocol.settings import require_whole
-from v2v_protocol.spec import SpecOptions, StreamSpec
+from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import read_recipe
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         keys: str | os.PathLike[str] | None = None,
         timeout_seconds: float = 60.0,
         patience: Patience | None = None,
-        **options: Unpack[SpecOptions],
+        **options: Any,
     ) -> None:
         super().__init__()
         require_arguments(V2VStreamDataset.__init__, options)
@@ -172,7 +172,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         flags: Sequence[str] = (),
         seed: int = 0,
         labels: Labels = "required",
-        **options: Unpack[SpecOptions],
+        **options: Any,
     ) -> V2VStreamDataset:
         """Start a server on this host and return a dataset that streams from it.
 
@@ -194,9 +194,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         """
         require_arguments(cls.local, options)
         resolved = StreamSpec.from_dict({"recipe": read_recipe(recipe)}).recipe
-        scene = StreamSpec.from_dict({key: options.get(key) for key in ("preset", "scene")}).scene
-        asked = [*recipe_flags(resolved), *(() if scene == "off" else ("--scene", scene)), *flags]
-        server = LocalServer(videos, workers=workers, flags=asked).__enter__()
+        server = LocalServer(videos, workers=workers, flags=server_flags(resolved, options, *flags)).__enter__()
         try:
             # V2V_KEYS may name a key for other servers.
             dataset = cls(server.address, batch_size, arrays, resolved, seed=seed, labels=labels, keys="", **options)
@@ -330,15 +328,11 @@ class V2VStreamDataset(IterableDataset[Batch]):
     def _ask_stream(self, start: ResumeState) -> StreamIdentity:
         # Not pinned: the spacing of siblings depends on the number of loader workers that iterate.
         with self._connected(start) as connection:
-            return connection.stream
+            return connection.conversation.stream
 
     @property
     def _consumer(self) -> Consumer:
         return Consumer(self._connector.batch_size, self.rank, self.world_size)
-
-    def _consumer_id(self, workers: int = 1) -> ConsumerId:
-        loader = get_worker_info()
-        return ConsumerId(self.rank, self.world_size, None if loader is None else loader.id, workers)
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the next iteration. It starts at the beginning, unless a state of that epoch was loaded.
@@ -425,18 +419,18 @@ class V2VStreamDataset(IterableDataset[Batch]):
     @contextmanager
     def _connected(self, start: ResumeState, workers: int = 0) -> Iterator[Connection]:
         """Yield an open connection to iterate with as one of ``workers`` loader workers, or only to ask (0)."""
-        member = self._consumer_id(max(workers, 1))
-        with closing(self._connector.connection(member, start)) as connection:
+        consumer = self.rank, self.world_size, max(workers, 1)
+        with closing(self._connector.connection(start, *consumer)) as connection:
             connection.open()
             if workers and start.stream is None:
-                self._connector.compare(connection, member, start)
+                self._connector.compare(connection, start, *consumer)
             yield connection
 
     @contextmanager
     def _opened(self, begun: Iteration) -> Iterator[tuple[Any, Iteration, EpochPlan]]:
         """Yield what :meth:`_take` needs: an open connection, the pass with its stream, and the plan of its epoch."""
         with self._connected(begun.state, begun.workers) as connection:
-            stream = connection.stream
+            stream = connection.conversation.stream
             if begun.state.stream is None:
                 begun = self._position.pin(begun, stream, connection.address)
             plan = self._consumer.plan(stream, begun.state)

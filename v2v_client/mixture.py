@@ -120,7 +120,7 @@ class Mixture(V2VStreamDataset):
         if len(streams) != len(self.members) or (ours != theirs and not is_new):
             raise StateMismatch(
                 f"the state is of {len(streams)} mixed datasets with {theirs}, this mixture of {len(self.members)} "
-                f"with {ours}; give the same (in a new epoch, seed, weights and samples may differ)"
+                f"with {ours}; give the same (in a new epoch, weights and samples may differ)"
             )
         for member, each in zip(self.members, streams, strict=True):
             member._check(state, each)
@@ -137,10 +137,10 @@ class Mixture(V2VStreamDataset):
             for member, stream, snapshot in zip(self.members, streams, self._snapshots(begun.state), strict=True):
                 start = dataclasses.replace(begun.state, stream=stream, quarantine=snapshot)
                 connections.append(stack.enter_context(member._connected(start, begun.workers)))
-            forms = {each.address: each.layout for each in connections}
-            if any(each.layout != connections[0].layout for each in connections):
+            forms = {each.address: each.conversation.layout for each in connections}
+            if any(each.conversation.layout != connections[0].conversation.layout for each in connections):
                 raise UsageError(f"mix: samples differ in form, {forms}: give recipes of one size, and one voxel_dtype")
-            stream = self._identity([each.stream for each in connections])
+            stream = self._identity([each.conversation.stream for each in connections])
             begun = self._position.pin(begun, stream, "this mixture")
             yield connections, begun, self._consumer.plan(stream, begun.state)
 
@@ -155,7 +155,7 @@ class Mixture(V2VStreamDataset):
             member._take(
                 connection,
                 begun,
-                member._consumer.plan(connection.stream, state.at_epoch(state.epoch)),
+                member._consumer.plan(connection.conversation.stream, state.at_epoch(state.epoch)),
                 np.flatnonzero(np.isin(np.flatnonzero(order == number), places)).tolist(),
             )
             for number, (member, connection) in enumerate(zip(self.members, connections, strict=True))

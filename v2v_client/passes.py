@@ -287,7 +287,7 @@ class Iteration:
 
     def batches(self, plan: EpochPlan) -> range:
         """Return the numbers of the batches that this process still has to deliver."""
-        return plan.batches_of_worker(self.worker, self.workers)[self.done :]
+        return range(self.worker, plan.batches, self.workers)[self.done :]
 
     def after(self, consumer: Consumer, delivered: int, quarantine: Snapshot) -> ResumeState:
         """Return the state of this loader worker after ``delivered`` batches of this iteration."""

@@ -253,20 +253,6 @@ class EpochPlan:
             self.origin + position * self.world_size + self.rank for position in range(first, first + self.batch_size)
         )
 
-    def position_after(self, batch: int) -> int:
-        """Return the number of local samples consumed after batch ``batch``."""
-        return self.position + (batch + 1) * self.batch_size
-
-    def batches_of_worker(self, worker: int, workers: int) -> range:
-        """Return the numbers of the batches that one of ``workers`` loader workers takes.
-
-        Raises:
-            UsageError: no such worker.
-        """
-        if not 0 <= worker < workers:
-            raise UsageError(f"loader worker {worker} of {workers}: workers are 0 .. {workers - 1}")
-        return range(worker, self.batches, workers)
-
     def shares_decodes(self, spacing: int, workers: int) -> bool:
         """Return whether all siblings, ``spacing`` apart in the epoch, go to the same loader worker of the same rank.
 
@@ -323,7 +309,8 @@ class Consumer:
         """
         if batch + 1 == plan.batches:
             return state.at_epoch(state.epoch + 1)
-        return dataclasses.replace(state, position=plan.position_after(batch), share=None, quarantine=quarantine)
+        position = plan.position + (batch + 1) * plan.batch_size
+        return dataclasses.replace(state, position=position, share=None, quarantine=quarantine)
 
     def adopt(self, state: ResumeState) -> ResumeState:
         """Return ``state`` for this world size; another one counts from the first index that no rank consumed."""

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trainer.config import OptimizerConfig, RunConfig, StreamConfig
-from trainer.feed import server_flags
+from trainer.feed import flags_of
 from trainer.learner import AveragedNetwork, learning_rate
 from trainer.models import FireNet
 from trainer.run.distributed import Ranks, ranks
@@ -29,17 +29,15 @@ ALONE = Ranks(0, 1, torch.device("cpu"))
 
 def test_a_local_server_gets_the_options_it_needs_at_its_start() -> None:
     recipe = Recipe.from_dict({"preset": "clean", "bins": 3})
-    plain = server_flags(StreamConfig(videos="clips", rows="top:0.5"), recipe)
+    plain = flags_of(StreamConfig(videos="clips", rows="top:0.5"), recipe)
     assert plain[:2] == ["--rows", "top:0.5"]
     assert plain[plain.index("bins=3") - 1] == "--set"
     assert "--list" not in plain
     assert "--scene" not in plain
-    asked = server_flags(StreamConfig(videos="clips", list="some.txt", spec={"scene": "auto"}), recipe)
+    asked = flags_of(StreamConfig(videos="clips", list="some.txt", spec={"scene": "auto"}), recipe)
     assert asked[-4:] == ["--list", "some.txt", "--scene", "auto"]
-    assert server_flags(StreamConfig(videos="clips", spec={"preset": "natural"}), recipe)[-2:] == ["--scene", "auto"]
-    assert "--scene" not in server_flags(
-        StreamConfig(videos="clips", spec={"preset": "natural", "scene": "off"}), recipe
-    )
+    assert flags_of(StreamConfig(videos="clips", spec={"preset": "natural"}), recipe)[-2:] == ["--scene", "auto"]
+    assert "--scene" not in flags_of(StreamConfig(videos="clips", spec={"preset": "natural", "scene": "off"}), recipe)
 
 
 def test_the_started_server_is_announced_before_it_is_ready(
