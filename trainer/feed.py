@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import signal
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any
 
@@ -29,7 +29,7 @@ HELD_OUT_SEED = 1 << 32
 
 
 def stream(config: TrainConfig, asked: Asked, address: str, **changes: Any) -> V2VStreamDataset:
-    """Return the dataset that the run trains on.
+    """Return the dataset of section ``stream``, without its ``mix``.
 
     Args:
         changes: arguments of the dataset that override the configuration.
@@ -52,10 +52,25 @@ def stream(config: TrainConfig, asked: Asked, address: str, **changes: Any) -> V
     return V2VStreamDataset(address, **(arguments | changes))
 
 
+def streams(config: TrainConfig, asked: Asked, addresses: Sequence[str]) -> V2VStreamDataset:
+    """Return the dataset that the run trains on, mixed of several with ``stream.mix``; see :func:`stream`."""
+    mixed = config.stream.mixed.values()
+    if len(mixed) == 1:
+        return stream(config, asked, addresses[0])
+    members = [
+        stream(dataclasses.replace(config, stream=each), asked, address)
+        for (each, _), address in zip(mixed, addresses, strict=True)
+    ]
+    return V2VStreamDataset.mix(
+        {member: weight for member, (_, weight) in zip(members, mixed, strict=True)}, config.stream.seed
+    )
+
+
 def flags_of(settings: StreamConfig, recipe: Recipe) -> list[str]:
     """Return the flags of a server on ``settings.videos``."""
-    listed = ("--list", settings.list) if settings.list else ()
-    return server_flags(recipe, settings.spec, "--rows", settings.rows, *listed)
+    asked = {"--list": settings.list, "--videos-kind": "" if settings.videos_kind == "videos" else settings.videos_kind}
+    others = [part for flag, value in asked.items() if value for part in (flag, value)]
+    return server_flags(recipe, settings.spec, "--rows", settings.rows, *others)
 
 
 def held_out_batch(config: TrainConfig, asked: Asked, address: str) -> Iterator[Batch]:

@@ -123,9 +123,13 @@ def _trained(config: TrainConfig, mine: Ranks, out: Path, resume: Checkpoint | N
     learner = build(config, mine)
     if mine.first:
         require_writable(out)
-    recipe = learner.task.asked.recipe(config.stream.resolved_recipe)
-    with serving(config.stream, recipe, mine) as address, StopRequest(config.run.seconds, mine.any) as stop:
-        steps = train(config, learner, address, mine, stop, out, resume)
+    with ExitStack() as stack:
+        addresses = [
+            stack.enter_context(serving(stream, learner.task.asked.recipe(stream.resolved_recipe), mine))
+            for stream, _ in config.stream.mixed.values()
+        ]
+        stop = stack.enter_context(StopRequest(config.run.seconds, mine.any))
+        steps = train(config, learner, addresses, mine, stop, out, resume)
     return steps, stop.signal
 
 

@@ -99,7 +99,7 @@ class V2VDataset(Dataset[Sample]):
         self.spec = StreamSpec.from_dict({**options, "recipe": read_recipe(recipe)})
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
         self._videos, self._kind = os.fspath(videos), (videos_kind, rate)
-        self._source = {"videos": self._videos, "rows": rows, "list_file": list_file, "cache_dir": cache_dir}
+        self._source = {"rows": rows, "list_file": list_file, "cache_dir": cache_dir}
         self._maker: Any = None
         self._process = 0
         self._length = int(self._open().count)
@@ -168,7 +168,9 @@ class V2VDataset(Dataset[Sample]):
                     "'.[server]' in a checkout"
                 ) from error
             kind = remake.VideosKind(*self._kind)
-            self._maker = remake.open_remaker(**self._source, kind=kind, spec=self.spec, arrays=self._arrays)
+            self._maker = remake.open_remaker(
+                self._videos, **self._source, kind=kind, spec=self.spec, arrays=self._arrays
+            )
             self._process = os.getpid()
         return self._maker
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from torch.utils.data import DataLoader
 from torchdata.stateful_dataloader import StatefulDataLoader
 
 from tests.client.fake_server import SPEC, FakeServer, expected
+from trainer.config_file import load_config
 from v2v_client import RepeatedSamplesWarning, ServerLost, StateMismatch, UsageError, V2VStreamDataset
 from v2v_client.mixture import MixtureConsumer
 from v2v_client.position import StreamIdentity
@@ -221,3 +224,16 @@ def test_a_lost_server_and_a_small_member_are_named(servers: tuple[FakeServer, F
         assert one.address in repr(mixture)
     with pytest.raises(UsageError, match="closed"):
         iter(mixture)
+
+
+def test_the_page_runs_and_its_configuration_is_valid(servers: tuple[FakeServer, FakeServer], tmp_path: Path) -> None:
+    page = Path(__file__, "../../../docs/guides/mix.md").resolve().read_text("utf-8")
+    code, configuration = re.findall(r"```(?:python|yaml)\n(.*?)```", page, re.DOTALL)
+    for port, server in (("5555", servers[0]), ("5556", servers[1])):
+        code = code.replace(f"tcp://127.0.0.1:{port}", server.address)
+    ran: dict[str, Any] = {}
+    exec(code, ran)
+    assert (ran["saved"]["epoch"], ran["saved"]["position"]) == (1, 0)
+    (tmp_path / "mine.yaml").write_text(configuration)
+    mixed_in = load_config(str(tmp_path / "mine.yaml")).stream.mixed
+    assert [weight for _, weight in mixed_in.values()] == [0.7, 0.3]
