@@ -317,7 +317,7 @@ class Connector:
             self.arrays,
             self.batch_size,
             self.seed,
-            quarantine=state.quarantine,
+            quarantine=state.quarantine if isinstance(state.quarantine, int) else None,  # a mixture does not connect
             stride=self.batch_size * consumers,
             name=name if loader is None else f"{name}, loader worker {loader.id} of {workers}",
             host=platform.node(),

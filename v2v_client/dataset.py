@@ -262,8 +262,13 @@ class V2VStreamDataset(IterableDataset[Batch]):
         return f"V2VStreamDataset({ours['address']!r}, batch_size {ours['batch_size']}, {own})"
 
     def _repr_html_(self) -> str:
-        ours = self._settings() | {"epoch": self.epoch}
-        return html_table(f"V2VStreamDataset of {ours.pop('address')}", ours)
+        ours = self._settings()
+        rows = ours | {
+            "arrays": ", ".join(ours["arrays"]),
+            "epoch": self.epoch,
+            "rank": f"{self.rank} of {self.world_size}",
+        }
+        return html_table("V2VStreamDataset", rows)
 
     @property
     def rank(self) -> int:

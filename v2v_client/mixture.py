@@ -72,9 +72,11 @@ class Mixture(V2VStreamDataset):
 
     def __init__(self, weights: Mapping[V2VStreamDataset, float | Sequence[float]], seed: int) -> None:
         self.members = members = tuple(weights)
-        given = [[*each] if isinstance(each, list | tuple) else [each] for each in weights.values()]
+        given: list[list[Any]] = [
+            ([*each] or [None]) if isinstance(each, list | tuple) else [each] for each in weights.values()
+        ]
         epochs = range(max(map(len, given), default=1))
-        self._weights = [[each[min(epoch, len(each) - 1)] if each else None for each in given] for epoch in epochs]
+        self._weights = [[each[min(epoch, len(each) - 1)] for each in given] for epoch in epochs]
         for epoch, row in enumerate(self._weights):
             are_shares = all(isinstance(weight, int | float) and 0 <= weight <= 1 for weight in row)
             if not are_shares or abs(sum(row) - 1) > _ROUNDING:
@@ -89,7 +91,7 @@ class Mixture(V2VStreamDataset):
         self._explicit, self._ambient = members[0]._explicit, members[0]._ambient
         self._position = Position(seed, members[0].epoch)
         self._offered, self._is_closed = None, False
-        self._stop_server = lambda: [member.close() for member in members]  # self would never be freed
+        self._stop_server = lambda: [member.close() for member in members]  # type: ignore[func-returns-value]  # self would stay
 
     def _settings(self) -> dict[str, Any]:
         settings = [member._settings() for member in self.members]
@@ -149,7 +151,7 @@ class Mixture(V2VStreamDataset):
 
     def _take(self, connections: Any, begun: Iteration, plan: EpochPlan, batches: Sequence[int]) -> Iterator[Batch]:
         consumer, state, snapshots = self._consumer, begun.state, self._snapshots(begun.state)
-        order = consumer.order(state.stream, state.epoch)
+        order = consumer.order(state.stream, state.epoch)  # type: ignore[arg-type]  # it was pinned
         places = plan.position // plan.batch_size + np.array(batches, np.int64)
         taken = [
             member._take(
