@@ -68,6 +68,9 @@ class Mixture(V2VStreamDataset):
 
     Attributes:
         members: the datasets; closing the mixture closes them. Iterate only the mixture.
+
+    Raises:
+        UsageError: the weights are not shares, or the datasets do not fit together.
     """
 
     def __init__(self, weights: Mapping[V2VStreamDataset, float | Sequence[float]], seed: int) -> None:

@@ -545,7 +545,9 @@ def largest_frame_bytes(sizes: Iterable[int]) -> int:
 def decode_sample(
     layout: Layout, payload: Sequence[Buffer], unpack: Callable[[Buffer, int], Buffer] | None = None
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of a sample whose header states this layout, as views of the payload (read-only).
+    """Return the arrays of a sample whose header states this layout, such as voxels [T, bins, H, W].
+
+    They are views of the payload (read-only).
 
     Args:
         layout: dtype and shape of each array.
