@@ -283,11 +283,14 @@ def test_a_missing_gpu_is_reported() -> None:
         pass
 
 
+TINY = {name: getattr(SPEC.recipe, name) for name in ("voxels_per_clip", "bins", "crop_height_px", "crop_width_px")}
+
+
 def test_a_run_trains_on_the_batches_of_its_streams() -> None:
     with FakeServer(sequences=40, spec=SPEC) as one, FakeServer(sequences=40, spec=SPEC) as other:
         one.catalogue, other.catalogue = "one", "other"
         mix = [{"weight": 0.25, "address": other.address}]
-        settings = StreamConfig(address=one.address, batch_size=4, recipe=SPEC.recipe.to_dict(), mix=mix)
+        settings = StreamConfig(address=one.address, batch_size=4, recipe=TINY, mix=mix)
         config, asked = TrainConfig(stream=settings), Asked(arrays=("voxels", "frames"))
         dataset = streams(config, asked, [one.address, other.address])
         batches = list(dataset)
