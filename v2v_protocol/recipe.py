@@ -147,6 +147,19 @@ PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
         "hot_pixel_share": (0.0, 5e-4),  # a guess, as davis346
         "hot_pixel_sigma": (0.0, 20.0),
     },
+    # Photographs that move, for the paper's pixel: from a tripod to a run, up to 7 px from frame to frame at 60 Hz.
+    "worlds": {
+        "world_speed_px": (4.0, 400.0),
+        "world_turn_deg": (0.0, 45.0),
+        "world_zoom": (0.0, 0.3),
+        "world_tilt": (0.0, 0.15),
+        "world_shake_px": (0.0, 3.0),
+        "world_patches": 2,
+        "world_patch_px": (32.0, 96.0),
+        "world_still_share": 0.1,
+        "world_turn_only_share": 0.1,
+        "world_plain_share": 0.1,
+    },
 }
 
 STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
@@ -154,13 +167,15 @@ STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
     "balanced": {"samples_per_decode": 2},
     "fast": {"samples_per_decode": 4},
     "natural": {"samples_per_decode": 1, "scene": "auto", "moving_share": 0.75},
+    "worlds": {"samples_per_decode": 1, "recipe": "worlds"},
     "natural-davis346": {
         "samples_per_decode": 1, "scene": "auto", "moving_share": 0.75, "recipe": "davis346-running",
     },
 }  # fmt: skip
 """Spec fields that each preset sets; a recipe by its name. The first three trade accuracy for speed
 (`docs/accuracy.md`); "natural" is for videos as they are: what spoils events is left out, and most crops show something
-that moves (`docs/scene.md`); "natural-davis346" shows them to a running camera (`docs/effects.md`).
+that moves (`docs/scene.md`); "natural-davis346" shows them to a running camera (`docs/effects.md`); "worlds" is for
+photographs.
 """
 
 
@@ -171,6 +186,7 @@ LARGEST_SIDE_PX = 16_384
 LARGEST_SCALE = 100.0
 EFFECTS_SECTION = "Effects beyond the paper's model; zero is off"
 """The group of fields that switch on an effect where the upper end of their range is above zero."""
+WORLDS_SECTION = "Worlds: photographs that move (--videos-kind photographs)"
 TIME_UNITS = ("Hz", "s")
 """An effect in one of these needs the time between frames."""
 STARTS = ("uniform", "triangular", "zero")
@@ -295,6 +311,40 @@ class Recipe(Persisted):
     )
     dead_pixel_share: Range = span((0.0, 0.0), 0.0, 1.0, "share of the crop's pixels that never fire")
 
+    world_speed_px: Range = span(
+        (0.0, 0.0), 1e-3, 1e4,
+        "speed of camera and patches over the photograph, px of the crop a second; drawn uniformly in its logarithm",
+        unit="px/s", off=True, is_later=True, group=WORLDS_SECTION,
+    )  # fmt: skip
+    world_turn_deg: Range = span((0.0, 0.0), 0.0, 3600.0, "speed at which they turn, either way", unit="deg/s",
+                                 is_later=True)  # fmt: skip
+    world_zoom: Range = span(
+        (0.0, 0.0), 0.0, 10.0, "speed at which they zoom, in or out, as a share of the size a second", is_later=True
+    )
+    world_tilt: Range = span(
+        (0.0, 0.0), 0.0, 0.25, "most tilt of the camera: share by which the crop's edges are larger or smaller",
+        is_later=True,
+    )  # fmt: skip
+    world_shake_px: Range = span(
+        (0.0, 0.0), 0.0, 1000.0, "most deviation of the camera by a shaking hand", unit="px", is_later=True
+    )
+    world_patches: int = whole(
+        0, 0, 2, "most patches, cut from other places of the photograph, that move in front of it", is_later=True
+    )
+    world_patch_px: Range = span(
+        (40.0, 100.0), 4.0, LARGEST_SIDE_PX, "diameter of the circle that holds a patch", unit="px", is_later=True
+    )
+    world_still_share: float = number(
+        0.0, 0.0, 1.0, "share of scenes with a still camera; patches still move", is_later=True
+    )
+    world_turn_only_share: float = number(
+        0.0, 0.0, 1.0, "share of scenes whose camera turns and does nothing else", is_later=True
+    )
+    world_plain_share: float = number(
+        0.0, 0.0, 1.0, "share of scenes whose photograph is out of focus behind sharp patches", is_later=True
+    )
+    track_points: int = whole(64, 1, 65_536, "N, points that the array tracks follows", is_later=True)
+
     def __post_init__(self) -> None:
         check_settings(self, "recipe {}".format, RecipeError)
         if self.grids_per_frame and self.frames_per_bin != 1:
@@ -332,6 +382,15 @@ class Recipe(Persisted):
     def has_effects(self) -> bool:
         """Return whether a draw may switch on an effect beyond the paper's model."""
         return any(getattr(self, name)[1] > 0.0 for name in effect_settings())
+
+    @property
+    def is_world(self) -> bool:
+        """Return whether a field is set that only photographs can obey."""
+        return any(
+            getattr(self, name) != setting.default
+            for name, setting in settings_of(Recipe).items()
+            if name.startswith("world_")
+        )
 
     @property
     def timed_effects(self) -> bool:

@@ -211,7 +211,8 @@ def test_what_is_no_pair_is_refused(name: str, value: Any) -> None:
 
 @pytest.mark.parametrize("name", RANGES)
 def test_a_range_is_given_lowest_first(name: str) -> None:
-    assert "lowest value comes first" in refuse(name, [1.0, 0.5])
+    setting = settings_of(Recipe)[name]
+    assert "lowest value comes first" in refuse(name, [setting.high, max(setting.low, setting.high / 2)])
 
 
 @pytest.mark.parametrize("name", WHOLE)

@@ -167,7 +167,7 @@ def simulate_clip(
         step_seconds: [steps] duration of each step (``voxel.py``); given exactly when the recipe or an array of ``out``
             needs seconds.
         out: C-contiguous arrays to fill, by name (``representations.NAMES``); None makes the voxels.
-        levels: grey levels between frames, only with 8 bits; None: log intensity is linear in time there.
+        levels: levels between frames; None: log intensity is linear in time there.
         signal: what the levels mean.
         tolerance: share of the events that effects may change which are left out (``effects/tolerance.py``).
 

@@ -34,7 +34,7 @@ from v2v_protocol.recipe import Range, Recipe, effect_settings
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation.voxel import step_seconds
 
-_SAMPLE_KEY = 0x7632762073616D70
+SAMPLE_KEY = 0x7632762073616D70
 _LEAST_CONTRAST = 2.0**-60
 """Replaces a drawn contrast of 0, because 0.0 means "unchanged"; it gives the same flat grey picture."""
 
@@ -54,6 +54,10 @@ class Purpose(IntEnum):
     LOG_EPS = 16
     VOXEL_SECONDS = 17
     CROP_CHOICE = 18
+    WORLD = 19
+    WORLD_PATH = 20
+    WORLD_KNOTS = 21
+    WORLD_POINTS = 22
 
 
 _LOG_EPS_STEPS = 32
@@ -120,15 +124,15 @@ def draw(
         )
 
     def stream(purpose: int, count: int) -> list[int]:
-        return _raw((seed, _SAMPLE_KEY), (0, purpose, index, epoch), count)
+        return raw_words((seed, SAMPLE_KEY), (0, purpose, index, epoch), count)
 
     crop = recipe.crop_height_px * recipe.crop_width_px
     threshold_pos, threshold_neg = _thresholds(recipe, stream(Purpose.THRESHOLD, 3), video_id, video_thresholds)
-    noise_sigma = _in_range(recipe.noise_sigma, stream(Purpose.NOISE_SIGMA, 1)[0])
+    noise_sigma = in_range(recipe.noise_sigma, stream(Purpose.NOISE_SIGMA, 1)[0])
     share, sigma = stream(Purpose.HOT_PIXELS, 2)
     low, high = recipe.resize_scale
     low = max(low, smallest_scale(recipe, picture_height_px, picture_width_px))
-    scale = _in_range((low, high), stream(Purpose.SCALE, 1)[0])
+    scale = in_range((low, high), stream(Purpose.SCALE, 1)[0])
     height, width = resized_size(picture_height_px, picture_width_px, scale)
     top, left = stream(Purpose.CROP, 2)
     degraded, contrast = stream(Purpose.CONTRAST, 2)
@@ -137,16 +141,16 @@ def draw(
         threshold_pos=threshold_pos,
         threshold_neg=threshold_neg,
         noise_sigma=noise_sigma * threshold_pos if recipe.noise_scales_with_threshold else noise_sigma,
-        hot_pixel_count=_rounded(_in_range(recipe.hot_pixel_share, share) * crop),
-        hot_pixel_sigma=_in_range(recipe.hot_pixel_sigma, sigma),
+        hot_pixel_count=_rounded(in_range(recipe.hot_pixel_share, share) * crop),
+        hot_pixel_sigma=in_range(recipe.hot_pixel_sigma, sigma),
         pauses=() if recipe.is_timed else _pauses(recipe, stream, recipe.steps),
         scale=scale,
-        crop_top_px=_below(height - recipe.crop_height_px + 1, top),
-        crop_left_px=_below(width - recipe.crop_width_px + 1, left),
-        flip=_unit(stream(Purpose.FLIP, 1)[0]) < recipe.flip_probability,
+        crop_top_px=below(height - recipe.crop_height_px + 1, top),
+        crop_left_px=below(width - recipe.crop_width_px + 1, left),
+        flip=unit_of(stream(Purpose.FLIP, 1)[0]) < recipe.flip_probability,
         contrast=(
-            max(_in_range(recipe.contrast_scale, contrast), _LEAST_CONTRAST)
-            if _unit(degraded) < recipe.contrast_probability
+            max(in_range(recipe.contrast_scale, contrast), _LEAST_CONTRAST)
+            if unit_of(degraded) < recipe.contrast_probability
             else 0.0
         ),
         noise_key=(first & 0xFFFFFFFF, first >> 32, second & 0xFFFFFFFF, second >> 32),
@@ -193,7 +197,7 @@ def _timed(params: SampleParams, recipe: Recipe, stream: _Stream, times: FrameTi
     steps = len(times.seconds) - 1
     params = replace(params, pauses=_pauses(recipe, stream, steps))
     durations, _ = step_seconds(times.seconds, params.source_index(steps), times.frames_per_second)
-    seconds = _in_range(recipe.voxel_seconds, stream(Purpose.VOXEL_SECONDS, 1)[0])
+    seconds = in_range(recipe.voxel_seconds, stream(Purpose.VOXEL_SECONDS, 1)[0])
     spans = grid_steps(durations, seconds, recipe.spans)
     return replace(params, voxel_seconds=seconds, grid_steps=spans, pauses=_until(params.pauses, sum(spans)))
 
@@ -223,15 +227,15 @@ def choose_crop(
         seed, epoch, index, picture_height_px, picture_width_px: see :func:`draw`.
         weigh: return the weight of a crop from its row and column in the resized picture; all 0: as drawn.
     """
-    words = _raw((seed, _SAMPLE_KEY), (0, Purpose.CROP_CHOICE, index, epoch), 2 + 2 * _CROP_PLACES)
+    words = raw_words((seed, SAMPLE_KEY), (0, Purpose.CROP_CHOICE, index, epoch), 2 + 2 * _CROP_PLACES)
     height, width = resized_size(picture_height_px, picture_width_px, params.scale)
     places = [
-        (_below(height - recipe.crop_height_px + 1, top), _below(width - recipe.crop_width_px + 1, left))
+        (below(height - recipe.crop_height_px + 1, top), below(width - recipe.crop_width_px + 1, left))
         for top, left in zip(words[2::2], words[3::2], strict=True)
     ]
-    if _unit(words[0]) >= share or not (total := sum(weights := [weigh(*place) for place in places])):
+    if unit_of(words[0]) >= share or not (total := sum(weights := [weigh(*place) for place in places])):
         return params
-    top, left = places[bisect_right(list(accumulate(weights)), _below(total, words[1]))]
+    top, left = places[bisect_right(list(accumulate(weights)), below(total, words[1]))]
     return dataclasses.replace(params, crop_top_px=top, crop_left_px=left)
 
 
@@ -255,7 +259,7 @@ def resized_size(height_px: int, width_px: int, scale: float) -> tuple[int, int]
 
 def noise_key_of_seed(seed: int) -> tuple[int, int, int, int]:
     """Return a noise key for a seed without a stream: that of (seed, epoch 0, index 0)."""
-    first, second = _raw((seed, _SAMPLE_KEY), (0, Purpose.NOISE_KEY, 0, 0), 2)
+    first, second = raw_words((seed, SAMPLE_KEY), (0, Purpose.NOISE_KEY, 0, 0), 2)
     return first & 0xFFFFFFFF, first >> 32, second & 0xFFFFFFFF, second >> 32
 
 
@@ -267,9 +271,9 @@ def _thresholds(
             return float(np.float32(listed[0])), float(np.float32(listed[1]))
         digest = hashlib.blake2b(video_id.encode("utf-8", "surrogateescape"), digest_size=16).digest()
         video_key = int.from_bytes(digest[:8], "little"), int.from_bytes(digest[8:], "little")
-        raw = _raw(video_key, (0, Purpose.THRESHOLD, 0, 0), 3)
-    one = _in_range(recipe.threshold, raw[0])
-    other = one * _in_range(recipe.threshold_ratio, raw[1])
+        raw = raw_words(video_key, (0, Purpose.THRESHOLD, 0, 0), 3)
+    one = in_range(recipe.threshold, raw[0])
+    other = one * in_range(recipe.threshold_ratio, raw[1])
     first, second = float(np.float32(one)), float(np.float32(other))
     return (first, second) if raw[2] >> 63 else (second, first)
 
@@ -279,7 +283,7 @@ def _log_eps(ends: Range, raw: int) -> float | None:
     of milliseconds, and a worker caches the last 64.
     """
     low, high = ends
-    return None if low == high else low + _below(_LOG_EPS_STEPS + 1, raw) / _LOG_EPS_STEPS * (high - low)
+    return None if low == high else low + below(_LOG_EPS_STEPS + 1, raw) / _LOG_EPS_STEPS * (high - low)
 
 
 def _stream_of(effect: str) -> int:
@@ -297,7 +301,7 @@ def _pauses(recipe: Recipe, stream: _Stream, steps: int) -> tuple[tuple[int, int
     runs: list[tuple[int, int]] = []
     first = 0  # position of the current run's first repeat; 0 while the camera runs
     for position, raw in enumerate(stream(Purpose.PAUSES, steps), start=1):
-        paused = _unit(raw) < (recipe.pause_stay_probability if first else recipe.pause_probability)
+        paused = unit_of(raw) < (recipe.pause_stay_probability if first else recipe.pause_probability)
         if paused and not first:
             first = position
         elif first and not paused:
@@ -308,25 +312,33 @@ def _pauses(recipe: Recipe, stream: _Stream, steps: int) -> tuple[tuple[int, int
     return tuple(runs)
 
 
-def _raw(key: tuple[int, int], counter: tuple[int, int, int, int], count: int) -> list[int]:
+def raw_words(key: tuple[int, int], counter: tuple[int, int, int, int], count: int) -> list[int]:
+    """Return raw output of the generator; the counter of a sample is (block, purpose, index, epoch)."""
     words = np.random.Philox(key=np.array(key, np.uint64), counter=np.array(counter, np.uint64)).random_raw(count)
     return [int(word) for word in words]
 
 
-def _unit(raw: int) -> float:
+def unit_of(raw: int) -> float:
+    """Return a uniform number in [0, 1)."""
     return (raw >> 11) * 2.0**-53
 
 
-def _in_range(ends: Range, raw: int) -> float:
+def in_range(ends: Range, raw: int) -> float:
+    """Return a uniform number of a range."""
     low, high = ends
-    return min(low + _unit(raw) * (high - low), high)
+    return min(low + unit_of(raw) * (high - low), high)
 
 
 def _effect(recipe: Recipe, name: str, raw: int) -> float:
     ends: Range = getattr(recipe, name)
+    return in_log_range(ends, raw) if name in recipe.log_drawn else in_range(ends, raw)
+
+
+def in_log_range(ends: Range, raw: int) -> float:
+    """Return a number of a range, uniform in its logarithm."""
     low, high = ends
-    if low == high or name not in recipe.log_drawn:
-        return _in_range(ends, raw)
+    if low == high:
+        return low
     value, root = low, high / low
     for bit in range(63, 39, -1):
         root = math.sqrt(root)
@@ -338,5 +350,6 @@ def _rounded(value: float) -> int:
     return math.floor(value + 0.5)
 
 
-def _below(count: int, raw: int) -> int:
+def below(count: int, raw: int) -> int:
+    """Return a whole number, 0 .. count - 1."""
     return (raw * count) >> 64

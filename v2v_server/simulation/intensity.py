@@ -84,15 +84,16 @@ def log_table_float64(gamma: float, log_eps: float, signal: Signal = SDR) -> Dou
 
 
 def fine_table(table: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return L of grey levels in 1/FINE_STEPS, linear between grey levels.
+    """Return L of the levels between frames: of grey levels in 1/FINE_STEPS, linear between grey levels.
 
     Args:
-        table: [256] float32 or float64, L of grey levels; empty (no grey levels) gives an empty table.
+        table: [256] float32 or float64, L of grey levels; one of another length, of more than 8 bits or empty (no grey
+            levels), is returned as it is.
 
     Returns:
         [255 FINE_STEPS + 1], of the same type.
     """
-    if not len(table):
+    if len(table) != 256:
         return table
     grey, part = np.divmod(np.arange(255 * FINE_STEPS + 1), FINE_STEPS)
     rise = np.append(np.diff(table), table.dtype.type(0))

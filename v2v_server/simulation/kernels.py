@@ -56,7 +56,7 @@ class KernelInput:
         dtype: "int8", "int16" or "float32".
         start_residual: log units; None draws it.
         start: how it is drawn, "uniform" or "triangular"; "zero" starts at 0.
-        levels: intermediate levels, or None; only with frames of 8 bits.
+        levels: intermediate levels, or None.
         grids_have_durations: whether a grid's time is that of ``step_seconds``; else all its steps count as equal.
     """
 

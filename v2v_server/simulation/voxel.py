@@ -68,9 +68,9 @@ class Levels(NamedTuple):
 
     Attributes:
         at: their K moments, ascending, none at a frame (share 0) and none in a step that shows the same frame twice.
-        grey: [K, H, W] uint16, in 1/FINE_STEPS of a grey level, 0 .. 255 FINE_STEPS. Between two grey levels the
-            natural logarithm of the intensity is linear; between two neighbouring levels, and between a level and a
-            frame, it is linear in time.
+        grey: [K, H, W] uint16; beside frames of 8 bits, in 1/FINE_STEPS of a grey level, 0 .. 255 FINE_STEPS, and
+            between two grey levels the natural logarithm of the intensity is linear; beside deeper frames, levels of
+            their signal. Between two neighbouring levels, and between a level and a frame, it is linear in time.
     """
 
     at: Moments

@@ -78,26 +78,32 @@ def test_it_counts_the_events_of_the_papers_kernel(
 
 
 @settings(max_examples=40, deadline=None)
-@given(data=st.data(), precision=st.sampled_from(["float32", "float64"]), grids=st.integers(1, 4))
-def test_kernel_equals_the_oracle(data: Any, precision: str, grids: int) -> None:
+@given(
+    data=st.data(), precision=st.sampled_from(["float32", "float64"]), grids=st.integers(1, 4),
+    bits=st.sampled_from([8, 12]),
+)  # fmt: skip
+def test_kernel_equals_the_oracle(data: Any, precision: str, grids: int, bits: int) -> None:
     """Noise, hot drift, intermediate levels and a refractory period; bins that do not meet the intermediate levels."""
     seed, bins, steps, pixels = data.draw(st.integers(0, 2**32)), 3, 6, 24
     random = np.random.default_rng(seed)
     effects = {"refractory_seconds": 0.006} if data.draw(st.booleans()) else {}
     sigma = data.draw(st.sampled_from([0.0, 0.1]))
+    frames, white, fine = moving_frames(steps + 1, 4, 6, seed % 256), 2**bits - 1, FINE_STEPS if bits == 8 else 1
+    if bits > 8:
+        frames = (frames * np.uint16(16) + random.integers(0, 16, frames.shape, np.uint16)).astype(np.uint16)
     made = simulate(
-        moving_frames(steps + 1, 4, 6, seed % 256), threshold_pos=0.2, threshold_neg=0.25, noise_sigma=sigma,
+        frames, threshold_pos=0.2, threshold_neg=0.25, noise_sigma=sigma, bits=bits,
         hot_pixel_count=2, hot_pixel_sigma=0.5, bins=bins, grids_per_frame=grids, seed=seed, dtype="float32",
         precision=precision, frames_per_second=FPS, **effects,
     )  # fmt: skip
     at = Moments(np.array([0, 0, 2, 3, 3, 3]), np.array([0.25, 0.7, 1 / 3, 0.1, 0.5, 0.9]))
-    levels = Levels(at, random.integers(0, 255 * FINE_STEPS + 1, (6, 4, 6), np.uint16))
+    levels = Levels(at, random.integers(0, white * fine + 1, (6, 4, 6), np.uint16))
     found = again(made, *NAMES, levels=levels)
     events = list_events(dataclasses.replace(made.given, levels=levels), made.real, np.full(steps, 1e6 / FPS))
 
-    table = np.log(1e-3 + (np.arange(256) / 255) ** 2.2)
+    table = np.log(1e-3 + (np.arange(white + 1) / white) ** 2.2)
     table_levels = table[made.given.frames.reshape(steps + 1, pixels)]
-    between = np.interp(levels.grey.reshape(6, pixels) / FINE_STEPS, np.arange(256), table)
+    between = np.interp(levels.grey.reshape(6, pixels) / fine, np.arange(white + 1), table)
     times = np.r_[np.arange(steps + 1.0), at.step + at.share]
     known = np.concatenate([table_levels, between])[np.argsort(times)]
     times = np.sort(times)

@@ -295,8 +295,8 @@ def simulate_general(
     Args:
         frames: [n, pixels] uint8 or uint16 grey levels, or real log intensities; C-contiguous. Row 0 is the clip's
             first frame.
-        between_frames: [K, pixels] uint16, intermediate levels: grey, in 1/FINE_STEPS.
-        fine: [255 FINE_STEPS + 1] real, their log intensity (``intensity.fine_table``).
+        between_frames: [K, pixels] uint16, intermediate levels (``voxel.Levels``).
+        fine: their log intensity, real (``intensity.fine_table``).
         table, key, hot_position, hot_drift: as in ``pixel.simulate_pixels``.
         segments: what is simulated, and when.
         threshold_pos, threshold_neg, tolerance: real, log units (``voxel.py``).

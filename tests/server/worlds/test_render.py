@@ -1,0 +1,214 @@
+"""Pictures and truth of drawn worlds, against the oracle written from the definition."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.oracles.known_motion import photograph
+from tests.oracles.worlds import Oracle
+from v2v_protocol.recipe import PRESETS, Recipe
+from v2v_server.simulation.draw import draw
+from v2v_server.simulation.view import Window
+from v2v_server.worlds.render import (
+    WHITEST,
+    PhotoPyramid,
+    flow_of,
+    levels_between,
+    masks_of,
+    pyramid_of,
+    render,
+    tracks_of,
+)
+from v2v_server.worlds.world import World, draw_world
+
+RECIPE = PRESETS["worlds"].replace(crop_height_px=48, crop_width_px=64, world_patch_px=[12.0, 60.0], track_points=40)
+FAST = {"world_speed_px": [200.0, 2000.0], "world_turn_deg": [90.0, 360.0], "world_zoom": [0.5, 1.0]}
+SCALED = {"resize_scale": [0.4, 0.9], "flip_probability": 1.0}
+SECONDS = (0.0, 2.0)
+
+
+@cache
+def photo() -> npt.NDArray[np.uint8]:
+    """Return a photograph with odd sides."""
+    return np.ascontiguousarray(photograph("astronaut")[60:421, 40:457])
+
+
+@cache
+def pyramid() -> PhotoPyramid:
+    """Return its pyramid."""
+    return pyramid_of(photo())
+
+
+def world_of(recipe: Recipe, index: int, picture: npt.NDArray[Any] | None = None) -> World:
+    """Draw the world of a sample."""
+    height, width = (photo() if picture is None else picture).shape
+    params = draw(
+        recipe, seed=5, epoch=1, index=index, picture_height_px=height, picture_width_px=width, video_id="photo.png"
+    )
+    return draw_world(
+        recipe, params, seed=5, epoch=1, index=index, picture_px=(height, width), seconds=SECONDS
+    )  # fmt: skip
+
+
+def mirrored(world: World, pictures: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return pictures as the view shows them."""
+    return pictures[..., ::-1] if world.flip else pictures
+
+
+@pytest.mark.parametrize("more", [{}, FAST, SCALED, FAST | SCALED, {"world_plain_share": 1.0}])
+def test_pictures_are_those_of_the_definition(more: dict[str, Any]) -> None:
+    """Within one level of twelve bits, which leaves the bar of one of eight bits far behind."""
+    patches, times = 0, np.array([0.0, 0.013, 1.0, 1.7, 2.0])
+    for index in range(8):
+        world = world_of(RECIPE.replace(**more), index)
+        oracle, made = Oracle(world, photo()), mirrored(world, render(pyramid(), world, times))
+        patches += len(world.layers) - 1
+        for seconds, picture in zip(times, made, strict=True):
+            assert np.abs(picture - oracle.picture(float(seconds))).max() <= 1.0
+    assert patches > 4
+
+
+@pytest.mark.parametrize("more", [{}, FAST, SCALED, FAST | SCALED])
+@pytest.mark.parametrize("apart", [1 / 240, 1 / 25, 0.3, -1 / 12])
+def test_flow_masks_and_validity_are_those_of_the_definition(more: dict[str, Any], apart: float) -> None:
+    hidden = left = 0
+    for index in range(8):
+        world = world_of(RECIPE.replace(**more), index)
+        oracle, at, other = Oracle(world, photo()), 0.4 + 0.15 * index, 0.4 + 0.15 * index + apart
+        grid = oracle.grid()
+        there, seen, layer = oracle.followed(at, other, grid)
+        flow, valid = flow_of(world, at, other)
+        on_outline = oracle.at_outline(at, grid) | oracle.at_outline(other, np.where(np.isfinite(there), there, 0.0))
+        expected = (there - grid) * np.array([-1.0 if world.flip else 1.0, 1.0])[:, None, None]
+        near = (oracle.at_outline(at, grid) == 0) & seen
+        assert np.abs(flow - expected)[:, near].max(initial=0.0) < 0.01
+        top, crop_left, height, width = world.crop
+        edge = np.minimum(np.abs(there[0] - crop_left), np.abs(there[0] - crop_left - width)) < 1e-6
+        edge |= np.minimum(np.abs(there[1] - top), np.abs(there[1] - top - height)) < 1e-6
+        assert (valid[0] == seen)[~on_outline & ~edge].all()
+        assert (masks_of(world, at)[0] == layer)[~oracle.at_outline(at, grid)].all()
+        inside = np.isfinite(there[0]) & (there[0] >= crop_left) & (there[0] < crop_left + width)
+        hidden += int(np.count_nonzero(inside & ~seen))
+        left += int(np.count_nonzero(~inside))
+    assert left > 0
+    assert hidden > 0 or not more
+
+
+@pytest.mark.parametrize("more", [{}, FAST | SCALED])
+def test_tracks_follow_their_points(more: dict[str, Any]) -> None:
+    """Each point is in front at a moment of its own, and is where the definition says at all others."""
+    times = np.linspace(*SECONDS, 9)
+    for index in range(8):
+        world = world_of(RECIPE.replace(**more), index)
+        oracle, tracks = Oracle(world, photo()), tracks_of(world, times)
+        top, left, height, width = world.crop
+        start = world.points[:, 2] * SECONDS[1]
+        for point in range(0, 40, 3):
+            x = world.points[point, :2].reshape(2, 1, 1) * np.array([width, height]).reshape(2, 1, 1)
+            x = x + np.array([left, top]).reshape(2, 1, 1)
+            if oracle.at_outline(float(start[point]), x).any():
+                continue
+            for moment, seconds in enumerate(times):
+                there, seen, _ = oracle.followed(float(start[point]), float(seconds), x)
+                if not oracle.at_outline(float(seconds), np.where(np.isfinite(there), there, 0.0)).any():
+                    assert tracks[moment, point, 2] == seen
+                if seen:
+                    place = there[0, 0, 0] - left, there[1, 0, 0] - top
+                    expected = (width - place[0] if world.flip else place[0]), place[1]
+                    np.testing.assert_allclose(tracks[moment, point, :2], expected, atol=0.01)
+        own = tracks_of(world, start)[np.arange(40), np.arange(40)]
+        assert (own[:, 2] == 1).all()
+
+
+def test_a_picture_that_stands_still_is_the_photograph_itself() -> None:
+    recipe = Recipe(crop_height_px=48, crop_width_px=64, flip_probability=0.0)
+    for index in range(4):
+        world = world_of(recipe, index)
+        top, left, height, width = world.crop
+        part = photo()[top : top + height, left : left + width].astype(np.uint32)
+        for picture in render(pyramid(), world, np.array([0.0, 1.3])):
+            np.testing.assert_array_equal(picture, (part * 4095 * 2 + 255) // 510)
+        flow, valid = flow_of(world, 0.0, 2.0)
+        assert not flow.any()
+        assert valid.all()
+
+
+def test_shares_of_still_and_turning_worlds() -> None:
+    still = RECIPE.replace(world_still_share=1.0, world_patches=0)
+    turning = RECIPE.replace(world_still_share=0.0, world_turn_only_share=1.0, world_patches=0)
+    for index in range(4):
+        assert not flow_of(world_of(still, index), 0.0, 1.5)[0].any()
+        world = world_of(turning, index)
+        flow, _ = flow_of(world, 0.5, 0.6)
+        assert flow.any()
+        middle = flow[:, 23:25, 31:33].mean(axis=(1, 2))
+        np.testing.assert_allclose(middle, 0.0, atol=0.02)
+
+
+def test_no_draw_changes_another() -> None:
+    """A field's range moves its own draw alone."""
+    plain = world_of(RECIPE, 3)
+    for name, value in (("world_zoom", 0.5), ("world_tilt", 0.0), ("world_shake_px", 9.0), ("world_patch_px", 20.0)):
+        other = world_of(RECIPE.replace(**{name: value}), 3)
+        assert len(other.layers) == len(plain.layers)
+        np.testing.assert_array_equal(other.layers[0].speed_px, plain.layers[0].speed_px)
+        np.testing.assert_array_equal(other.points, plain.points)
+        np.testing.assert_array_equal(other.knots[2:], plain.knots[2:])
+    alone = world_of(RECIPE.replace(world_patches=0), 3)
+    np.testing.assert_array_equal(alone.places(np.array([0.3]))[:, 0], plain.places(np.array([0.3]))[:, 0])
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    height=st.integers(1, 40), width=st.integers(1, 40), deep=st.booleans(), index=st.integers(0, 2**48 - 1),
+    tilt=st.floats(0.0, 0.25), scale=st.floats(0.05, 30.0),
+)  # fmt: skip
+def test_any_photograph_and_any_draw_give_levels_and_numbers(
+    height: int, width: int, deep: bool, index: int, tilt: float, scale: float
+) -> None:
+    """Sides down to one pixel, a window beyond the picture, the most extreme motion."""
+    random = np.random.default_rng(index)
+    grey = random.integers(0, 65536 if deep else 256, (height, width), np.uint16 if deep else np.uint8)
+    recipe = RECIPE.replace(
+        crop_height_px=5, crop_width_px=3, resize_scale=[scale, 100.0], world_speed_px=1e4, world_turn_deg=3600.0,
+        world_zoom=10.0, world_tilt=tilt, world_shake_px=1000.0, world_patch_px=[4.0, 16000.0],
+    )  # fmt: skip
+    world = world_of(recipe, index, grey)
+    times = np.array([-1.0, 0.0, 0.7, 2.0, 5.0])
+    pictures = render(pyramid_of(grey), world, times, Window(-9, 70, 11, 13))
+    low, high = int(grey.min()), int(grey.max())
+    white = 65535 if deep else 255
+    assert pictures.min() >= low * WHITEST // white
+    assert pictures.max() <= -(-high * WHITEST // white)
+    flow, valid = flow_of(world, 0.0, 1.0)
+    assert np.isfinite(flow).all()
+    assert set(np.unique(valid)) <= {0, 1}
+    assert np.isfinite(tracks_of(world, times)).all()
+    assert masks_of(world, 1.0).max() < len(world.layers)
+
+
+def test_levels_between_are_pictures_at_their_times() -> None:
+    """A step has the more sub-steps the farther it moves, a paused one has none, and they are mirrored with the crop."""
+    recipe = RECIPE.replace(
+        world_speed_px=240.0, world_still_share=0.0, world_turn_only_share=0.0, flip_probability=1.0
+    )
+    world, seconds = world_of(recipe, 1), np.arange(5) / 60
+    source = np.array([0, 1, 1, 2, 3])
+    levels = levels_between(pyramid(), world, seconds, source, 1.0, 16)
+    assert levels is not None
+    step, share = levels.at
+    assert set(step.tolist()) == {0, 2, 3}
+    assert 2 <= np.bincount(step)[0] <= 15
+    at = seconds[source[step]] + share / 60
+    np.testing.assert_array_equal(levels.grey, render(pyramid(), world, at)[:, :, ::-1])
+    few = levels_between(pyramid(), world, seconds, source, 3.0, 16)
+    assert few is None or len(few.grey) < len(levels.grey)
+    still = world_of(RECIPE.replace(world_still_share=1.0, world_patches=0), 1)
+    assert levels_between(pyramid(), still, seconds, source, 1.0, 16) is None

@@ -1,0 +1,336 @@
+"""Render the pictures of a world at any times, in levels of 12 bits; where its points go, and what hides them.
+
+A pyramid has the photograph in 12 bits and its means of 2 x 2, each rounded. A layer that shows f pixels of the
+photograph in one of the picture (the root of the area, at the middle of the crop) is read from the levels 2^l <= f <
+2^(l+1) and l + 1, each bilinearly, in the ratio 2 - f / 2^l to f / 2^l - 1: a zoom has no moment at which the picture
+gets sharper at once. Below f = 1 level 0 is read alone. Beyond its border the photograph is mirrored.
+
+Everything has the same bytes on every host: it is compiled without fast-math and without contraction to fused
+multiply-add, so the instruction set changes the speed, never a bit.
+"""
+
+# mypy: allow-untyped-defs, allow-untyped-calls
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from v2v_server.simulation.view import Window
+from v2v_server.simulation.voxel import Levels, Moments
+from v2v_server.worlds.world import Doubles, World
+
+WHITEST = 4095
+"""The highest level of a rendered picture."""
+_LEAST_DEPTH = 2.0**-6
+"""A place that is farther away, or behind the camera, counts as that far: only what is never seen can be."""
+compiled: Any = numba.njit(nogil=True, cache=True, error_model="numpy")
+"""Decorator of this folder's compiled functions."""
+
+
+class PhotoPyramid(NamedTuple):
+    """A photograph from fine to coarse.
+
+    Attributes:
+        grey: [pixels of all levels] float32, one level after the other, whole numbers from 0 to WHITEST.
+        first: [levels] int64, where each begins.
+        size: [levels, 2] int64, height and width of each, at least 2.
+    """
+
+    grey: npt.NDArray[np.float32]
+    first: npt.NDArray[np.int64]
+    size: npt.NDArray[np.int64]
+
+
+def pyramid_of(grey: npt.NDArray[Any]) -> PhotoPyramid:
+    """Return the pyramid of a photograph, [H, W] uint8 or uint16 grey levels from black to white of their type."""
+    white = np.iinfo(grey.dtype).max
+    table = ((np.arange(white + 1, dtype=np.uint64) * (2 * WHITEST) + white) // (2 * white)).astype(np.float32)
+    levels = [np.pad(table[grey], [(0, max(0, 2 - side)) for side in grey.shape], "edge")]
+    while min(levels[-1].shape) > 2:
+        level = np.pad(levels[-1], [(0, side % 2) for side in levels[-1].shape], "edge")
+        total = level[::2, ::2] + level[::2, 1::2] + level[1::2, ::2] + level[1::2, 1::2]
+        levels.append(np.floor((total + np.float32(2)) * np.float32(0.25)))
+    first, sizes = np.cumsum([0, *(level.size for level in levels)])[:-1], np.array([level.shape for level in levels])
+    return PhotoPyramid(np.concatenate([level.ravel() for level in levels]), first, sizes)
+
+
+def render(
+    pyramid: PhotoPyramid, world: World, seconds: Doubles, window: Window | None = None
+) -> npt.NDArray[np.uint16]:
+    """Return the pictures of a world.
+
+    Args:
+        pyramid: of its photograph.
+        world: the draw.
+        seconds: [n] moments.
+        window: the part to render, px of the picture (``world.py``), which it may leave; None: the crop.
+
+    Returns:
+        [n, h, w] uint16, 0 .. WHITEST, not mirrored.
+    """
+    top, left, height, width = world.crop if window is None else window
+    out, places, outlines = np.empty((len(seconds), height, width), np.uint16), world.places(seconds), world.outlines
+    back, shown = _inverse(places)
+    shown[:, 0] = np.maximum(shown[:, 0], 1 << world.focus)
+    boxes = np.full((*shown.shape, 4), (0, height, 0, width))
+    for layer, outline in enumerate(outlines, 1):
+        reach = outline[2] * (1.0 + 1.0 / (6.0 * outline[8])) * np.array([-1.0, 1.0])  # there q exceeds what covers
+        corners = (part.ravel() for part in np.meshgrid(outline[0] + reach, outline[1] + reach))
+        ends = np.stack(_taken(back[:, layer, None], *corners)) - np.array([left, top])[:, None, None]
+        for axis, side in enumerate((width, height)):
+            box = np.floor(ends[axis].min(axis=1)), np.ceil(ends[axis].max(axis=1))
+            boxes[:, layer, 2 - 2 * axis : 4 - 2 * axis] = np.clip(np.stack(box, axis=1), 0, side)
+    _render(
+        *pyramid, places, shown, boxes, outlines, top + 0.5, left + 0.5, np.empty((3, width)),
+        np.empty((4, width), np.float32), np.empty((2, width), np.int32), np.empty((height, width), np.float32), out,
+    )  # fmt: skip
+    return out
+
+
+def levels_between(
+    pyramid: PhotoPyramid,
+    world: World,
+    seconds: Doubles,
+    source_index: npt.NDArray[np.int64],
+    substep_px: float,
+    most_substeps: int,
+) -> Levels | None:
+    """Return the levels between the frames of a sample, rendered at their times.
+
+    Args:
+        pyramid, world: the photograph and the draw.
+        seconds: [n], moment of each frame.
+        source_index: [steps + 1], which frame each position of the clip shows.
+        substep_px: longest motion of a sub-step, above 0.
+        most_substeps: of a step.
+
+    Returns:
+        the levels, in 12 bits as the frames, mirrored if the crop is; None if no step is divided.
+    """
+    top, left, height, width = world.crop
+    places, halves = world.places(seconds), np.arange(3) / 2
+    x, y = (part.ravel() for part in np.meshgrid(left + width * halves, top + height * halves))
+    to_x, to_y = _taken(_inverse(places[1:])[0][:, :, None], *_taken(places[:-1, :, None], x, y))
+    longest = np.sqrt(((to_x - x) * (to_x - x) + (to_y - y) * (to_y - y)).max(axis=(1, 2)))
+    step = np.flatnonzero(np.diff(source_index))
+    shown = source_index[step]
+    more = np.minimum(longest[shown] / substep_px, most_substeps - 1).astype(np.int64)
+    if not more.any():
+        return None
+    share = np.concatenate([np.arange(1, count + 1) / (count + 1) for count in more])
+    begin, end = np.repeat(seconds[shown], more), np.repeat(seconds[shown + 1], more)
+    grey = render(pyramid, world, begin + share * (end - begin))
+    return Levels(Moments(np.repeat(step, more), share), np.ascontiguousarray(grey[:, :, ::-1]) if world.flip else grey)
+
+
+def flow_of(
+    world: World, seconds: float, other_seconds: float
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
+    """Return the exact flow of the crop from one moment to another.
+
+    Args:
+        world: the draw.
+        seconds: the moment on whose grid it is.
+        other_seconds: the moment that it leads to.
+
+    Returns:
+        [2, H, W], (x, y), px of the crop; [1, H, W], 1 where the point is seen at the other moment.
+    """
+    grid, _, (there,) = _pixels(world, seconds, [other_seconds])
+    there[..., :2] -= grid
+    there[..., 0] *= -1.0 if world.flip else 1.0
+    flow, valid = _turned(world, there[..., :2]), _turned(world, there[..., 2:])
+    return flow.astype(np.float32), valid.astype(np.uint8)
+
+
+def masks_of(world: World, seconds: float) -> npt.NDArray[np.uint8]:
+    """Return which layer each pixel of the crop shows, [1, H, W]: 0 the photograph, 1 the first patch."""
+    return _turned(world, _pixels(world, seconds, [])[1][..., None])
+
+
+def tracks_of(world: World, seconds: Doubles) -> npt.NDArray[np.float32]:
+    """Return the paths of the world's points, [n, N, 3]: x and y in px of the crop, and 1 where the point is seen."""
+    (start, end), (_, _, height, width) = world.seconds, world.crop
+    at, points = start + world.points[:, 2] * (end - start), world.points[:, :2] * (float(width), float(height))
+    tracks = _follow(world, at, points, seconds)[1]
+    if world.flip:
+        tracks[..., 0] = width - tracks[..., 0]
+    return tracks.astype(np.float32)
+
+
+def _pixels(world: World, seconds: float, others: list[float]) -> tuple[Doubles, npt.NDArray[np.uint8], Doubles]:
+    """Follow what each pixel of the crop shows; return [H, W, 2], their middles, [H, W], layers, and [n, H, W, 3]."""
+    _, _, height, width = world.crop
+    grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+    layers, tracks = _follow(world, np.array([seconds]), grid.reshape(-1, 2), np.array(others, np.float64))
+    return grid, layers.reshape(height, width), tracks.reshape(-1, height, width, 3)
+
+
+def _turned(world: World, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return values [H, W, k] as arrays [k, H, W], mirrored if the crop is."""
+    return np.ascontiguousarray((values[:, ::-1] if world.flip else values).transpose(2, 0, 1))
+
+
+def _follow(world: World, at: Doubles, points: Doubles, seconds: Doubles) -> tuple[npt.NDArray[np.uint8], Doubles]:
+    """Follow what is in front at places of the crop.
+
+    A place shows the frontmost layer that covers at least half of what is behind it. Its point is the place of the
+    photograph on that layer. It is seen at another moment if it lies in the crop then, and no layer in front covers
+    half of it there.
+
+    Args:
+        world: the draw.
+        at: [N] or [1], moment of each place.
+        points: [N, 2], the places, px of the crop.
+        seconds: [n] moments.
+
+    Returns:
+        [N], the layers; [n, N, 3], where each point is in the crop, and 1 where it is seen.
+    """
+    layers, tracks = np.empty(len(points), np.uint8), np.empty((len(seconds), len(points), 3))
+    places = world.places(seconds)
+    _walk(world.places(at), points, places, _inverse(places)[0], world.outlines, *world.crop, layers, tracks)
+    return layers, tracks
+
+
+def _inverse(places: Doubles) -> tuple[Doubles, Doubles]:
+    """Return the inverse homographies, [..., 3, 3]; how many pixels of the photograph one of the picture shows at the
+    middle of the crop, in each direction, [...].
+    """
+    found = np.empty_like(places)
+    for row, column in np.ndindex(3, 3):
+        (a, b), (c, d) = ((axis - 2, axis - 1) for axis in (row, column))
+        found[..., column, row] = places[..., a, c] * places[..., b, d] - places[..., a, d] * places[..., b, c]
+    first, second, third = (places[..., 0, axis] * found[..., axis, 0] for axis in range(3))
+    area = first + second + third  # the determinant, because the depth there is 1
+    return found / area[..., None, None], np.sqrt(area)
+
+
+def _taken(places: Doubles, x: Doubles, y: Doubles) -> tuple[Doubles, Doubles]:
+    """Return x and y of places through homographies."""
+    across, down, depth = (places[..., row, 0] * x + places[..., row, 1] * y + places[..., row, 2] for row in range(3))
+    depth = np.maximum(depth, _LEAST_DEPTH)
+    return across / depth, down / depth
+
+
+@compiled
+def _cover(outline, x, y):
+    """Return the share of what is behind a patch that it covers at a place of the photograph (``world.Layer``)."""
+    a, b = (x - outline[0]) / outline[2], (y - outline[1]) / outline[2]
+    real, imaginary = a * a - b * b, 2.0 * a * b
+    square = a * a + b * b
+    q = (outline[3] * square + outline[4] * real + outline[5] * imaginary) * square
+    q += outline[6] * (a * real - b * imaginary) + outline[7] * (a * imaginary + b * real)
+    u = min(max(outline[8] * (1.0 - q) + 0.5, 0.0), 1.0)
+    return u * u * (3.0 - 2.0 * u)
+
+
+@compiled
+def _along(place, x, y, across, down, count):
+    """Write the places of the photograph that a row shows."""
+    across_y = place[0, 1] * y + place[0, 2]
+    down_y, depth_y = place[1, 1] * y + place[1, 2], place[2, 1] * y + place[2, 2]
+    for i in range(count):
+        column = x + np.float64(np.int32(i))
+        share = 1.0 / (place[2, 0] * column + depth_y)
+        across[i] = (place[0, 0] * column + across_y) * share
+        down[i] = (place[1, 0] * column + down_y) * share
+
+
+@compiled
+def _split(places, side, scale, pixels, whole, part, count):
+    """Write number and fraction of the first of the two pixels of a level between which the places of an axis lie."""
+    twice, share, most = 2.0 * side, 1.0 / (2.0 * side), np.float64(pixels - 1)
+    for i in range(count):
+        x = places[i] - twice * np.floor(places[i] * share)
+        x = min(max(min(x, twice - x) * scale - 0.5, 0.0), most)
+        first = np.floor(min(x, most - 1.0))
+        whole[i], part[i] = np.int32(first), np.float32(x - first)
+
+
+@compiled
+def _read(grey, first, pitch, columns, rows, x, y, found, count):
+    """Write the levels between four pixels each."""
+    pitch, first = np.int32(pitch), np.int64(first)
+    for i in range(count):
+        at = np.uint64(first + np.int64(rows[i] * pitch + columns[i]))
+        a, b = grey[at], grey[at + np.uint64(1)]
+        at += np.uint64(pitch)
+        c, d = grey[at], grey[at + np.uint64(1)]
+        above, below = a + (b - a) * x[i], c + (d - c) * x[i]
+        found[i] = above + (below - above) * y[i]
+
+
+@compiled
+def _render(grey, first, size, places, shown, boxes, outlines, top, left, doubles, singles, wholes, picture, out):
+    """Render in memory of the caller; ``top`` and ``left`` are the middle of the first pixel."""
+    across, down, share = doubles[0], doubles[1], doubles[2]
+    x, y, found, coarse = singles[0], singles[1], singles[2], singles[3]
+    columns, rows = wholes[0], wholes[1]
+    for number in range(len(out)):
+        for layer in range(places.shape[1]):
+            level, part = 0, shown[number, layer]
+            while part >= 2.0 and level < len(size) - 1:
+                level, part = level + 1, part * 0.5
+            blends = part > 1.0 and level < len(size) - 1
+            begin, end = boxes[number, layer, 2], boxes[number, layer, 3]
+            count = max(end - begin, 0)
+            for row in range(boxes[number, layer, 0], boxes[number, layer, 1]):
+                _along(places[number, layer], left + begin, top + row, across, down, count)
+                for finer in range(level + blends, level - 1, -1):
+                    scale = 1.0 / (1 << finer)
+                    _split(across, size[0, 1], scale, size[finer, 1], columns, x, count)
+                    _split(down, size[0, 0], scale, size[finer, 0], rows, y, count)
+                    into = coarse if finer > level else found
+                    _read(grey, first[finer], size[finer, 1], columns, rows, x, y, into, count)
+                if blends:
+                    weight = np.float32(part - 1.0)
+                    for i in range(count):
+                        found[i] += (coarse[i] - found[i]) * weight
+                if layer == 0:
+                    for i in range(count):
+                        picture[row, i] = found[i]
+                    continue
+                for i in range(count):
+                    share[i] = _cover(outlines[layer - 1], across[i], down[i])
+                for i in range(count):
+                    behind = picture[row, begin + i]
+                    picture[row, begin + i] = behind + (found[i] - behind) * np.float32(share[i])
+        for row in range(out.shape[1]):
+            for i in range(out.shape[2]):
+                out[number, row, i] = np.uint16(np.int32(picture[row, i] + np.float32(0.5)))
+
+
+@compiled
+def _taken_one(place, x, y):
+    """Return a place through a homography (:func:`_taken`)."""
+    depth = max(place[2, 0] * x + place[2, 1] * y + place[2, 2], _LEAST_DEPTH)
+    across = place[0, 0] * x + place[0, 1] * y + place[0, 2]
+    return across / depth, (place[1, 0] * x + place[1, 1] * y + place[1, 2]) / depth
+
+
+@compiled
+def _front(places, outlines, x, y, behind):
+    """Return the frontmost layer at a place of the picture; ``behind`` if none in front of that layer covers it."""
+    for layer in range(len(outlines), behind, -1):
+        across, down = _taken_one(places[layer], x, y)
+        if _cover(outlines[layer - 1], across, down) >= 0.5:
+            return layer
+    return behind
+
+
+@compiled
+def _walk(at, points, places, back, outlines, top, left, height, width, layers, tracks):
+    for point in range(len(points)):
+        start = at[min(point, len(at) - 1)]
+        x, y = points[point, 0] + left, points[point, 1] + top
+        layers[point] = layer = _front(start, outlines, x, y, 0)
+        across, down = _taken_one(start[layer], x, y)
+        for moment in range(len(tracks)):
+            x, y = _taken_one(back[moment, layer], across, down)
+            is_inside = left <= x < left + width and top <= y < top + height
+            tracks[moment, point, 0], tracks[moment, point, 1] = x - left, y - top
+            tracks[moment, point, 2] = is_inside and _front(places[moment], outlines, x, y, layer) == layer
