@@ -96,6 +96,15 @@ def test_a_file_may_extend_a_shipped_one(tmp_path):
     assert (config.network.name, config.run.steps) == ("firenet", 3)
 
 
+@pytest.mark.parametrize("name", ["evflownet", "eraft"])
+def test_worlds_give_exact_flow_where_it_is_seen(name):
+    plain, worlds = load_config(name), load_config(f"{name}-worlds")
+    assert (worlds.network, worlds.loss.gamma) == (plain.network, plain.loss.gamma)
+    assert (worlds.loss.flow, worlds.loss.valid) == ("stream", "consistent")
+    assert worlds.stream.resolved_recipe == preset("worlds")
+    assert (worlds.stream.videos_kind, worlds.stream.rows) == ("photographs", "full")
+
+
 def test_streams_are_mixed_in_with_what_they_say(tmp_path):
     mine = (
         "extends: e2vid-filtered\nstream: {mix: [{weight: .2, videos: b, rows: full}, {weight: .3, recipe: sensor}]}\n"
