@@ -32,7 +32,7 @@ from v2v_client.options import Options
 from v2v_pictures.files import write_png
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.events import EventList
-from v2v_protocol.recipe import PRESETS
+from v2v_protocol.recipe import PRESETS, Recipe
 from v2v_protocol.settings import settings_of
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
@@ -261,7 +261,7 @@ def dataset(**options: Any) -> V2VStreamDataset:
 
 
 def batch() -> Batch:
-    return Batch({"voxels": torch.zeros(1, 1, 1, 2, 2)}, (0,), 0, (), {}, 0.0, 0.0, 1)
+    return Batch({"voxels": torch.zeros(1, 1, 1, 2, 2)}, (0,), 0, (), {}, 0.0, 0.0, 1, Recipe())
 
 
 @pytest.mark.parametrize("number", range(len(IN_PYTHON)))

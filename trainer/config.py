@@ -47,17 +47,21 @@ class StreamConfig:
 
     Attributes:
         address: of a running server, or of several, separated by commas; empty: start one here, on ``videos``.
-        videos, list, rows, workers: for that server, see ``v2v-serve --help``.
+        videos, videos_kind, list, rows, workers: for that server, see ``v2v-serve --help``.
         batch_size: samples of one rank's batch.
         recipe: its name, its YAML file, or recipe fields (with ``preset`` to start from); never the server's default.
         seed: of all draws and of the order.
         spec: other fields of :class:`v2v_protocol.spec.StreamSpec`; missing ones have the server's default.
         loader_workers: processes of each rank that receive batches; 0: the training process receives them.
         timeout_seconds: silence after which the server counts as lost.
+        mix: other streams whose batches are mixed in: a list of sections like this one, each with its ``weight`` (see
+            :meth:`v2v_client.V2VStreamDataset.mix`). Keys that one leaves out are those of this section; but with
+            ``videos`` it has no ``address`` or ``list`` of this section.
     """
 
     address: str = ""
     videos: str = ""
+    videos_kind: str = "videos"
     list: str = ""
     rows: str = "full"
     workers: int = limited(2, 1, 4096)
@@ -67,6 +71,28 @@ class StreamConfig:
     spec: Mapping[str, Any] = field(default_factory=dict)
     loader_workers: int = limited(0, 0, 64)
     timeout_seconds: float = limited(60.0, 0.1, 1e6)
+    mix: Any = field(default_factory=lambda: [])  # noqa: PIE807 - here, `list` is the field above
+
+    @property
+    def mixed(self) -> dict[str, tuple[StreamConfig, float]]:
+        """Return each stream with its weight, by the name of its section. This one has what the others leave.
+
+        Raises:
+            UsageError: ``mix`` is not a list of sections with weights.
+        """
+        own, rest, found = dataclasses.asdict(self) | {"mix": []}, 1.0, {}
+        for number, item in enumerate(self.mix if isinstance(self.mix, list | tuple) else [None]):
+            name, keys = f"stream.mix.{number}", dict(item) if isinstance(item, Mapping) else {}
+            weight = keys.pop("weight", None)
+            if not isinstance(weight, int | float) or not 0 <= weight <= rest or "mix" in keys:
+                raise UsageError(
+                    f"{name} = {format_value(item)}: give keys of section stream and weight, the share of its batches; "
+                    "all weights together are at most 1"
+                )
+            rest = round(rest - weight, 9)
+            base = own | ({"address": "", "list": ""} if "videos" in keys else {})
+            found[name] = _section(StreamConfig, name, base | keys), weight
+        return {"stream": (self, rest), **found}
 
     @property
     def resolved_recipe(self) -> Recipe:
@@ -207,16 +233,21 @@ class TrainConfig:
         task = TASKS[NETWORKS[self.network.name].task]
         if self.loss is None:
             object.__setattr__(self, "loss", task.Settings())
-        for name in ("lead_frames", "lead_voxels"):
-            if isinstance(self.stream.recipe, Mapping) and name in self.stream.recipe:
-                raise UsageError(f"stream.recipe.{name}: leave it out, it follows from network.name and section loss")
-        for name, remedy in _SET_ELSEWHERE.items():
-            if name in self.stream.spec:
-                raise UsageError(f"stream.spec.{name}: {remedy}")
-        named = StreamSpec.from_dict(self.stream.spec).recipe
-        if named != Recipe():
-            preset = self.stream.spec["preset"]
-            raise UsageError(f"stream.spec.preset {preset} names a recipe: set stream.recipe, and preset natural")
+        for section, (stream, _) in self.stream.mixed.items():
+            for name in ("lead_frames", "lead_voxels"):
+                if isinstance(stream.recipe, Mapping) and name in stream.recipe:
+                    raise UsageError(
+                        f"{section}.recipe.{name}: leave it out, it follows from network.name and section loss"
+                    )
+            for name, remedy in _SET_ELSEWHERE.items():
+                if name in stream.spec:
+                    raise UsageError(f"{section}.spec.{name}: {remedy}")
+            if StreamSpec.from_dict(stream.spec).recipe != Recipe():
+                preset = stream.spec["preset"]
+                raise UsageError(
+                    f"{section}.spec.preset {preset} names a recipe: set {section}.recipe, and preset natural"
+                )
+            task.check(self.loss, stream.resolved_recipe)
         if "bins" in self.network.options:
             raise UsageError("network.options.bins: set stream.recipe.bins instead, the network follows it")
         if self.run.validate_config and not self.run.validate:
@@ -224,7 +255,6 @@ class TrainConfig:
                 f"run.validate_config = {self.run.validate_config}: run.validate is missing; give the folder of the "
                 "recordings"
             )
-        task.check(self.loss, self.stream.resolved_recipe)
 
     def with_network_options(self, options: Mapping[str, Any], **changes: Any) -> TrainConfig:
         """Return this configuration with defaults for options of the network, and other changes of that section."""

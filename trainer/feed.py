@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import signal
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any
 
@@ -19,18 +19,17 @@ from torch.utils.data import DataLoader
 from trainer.config import StreamConfig, TrainConfig
 from trainer.tasks import Asked
 from v2v_client import Batch, V2VStreamDataset
-from v2v_client.local_server import LocalServer, recipe_flags
+from v2v_client.local_server import LocalServer, server_flags
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_SEED
-from v2v_protocol.spec import StreamSpec
 
 HELD_OUT_SEED = 1 << 32
 """Added to the seed: the held-out batch has the same virtual cameras throughout, none of which is trained on."""
 
 
 def stream(config: TrainConfig, asked: Asked, address: str, **changes: Any) -> V2VStreamDataset:
-    """Return the dataset that the run trains on.
+    """Return the dataset of section ``stream``, without its ``mix``.
 
     Args:
         changes: arguments of the dataset that override the configuration.
@@ -53,15 +52,25 @@ def stream(config: TrainConfig, asked: Asked, address: str, **changes: Any) -> V
     return V2VStreamDataset(address, **(arguments | changes))
 
 
-def server_flags(settings: StreamConfig, recipe: Recipe) -> list[str]:
-    """Return the flags of a server on ``settings.videos``.
+def streams(config: TrainConfig, asked: Asked, addresses: Sequence[str]) -> V2VStreamDataset:
+    """Return the dataset that the run trains on, mixed of several with ``stream.mix``; see :func:`stream`."""
+    mixed = config.stream.mixed.values()
+    if len(mixed) == 1:
+        return stream(config, asked, addresses[0])
+    members = [
+        stream(dataclasses.replace(config, stream=each), asked, address)
+        for (each, _), address in zip(mixed, addresses, strict=True)
+    ]
+    return V2VStreamDataset.mix(
+        {member: weight for member, (_, weight) in zip(members, mixed, strict=True)}, config.stream.seed
+    )
 
-    The server's recipe decides which videos are long enough, so it gets ours; it analyses scenes only if asked.
-    """
-    scene = StreamSpec.from_dict({key: settings.spec.get(key) for key in ("preset", "scene")}).scene
-    asked = {"--list": settings.list, "--scene": "" if scene == "off" else scene}
-    flags = [part for flag, value in asked.items() if value for part in (flag, value)]
-    return ["--rows", settings.rows, *recipe_flags(recipe), *flags]
+
+def flags_of(settings: StreamConfig, recipe: Recipe) -> list[str]:
+    """Return the flags of a server on ``settings.videos``."""
+    asked = {"--list": settings.list, "--videos-kind": "" if settings.videos_kind == "videos" else settings.videos_kind}
+    others = [part for flag, value in asked.items() if value for part in (flag, value)]
+    return server_flags(recipe, settings.spec, "--rows", settings.rows, *others)
 
 
 def held_out_batch(config: TrainConfig, asked: Asked, address: str) -> Iterator[Batch]:
@@ -79,7 +88,7 @@ def held_out_batch(config: TrainConfig, asked: Asked, address: str) -> Iterator[
     settings = dataclasses.replace(config.stream, address="", videos=config.run.judge_videos, list="")
     config = dataclasses.replace(config, stream=settings)
     try:
-        flags = server_flags(settings, asked.recipe(settings.resolved_recipe))
+        flags = flags_of(settings, asked.recipe(settings.resolved_recipe))
         with LocalServer(settings.videos, workers=1, flags=flags) as server:
             batches = list(_held_out(config, asked, server.address))
     except UsageError as error:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import chain, islice
 from pathlib import Path
 
 from trainer.config import TrainConfig
-from trainer.feed import Feed, held_out_batch, stream
+from trainer.feed import Feed, held_out_batch, streams
 from trainer.learner import Learner
 from trainer.run.checkpoint import BEST, LAST, Checkpoint, epoch_name, prune_epochs, save_checkpoint, unwritable
 from trainer.run.distributed import Ranks
@@ -24,13 +25,16 @@ class Diverged(V2VError):
 def train(
     config: TrainConfig,
     learner: Learner,
-    address: str,
+    addresses: Sequence[str],
     ranks: Ranks,
     stop: StopRequest,
     out: Path,
     resume: Checkpoint | None = None,
 ) -> int:
     """Train to the configured end, or until ``stop``, and save ``out/last.pt`` to resume from.
+
+    Args:
+        addresses: of the server of each stream of ``config.stream.mixed``.
 
     Returns:
         Optimiser steps so far, including those before ``resume``.
@@ -43,7 +47,7 @@ def train(
     run, task = config.run, learner.task
 
     # Where to begin in the stream.
-    dataset = stream(config, task.asked, address)
+    dataset = streams(config, task.asked, addresses)
     step, epoch, position = 0, 0, None
     if resume is not None:
         learner.restore(resume)
@@ -58,7 +62,7 @@ def train(
     if run.steps:
         batches = islice(batches, max(0, run.steps - step))
     judges = ranks.first and (run.judge_every or run.preview_every)
-    held_out = stop.next(held_out_batch(config, task.asked, address)) if judges else None
+    held_out = stop.next(held_out_batch(config, task.asked, addresses[0])) if judges else None
     validation = Validation(task, learner.trained, run, ranks) if run.validate else None
     # The first batch comes before anything is written: a server that refuses the run leaves its folder untouched.
     taken = stop.until(batches)

@@ -13,7 +13,7 @@ import torch
 
 from trainer.config import StreamConfig, TrainConfig, keys
 from trainer.config_file import load_config, shipped, show_config
-from trainer.feed import server_flags
+from trainer.feed import flags_of
 from trainer.learner import build, obeying_weights
 from trainer.loop import Diverged, train
 from trainer.run.checkpoint import LAST, Checkpoint, load_checkpoint, require_fresh, require_same_run, require_writable
@@ -104,7 +104,7 @@ def serving(stream: StreamConfig, recipe: Recipe, mine: Ranks) -> Iterator[str]:
     print(f"starting a server: {stream.videos}, rows {stream.rows}, {stream.workers} workers", file=sys.stderr)
     with ExitStack() as stack:
         try:
-            server = LocalServer(stream.videos, workers=stream.workers, flags=server_flags(stream, recipe))
+            server = LocalServer(stream.videos, workers=stream.workers, flags=flags_of(stream, recipe))
             stack.enter_context(server)
         except V2VError as error:
             mine.from_first(("", str(error)))
@@ -123,9 +123,13 @@ def _trained(config: TrainConfig, mine: Ranks, out: Path, resume: Checkpoint | N
     learner = build(config, mine)
     if mine.first:
         require_writable(out)
-    recipe = learner.task.asked.recipe(config.stream.resolved_recipe)
-    with serving(config.stream, recipe, mine) as address, StopRequest(config.run.seconds, mine.any) as stop:
-        steps = train(config, learner, address, mine, stop, out, resume)
+    with ExitStack() as stack:
+        addresses = [
+            stack.enter_context(serving(stream, learner.task.asked.recipe(stream.resolved_recipe), mine))
+            for stream, _ in config.stream.mixed.values()
+        ]
+        stop = stack.enter_context(StopRequest(config.run.seconds, mine.any))
+        steps = train(config, learner, addresses, mine, stop, out, resume)
     return steps, stop.signal
 
 

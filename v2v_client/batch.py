@@ -23,7 +23,6 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import ARRAYS, Provenance, empty_value, html_table
 from v2v_protocol.settings import nearest
-from v2v_protocol.spec import StreamSpec
 
 _SHOWN = 3
 
@@ -103,6 +102,7 @@ class Batch(Drawn):
         wait_seconds: how long the consumer (with a DataLoader: the loader worker) waited for this batch.
         cpu_seconds: processor time that the server's workers spent on it.
         decodes: clips decoded for it; fewer than its samples if siblings share a decode.
+        recipe: the virtual cameras that its samples were drawn from.
     """
 
     arrays: Mapping[str, torch.Tensor]
@@ -113,6 +113,7 @@ class Batch(Drawn):
     wait_seconds: float
     cpu_seconds: float
     decodes: int
+    recipe: Recipe
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -146,14 +147,12 @@ class Batch(Drawn):
         return f"Batch({arrays}epoch {self.epoch}, indices {some})"
 
     def _picture(self) -> npt.NDArray[np.uint8]:
-        spec = self.resume_state.get("spec")
-        recipe = None if spec is None else StreamSpec.from_dict(spec).recipe
         count = min(_SHOWN, len(self))
         samples = [
             ({name: tensor[place].cpu().numpy() for name, tensor in self.arrays.items()}, self.provenance[place])
             for place in range(count)
         ]
-        return draw_samples(samples, recipe, f"{count} of {len(self)} samples, epoch {self.epoch}")
+        return draw_samples(samples, self.recipe, f"{count} of {len(self)} samples, epoch {self.epoch}")
 
     def _repr_html_(self) -> str:
         rows = {name: f"{tensor.dtype} {list(tensor.shape)} {tensor.device}" for name, tensor in self.arrays.items()}
@@ -165,13 +164,8 @@ class Batch(Drawn):
 
         ``outputs[:, batch.frame_grids]`` are the outputs of a network at the frames. A lead frame before the first grid
         has -1.
-
-        Raises:
-            UsageError: the batch does not state its spec.
         """
-        if "spec" not in self.resume_state:
-            raise UsageError("batch.frame_grids: resume_state of this batch has no spec; use Recipe.frame_grids")
-        return torch.tensor(StreamSpec.from_dict(self.resume_state["spec"]).recipe.frame_grids)
+        return torch.tensor(self.recipe.frame_grids)
 
     @property
     def boxes(self) -> list[list[torch.Tensor]]:
@@ -261,13 +255,13 @@ default_collate_fn_map[Batch] = _collate
 
 
 def draw_samples(
-    samples: Sequence[tuple[Mapping[str, npt.NDArray[Any]], Provenance]], recipe: Recipe | None, title: str
+    samples: Sequence[tuple[Mapping[str, npt.NDArray[Any]], Provenance]], recipe: Recipe, title: str
 ) -> npt.NDArray[np.uint8]:
     """Draw a sheet of samples: frame, bins, flow, and activity over time.
 
     Args:
         samples: arrays and provenance of each, at least one.
-        recipe: None if it is unknown. Then pauses cannot be placed: they are not marked, and the title says so.
+        recipe: their virtual cameras.
 
     Returns:
         [height, width, 3] uint8 RGB.
@@ -276,17 +270,9 @@ def draw_samples(
         UsageError: voxels or frames are not among the arrays, or pillow or av is not installed.
     """
     camera, sheet = _drawing("camera"), _drawing("sheet")
-    cameras = []
-    for arrays, provenance in samples:
-        if recipe is None and provenance.params.pauses:
-            provenance = dataclasses.replace(provenance, params=dataclasses.replace(provenance.params, pauses=()))
-            title = title.removesuffix(_UNMARKED) + _UNMARKED
-        cameras.append(camera.Camera.of(arrays, provenance, "", recipe))
+    cameras = [camera.Camera.of(arrays, provenance, "", recipe) for arrays, provenance in samples]
     drawn: npt.NDArray[np.uint8] = sheet.draw_sheet(cameras, title)
     return drawn
-
-
-_UNMARKED = " (pauses are not marked)"
 
 
 def _drawing(name: str) -> Any:

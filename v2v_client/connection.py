@@ -25,6 +25,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 
+from torch.utils.data import get_worker_info
+
 from v2v_client.conversation import WAIT_REPORT_SECONDS, Arrival, Conversation, Event, ListeningClock, State
 from v2v_client.memory import open_sample
 from v2v_client.options import Options, Patience
@@ -33,7 +35,6 @@ from v2v_protocol.arena import Slot
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.link.dealer import Dealer, diagnose
 from v2v_protocol.messages import LARGEST_HEADER_BYTES, Hello, SampleHeader, decode, encode, largest_frame_bytes
-from v2v_protocol.sample import Layout, Provenance
 
 _GOODBYE_LINGER_MS = 250
 """Time that closing may spend on sending the Goodbye. Without it the server would go on making requested samples."""
@@ -60,6 +61,7 @@ class Connection:
 
     Attributes:
         address: of the current broker.
+        conversation: its state; stream, layout and credit are known once the connection is open.
     """
 
     def __init__(
@@ -86,29 +88,10 @@ class Connection:
         self._process = os.getpid()
         self._link: Dealer | None = None
         self._largest_frame_bytes = LARGEST_HEADER_BYTES
-        self._conversation = Conversation(
+        self.conversation = Conversation(
             self.address, hello, epoch, pinned=pinned, pinned_by=pinned_by, patience=self._patience, now=self._now()
         )
         self._last_sample = self._now()  # initially the time of creation
-
-    @property
-    def stream(self) -> StreamIdentity:
-        """Return the stream that the server offers; available once the connection is open."""
-        return self._conversation.stream
-
-    @property
-    def credit(self) -> int:
-        """Return the maximum number of samples requested and not received."""
-        return self._conversation.credit
-
-    @property
-    def layout(self) -> Layout:
-        """Return dtype and shape of each array of one sample."""
-        return self._conversation.layout
-
-    def provenance(self, header: SampleHeader) -> Provenance:
-        """See :meth:`Conversation.provenance`."""
-        return self._conversation.provenance(header)
 
     def _now(self) -> float:
         return self._listening.time(self._clock())
@@ -133,7 +116,7 @@ class Connection:
                 self._link.connect(self._largest_frame_bytes)
                 self._await_welcome()
                 self._leave(self._open_link())
-            self._largest_frame_bytes = largest_frame_bytes(self._conversation.form.sizes)
+            self._largest_frame_bytes = largest_frame_bytes(self.conversation.form.sizes)
             self._open_link().connect(self._largest_frame_bytes)
             self._await_welcome()
             self._listening.pause(self._clock())  # opening counts as listening
@@ -142,10 +125,10 @@ class Connection:
             raise
 
     def _await_welcome(self) -> None:
-        self._conversation.handle_event(Event.OPENED, self._now())
+        self.conversation.handle_event(Event.OPENED, self._now())
         is_reported = False
-        while self._conversation.state is not State.WELCOMED:
-            if not is_reported and self._conversation.silence(self._now()) >= _REPORT_SECONDS:
+        while self.conversation.state is not State.WELCOMED:
+            if not is_reported and self.conversation.silence(self._now()) >= _REPORT_SECONDS:
                 is_reported, limit = True, self._patience.timeout_seconds
                 _log.warning("%s: %s; giving up after %g s", self.address, diagnose(self.address), limit)
             try:
@@ -155,9 +138,9 @@ class Connection:
 
     def _leave(self, link: Dealer) -> None:
         """Send Goodbye, without waiting for a silent server."""
-        quiet = self._conversation.silence(self._now()) >= self._patience.ping_seconds
-        self._conversation.outbox.clear()
-        self._conversation.handle_event(Event.LEFT, self._now())
+        quiet = self.conversation.silence(self._now()) >= self._patience.ping_seconds
+        self.conversation.outbox.clear()
+        self.conversation.handle_event(Event.LEFT, self._now())
         with suppress(ServerLost):  # no server to send it to
             self._send(link)
         link.disconnect(linger_ms=0 if quiet else _GOODBYE_LINGER_MS)
@@ -187,7 +170,7 @@ class Connection:
             UsageError: another process opened it, from which this one was forked.
         """
         link = self._open_link()
-        self._conversation.want(indices, slots)
+        self.conversation.want(indices, slots)
         self._send(link)
 
     def receive(self, *, wait: bool = True) -> Arrival | None:
@@ -208,7 +191,7 @@ class Connection:
                 arrival, idle = self._step(wait=wait)
                 if wait:
                     began, before = self._clock(), began
-                    self._conversation.record_wait(began - before, self._now())
+                    self.conversation.record_wait(began - before, self._now())
                 if arrival is not None or (idle and not wait):
                     return arrival
         finally:
@@ -216,7 +199,7 @@ class Connection:
 
     def _step(self, *, wait: bool) -> tuple[Arrival | None, bool]:
         """Run due timers, then handle one message. Return (a sample, if one arrived; whether no message came)."""
-        if len(self._brokers) > 1 and self._conversation.silence(self._now()) >= self._patience.takeover_seconds:
+        if len(self._brokers) > 1 and self.conversation.silence(self._now()) >= self._patience.takeover_seconds:
             self._take_over("silent")
         try:
             arrival, idle = self._exchange(wait=wait)
@@ -248,10 +231,10 @@ class Connection:
         old, self._link = self._open_link(), self._transport(self.address)
         old.close()
         self._link.connect(self._largest_frame_bytes)
-        self._conversation.move(self.address, now)
+        self.conversation.move(self.address, now)
 
     def _exchange(self, *, wait: bool) -> tuple[Arrival | None, bool]:
-        link, conversation = self._open_link(), self._conversation
+        link, conversation = self._open_link(), self.conversation
         if conversation.tick(self._now()):
             link.connect(self._largest_frame_bytes, again=True)
         self._send(link)
@@ -271,7 +254,7 @@ class Connection:
         return arrival, frames is None
 
     def _send(self, link: Dealer) -> None:
-        outbox, self._conversation.outbox = self._conversation.outbox, []
+        outbox, self.conversation.outbox = self.conversation.outbox, []
         for message in outbox:
             link.send(encode(message))
 
@@ -284,28 +267,6 @@ class Connection:
         if self._link is None:
             raise ServerLost(f"{self.address}: this connection is closed")
         return self._link
-
-
-@dataclass(frozen=True, slots=True)
-class ConsumerId:
-    """Hold which of a stream's consumers a process is.
-
-    Attributes:
-        rank, world_size: number of the rank, and of ranks.
-        worker: number of the loader worker; None outside of one.
-        workers: number of loader workers of each rank; 1 without any.
-    """
-
-    rank: int
-    world_size: int
-    worker: int | None = None
-    workers: int = 1
-
-    @property
-    def name(self) -> str:
-        """Return the name that status displays show."""
-        of_loader = "" if self.worker is None else f", loader worker {self.worker} of {self.workers}"
-        return f"rank {self.rank} of {self.world_size}{of_loader}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,8 +290,10 @@ class Connector:
 
     def connection(
         self,
-        member: ConsumerId,
         state: ResumeState,
+        rank: int,
+        world_size: int,
+        workers: int = 1,
         *,
         brokers: Sequence[str] | None = None,
         patience: Patience | None = None,
@@ -338,23 +301,25 @@ class Connector:
         """Return a connection that is not open yet.
 
         Args:
-            member: the consumer that it is for.
             state: where the consumer starts; its stream is pinned.
+            rank, world_size: number of the rank, and of ranks.
+            workers: number of loader workers of each rank; 1 without any.
             brokers: None tries all, in the order of this consumer.
             patience: None uses that of the dataset.
 
         Raises:
             StateMismatch: the options contradict the pinned stream.
         """
-        consumer, consumers = member.rank * member.workers + (member.worker or 0), member.world_size * member.workers
+        loader, name, consumers = get_worker_info(), f"rank {rank} of {world_size}", world_size * workers
+        consumer = rank * workers + (0 if loader is None else loader.id)
         hello = Hello(
             self.options.spec(state.stream, "this dataset's stream"),
             self.arrays,
             self.batch_size,
             self.seed,
-            quarantine=state.quarantine,
+            quarantine=state.quarantine if isinstance(state.quarantine, int) else None,  # a mixture does not connect
             stride=self.batch_size * consumers,
-            name=member.name,
+            name=name if loader is None else f"{name}, loader worker {loader.id} of {workers}",
             host=platform.node(),
             packed=self.compress,
         )
@@ -368,7 +333,7 @@ class Connector:
             transport=functools.partial(Dealer, keys=self.keys),
         )
 
-    def compare(self, connection: Connection, member: ConsumerId, state: ResumeState) -> None:
+    def compare(self, connection: Connection, state: ResumeState, *consumer: int) -> None:
         """Compare an open connection with the first other broker that answers, which is the same for nearly all ranks.
 
         Raises:
@@ -379,9 +344,11 @@ class Connector:
             if broker == connection.address:
                 continue
             try:
-                with closing(self.connection(member, state, brokers=(broker,), patience=patience)) as other:
+                with closing(self.connection(state, *consumer, brokers=(broker,), patience=patience)) as other:
                     other.open()
-                    connection.stream.require_same(other.stream, ours=connection.address, theirs=broker)
+                    connection.conversation.stream.require_same(
+                        other.conversation.stream, ours=connection.address, theirs=broker
+                    )
             except ServerLost as lost:
                 _log.warning("cannot compare %s with %s before it takes over: %s", connection.address, broker, lost)
                 continue

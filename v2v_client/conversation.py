@@ -29,7 +29,7 @@ from typing import Any
 import numpy.typing as npt
 import zstandard
 
-from v2v_client.memory import Answer, Slots
+from v2v_client.memory import Slots
 from v2v_client.options import Patience
 from v2v_client.position import StreamIdentity
 from v2v_protocol.arena import NO_SLOT, Slot
@@ -50,7 +50,6 @@ from v2v_protocol.messages import (
     Welcome,
     decode_map,
     decode_sample,
-    layout_of,
 )
 from v2v_protocol.sample import Form, Layout, Provenance, SampleId, array_layout
 
@@ -347,18 +346,19 @@ class Conversation:
         form = self.form
         if (header.names, header.dtypes, header.shapes) != (form.names, form.dtypes, form.shapes):
             raise ProtocolError(
-                f"{self._address} sent sample {header.index} of epoch {header.epoch} as {layout_of(header)}; "
-                f"asked: {self.layout}"
+                f"{self._address} sent sample {header.index} of epoch {header.epoch} as {header.names!r:.200} of "
+                f"{header.dtypes!r:.200}, shapes {header.shapes!r:.200}; asked: {self.layout}"
             )
         again = header.index not in self._asked
         is_gone = bool(header.arena) and not frames  # the server dropped it before it was read
         in_message = bool(frames) or is_gone or header.slot == NO_SLOT
-        arrays = decode_sample(header, frames, unpack) if in_message and not is_gone else None
-        answer = self._slots.record_arrival(header.index, header.slot, in_message=in_message)
+        unpacked = unpack if header.packed else None
+        arrays = decode_sample(self.layout, frames, unpacked) if in_message and not is_gone else None
+        slot_is_free = self._slots.record_arrival(header.index, header.slot, in_message=in_message)
         if is_gone and not again:
             del self._asked[header.index]
             self._queued.appendleft(header.index)  # without a slot, it comes in a message
-        if is_gone or answer is Answer.NOWHERE:
+        if is_gone or slot_is_free is None:
             self._ask_for_more(again)
             return None
         self._hello = replace(self._hello, quarantine=max(self._hello.quarantine or 0, header.quarantine))
@@ -366,7 +366,7 @@ class Conversation:
         self._credit_denials = 0
         self._last = header.index
         self._ask_for_more(again)
-        return Arrival(header, arrays, slot_is_free=answer is not Answer.ABANDONED)
+        return Arrival(header, arrays, slot_is_free=slot_is_free)
 
     def _ask_for_more(self, again: bool) -> None:
         """Send queued requests after a sample. A second copy (``again``) held credit that counted as free."""

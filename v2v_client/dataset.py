@@ -9,16 +9,16 @@ import os
 import warnings
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
-from typing import Any, Never, Self, Unpack
+from contextlib import closing, contextmanager
+from typing import TYPE_CHECKING, Any, Never, Self
 
 from torch.utils.data import IterableDataset, get_worker_info
 
 from v2v_client.batch import Batch
-from v2v_client.connection import Connector, ConsumerId, addresses
+from v2v_client.connection import Connection, Connector, addresses
 from v2v_client.delivery import deliver
 from v2v_client.loaders import distributed_rank, end_with_parent, send_before_exit
-from v2v_client.local_server import LocalServer, recipe_flags
+from v2v_client.local_server import LocalServer, server_flags
 from v2v_client.memory import BatchBuffers
 from v2v_client.options import Labels, Options, Patience, check_labels, require_arguments, require_labels
 from v2v_client.passes import Iteration, Position
@@ -28,8 +28,11 @@ from v2v_protocol.keys import leaves_host
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, html_table
 from v2v_protocol.settings import require_whole
-from v2v_protocol.spec import SpecOptions, StreamSpec
+from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import read_recipe
+
+if TYPE_CHECKING:
+    from v2v_client.mixture import Mixture
 
 _NOT_SHARED = (
     "samples of one decode go to different ranks or loader workers here, so each is decoded separately: the stream was "
@@ -128,7 +131,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         keys: str | os.PathLike[str] | None = None,
         timeout_seconds: float = 60.0,
         patience: Patience | None = None,
-        **options: Unpack[SpecOptions],
+        **options: Any,
     ) -> None:
         super().__init__()
         require_arguments(V2VStreamDataset.__init__, options)
@@ -169,7 +172,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         flags: Sequence[str] = (),
         seed: int = 0,
         labels: Labels = "required",
-        **options: Unpack[SpecOptions],
+        **options: Any,
     ) -> V2VStreamDataset:
         """Start a server on this host and return a dataset that streams from it.
 
@@ -191,9 +194,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         """
         require_arguments(cls.local, options)
         resolved = StreamSpec.from_dict({"recipe": read_recipe(recipe)}).recipe
-        scene = StreamSpec.from_dict({key: options.get(key) for key in ("preset", "scene")}).scene
-        asked = [*recipe_flags(resolved), *(() if scene == "off" else ("--scene", scene)), *flags]
-        server = LocalServer(videos, workers=workers, flags=asked).__enter__()
+        server = LocalServer(videos, workers=workers, flags=server_flags(resolved, options, *flags)).__enter__()
         try:
             # V2V_KEYS may name a key for other servers.
             dataset = cls(server.address, batch_size, arrays, resolved, seed=seed, labels=labels, keys="", **options)
@@ -202,6 +203,33 @@ class V2VStreamDataset(IterableDataset[Batch]):
             raise
         dataset._stop_server = weakref.finalize(dataset, server.stop)
         return dataset
+
+    @staticmethod
+    def mix(weights: Mapping[V2VStreamDataset, float | Sequence[float]], seed: int = 0) -> Mixture:
+        """Return a dataset of the batches of several datasets, in a fixed order.
+
+            natural = V2VStreamDataset("tcp://127.0.0.1:5555", preset="natural")
+            worlds = V2VStreamDataset("tcp://127.0.0.1:5556")
+            for batch in V2VStreamDataset.mix({natural: 0.7, worlds: 0.3}):
+                batch.voxels
+
+        Each batch is one of a member's own, with the same bytes. The mixture has all methods of a dataset, takes ranks
+        and loader workers, and its ``resume_state`` holds for all members. In an epoch it delivers batches of that
+        epoch of each member, until the weights would need more of a member than there are; the rest is dropped. The
+        members need equal batch sizes, arrays and shapes. Their connections each have a credit of their own. With
+        several loader workers, samples of one decode (``samples_per_decode``) are mostly decoded separately.
+
+        Args:
+            weights: share of each dataset in the batches of an epoch, 0 to 1, or a list of its shares in epochs 0, 1,
+                2 ...; the last one stays. The shares of an epoch sum to 1.
+            seed: of the order.
+
+        Raises:
+            UsageError: the weights are not shares, or the datasets do not fit together.
+        """
+        from v2v_client.mixture import Mixture  # which imports this module
+
+        return Mixture(weights, seed)
 
     def close(self) -> None:
         """Stop the server that :meth:`local` started, and free unused memory. Repeated calls do nothing.
@@ -230,13 +258,17 @@ class V2VStreamDataset(IterableDataset[Batch]):
         return self.__dict__ | {"_ambient": distributed_rank() or self._ambient} | own
 
     def __repr__(self) -> str:
-        own = f"seed {self._connector.seed}, rank {self.rank} of {self.world_size}"
-        return f"V2VStreamDataset({self._address!r}, batch_size {self._connector.batch_size}, {own})"
+        own = "seed {seed}, rank {rank} of {world_size}".format_map(ours := self._settings())
+        return f"V2VStreamDataset({ours['address']!r}, batch_size {ours['batch_size']}, {own})"
 
     def _repr_html_(self) -> str:
-        ours = self._connector
-        rows = {"batch_size": ours.batch_size, "arrays": ", ".join(ours.arrays), "seed": ours.seed, "epoch": self.epoch}
-        return html_table(f"V2VStreamDataset of {self._address}", rows | {"rank": f"{self.rank} of {self.world_size}"})
+        ours = self._settings()
+        rows = ours | {
+            "arrays": ", ".join(ours["arrays"]),
+            "epoch": self.epoch,
+            "rank": f"{self.rank} of {self.world_size}",
+        }
+        return html_table("V2VStreamDataset", rows)
 
     @property
     def rank(self) -> int:
@@ -266,9 +298,14 @@ class V2VStreamDataset(IterableDataset[Batch]):
         """
         stream = self.stream
         if stream is None:
-            raise UsageError(f"the stream of {self._address} is not known yet: iterate first")
-        return {field.name: getattr(stream, field.name) for field in dataclasses.fields(StreamIdentity)} | {
-            "address": self._address,
+            raise UsageError(f"the stream of {self._settings()['address']} is not known yet: iterate first")
+        return {
+            field.name: getattr(stream, field.name) for field in dataclasses.fields(StreamIdentity)
+        } | self._settings()
+
+    def _settings(self) -> dict[str, Any]:
+        return {
+            "address": ",".join(self._connector.brokers),
             "arrays": list(self._connector.arrays),
             "batch_size": self._connector.batch_size,
             "seed": self._connector.seed,
@@ -290,23 +327,17 @@ class V2VStreamDataset(IterableDataset[Batch]):
         start = self._position.start(self._consumer)
         stream = start.stream or self._offered
         if stream is None:
-            with closing(self._connector.connection(self._consumer_id(), start)) as connection:
-                connection.open()
-                # Not pinned: the spacing of siblings depends on the number of loader workers that iterate.
-                stream = self._offered = connection.stream
-        return self._consumer.plan(stream, start.at_epoch(0)).batches
+            stream = self._offered = self._ask_stream(start)
+        return self._consumer.plan(stream, start.at_epoch(start.epoch)).batches
 
-    @property
-    def _address(self) -> str:
-        return ",".join(self._connector.brokers)
+    def _ask_stream(self, start: ResumeState) -> StreamIdentity:
+        # Not pinned: the spacing of siblings depends on the number of loader workers that iterate.
+        with self._connected(start) as connection:
+            return connection.conversation.stream
 
     @property
     def _consumer(self) -> Consumer:
         return Consumer(self._connector.batch_size, self.rank, self.world_size)
-
-    def _consumer_id(self, workers: int = 1) -> ConsumerId:
-        loader = get_worker_info()
-        return ConsumerId(self.rank, self.world_size, None if loader is None else loader.id, workers)
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the next iteration. It starts at the beginning, unless a state of that epoch was loaded.
@@ -343,13 +374,23 @@ class V2VStreamDataset(IterableDataset[Batch]):
             UsageError: it is not a state, or a loader worker's state that this process cannot use.
         """
         self._require_open()
+        self._position.load(self._read_state(state), self._consumer)
+
+    def _read_state(self, state: Mapping[str, Any]) -> ResumeState:
         loaded = ResumeState.from_dict(state)
-        seed = self._connector.seed
+        seed = self._settings()["seed"]
         if loaded.seed != seed:
             raise StateMismatch(f"seed: the state has {loaded.seed}, this dataset {seed}; give seed={loaded.seed}")
-        if loaded.stream is not None:
-            self._connector.options.spec(loaded.stream, "the state")
-        self._position.load(loaded, self._consumer)
+        return (
+            loaded if loaded.stream is None else dataclasses.replace(loaded, stream=self._check(loaded, loaded.stream))
+        )
+
+    def _check(self, _state: ResumeState, stream: StreamIdentity) -> StreamIdentity:
+        """Return the stream of a state, if it is that of this dataset."""
+        if "mixture" in stream.spec:
+            raise StateMismatch("the state is of mixed datasets, this is one: load it in V2VStreamDataset.mix")
+        self._connector.options.spec(stream, "the state")
+        return stream
 
     def __getitem__(self, index: Any) -> Never:
         """Refuse an index.
@@ -370,38 +411,57 @@ class V2VStreamDataset(IterableDataset[Batch]):
         end_with_parent()
         return self._iterate(self._begin())  # stateful loaders ask for the state before the first batch
 
-    def _begin(self) -> Iteration:
+    def _begin(self) -> Any:
         begun = self._position.begin(self._consumer)
         if begun.repeats:
             warnings.warn(begun.warning, RepeatedSamplesWarning, stacklevel=3)
+        stream = begun.state.stream
+        if begun.done and stream is not None and not begun.batches(self._consumer.plan(stream, begun.state)):
+            # A stateful loader may drop this iterator unused, but the epoch is over.
+            self._position.finish(begun)
         return begun
 
-    def _iterate(self, begun: Iteration | None = None) -> Iterator[Batch]:
-        begun = begun or self._begin()
-        consumer, member, pinned = self._consumer, self._consumer_id(begun.workers), begun.state.stream
-        with closing(self._connector.connection(member, begun.state)) as connection:
+    @contextmanager
+    def _connected(self, start: ResumeState, workers: int = 0) -> Iterator[Connection]:
+        """Yield an open connection to iterate with as one of ``workers`` loader workers, or only to ask (0)."""
+        consumer = self.rank, self.world_size, max(workers, 1)
+        with closing(self._connector.connection(start, *consumer)) as connection:
             connection.open()
-            stream = connection.stream
-            if pinned is None:
-                self._connector.compare(connection, member, begun.state)
+            if workers and start.stream is None:
+                self._connector.compare(connection, start, *consumer)
+            yield connection
+
+    @contextmanager
+    def _opened(self, begun: Iteration) -> Iterator[tuple[Any, Iteration, EpochPlan]]:
+        """Yield what :meth:`_take` needs: an open connection, the pass with its stream, and the plan of its epoch."""
+        with self._connected(begun.state, begun.workers) as connection:
+            stream = connection.conversation.stream
+            if begun.state.stream is None:
                 begun = self._position.pin(begun, stream, connection.address)
-            plan = consumer.plan(stream, begun.state)
+            plan = self._consumer.plan(stream, begun.state)
+            spec = stream.resolved
+            if spec.samples_per_decode > 1 and not plan.shares_decodes(spec.sibling_spacing, begun.workers):
+                warnings.warn(_NOT_SHARED, stacklevel=4)
+            yield connection, begun, plan
+
+    def _take(self, connection: Any, begun: Iteration, plan: EpochPlan, batches: Sequence[int]) -> Iterator[Batch]:
+        """Yield the batches of these numbers."""
+        after = functools.partial(self._consumer.after, begun.state, plan)
+        for batch in deliver(
+            connection, plan, batches, begun.state.epoch, after, self._buffers, shared_memory=self._shared_memory
+        ):
+            if self._needs_labels:
+                require_labels(batch.provenance)
+            yield batch
+
+    def _iterate(self, begun: Any = None) -> Iterator[Batch]:
+        with self._opened(begun or self._begin()) as (connection, begun, plan):
             if begun.state.is_beginning:
                 plan.require_batches()
-            if stream.resolved.samples_per_decode > 1 and not plan.shares_decodes(
-                stream.resolved.sibling_spacing, begun.workers
-            ):
-                warnings.warn(_NOT_SHARED, stacklevel=2)
             batches = begun.batches(plan)
-            after = functools.partial(consumer.after, begun.state, plan)
-            delivered = deliver(
-                connection, plan, batches, begun.state.epoch, after, self._buffers, shared_memory=self._shared_memory
-            )
-            for batch, number in zip(delivered, batches, strict=True):
-                if self._needs_labels:
-                    require_labels(batch.provenance)
-                state = after(number, batch.resume_state["quarantine"])
-                self._position.reached(begun, consumer, state, last=number == batches[-1])
+            for batch, number in zip(self._take(connection, begun, plan, batches), batches, strict=True):
+                state = self._consumer.after(begun.state, plan, number, batch.resume_state["quarantine"])
+                self._position.reached(begun, self._consumer, state, last=number == batches[-1])
                 yield batch
                 self._require_open()
         self._position.finish(begun)

@@ -19,6 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
+from typing import NamedTuple
 
 import torch
 
@@ -34,8 +35,7 @@ _REQUESTS_A_CREDIT = 8
 """A request asks for at least 1/8 of the credit, so up to 1/8 of the credit may stay unused."""
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
+class Place(NamedTuple):
     """Hold where a sample belongs: the number of its batch, and the row in it."""
 
     batch: int
@@ -50,6 +50,9 @@ class ReorderWindow:
         indices: returns the global indices of a batch's samples; batches are disjoint.
         batch_size: samples in each batch.
         credit: maximum number of samples requested and not received.
+
+    Attributes:
+        outstanding: the samples requested and not received, in the order of the requests.
 
     Raises:
         LimitExceeded: the credit is below 1.
@@ -67,18 +70,13 @@ class ReorderWindow:
         self._unasked = ((index, Place(batch, row)) for batch in batches for row, index in enumerate(indices(batch)))
         self._taken = 0  # batches delivered
         self._places: dict[int, Place] = {}  # samples asked for, until their batch is taken
-        self._outstanding: dict[int, None] = {}  # of those, the ones not received, in the order asked
+        self.outstanding: dict[int, None] = {}
         self._received: Counter[int] = Counter()  # samples received of each batch, until it is taken
 
     @property
     def finished(self) -> bool:
         """Return whether every batch was taken."""
         return self._taken == len(self._batches)
-
-    @property
-    def outstanding(self) -> tuple[int, ...]:
-        """Return the samples requested and not received, in the order of the requests."""
-        return tuple(self._outstanding)
 
     def ask(self) -> tuple[int, ...]:
         """Return the indices to request now, within both limits. They count as requested from here on.
@@ -87,14 +85,14 @@ class ReorderWindow:
         would cost the server as much as the sample does.
         """
         allowed = min(
-            self._credit - len(self._outstanding),
+            self._credit - len(self.outstanding),
             self._credit + self._batch_size - len(self._places),
         )
-        if allowed < self._credit // _REQUESTS_A_CREDIT and self._outstanding:
+        if allowed < self._credit // _REQUESTS_A_CREDIT and self.outstanding:
             return ()
         asked = dict(islice(self._unasked, allowed))
         self._places |= asked
-        self._outstanding |= dict.fromkeys(asked)
+        self.outstanding |= dict.fromkeys(asked)
         return tuple(asked)
 
     def place(self, index: int) -> Place:
@@ -103,9 +101,9 @@ class ReorderWindow:
 
     def receive(self, index: int) -> Place | None:
         """Record an arrived sample and return its place, or None if it must be dropped."""
-        if index not in self._outstanding:
+        if index not in self.outstanding:
             return None
-        del self._outstanding[index]
+        del self.outstanding[index]
         place = self._places[index]
         self._received[place.batch] += 1
         return place
@@ -158,12 +156,14 @@ def deliver(
     Raises:
         see :meth:`Connection.receive`.
     """
-    window = ReorderWindow(batches, plan.indices, plan.batch_size, connection.credit)
-    most_partial = -(-connection.credit // plan.batch_size) + 2
+    conversation = connection.conversation
+    window = ReorderWindow(batches, plan.indices, plan.batch_size, conversation.credit)
+    most_partial = -(-conversation.credit // plan.batch_size) + 2
     # One more for the batch that the trainer holds: all of them are free when an epoch ends.
-    buffers.shape(connection.layout, plan.batch_size, spare=most_partial + 1)
+    buffers.shape(conversation.layout, plan.batch_size, spare=most_partial + 1)
     partial: dict[int, _PartialBatch] = {}
     quarantine, lend = 0, shared_memory
+    recipe = conversation.stream.resolved.recipe
 
     def ask() -> None:
         asked, slots = window.ask(), {}
@@ -202,7 +202,7 @@ def deliver(
         # Workers on other hosts cannot use slots, and a message without slots is cheaper.
         lend = lend and (batch.is_local or not batch.memory.has_slots)
         headers = [batch.headers[row] for row in range(plan.batch_size)]
-        provenance = tuple(connection.provenance(header) for header in headers)
+        provenance = tuple(conversation.provenance(header) for header in headers)
         quarantine = max([quarantine, *(item.quarantine for item in provenance)])
         tensors = {name: torch.from_numpy(array) for name, array in batch.memory.finish().items()}
         yield Batch(
@@ -214,5 +214,6 @@ def deliver(
             wait_seconds=clock() - began,
             cpu_seconds=sum(header.cpu_seconds for header in headers),
             decodes=sum(header.decoded for header in headers),
+            recipe=recipe,
         )
         del batch, tensors

@@ -10,7 +10,7 @@ import importlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,7 @@ from v2v_protocol.events import EventList
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample, html_table
 from v2v_protocol.settings import require_whole
-from v2v_protocol.spec import SpecOptions, StreamSpec
+from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import read_recipe
 
 
@@ -91,7 +91,7 @@ class V2VDataset(Dataset[Sample]):
         rate: float = 0.0,
         photograph_seconds: float = 0.0,
         labels: Labels = "required",
-        **options: Unpack[SpecOptions],
+        **options: Any,
     ) -> None:
         require_arguments(V2VDataset.__init__, options)
         self.seed = require_whole("seed", seed, 0, LARGEST_SEED)
@@ -99,7 +99,8 @@ class V2VDataset(Dataset[Sample]):
         self._needs_labels = check_labels(labels)
         self.spec = StreamSpec.from_dict({**options, "recipe": read_recipe(recipe)})
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
-        self._source = (os.fspath(videos), rows, list_file, cache_dir, (videos_kind, rate, photograph_seconds))
+        self._videos, self._kind = os.fspath(videos), (videos_kind, rate, photograph_seconds)
+        self._source = {"rows": rows, "list_file": list_file, "cache_dir": cache_dir}
         self._maker: Any = None
         self._process = 0
         self._length = int(self._open().count)
@@ -136,13 +137,13 @@ class V2VDataset(Dataset[Sample]):
         self.epoch = epoch
 
     def __repr__(self) -> str:
-        return f"V2VDataset({self._source[0]!r}, {self._length} samples, seed {self.seed}, epoch {self.epoch})"
+        return f"V2VDataset({self._videos!r}, {self._length} samples, seed {self.seed}, epoch {self.epoch})"
 
     def _repr_html_(self) -> str:
         recipe = self.spec.recipe
         shape = f"{recipe.voxels_per_clip} voxel grids of {recipe.bins} bins, {recipe.crop_width_px} x "
         rows = {"samples": self._length, "of": f"{shape}{recipe.crop_height_px} px", "arrays": ", ".join(self._arrays)}
-        return html_table(f"V2VDataset of {self._source[0]}", rows | {"seed": self.seed, "epoch": self.epoch})
+        return html_table(f"V2VDataset of {self._videos}", rows | {"seed": self.seed, "epoch": self.epoch})
 
     def show(self, index: int = 0, path: str | os.PathLike[str] | None = None) -> Any:
         """Draw one sample as a picture, which a notebook displays: ``dataset[index].show(path)``."""
@@ -160,33 +161,22 @@ class V2VDataset(Dataset[Sample]):
     def _open(self) -> Any:
         """Return this process's own remaker: an index file that was opened before a fork must not be read."""
         if self._maker is None or self._process != os.getpid():
-            self._maker, self._process = _open_remaker(*self._source, self.spec, self._arrays), os.getpid()
+            try:
+                remake = importlib.import_module("v2v_tools.remake")
+            except ModuleNotFoundError as error:
+                raise UsageError(
+                    f"V2VDataset makes samples in this process, which needs the package {error.name}: pip install "
+                    "'.[server]' in a checkout"
+                ) from error
+            kind = remake.VideosKind(*self._kind)
+            self._maker = remake.open_remaker(
+                self._videos, **self._source, kind=kind, spec=self.spec, arrays=self._arrays
+            )
+            self._process = os.getpid()
         return self._maker
 
 
-def _open_remaker(
-    videos: str,
-    rows: str,
-    list_file: str | None,
-    cache_dir: str | None,
-    kind: tuple[str, float, float],
-    spec: StreamSpec,
-    arrays: tuple[str, ...],
-) -> Any:
-    try:
-        remake = importlib.import_module("v2v_tools.remake")
-    except ModuleNotFoundError as error:
-        raise UsageError(
-            f"V2VDataset makes samples in this process, which needs the package {error.name}: pip install '.[server]' "
-            "in a checkout"
-        ) from error
-    return remake.open_remaker(
-        videos, rows=rows, list_file=list_file, cache_dir=cache_dir, kind=remake.VideosKind(*kind),
-        spec=spec, arrays=arrays,
-    )  # fmt: skip
-
-
-def _collate(samples: Sequence[Sample], *, collate_fn_map: Any) -> Batch:
+def _collate(samples: Sequence[ShownSample], *, collate_fn_map: Any) -> Batch:
     tensors = {
         name: torch.stack([torch.from_numpy(sample.arrays[name]) for sample in samples]) for name in samples[0].arrays
     }
@@ -199,8 +189,9 @@ def _collate(samples: Sequence[Sample], *, collate_fn_map: Any) -> Batch:
         wait_seconds=0.0,
         cpu_seconds=0.0,
         decodes=len(samples),
+        recipe=samples[0].recipe,
     )
 
 
 # PyTorch's registry of collate functions for custom types.
-default_collate_fn_map[Sample] = _collate
+default_collate_fn_map[ShownSample] = _collate

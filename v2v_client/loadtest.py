@@ -12,22 +12,21 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import psutil
 from rich.console import Console
 from rich.table import Table
 
-from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
-from v2v_client.local_server import LocalServer
+from v2v_client.local_server import LocalServer, server_flags
 from v2v_protocol.command import INTERRUPTED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
+from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS
-from v2v_protocol.spec import StreamSpec
-from v2v_protocol.spec_flags import add_spec, recipe_changes, spec_fields
+from v2v_protocol.spec_flags import add_spec, recipe_changes, recipe_setting, spec_fields
 from v2v_protocol.write_aside import write_json
 
 _RSS_EVERY_SECONDS = 0.5
@@ -48,26 +47,6 @@ _COLUMNS = (
     ("lost", "lost", "{}"),
     ("duplicated", "twice", "{}"),
 )
-
-
-@dataclass(slots=True)
-class Measurement:
-    """Sum up what one run consumed, after warm-up."""
-
-    waits: list[float] = field(default_factory=list)
-    samples: int = 0
-    bytes: int = 0
-    decodes: int = 0
-    worker_cpu_seconds: float = 0.0
-    compute_seconds: float = 0.0
-
-    def add(self, batch: Batch, wait_seconds: float, compute_seconds: float) -> None:
-        self.waits.append(wait_seconds)
-        self.samples += len(batch)
-        self.bytes += batch.nbytes
-        self.decodes += batch.decodes
-        self.worker_cpu_seconds += batch.cpu_seconds
-        self.compute_seconds += compute_seconds
 
 
 class Usage:
@@ -126,13 +105,14 @@ def measure(
     first_epoch = dataset.epoch
     usage = Usage(server)
     check: ScheduleCheck | None = None
-    measured = Measurement()
+    waits: list[float] = []  # of the batches after warm-up
+    sums = np.zeros(4)  # of these batches: samples, bytes, decodes, seconds of the workers
     received = epochs = 0
     interrupted = False
     batches = iter(dataset)
     began = ended = time.perf_counter()
     cpu_began = usage.cpu_seconds()
-    while not measured.waits or ended - began < seconds:
+    while not waits or ended - began < seconds:
         asked = time.perf_counter()
         try:
             batch = next(batches, None)
@@ -141,7 +121,7 @@ def measure(
                 batches = iter(dataset)
                 batch = next(batches)
         except KeyboardInterrupt:
-            if not measured.waits:
+            if not waits:
                 raise
             interrupted = True
             break
@@ -158,29 +138,31 @@ def measure(
             began, cpu_began = ended, usage.cpu_seconds()
             continue
         usage.sample(ended)
-        measured.add(batch, wait, trainer_seconds)
+        waits.append(wait)
+        sums += len(batch), batch.nbytes, batch.decodes, batch.cpu_seconds
         if progress is not None:
-            _show(progress, ended - began, seconds, len(measured.waits))
-    cpu = usage.cpu_seconds() - cpu_began + (measured.worker_cpu_seconds if server is None else 0.0)
+            _show(progress, ended - began, seconds, len(waits))
+    samples, nbytes, decodes, worker_seconds = sums.tolist()
+    cpu = usage.cpu_seconds() - cpu_began + (worker_seconds if server is None else 0.0)
     elapsed = ended - began
-    count = len(measured.waits)
+    count = len(waits)
     assert check is not None  # the loop ends after a batch
     record = {
         "workers": workers,
         "batches_per_second": count / elapsed,
-        "samples_per_second": measured.samples / elapsed,
-        "p50_ms": 1e3 * percentile(measured.waits, 0.5),
-        "p99_ms": 1e3 * percentile(measured.waits, 0.99),
+        "samples_per_second": samples / elapsed,
+        "p50_ms": 1e3 * percentile(waits, 0.5),
+        "p99_ms": 1e3 * percentile(waits, 0.99),
         "cpu_seconds_per_batch": cpu / count,
-        "bytes_per_second": measured.bytes / elapsed,
-        "client_stall_fraction": sum(measured.waits) / elapsed,
+        "bytes_per_second": nbytes / elapsed,
+        "client_stall_fraction": sum(waits) / elapsed,
         "peak_rss_bytes": usage.peak_rss_bytes,
-        "samples_per_decode": measured.samples / max(measured.decodes, 1),
+        "samples_per_decode": samples / max(decodes, 1),
         "lost": check.lost,
         "duplicated": check.duplicated,
         "foreign": check.foreign,
         "out_of_order": check.out_of_order,
-        "accelerator_utilisation": measured.compute_seconds / elapsed if trainer_seconds else None,
+        "accelerator_utilisation": count * trainer_seconds / elapsed if trainer_seconds else None,
         "batches": count,
         "seconds": elapsed,
         "warmup_batches": warmup_batches,
@@ -281,14 +263,6 @@ def _dataset(arguments: argparse.Namespace, address: str) -> V2VStreamDataset:
     )
 
 
-def _server_flags(arguments: argparse.Namespace) -> list[str]:
-    # The server checks with its own recipe which videos are long enough, so it gets the stream's.
-    scene = StreamSpec.from_dict({"preset": arguments.preset, "scene": arguments.scene}).scene
-    settings = {"--rows": arguments.rows, "--recipe": arguments.recipe, "--scene": "" if scene == "off" else scene}
-    flags = [part for flag, value in settings.items() if value for part in (flag, value)]
-    return [*flags, *(part for change in arguments.set for part in ("--set", change))]
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Measure, print and write the records; return the exit status.
 
@@ -311,10 +285,11 @@ def run(arguments: argparse.Namespace) -> int:
     results = []
     if not arguments.connect:
         _dataset(arguments, "tcp://127.0.0.1:0")  # report wrong options before a server is started
+        # The server checks with its own recipe which videos are long enough, so it gets the stream's.
+        recipe = recipe_setting(arguments.recipe, arguments.set) or Recipe()
+        flags = server_flags(recipe, vars(arguments), *(("--rows", arguments.rows) if arguments.rows else ()))
     for workers in (None,) if arguments.connect else arguments.workers or (1, 2):
-        local = (
-            None if workers is None else LocalServer(arguments.videos, workers=workers, flags=_server_flags(arguments))
-        )
+        local = None if workers is None else LocalServer(arguments.videos, workers=workers, flags=flags)
         with local or nullcontext() as server, Progress(arguments.connect or f"{workers} workers", "%") as progress:
             address = arguments.connect if server is None else server.address
             dataset = _dataset(arguments, address)

@@ -8,16 +8,17 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import psutil
 
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.programs import environment
 from v2v_protocol.recipe import Recipe
+from v2v_protocol.spec import StreamSpec
 
 _POLL_SECONDS = 0.05
 _LAST_LINES = 12
@@ -151,7 +152,7 @@ class LocalServer:
                     process.kill()
                     process.wait()
                 for survivor in tree:
-                    with _ignore_ended_process():
+                    with suppress(psutil.NoSuchProcess):
                         survivor.kill()
                 psutil.wait_procs(tree, self._stop_seconds)
         finally:
@@ -162,7 +163,7 @@ class LocalServer:
     def cpu_seconds(self) -> dict[int, float]:
         """Return user plus system time of each process of the tree by process id, including ended ones seen before."""
         for process in _tree(self.pid):
-            with _ignore_ended_process():
+            with suppress(psutil.NoSuchProcess):
                 times = process.cpu_times()
                 self._cpu_seconds[process.pid, process.create_time()] = times.user + times.system
         found: dict[int, float] = {}
@@ -174,27 +175,27 @@ class LocalServer:
         """Return resident bytes of each living process of the tree by process id; shared pages count for each."""
         found: dict[int, int] = {}
         for process in _tree(self.pid):
-            with _ignore_ended_process():
+            with suppress(psutil.NoSuchProcess):
                 found[process.pid] = process.memory_info().rss
         return found
 
 
-def recipe_flags(recipe: Recipe) -> list[str]:
-    """Return flags that give ``v2v-serve`` this recipe: its start then names the videos that are too small."""
-    return [text for key, value in recipe.to_dict().items() for text in ("--set", f"{key}={json.dumps(value)}")]
+def server_flags(recipe: Recipe, options: Mapping[str, Any], *others: str) -> list[str]:
+    """Return flags that give ``v2v-serve`` a stream's recipe, so that its start names the videos that are too small,
+    and its scene analysis.
+
+    Args:
+        options: fields of the stream's spec by name; None takes the default.
+        others: more flags.
+    """
+    scene = StreamSpec.from_dict({key: options.get(key) for key in ("preset", "scene")}).scene
+    flags = [text for key, value in recipe.to_dict().items() for text in ("--set", f"{key}={json.dumps(value)}")]
+    return [*flags, *(() if scene == "off" else ("--scene", scene)), *others]
 
 
 def _tree(pid: int) -> Iterator[psutil.Process]:
-    with _ignore_ended_process():
+    # A process may end between being listed and being queried, here and above.
+    with suppress(psutil.NoSuchProcess):
         root = psutil.Process(pid)
         yield root
         yield from root.children(recursive=True)
-
-
-@contextmanager
-def _ignore_ended_process() -> Iterator[None]:
-    """Ignore that a process ended between being listed and being queried."""
-    try:
-        yield
-    except psutil.NoSuchProcess:
-        return

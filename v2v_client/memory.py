@@ -25,7 +25,6 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from enum import Enum, auto
 from typing import Any
 
 import numpy as np
@@ -78,11 +77,6 @@ def lend(memory: ByteArray, back: Callable[[ByteArray], object]) -> ByteArray:
     # The finalizer holds the memory while the loan lives.
     weakref.finalize(loan, back, memory).atexit = False
     return np.asarray(loan)
-
-
-def batch_bytes(layout: Layout, slots: int) -> int:
-    """Return the size in bytes of the memory of a batch of ``slots`` samples."""
-    return array_offsets(Form.of(layout).sizes, slots)[-1]
 
 
 def batch_arrays(memory: ByteArray, layout: Layout, slots: int) -> dict[str, npt.NDArray[Any]]:
@@ -310,7 +304,7 @@ class BatchBuffers:
         try:
             memory = self._free.pop()
         except IndexError:
-            memory = np.empty(batch_bytes(layout, batch_size), np.uint8)
+            memory = np.empty(array_offsets(Form.of(layout).sizes, batch_size)[-1], np.uint8)
         return batch_arrays(lend(memory, self._free.append), layout, batch_size)
 
     def _take_arena(self) -> Arena | None:
@@ -346,15 +340,6 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_note_fork)
 
 
-class Answer(Enum):
-    """Say what an arrival means for the slot of its sample."""
-
-    THERE = auto()  # the arrays are in the slot, and no worker writes there any more
-    MESSAGE = auto()  # the arrays came in the message, and no worker writes to the slot, if there was one
-    ABANDONED = auto()  # the arrays came in the message, but a worker may still write to the slot
-    NOWHERE = auto()  # the arrays were written to another sample's slot and cannot be read
-
-
 class Slots:
     """Track the slots named in the requests of one connection, without their bytes."""
 
@@ -382,8 +367,10 @@ class Slots:
             tuple(NO_SLOT if slot is None else slot.number for slot in slots),
         )
 
-    def record_arrival(self, index: int, number: int, *, in_message: bool) -> Answer:
-        """Record that a sample arrived, and return what that means for its slot.
+    def record_arrival(self, index: int, number: int, *, in_message: bool) -> bool | None:
+        """Record that a sample arrived; return whether its slot is free: no worker may still write there.
+
+        None: the arrays were written to another sample's slot and cannot be read.
 
         Args:
             index: global index of the sample.
@@ -393,11 +380,9 @@ class Slots:
         slot = self._named.get(index)
         returned = slot is not None and number == slot.number
         if not in_message and not returned:
-            return Answer.NOWHERE
+            return None
         self._named.pop(index, None)
-        if not in_message:
-            return Answer.THERE
-        return Answer.MESSAGE if returned or slot is None else Answer.ABANDONED
+        return returned or slot is None
 
 
 def open_sample(arena: str, sizes: Sequence[int]) -> list[memoryview]:

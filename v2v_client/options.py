@@ -13,7 +13,7 @@ from v2v_protocol.errors import SampleUnavailable, UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, array_layout
 from v2v_protocol.settings import nearest, settings_of
-from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, SpecOptions, StreamSpec
+from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, SPEC_KEYS, StreamSpec
 from v2v_protocol.spec_flags import read_recipe
 
 Labels = Literal["required", "optional"]
@@ -68,8 +68,7 @@ class Options:
     def __init__(self, arrays: tuple[str, ...], **fields: Any) -> None:
         fields = fields | {"recipe": _plain(fields.get("recipe"))}
         self._asked = {name: value for name, value in fields.items() if value is not None}
-        others = {name: value for name, value in self._asked.items() if name != "flow_from"}
-        spec = StreamSpec.from_dict(others, default=_ANY)
+        spec = StreamSpec.from_dict(self._asked | {"flow_from": None}, default=_ANY)
         array_layout(spec.recipe, spec.voxel_dtype, arrays)
         asked = self._asked.get("recipe", {})
         is_ours = isinstance(asked, str) or not {"preset", "voxels_per_clip"}.isdisjoint(asked)
@@ -107,9 +106,9 @@ def require_arguments(function: Callable[..., Any], options: Mapping[str, Any]) 
         UsageError: a name is not a field of a StreamSpec.
     """
     named = [name for name in inspect.signature(function).parameters if name not in ("self", "options")]
-    known = [*named, *SpecOptions.__annotations__]
+    known = dict.fromkeys((*named, *SPEC_KEYS))
     for name in options:
-        if name not in SpecOptions.__annotations__:
+        if name not in SPEC_KEYS:
             hint = f": it belongs to the recipe, recipe={{{name!r}: ...}}" if name in settings_of(Recipe) else ""
             raise UsageError(f"no argument {name!r}{hint or nearest(name, known)}; known: {', '.join(known)}")
 

@@ -40,7 +40,7 @@ from typing import Any
 import psutil
 from torch.utils.data import get_worker_info
 
-from v2v_client.position import Consumer, EpochPlan, LoaderShare, ResumeState, StreamIdentity
+from v2v_client.position import Consumer, EpochPlan, LoaderShare, ResumeState, Snapshot, StreamIdentity
 from v2v_protocol.errors import UsageError
 
 _MOST_PASSES = 8
@@ -287,9 +287,9 @@ class Iteration:
 
     def batches(self, plan: EpochPlan) -> range:
         """Return the numbers of the batches that this process still has to deliver."""
-        return plan.batches_of_worker(self.worker, self.workers)[self.done :]
+        return range(self.worker, plan.batches, self.workers)[self.done :]
 
-    def after(self, consumer: Consumer, delivered: int, quarantine: int | None) -> ResumeState:
+    def after(self, consumer: Consumer, delivered: int, quarantine: Snapshot) -> ResumeState:
         """Return the state of this loader worker after ``delivered`` batches of this iteration."""
         share = LoaderShare(self.worker, self.workers, consumer.batch_size, self.done + delivered)
         return dataclasses.replace(self.state, share=share, quarantine=quarantine)
@@ -382,9 +382,6 @@ class Position:
         done = begun.shares.get((worker, workers), 0)
         iteration = Iteration(number, state, worker, workers, loader is not None, done, repeats)
         self._here = state if loader is None else iteration.after(consumer, 0, state.quarantine)
-        if done and state.stream is not None and not iteration.batches(consumer.plan(state.stream, state)):
-            # A stateful loader may drop this iterator unused, but the epoch is over.
-            self.finish(iteration)
         return iteration
 
     def pin(self, begun: Iteration, stream: StreamIdentity, address: str) -> Iteration:

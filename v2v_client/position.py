@@ -33,6 +33,8 @@ from v2v_protocol.spec import StreamSpec
 
 STATE_VERSION = 1
 Count: TypeAlias = Annotated[int, Limits(0, LARGEST_INDEX)]
+Snapshot: TypeAlias = Count | tuple[Count | None, ...] | None
+"""Number of the quarantine snapshot to continue with; of a mixture, that of each member. None: the server's newest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +151,7 @@ class ResumeState(Persisted):
         origin, position, world_size: see the module.
         share: progress of a loader worker since ``position``; None for the state of a rank, which is valid for any
             number of loader workers.
-        quarantine: number of the quarantine snapshot to continue with; None for the server's newest.
+        quarantine: the quarantine snapshot to continue with.
     """
 
     stream: StreamIdentity | None
@@ -159,7 +161,7 @@ class ResumeState(Persisted):
     position: Count
     world_size: Annotated[int, Limits(1, LARGEST_INDEX)]
     share: LoaderShare | None = None
-    quarantine: Count | None = None
+    quarantine: Snapshot = None
 
     @property
     def place(self) -> tuple[int, int, int]:
@@ -251,20 +253,6 @@ class EpochPlan:
             self.origin + position * self.world_size + self.rank for position in range(first, first + self.batch_size)
         )
 
-    def position_after(self, batch: int) -> int:
-        """Return the number of local samples consumed after batch ``batch``."""
-        return self.position + (batch + 1) * self.batch_size
-
-    def batches_of_worker(self, worker: int, workers: int) -> range:
-        """Return the numbers of the batches that one of ``workers`` loader workers takes.
-
-        Raises:
-            UsageError: no such worker.
-        """
-        if not 0 <= worker < workers:
-            raise UsageError(f"loader worker {worker} of {workers}: workers are 0 .. {workers - 1}")
-        return range(worker, self.batches, workers)
-
     def shares_decodes(self, spacing: int, workers: int) -> bool:
         """Return whether all siblings, ``spacing`` apart in the epoch, go to the same loader worker of the same rank.
 
@@ -311,7 +299,7 @@ class Consumer:
         """Return the batches of an epoch from ``state`` on."""
         return EpochPlan(stream.sequences, self.world_size, self.rank, self.batch_size, state.origin, state.position)
 
-    def after(self, state: ResumeState, plan: EpochPlan, batch: int, quarantine: int | None) -> ResumeState:
+    def after(self, state: ResumeState, plan: EpochPlan, batch: int, quarantine: Snapshot) -> ResumeState:
         """Return the rank's state after a batch. After the last one, it is the beginning of the next epoch.
 
         Args:
@@ -321,7 +309,8 @@ class Consumer:
         """
         if batch + 1 == plan.batches:
             return state.at_epoch(state.epoch + 1)
-        return dataclasses.replace(state, position=plan.position_after(batch), share=None, quarantine=quarantine)
+        position = plan.position + (batch + 1) * plan.batch_size
+        return dataclasses.replace(state, position=position, share=None, quarantine=quarantine)
 
     def adopt(self, state: ResumeState) -> ResumeState:
         """Return ``state`` for this world size; another one counts from the first index that no rank consumed."""

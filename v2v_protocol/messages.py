@@ -33,6 +33,7 @@ from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.errors import LimitExceeded, ProtocolError, VersionMismatch
 from v2v_protocol.persisted import Persisted, add_fields, later, reader, shown
+from v2v_protocol.sample import Layout
 
 
 class ErrorCode(StrEnum):
@@ -384,8 +385,6 @@ ARRAY_DTYPES = ("int8", "uint8", "int16", "uint16", "float16", "float32")
 _DTYPE_NAMES = {np.dtype(name): name for name in ARRAY_DTYPES}
 _ENCRYPTION_BYTES = 64
 """Bytes added to a frame by encryption; CURVE adds 33."""
-_MOST_ARRAYS = 16
-_MOST_DIMENSIONS = 8
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
 Frames: TypeAlias = list[Buffer]
@@ -544,66 +543,33 @@ def largest_frame_bytes(sizes: Iterable[int]) -> int:
 
 
 def decode_sample(
-    header: SampleHeader, payload: Sequence[Buffer], unpack: Callable[[Buffer, int], Buffer] | None = None
+    layout: Layout, payload: Sequence[Buffer], unpack: Callable[[Buffer, int], Buffer] | None = None
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays behind a SampleHeader, such as voxels [T, bins, H, W], as views of the payload (read-only).
+    """Return the arrays of a sample whose header states this layout, such as voxels [T, bins, H, W].
+
+    They are views of the payload (read-only).
 
     Args:
-        header, payload: of the sample.
-        unpack: takes a packed array's frame and its number of bytes, and returns these bytes; it raises ProtocolError
-            for any other content. None: packed samples are refused.
+        layout: dtype and shape of each array.
+        payload: the raw frames behind the header.
+        unpack: of a packed sample: takes an array's frame and its number of bytes, and returns these bytes; it raises
+            ProtocolError for any other content.
 
     Raises:
-        ProtocolError, LimitExceeded: names, dtypes, shapes and frame lengths do not agree, or break a limit.
+        ProtocolError: the frames do not have the number and the sizes of the arrays.
     """
-    if len(header.names) != len(payload):
-        raise ProtocolError(
-            f"sample: {len(header.names)} names, {len(header.dtypes)} dtypes and {len(payload)} raw frames: "
-            "the numbers must be equal"
-        )
-    if header.packed and unpack is None:
-        raise ProtocolError("sample: its arrays are compressed, but compression was not requested")
+    if len(layout) != len(payload):
+        raise ProtocolError(f"sample: {len(payload)} raw frames for {len(layout)} arrays")
     arrays: dict[str, npt.NDArray[Any]] = {}
-    for (name, (dtype, shape)), raw in zip(layout_of(header).items(), payload, strict=True):
+    for (name, (dtype, shape)), raw in zip(layout.items(), payload, strict=True):
         size = math.prod(shape) * np.dtype(dtype).itemsize
-        if header.packed and unpack is not None:
-            raw = unpack(raw, size)
+        raw = raw if unpack is None else unpack(raw, size)
         if size != len(raw):
-            raise ProtocolError(f"sample: array {name!r:.40} {dtype}{list(shape)} is {size} bytes, got {len(raw)}")
+            raise ProtocolError(f"sample: array {name} {dtype}{list(shape)} is {size} bytes, got {len(raw)}")
         array = np.frombuffer(raw, dtype=np.dtype(dtype)).reshape(shape)
         array.flags.writeable = False
         arrays[name] = array
     return arrays
-
-
-def layout_of(header: SampleHeader) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Return dtype and shape of each array of a sample, as its header states them.
-
-    Raises:
-        ProtocolError, LimitExceeded: names, dtypes and shapes do not agree, or break a limit.
-    """
-    if len(header.names) != len(header.dtypes):
-        raise ProtocolError(f"sample: {len(header.names)} names, {len(header.dtypes)} dtypes")
-    if len(header.names) > _MOST_ARRAYS or len(set(header.names)) != len(header.names):
-        raise LimitExceeded(f"sample: arrays {list(header.names)!r:.200}; at most {_MOST_ARRAYS}, no name twice")
-    layout: dict[str, tuple[str, tuple[int, ...]]] = {}
-    rest = list(header.shapes)
-    for name, dtype in zip(header.names, header.dtypes, strict=True):
-        if dtype not in ARRAY_DTYPES:
-            raise ProtocolError(
-                f"sample: array {name!r:.40} of dtype {dtype!r:.40}; allowed: {', '.join(ARRAY_DTYPES)}"
-            )
-        ndim = rest.pop(0) if rest else 0
-        shape, rest = tuple(rest[:ndim]), rest[ndim:]
-        if len(shape) != ndim or not 0 < ndim <= _MOST_DIMENSIONS or 0 in shape:
-            raise ProtocolError(f"sample: array {name!r:.40} has no complete shape of extents from 1")
-        size = math.prod(shape) * np.dtype(dtype).itemsize
-        if size > LARGEST_ARRAY_BYTES:
-            raise LimitExceeded(f"sample: array {name!r:.40} of {size} bytes; the limit is {LARGEST_ARRAY_BYTES}")
-        layout[name] = (dtype, shape)
-    if rest:
-        raise ProtocolError(f"sample: {len(rest)} extents belong to no array")
-    return layout
 
 
 def _unpacked(packed: Buffer, what: str) -> Any:

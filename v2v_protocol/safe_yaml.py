@@ -1,7 +1,7 @@
 """Read YAML: values of plain types, of bounded size. Every configuration and recipe is read here.
 
-An alias (``*name``) repeats the node that it names. Nine lines of nine aliases each stand for 10**9 values. So the
-bound applies to the values after aliases are replaced, and it is checked before any of them is built.
+An alias (``*name``) repeats the node that it names, so nine lines of nine aliases each stand for 10**9 values. Aliases
+are refused: the size of a file then bounds its values.
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ from typing import Any
 import yaml
 
 LARGEST_BYTES = 1 << 20
-MOST_VALUES = 100_000
-"""Scalars, lists and mappings of a text; an alias counts as all the values that it repeats."""
 MOST_LEVELS = 32
 
 
@@ -26,7 +24,7 @@ def parse_yaml(text: str) -> Any:
     """Return the value of a YAML text; None for an empty one.
 
     Raises:
-        YamlError: it is not YAML, has a key twice, or exceeds :data:`MOST_VALUES` or :data:`MOST_LEVELS`.
+        YamlError: it is not YAML, has a key twice or an alias, or exceeds :data:`MOST_LEVELS`.
     """
     try:
         return yaml.load(text, _Loader)
@@ -64,46 +62,18 @@ def format_yaml(value: Any) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Loader that refuses texts that expand beyond the limits, and duplicate keys (SafeLoader silently takes the
-    last).
-    """
+    """Loader that refuses aliases, deep texts, and duplicate keys (SafeLoader silently takes the last)."""
 
-    def __init__(self, text: str) -> None:
-        super().__init__(text)
-        self._values = 0
-        self._level = self._deepest = 0
-        self._extents: dict[int, tuple[int, int]] = {}  # by id of a composed node: its values and levels
+    _level = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
-        is_alias = self.check_event(yaml.AliasEvent)
-        before, outer = self._values, self._deepest
-        self._level += 1
-        self._deepest = self._level
-        self._check_limits(mark)  # before a deep text is descended into
+        is_alias, self._level = self.check_event(yaml.AliasEvent), self._level + 1
+        if is_alias or self._level > MOST_LEVELS:  # before a deep text is descended into
+            why = "an alias (*name): write its value again" if is_alias else f"more than {MOST_LEVELS} levels"
+            raise yaml.composer.ComposerError(None, None, why, self.peek_event().start_mark)  # type: ignore[no-untyped-call]
         node = super().compose_node(parent, index)
-        if is_alias:
-            if id(node) not in self._extents:
-                raise yaml.composer.ComposerError(None, None, "an alias refers to a node that contains it", mark)
-            values, levels = self._extents[id(node)]
-        else:
-            values, levels = self._values - before + 1, self._deepest - self._level + 1
-            self._extents[id(node)] = values, levels
-        self._values = before + values
-        self._deepest = max(outer, self._level + levels - 1)
-        self._check_limits(mark)
         self._level -= 1
         return node
-
-    def _check_limits(self, mark: yaml.Mark | None) -> None:
-        for count, limit, unit in (
-            (self._values, MOST_VALUES, "values (aliases count as the values that they repeat)"),
-            (self._deepest, MOST_LEVELS, "levels"),
-        ):
-            if count > limit:
-                raise yaml.composer.ComposerError(
-                    None, None, f"more than {limit} {unit}; write it with fewer or without aliases", mark
-                )
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()

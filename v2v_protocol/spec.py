@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal, TypedDict, get_args
+from typing import Any, Literal, get_args
 
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.persisted import Persisted, always_written
@@ -31,7 +31,6 @@ OnBadVideo = Literal["substitute", "raise"]
 FlowMethod = Literal["auto", "zero", "dis-ultrafast", "dis-fast", "dis-fast-lean", "dis-fast-1"]
 FlowDirection = Literal["forward", "backward"]
 SceneChoice = Literal["off", "auto"]
-SpeedPreset = Literal["exact", "balanced", "fast", "natural", "worlds", "natural-davis346"]
 VOXEL_DTYPES: tuple[VoxelDtype, ...] = get_args(VoxelDtype)
 SCENES: tuple[SceneChoice, ...] = get_args(SceneChoice)
 DEFECTS = ("bars", "black", "combed", "cuts", "duplicates", "fades", "white")
@@ -218,31 +217,6 @@ class StreamSpec(Persisted):
     def digest(self) -> str:
         """32 hexadecimal digits that name this spec."""
         return _digest(self)
-
-
-class SpecOptions(TypedDict, total=False):
-    """What a consumer may request besides its recipe, as keyword arguments, for editors and type checkers; None takes
-    the server's value. A test keeps it equal to the fields of :class:`StreamSpec`, which explain each one.
-    """
-
-    preset: SpeedPreset | None
-    voxel_dtype: VoxelDtype | None
-    shuffle: bool | None
-    max_sequences_per_video: int | None
-    on_bad_video: OnBadVideo | None
-    samples_per_decode: int | None
-    sibling_spacing: int | None
-    flow_method: FlowMethod | None
-    flow_direction: FlowDirection | None
-    flow_from: int | None
-    flow_margin_px: int | None
-    scene: SceneChoice | None
-    keep_defects: str | None
-    still_share: float | None
-    quiet_share: float | None
-    moving_share: float | None
-    substep_px: float | None
-    tolerance: float | None
 
 
 SPEC_KEYS = ("preset", "recipe", *settings_of(StreamSpec))

@@ -13,6 +13,7 @@ from tests.protocol.test_sample import PROVENANCE
 from v2v_client import Batch
 from v2v_client.options import require_labels
 from v2v_protocol.errors import SampleUnavailable, UsageError
+from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import ARRAYS, Provenance
 
 
@@ -39,7 +40,7 @@ def of(voxels: Any) -> Batch:
 def with_arrays(**arrays: Any) -> Batch:
     return Batch(
         arrays=arrays, indices=(0,), epoch=0, provenance=(), resume_state={}, wait_seconds=0.0,
-        cpu_seconds=0.0, decodes=1,
+        cpu_seconds=0.0, decodes=1, recipe=Recipe(),
     )  # fmt: skip
 
 

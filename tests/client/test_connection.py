@@ -46,7 +46,7 @@ def test_requests_denied_for_credit_are_repeated_when_a_sample_comes_twice(serve
         connection.want(range(4))
         until(lambda: len(server.wants) == 4)
         server.call(lambda: server.answer(0, 0))
-        connection._conversation.handle_event(Event.DISCONNECTED, connection._now())
+        connection.conversation.handle_event(Event.DISCONNECTED, connection._now())
         connection.want(())  # and all four are asked for again
         until(lambda: len(server.wants) == 8)
         assert _next(connection) == 0
@@ -117,7 +117,7 @@ def test_time_spent_opening_counts_as_listening(server: FakeServer, monkeypatch:
         monkeypatch.setattr(dealer.Dealer, "receive", receive)
         connection.open()
         assert connection.receive(wait=False) is None
-        assert connection._conversation.silence(connection._now()) >= 0.0
+        assert connection.conversation.silence(connection._now()) >= 0.0
 
 
 @pytest.mark.parametrize(

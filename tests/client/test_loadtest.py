@@ -10,7 +10,9 @@ import pytest
 from tests.client.fake_server import FakeServer
 from v2v_client import loadtest
 from v2v_client.loadtest import ScheduleCheck
+from v2v_client.local_server import server_flags
 from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec_flags import recipe_changes
 
 KEYS = {
@@ -124,9 +126,14 @@ def test_a_local_server_gets_the_requested_recipe(server, monkeypatch):
     flags = ["--videos", "clips", "--workers", "3", "--batch-size", "4", "--seconds", "0.1", "--rows", "top:0.5"]
     # With its own, the paper's 201 frames, it would refuse clips that are long enough for this.
     assert loadtest.main([*flags, "--recipe", "clean", "--set", "bins=3", "--set", "gamma=2"]) == 0
-    assert started == [("clips", 3, ["--rows", "top:0.5", "--recipe", "clean", "--set", "bins=3", "--set", "gamma=2"])]
+    rows, asked = ("--rows", "top:0.5"), Recipe.from_dict({"preset": "clean", "bins": 3, "gamma": 2})
     loadtest.main([*flags, "--preset", "natural"])
-    assert started[1] == ("clips", 3, ["--rows", "top:0.5", "--scene", "auto"])
+    assert started == [
+        ("clips", 3, server_flags(asked, {}, *rows)),
+        ("clips", 3, server_flags(Recipe(), {"preset": "natural"}, *rows)),
+    ]
+    assert "gamma=2.0" in started[0][2]
+    assert started[1][2][-4:] == ["--scene", "auto", *rows]
 
 
 def test_no_server_is_status_2(capsys):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -19,7 +20,6 @@ from tests.leftovers import abandoned_memory, shared_memory
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_protocol.errors import ServerLost, UsageError
-from v2v_protocol.spec import SpecOptions
 from v2v_server.keys import KeyFolder
 
 RECIPE = {"preset": "noise-free", "voxels_per_clip": 2, "crop_height_px": 32, "crop_width_px": 32}
@@ -183,7 +183,7 @@ def test_no_process_is_left_when_the_program_ends(clips: Path, tmp_path: Path, e
     ("options", "scene"), [({}, "off"), ({"preset": "natural"}, "auto"), ({"scene": "auto"}, "auto")]
 )
 def test_its_server_has_the_statistics_that_the_options_need(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, options: SpecOptions, scene: str
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, options: dict[str, Any], scene: str
 ) -> None:
     asked: list[list[str]] = []
 

@@ -14,7 +14,6 @@ from torch.utils.data import DataLoader
 from tests.clips import panned_luma, write_clip
 from v2v_client import UsageError, V2VDataset, V2VStreamDataset
 from v2v_client.batch import _drawing, draw_samples
-from v2v_client.position import ResumeState, StreamIdentity
 from v2v_pictures.colours import BRIGHTER
 from v2v_protocol.recipe import Recipe
 from v2v_server.simulation import simulate
@@ -101,20 +100,16 @@ def test_pauses_of_unknown_length_are_not_marked(dataset: V2VDataset, monkeypatc
         return np.zeros((1, 1, 3), np.uint8)
 
     monkeypatch.setattr(sheet, "draw_sheet", draw)
-    draw_samples([(sample.arrays, paused)], None, "T")
     draw_samples([(sample.arrays, paused)], dataset.spec.recipe, "T")
-    assert titles == [("T (pauses are not marked)", False), ("T", True)]
+    assert titles == [("T", True)]
 
 
-def test_a_streamed_batch_knows_its_recipe(dataset: V2VDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_knows_its_recipe(dataset: V2VDataset, monkeypatch: pytest.MonkeyPatch) -> None:
     batch = next(iter(DataLoader(dataset, batch_size=1)))
-    stream = StreamIdentity(dataset.spec.to_dict(), dataset.spec.digest, "", 1, len(dataset))
-    state = ResumeState(stream=stream, seed=0, epoch=0, origin=0, position=1, world_size=1, quarantine=0).to_dict()
-    asked: list[Recipe | None] = []
+    asked: list[Recipe] = []
     monkeypatch.setattr("v2v_client.batch.draw_samples", lambda samples, recipe, title: asked.append(recipe))
-    dataclasses.replace(batch, resume_state=state)._picture()
     batch._picture()
-    assert asked == [dataset.spec.recipe, None]
+    assert asked == [batch.recipe] == [dataset.spec.recipe]
 
 
 def test_grids_within_a_step_are_shown_and_found_at_their_frames(tmp_path: Path) -> None:
@@ -127,10 +122,7 @@ def test_grids_within_a_step_are_shown_and_found_at_their_frames(tmp_path: Path)
     assert batch["voxels_bilinear"].shape == (1, 12, 2, 48, 48)
     assert divided.show(0).width > 500
     assert divided.spec.recipe.frame_grids == (-1, 2, 5, 8, 11)
-    with pytest.raises(UsageError, match="no spec"):
-        _ = batch.frame_grids
-    streamed = dataclasses.replace(batch, resume_state={"spec": divided.spec.to_dict()})
-    assert streamed.frame_grids.tolist() == [-1, 2, 5, 8, 11]
+    assert batch.frame_grids.tolist() == [-1, 2, 5, 8, 11]
 
 
 def test_datasets_show_themselves_as_tables(dataset: V2VDataset) -> None:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from v2v_client.passes import Iteration
 from v2v_client.position import Consumer, EpochPlan, LoaderShare, ResumeState, StreamIdentity
 from v2v_protocol.errors import StateMismatch, UsageError
 
@@ -37,7 +38,8 @@ def test_ranks_and_loader_workers_take_the_prefix_once(sequences, world, batch, 
     everything = sorted(consumed(plans))
     assert everything == list(range(sequences - sequences % (world * batch)))
     for plan in plans:
-        shares = [list(plan.batches_of_worker(worker, workers)) for worker in range(workers)]
+        state = ResumeState(None, 0, 0, 0, 0, world)
+        shares = [list(Iteration(1, state, worker, workers).batches(plan)) for worker in range(workers)]
         assert sorted(number for share in shares for number in share) == list(range(plan.batches))
 
 
@@ -70,7 +72,8 @@ def test_another_world_size_goes_on_at_a_global_batch_boundary(sequences, world,
 def test_position_after_a_batch_resumes_at_the_next_one(sequences, world, batch, number):
     plan = EpochPlan(sequences, world, world - 1, batch)
     assume(number + 1 < plan.batches)
-    rest = EpochPlan(sequences, world, world - 1, batch, position=plan.position_after(number))
+    after = Consumer(batch, world - 1, world).after(ResumeState(None, 0, 0, 0, 0, world), plan, number, None)
+    rest = EpochPlan(sequences, world, world - 1, batch, position=after.position)
     assert rest.indices(0) == plan.indices(number + 1)
     assert rest.batches == plan.batches - number - 1
 
@@ -95,11 +98,6 @@ def test_an_epoch_smaller_than_a_global_batch_says_so_with_the_numbers():
 def test_impossible_plans_are_refused(bad):
     with pytest.raises(UsageError):
         EpochPlan(**({"sequences": 10} | bad))
-
-
-def test_a_loader_worker_that_is_none_is_refused():
-    with pytest.raises(UsageError, match="worker 2 of 2"):
-        EpochPlan(10).batches_of_worker(2, 2)
 
 
 STATE = ResumeState(

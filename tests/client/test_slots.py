@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from v2v_client.memory import Answer, Slots
+from v2v_client.memory import Slots
 from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.messages import Want
 
@@ -33,27 +33,25 @@ def test_a_repeated_request_names_no_slot() -> None:
 def test_a_sample_is_accepted_from_its_slot_once() -> None:
     slots = offered(5)
     slots.want(0, [5])
-    assert slots.record_arrival(5, 6, in_message=False) is Answer.THERE
-    assert slots.record_arrival(5, 6, in_message=False) is Answer.NOWHERE
+    assert slots.record_arrival(5, 6, in_message=False) is True
+    assert slots.record_arrival(5, 6, in_message=False) is None
 
 
 def test_a_sample_in_a_message_with_its_slot_frees_the_slot() -> None:
     slots = offered(5)
     slots.want(0, [5])
-    assert slots.record_arrival(5, 6, in_message=True) is Answer.MESSAGE
+    assert slots.record_arrival(5, 6, in_message=True) is True
 
 
 def test_a_sample_from_another_worker_abandons_the_slot() -> None:
     slots = offered(5)
     slots.want(0, [5])
-    assert (
-        slots.record_arrival(5, 7, in_message=False) is Answer.NOWHERE
-    )  # in another sample's slot, which must not be read
-    assert slots.record_arrival(5, NO_SLOT, in_message=True) is Answer.ABANDONED
+    assert slots.record_arrival(5, 7, in_message=False) is None  # in another sample's slot, which must not be read
+    assert slots.record_arrival(5, NO_SLOT, in_message=True) is False
 
 
 def test_without_offers_requests_name_no_slots() -> None:
     slots = Slots()
     assert slots.want(2, [4, 5]) == Want(2, (4, 5))
-    assert slots.record_arrival(4, 1, in_message=False) is Answer.NOWHERE
-    assert slots.record_arrival(4, NO_SLOT, in_message=True) is Answer.MESSAGE
+    assert slots.record_arrival(4, 1, in_message=False) is None
+    assert slots.record_arrival(4, NO_SLOT, in_message=True) is True

@@ -34,6 +34,8 @@ MOST_DECODE_SECONDS = 1.0
 _LONGEST_ERROR = 5000
 _SHOWN_BYTES = 400
 _MIB = float(1 << 20)
+FUZZED = {"voxels": ("int16", (2, 3)), "frames": ("uint8", (5,))}
+"""Layout that the frames of samples are compared with."""
 MESSAGE_TYPES: tuple[type[Any], ...] = get_args(Message)
 _ITEM_BYTES = {"int8": 1, "uint8": 1, "int16": 2, "float16": 2, "float32": 4}
 _EDGES = (0, 1, 2, 127, 128, 255, 65_535, 65_536, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**63, 2**64 - 1)
@@ -92,6 +94,18 @@ class FrameFuzzer:
             shapes.append(1)
         header = SampleHeader(1, self._int(), names, dtypes, tuple(shapes), self.noise(), "w", 0.0)
         return header, payload
+
+    def payload(self) -> list[bytes]:
+        """Return raw frames that may or may not fit :data:`FUZZED`."""
+        frames = [bytes(12), bytes(5)]
+        match self._random.randrange(5):
+            case 0:
+                frames.pop()
+            case 1:
+                frames[0] += b"\0"
+            case 2:
+                frames.insert(self._random.randrange(3), self.noise())
+        return frames
 
     def message(self) -> Frames:
         """Return a multipart message: a header of any form, mostly alone."""
@@ -218,12 +232,11 @@ def fuzz_decoder(frames: int, seed: int) -> dict[str, Any]:
     for number in range(frames):
         if number == frames // 10:
             before, peak_before = psutil.Process().memory_info().rss / _MIB, _peak_mib()
-        header: Any
-        header, payload = fuzzer.sample() if number % 5 == 4 else (fuzzer.header(), None)
+        header, payload = fuzzer.header(), fuzzer.payload() if number % 5 == 4 else None
         started = time.thread_time()
         try:
             if payload is not None:
-                decode_sample(header, payload)
+                decode_sample(FUZZED, payload)
                 outcomes["samples"] += 1
             else:
                 message = decode(header)

@@ -57,7 +57,7 @@ class Oracle:
         """Return o, z R / scale, the shake, the tilt and c, each with axes to broadcast."""
         world, layer = self.world, self.world.layers[number]
         top, left, height, width = world.crop
-        since, (begin, end) = seconds - sum(world.seconds) / 2, world.seconds
+        since, begin = seconds - sum(world.seconds) / 2, world.seconds[0]
         count = world.knots.shape[1]
         at = np.clip((seconds - begin) / 0.2, 0, count - 3) + 3
         shake_x, shake_y, *pace = (float(BSpline(np.arange(count + 4), knots, 3)(at)) for knots in world.knots)

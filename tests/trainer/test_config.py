@@ -10,6 +10,7 @@ import yaml
 from trainer.config import TrainConfig, differences
 from trainer.config_file import load_config, shipped
 from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import preset
 
 
 def written(folder: Path, name: str, text: str) -> str:
@@ -95,6 +96,34 @@ def test_a_file_may_extend_a_shipped_one(tmp_path):
     assert (config.network.name, config.run.steps) == ("firenet", 3)
 
 
+@pytest.mark.parametrize("name", ["evflownet", "eraft"])
+def test_worlds_give_exact_flow_where_it_is_seen(name):
+    plain, worlds = load_config(name), load_config(f"{name}-worlds")
+    assert (worlds.network, worlds.loss.gamma) == (plain.network, plain.loss.gamma)
+    assert (worlds.loss.flow, worlds.loss.valid) == ("stream", "consistent")
+    assert worlds.stream.resolved_recipe == preset("worlds")
+    assert (worlds.stream.videos_kind, worlds.stream.rows) == ("photographs", "full")
+
+
+def test_streams_are_mixed_in_with_what_they_say(tmp_path):
+    mine = (
+        "extends: e2vid-filtered\nstream: {mix: [{weight: .2, videos: b, rows: full}, {weight: .3, recipe: sensor}]}\n"
+    )
+    mixed = load_config(written(tmp_path, "mine.yaml", mine)).stream.mixed
+    assert {name: weight for name, (_, weight) in mixed.items()} == {
+        "stream": 0.5,
+        "stream.mix.0": 0.2,
+        "stream.mix.1": 0.3,
+    }
+    first, *others = (stream for stream, _ in mixed.values())
+    assert [(each.videos, each.rows, each.list) for each in others] == [
+        ("b", "full", ""),
+        (first.videos, first.rows, first.list),
+    ]
+    assert others[1].resolved_recipe == preset("sensor")
+    assert {each.batch_size for each in others} == {first.batch_size}
+
+
 def test_numbers_without_a_point_are_numbers(tmp_path):
     """YAML 1.1 takes 1e-4 for text."""
     config = load_config(written(tmp_path, "c.yaml", "optimizer: {learning_rate: 1e-4, weight_decay: 0}\n"))
@@ -121,6 +150,13 @@ def test_numbers_without_a_point_are_numbers(tmp_path):
         ("stream.recipe.gama=2", r"unknown recipe key 'gama'.*gamma"),
         ("stream.recipe.lead_frames=1", r"stream\.recipe\.lead_frames: leave it out"),
         ("stream.spec.flow_from=3", r"stream\.spec\.flow_from: section loss decides"),
+        ("stream.mix=3", r"stream\.mix\.0 = None: give keys of section stream and weight"),
+        ("stream.mix=[{weight: 1.2}]", r"stream\.mix\.0 = {'weight': 1\.2}: give .* at most 1"),
+        ("stream.mix=[{videos: a}]", r"stream\.mix\.0 = {'videos': 'a'}: give keys"),
+        ("stream.mix=[{weight: .7}, {weight: .7}]", r"stream\.mix\.1 = {'weight': 0\.7}: give"),
+        ("stream.mix=[{weight: .5, mix: []}]", r"stream\.mix\.0 = "),
+        ("stream.mix=[{weight: .5, lst: a}]", r"unknown key stream\.mix\.0\.lst \(did you mean 'list'"),
+        ("stream.mix=[{weight: .5, spec: {flow_from: 3}}]", r"stream\.mix\.0\.spec\.flow_from: section loss decides"),
         ("stream.spec.preset=natural-davis346", r"natural-davis346 names a recipe: set stream\.recipe"),
         ("stream.spec.voxel_dtype=int4", r"voxel_dtype = 'int4'"),
         ("loss.l1_weight=0", r"l1_weight, lpips_weight and temporal_weight are all 0"),

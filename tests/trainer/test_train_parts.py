@@ -14,12 +14,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trainer.config import OptimizerConfig, RunConfig, StreamConfig
-from trainer.feed import server_flags
+from tests.client.fake_server import SPEC, FakeServer
+from trainer.config import OptimizerConfig, RunConfig, StreamConfig, TrainConfig
+from trainer.feed import flags_of, streams
 from trainer.learner import AveragedNetwork, learning_rate
 from trainer.models import FireNet
 from trainer.run.distributed import Ranks, ranks
 from trainer.run.interruption import StopRequest
+from trainer.run.reporting import _planned_steps
+from trainer.tasks import Asked
 from trainer.train import serving
 from v2v_protocol.errors import ServerLost, StateMismatch, UsageError, V2VError, WorkerCrashLoop
 from v2v_protocol.recipe import Recipe
@@ -29,17 +32,16 @@ ALONE = Ranks(0, 1, torch.device("cpu"))
 
 def test_a_local_server_gets_the_options_it_needs_at_its_start() -> None:
     recipe = Recipe.from_dict({"preset": "clean", "bins": 3})
-    plain = server_flags(StreamConfig(videos="clips", rows="top:0.5"), recipe)
-    assert plain[:2] == ["--rows", "top:0.5"]
+    plain = flags_of(StreamConfig(videos="clips", rows="top:0.5"), recipe)
+    assert plain[-2:] == ["--rows", "top:0.5"]
     assert plain[plain.index("bins=3") - 1] == "--set"
     assert "--list" not in plain
     assert "--scene" not in plain
-    asked = server_flags(StreamConfig(videos="clips", list="some.txt", spec={"scene": "auto"}), recipe)
-    assert asked[-4:] == ["--list", "some.txt", "--scene", "auto"]
-    assert server_flags(StreamConfig(videos="clips", spec={"preset": "natural"}), recipe)[-2:] == ["--scene", "auto"]
-    assert "--scene" not in server_flags(
-        StreamConfig(videos="clips", spec={"preset": "natural", "scene": "off"}), recipe
-    )
+    asked = flags_of(StreamConfig(videos="clips", list="some.txt", spec={"scene": "auto"}), recipe)
+    assert asked[-6:] == ["--scene", "auto", "--rows", "full", "--list", "some.txt"]
+    assert flags_of(StreamConfig(videos="clips", spec={"preset": "natural"}), recipe)[-4:-2] == ["--scene", "auto"]
+    assert flags_of(StreamConfig(videos_kind="sequences"), recipe)[-2:] == ["--videos-kind", "sequences"]
+    assert "--scene" not in flags_of(StreamConfig(videos="clips", spec={"preset": "natural", "scene": "off"}), recipe)
 
 
 def test_the_started_server_is_announced_before_it_is_ready(
@@ -279,3 +281,19 @@ def test_the_process_group_is_destroyed_after_training(monkeypatch: pytest.Monke
 def test_a_missing_gpu_is_reported() -> None:
     with pytest.raises(UsageError, match=r"compute\.device = cuda: PyTorch sees no GPU"), ranks("cuda", 60.0):
         pass
+
+
+TINY = {name: getattr(SPEC.recipe, name) for name in ("voxels_per_clip", "bins", "crop_height_px", "crop_width_px")}
+
+
+def test_a_run_trains_on_the_batches_of_its_streams() -> None:
+    with FakeServer(sequences=40, spec=SPEC) as one, FakeServer(sequences=40, spec=SPEC) as other:
+        one.catalogue, other.catalogue = "one", "other"
+        mix = [{"weight": 0.25, "address": other.address}]
+        settings = StreamConfig(address=one.address, batch_size=4, recipe=TINY, mix=mix)
+        config, asked = TrainConfig(stream=settings), Asked(arrays=("voxels", "frames"))
+        dataset = streams(config, asked, [one.address, other.address])
+        batches = list(dataset)
+        assert len(batches) == len(dataset) == 13
+        assert sum(each.provenance[0].id.catalogue_digest == "other" for each in batches) == 3
+        assert _planned_steps(dataset, config) == 13

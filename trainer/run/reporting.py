@@ -266,8 +266,7 @@ def _planned_steps(dataset: V2VStreamDataset, config: TrainConfig) -> int | None
     """Return the number of steps of the whole run; None if only a time limit ends it."""
     if config.run.seconds and not config.run.steps:
         return None
-    sequences = 0 if dataset.stream is None else dataset.stream.sequences
-    steps = config.run.epochs * (sequences // (dataset.world_size * config.stream.batch_size))
+    steps = config.run.epochs * len(dataset)
     return min(steps, config.run.steps or steps)
 
 

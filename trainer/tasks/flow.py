@@ -32,10 +32,11 @@ class FlowTaskSettings:
     """The loss.
 
     Attributes:
-        flow: "raft" on this device, or "stream": estimated by the server's workers.
+        flow: "raft" on this device, or "stream": estimated by the server's workers, or exact where the stream shows
+            photographs that move.
         raft_size, raft_weights: "small" or "large", and its weight file.
-        valid: which pixels count: "all" (published), or "consistent": those where forward and backward flow of the
-            stream agree.
+        valid: which pixels count: "all" (published), or "consistent": those that the stream's ``flow_valid`` admits.
+            There forward and backward flow agree, or a point of a photograph is seen at both ends.
         gamma: for a network that refines its estimate, update i of n has weight gamma^(n - 1 - i); 0: only the last
             one counts (published).
     """

@@ -30,7 +30,7 @@ def test_an_answer_passes_every_check_of_server_and_client(arrays: tuple[str, ..
     frames = answer(lease, "null-1")
     layout = array_layout(SMALL_SPEC.recipe, SMALL_SPEC.voxel_dtype, arrays)
     header = check_result(frames, request, Form.of(layout))
-    found = decode_sample(header, frames[1:])
+    found = decode_sample(layout, frames[1:])
     assert {name: (array.dtype.name, array.shape) for name, array in found.items()} == layout
     assert all(np.all(array == 1) for array in found.values())
     provenance = Provenance.from_dict(decode_map(header.provenance))

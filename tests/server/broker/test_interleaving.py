@@ -12,7 +12,7 @@ from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from tests.server.peers import CREDIT, DEADLINE, peers, sample_frames
-from v2v_client.memory import Answer, Slots
+from v2v_client.memory import Slots
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
 from v2v_protocol.messages import (
     Denied,
@@ -384,16 +384,16 @@ class WithSlots(Interleaving):
         slots = self.slots[identity]
         key = header.epoch * 1000 + header.index
         slot = slots._named.get(key)
-        answer = slots.record_arrival(key, header.slot, in_message=in_message)
-        assert answer is not Answer.NOWHERE
-        self.abandoned += answer is Answer.ABANDONED
-        if answer is Answer.THERE:
+        slot_is_free = slots.record_arrival(key, header.slot, in_message=in_message)
+        assert slot_is_free is not None
+        self.abandoned += not slot_is_free
+        if not in_message:
             assert slot is not None
             self.read_there += 1
             place = (slot.arena, slot.number)
             assert place not in {(lease.arena, lease.slot) for lease in self.lent.values()}, "it may change as we read"
             assert self.memory[place] == (header.epoch, header.index, self.seed[identity])
-        if slot is not None and answer is not Answer.ABANDONED:
+        if slot is not None and slot_is_free:
             self.expected[slot.arena].discard(slot.number)
             if not self.expected[slot.arena]:
                 assert slot.arena not in {lease.arena for lease in self.lent.values()}, "its next batch may change"

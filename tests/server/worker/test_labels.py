@@ -147,7 +147,7 @@ def test_a_toy_label_with_a_cap_needs_no_field_of_its_own(
     assert Provenance.from_dict(sample.provenance.to_dict()) == sample.provenance
     assert "dropped" not in plain.provenance.to_dict()
     arrays = {name: torch.from_numpy(array[None].copy()) for name, array in sample.arrays.items()}
-    batch = Batch(arrays, (0,), 0, (sample.provenance,), {}, 0.0, 0.0, 1)
+    batch = Batch(arrays, (0,), 0, (sample.provenance,), {}, 0.0, 0.0, 1, Recipe())
     for frame, rows in zip(frames, batch.rows("points")[0], strict=True):
         assert rows.tolist() == [[frame, 0], [frame, 1]][: 2 if frame % 3 < 2 else 1]
     assert batch.points is batch["points"]
