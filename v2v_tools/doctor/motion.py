@@ -22,8 +22,6 @@ _LONGEST_SECONDS = 30.0
 """After this time no other video is begun."""
 _LONGEST_VIDEO_SECONDS = 90.0
 """The first one may compile the kernels."""
-_Fields = tuple[tuple[float, ...], float, float, float, float, float, float, float]
-"""Fields of a Prediction, in order."""
 
 
 def look_at_motion(
@@ -68,7 +66,7 @@ def _middles(catalogue: Catalogue) -> Iterator[Excerpt]:
             yield replace(each, window=(top + (rows - height) // 2, left + (columns - width) // 2, height, width))
 
 
-def _predicted(source: VideoSource, middle: Excerpt) -> _Fields | None:
+def _predicted(source: VideoSource, middle: Excerpt) -> tuple[float, ...] | None:
     """Return the fields of the prediction; None where the frames do not decode."""
     import numpy as np
 

@@ -19,7 +19,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_recipe, recipe_setting
 from v2v_protocol.write_aside import write_file, write_json
-from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, Prediction
+from v2v_server.motion.prediction import SUBSTEP_PX, Prediction
 from v2v_server.simulation.precision import warm_up
 from v2v_server.system.process import keep_freed_memory
 from v2v_server.video.rows import Rows
@@ -183,14 +183,15 @@ def _measured(
 
 def _record(setting: ServeSetting, corpus: Mapping[str, CorpusForm], loss: Prediction) -> dict[str, Any]:
     form, spec = corpus[setting.form], setting.spec
-    predicted = {0.0: loss.errors("linear"), SUBSTEP_PX: loss.errors("divided")}.get(spec.substep_px)
+    predicted = loss.loss(divided=spec.substep_px > 0.0) if spec.substep_px in (0.0, SUBSTEP_PX) else None
     known = predicted if loss.can_be_followed or loss.is_slow else None
     return {
         "measure": "setting", "name": setting.name, "way": setting.way, "form": setting.form,
         "samples_per_decode": spec.samples_per_decode, "substep_px": spec.substep_px, "tolerance": spec.tolerance,
         "bytes_ratio": form.nbytes / corpus[SOURCE].nbytes, "bytes_per_video_second": form.nbytes / form.seconds,
         "px_per_frame": loss.px_per_frame,
-        **{f"predicted_{name}": None if known is None else getattr(known, name) for name in PredictedErrors._fields},
+        **{f"predicted_lost{'_' if name else ''}{name}": None if known is None else getattr(known, name or "likely")
+           for name in ("", "low", "high")},
     }  # fmt: skip
 
 
