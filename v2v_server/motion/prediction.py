@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from v2v_server.motion.clip import levels_between
 from v2v_server.motion.lanes import CELL_PX
-from v2v_server.motion.matching import UNITS_PER_PX, without_slow
+from v2v_server.motion.matching import UNITS_PER_PX
 from v2v_server.motion.plane import motions
 from v2v_server.simulation.intensity import fine_table, log_table
 from v2v_server.simulation.view import FrameArray
@@ -37,7 +37,6 @@ SUBSTEP_PX, THRESHOLD = 1.0, 0.2
 """``substep_px`` and contrast threshold that predictions are for."""
 _MOST_FRAMES = 33
 """Frames that a prediction is made from: a fraction of a second's work."""
-_SHORTEST = math.ceil(SUBSTEP_PX * UNITS_PER_PX / 2)
 _GAMMA, _LOG_EPS = 2.2, 1e-3
 _WEIGHTS = (
     (-0.03, (0.0, 0.16, 0.2, 0.05, -1.6)),
@@ -111,7 +110,7 @@ class Prediction:
         ways = self.along * self.across_twice, self.across * self.along_twice
         smear = math.log(ways[0] / ways[1]) if min(ways) > 0.0 else 0.0
         return Features(
-            max(1.0 - self.linear / max(self.divided, 1.0), 0.0),
+            max(1.0 - self.linear / self.divided, 0.0) if self.divided else 0.0,
             min(max(smear - _SHARP, 0.0) / (_SMEARED - _SHARP), 1.0) * math.log1p(self.px_per_frame),
             max(self.unsteady / max(self.paired, 1.0) - _STEADY, 0.0),
             self.flicker / max(self.linear, 1.0),
@@ -168,7 +167,8 @@ def predict(pictures: FrameArray) -> Prediction:
     first = np.arange(count - 1) + np.searchsorted(levels.at.step, np.arange(count - 1))
     # Without the dtype NumPy makes a copy in int64.
     events = _by_cell(np.add, np.add.reduceat(along, first, dtype=np.int16))
-    moved = without_slow(vectors, _SHORTEST)[1:].astype(np.float64) / UNITS_PER_PX
+    moved = vectors[1:] / UNITS_PER_PX
+    moved *= np.hypot(moved[:, :1], moved[:, 1:]) >= SUBSTEP_PX / 2
     speed = np.hypot(moved[:, 0], moved[:, 1])
     moves = speed > 0.0
     changed = _by_cell(np.add, cv2.absdiff(pictures[1:], pictures[:-1])) / CELL_PX**2

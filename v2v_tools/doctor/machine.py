@@ -19,7 +19,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from packaging.requirements import Requirement
 
@@ -139,23 +138,13 @@ def _libraries() -> Iterator[Finding]:
         OK, "libraries",
         f"PyAV {av.__version__} (libavcodec {ffmpeg}), libzmq {zmq.zmq_version()}, numba {numba.__version__}",
     )  # fmt: skip
-    absent = [name for name in DECODERS if not _has_codec(av, name, "r")]
-    absent += [f"{name} (encoder)" for name in ENCODERS if not _has_codec(av, name, "w")]
-    if absent:
+    if absent := [name for name in (*DECODERS, *ENCODERS) if name not in av.codecs_available]:
         change = "pip install --force-reinstall av, whose wheels bring FFmpeg with all of them"
         yield Finding(NOTE, "codecs", f"this FFmpeg lacks {', '.join(absent)}", change)
     else:
         yield Finding(OK, "codecs", f"decodes {', '.join(DECODERS)}; encodes {', '.join(ENCODERS)}")
     if not zmq.has("curve"):
         yield Finding(NOTE, "keys", "this libzmq has no CURVE: no connections with keys", "pip install pyzmq again")
-
-
-def _has_codec(av: Any, name: str, mode: str) -> bool:
-    try:
-        av.Codec(name, mode)
-    except ValueError:  # PyAV's UnknownCodecError is one
-        return False
-    return True
 
 
 def _torch() -> Finding:
@@ -177,11 +166,8 @@ def _torch() -> Finding:
 
 
 def _cards() -> str:
-    program = shutil.which("nvidia-smi")
-    if program is None:
-        return ""
-    with suppress(OSError, subprocess.TimeoutExpired):
-        done = subprocess.run([program, "-L"], capture_output=True, text=True, timeout=30, check=False)
+    with suppress(OSError, subprocess.TimeoutExpired):  # the first where there is no such program
+        done = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=30, check=False)
         if done.returncode == 0:
             return ", ".join(re.findall(r"^GPU \d+: ([^(\n]+?) *\(", done.stdout, re.M))
     return ""

@@ -48,14 +48,12 @@ def look_at_motion(
     from v2v_tools.motion import describe_loss
 
     total = sum((Prediction(*each) for each in found.values()), Prediction())
-    change = ""
-    if not total.is_slow:
-        change = "more frames a second lose less"
-        if total.can_be_followed:
-            change += "; so does substep_px: 1 in the spec, for processor time"
+    change = "more frames a second lose less"
+    if total.can_be_followed and not total.uncovers:
+        change += "; so does substep_px: 1 in the spec, for processor time"
     loss = describe_loss(total, [each for id in found for each in defects.get(id, ())])
     text = f"{loss}; {_FRAMES} frames in the middle of {len(found)} videos"
-    yield "ok" if total.is_slow else "note", "motion", text.removeprefix("motion: "), change
+    yield ("ok", "motion", text.removeprefix("motion: "), "") if total.is_slow else ("note", "motion", text, change)
 
 
 def _middles(catalogue: Catalogue) -> Iterator[Excerpt]:

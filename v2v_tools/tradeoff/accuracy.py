@@ -20,9 +20,7 @@ import numpy as np
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import SampleParams
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.motion.prediction import Prediction, predict
 from v2v_server.simulation.clip import simulate_clip
-from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.kernels import Voxels
 from v2v_server.worker.arrays import SampleContext
 from v2v_server.worker.produce import decode_for, plan_sample, sample_context
@@ -99,12 +97,6 @@ def accuracy(model: Places, others: Mapping[str, Places], *, until: float) -> di
                 changed = dataclasses.replace(camera, **changes)
                 tallies[name][threshold] += compare(simulated(exact, changed).voxels, truth[threshold])
     return tallies
-
-
-def predicted_loss(places: Places) -> Prediction:
-    """Predict what the first sample of each place loses between its frames."""
-    views = (seen(places, place)[0] for place in range(len(places.leases)))
-    return sum((predict(eight_bits(view.view, view.signal)) for view in views), Prediction())
 
 
 def parts(places: Places, *, until: float) -> dict[str, Any]:

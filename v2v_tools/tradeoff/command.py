@@ -19,11 +19,10 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_recipe, recipe_setting
 from v2v_protocol.write_aside import write_file, write_json
-from v2v_server.motion.prediction import SUBSTEP_PX, Prediction
 from v2v_server.simulation.precision import warm_up
 from v2v_server.system.process import keep_freed_memory
 from v2v_server.video.rows import Rows
-from v2v_tools.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, Places, accuracy, parts, predicted_loss
+from v2v_tools.tradeoff.accuracy import DRAW_ROW, NOISE_ROW, Places, accuracy, parts
 from v2v_tools.tradeoff.diversity import diversity
 from v2v_tools.tradeoff.forms import BESIDE, DEFAULT_FORMS, SOURCE, STORES, CorpusForm, forms
 from v2v_tools.tradeoff.front import best
@@ -148,9 +147,8 @@ def _measured(
         singles = {setting.single.name: sources[setting.single] for setting in mine}
         _tell(f"comparing {len(singles)} ways to make samples")
         tallies = accuracy(sources[model], singles, until=begun + _ACCURACY_SHARE * budget)
-        loss = predicted_loss(sources[model])
         for setting in mine:
-            records.append(_record(setting, corpus, loss) | error_fields(tallies[setting.single.name]))
+            records.append(_record(setting, corpus) | error_fields(tallies[setting.single.name]))
         if not number:
             scale = [{"measure": "scale", "way": name, **error_fields(tallies[name])} for name in (NOISE_ROW, DRAW_ROW)]
     _tell("measuring diversity and the parts of a sample")
@@ -181,17 +179,12 @@ def _measured(
     return records + scale + taken + alike
 
 
-def _record(setting: ServeSetting, corpus: Mapping[str, CorpusForm], loss: Prediction) -> dict[str, Any]:
+def _record(setting: ServeSetting, corpus: Mapping[str, CorpusForm]) -> dict[str, Any]:
     form, spec = corpus[setting.form], setting.spec
-    predicted = loss.loss(divided=spec.substep_px > 0.0) if spec.substep_px in (0.0, SUBSTEP_PX) else None
-    known = predicted if loss.can_be_followed or loss.is_slow else None
     return {
         "measure": "setting", "name": setting.name, "way": setting.way, "form": setting.form,
         "samples_per_decode": spec.samples_per_decode, "substep_px": spec.substep_px, "tolerance": spec.tolerance,
         "bytes_ratio": form.nbytes / corpus[SOURCE].nbytes, "bytes_per_video_second": form.nbytes / form.seconds,
-        "px_per_frame": loss.px_per_frame,
-        **{f"predicted_lost{'_' if name else ''}{name}": None if known is None else getattr(known, name or "likely")
-           for name in ("", "low", "high")},
     }  # fmt: skip
 
 

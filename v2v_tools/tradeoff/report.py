@@ -44,9 +44,6 @@ _SETTINGS: _Columns = (
     ("bytes_ratio", "x disk", "{:.2f}", 1),
     ("bytes_per_video_second", "MB/s", "{:.2f}", 1e-6),
     (ERROR_KEY, f"voxels {ERROR_THRESHOLD:g}", "{:.2f}", 100),
-    ("predicted_lost", "lost", "{:.0f}", 100),
-    ("predicted_lost_low", "from", "{:.0f}", 100),
-    ("predicted_lost_high", "to", "{:.0f}", 100),
     ("dominated_by", "dominated by", "{}", 1),
 )
 _PARTS: _Columns = (
@@ -80,7 +77,7 @@ def error_fields(tallies: Mapping[float, Tally]) -> dict[str, Any]:
 
 def name_dominated(records: Sequence[dict[str, Any]]) -> None:
     """Add to each setting's record a setting that dominates it in speed, errors, diversity and disk space, or None."""
-    keys = ("cpu_seconds_per_sample", ERROR_KEY, "predicted_lost", "samples_per_decode", "bytes_per_video_second")
+    keys = ("cpu_seconds_per_sample", ERROR_KEY, "samples_per_decode", "bytes_per_video_second")
     # Without events there is no relative error, and no form is worse than another.
     found = dominators(
         {r["name"]: tuple(math.inf if r[key] is None else float(r[key]) for key in keys) for r in records}
@@ -111,8 +108,7 @@ def tables(records: Sequence[Record]) -> str:
     ]
     about = (
         f"CPU s/batch: of {BATCH} samples; x disk: of the source; MB/s: of video; voxels: error against the full "
-        "model, per cent\nlost, from, to: per cent of the events that are predicted to be lost between frames at "
-        "c = 0.2, and its interval; -: unpredictable\n"
+        "model, per cent\n"
     )
     parts = [
         format_table(listed, _SETTINGS) + about,
