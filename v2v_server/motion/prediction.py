@@ -51,7 +51,7 @@ _STILL_GREY, _TEXTURE_GREY = 3.0, 8.0
 """Mean change, at most, and range of grey levels, at least, of a cell that rests and would show a motion."""
 
 
-class Loss(NamedTuple):
+class PredictedLoss(NamedTuple):
     """A predicted share of the events, and the interval that held for nine of ten scenes of other kinds."""
 
     low: float
@@ -132,7 +132,7 @@ class Prediction:
         """Return whether something moves over a still picture, where sub-steps make false events."""
         return self.features.uncovered > _UNCOVERS
 
-    def loss(self, *, divided: bool = False) -> Loss:
+    def loss(self, *, divided: bool = False) -> PredictedLoss:
         """Return the predicted loss in bins of a frame.
 
         Args:
@@ -140,7 +140,7 @@ class Prediction:
         """
         kept = self.linear / self.divided if self.divided and not divided else 1.0
         hidden = [sum(map(operator.mul, weights, self.features)) + start for start, weights in _WEIGHTS]
-        return Loss(*(min(max(1.0 - kept * math.exp(-each), 0.0), 1.0) for each in hidden))
+        return PredictedLoss(*(min(max(1.0 - kept * math.exp(-each), 0.0), 1.0) for each in hidden))
 
 
 def predict(pictures: FrameArray) -> Prediction:
