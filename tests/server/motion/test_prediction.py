@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tracemalloc
 
 import numpy as np
@@ -78,9 +79,22 @@ def test_blur_along_the_motion_hides_losses() -> None:
     assert blurred.loss(divided=True).likely > sharp.loss(divided=True).likely + 0.1
 
 
-@given(st.lists(st.floats(0.0, 1e9), min_size=12, max_size=12))
-def test_a_loss_lies_in_its_interval(sums: list[float]) -> None:
-    found = Prediction(*sums)
+SHARES = st.floats(0.0, 1.0)
+
+
+@given(
+    divided=st.floats(0.0, 1e9), linear=st.floats(0.0, 1.2), moving=SHARES, beside=SHARES, px=st.floats(0.5, 100.0),
+    unsteady=SHARES, flicker=SHARES, sharp=st.lists(st.floats(0.0, 1e12), min_size=4, max_size=4),
+)  # fmt: skip
+def test_a_loss_lies_in_its_interval(
+    divided: float, linear: float, moving: float, beside: float, px: float, unsteady: float, flicker: float,
+    sharp: list[float],
+) -> None:  # fmt: skip
+    moves = divided * moving
+    found = Prediction(
+        divided * linear, divided, moves, moves * beside, moves * math.log(px), moves, moves * unsteady,
+        divided * linear * flicker, *sharp,
+    )  # fmt: skip
     for each in (found.loss(), found.loss(divided=True)):
         assert 0.0 <= each.low <= each.likely <= each.high <= 1.0
     assert found.linear > found.divided or found.loss().likely >= found.loss(divided=True).likely
