@@ -36,6 +36,7 @@ BENCHES = {
     "physics": "accuracy.physics",
     "motion": "speed.motion",
     "substeps": "accuracy.substeps",
+    "loss": "accuracy.loss",
     "fit": "accuracy.fit",
     "sensor": "accuracy.sensor",
     "scene": "accuracy.scene",

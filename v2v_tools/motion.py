@@ -99,19 +99,19 @@ def describe_loss(found: Prediction, defects: Sequence[Defect] = ()) -> str:
         causes = dict.fromkeys(f"{each.text}: {CHANGES[each.kind]}" for each in defects if each.kind in CHANGES)
         return f"changes that motion does not explain: {'; '.join(causes)}"
     if found.is_slow:
-        return (
-            f"motion: {found.px_per_frame:.2g} px a frame at the median of what moves; substep_px would change little"
-        )
+        return f"motion: {found.px_per_frame:.2g} px a frame where something moves; substep_px would change little"
     if not found.can_be_followed:
         return (
             "fast changes that motion does not explain, such as flicker or vibration: events between frames are lost, "
             "and substep_px restores few of them; take videos with more frames a second"
         )
-    off, on = (max(5, 5 * round(20 * found.errors(setting).lost)) for setting in ("linear", "divided"))
+    (low, off, high), (least, on, most) = (
+        [round(100 * share) for share in found.loss(divided=divided)] for divided in (False, True)
+    )
     return (
-        f"fast motion: {found.px_per_frame:.2g} px a frame at the median of what moves; about {off} % of the events "
-        f"are lost between frames, {on} % with --substep-px {SUBSTEP_PX:g} "
-        "(prediction; motion blur hides further losses)"
+        f"fast motion: {found.px_per_frame:.2g} px a frame where something moves; about {off} % ({low} to {high} %) of "
+        f"the events are lost between frames, {on} % with --substep-px {SUBSTEP_PX:g} ({least} to {most} %)"
+        + ("; it makes false events where something moves over a still picture" if found.uncovers else "")
     )
 
 

@@ -9,6 +9,9 @@ frame. Both sides start with the same residuals and are summed into the same bin
     count error   (events of V2V - events) / events, whatever their sign
     voxel error   sum of |V2V - true| / sum of |true|, over the signed counts of common bins and pixels
 
+With a low-pass, the events of a bin are those of its net change. The photograph "coffee" at 30 frames a second shows
+how many of the events with 24 bins a frame fire with fewer bins.
+
 Bars: scenes without a turn are exact at every frame rate; from all frames of the film, V2V and the event-by-event
 simulation of the same frames differ in at most 60 bins of a million.
 """
@@ -48,6 +51,7 @@ EVERY = (1, 2, 4, 8, 16, 48)
 SPEEDS_PX = (0.005, 0.02, 0.1, 0.5)  # px per rendered frame: 6 to 600 px/s
 VIDEO_EVERY, VIDEO_BIN_FRAMES, VIDEO_SIDE_PX = (1, 2, 4, 8, 16), 16, 320
 LARGEST_DIFFERENCE_PPM = 60.0
+LOW_PASS_HZ, LOW_PASS_PX, PARTS = (30.0, 100.0, 300.0), (2.0, 6.0, 12.0), (1, 2, 3, 6, 24)
 
 
 def analytic(threshold: float = 0.2) -> Iterator[dict[str, Any]]:
@@ -119,6 +123,22 @@ def moved_photographs() -> Records:
         | {key: float(np.mean([each[key] for each in found])) for key in found[0]}
         for (threshold, speed, every), found in cells.items()
     ]  # fmt: skip
+
+
+def low_passed() -> Iterator[dict[str, Any]]:
+    """Yield the events of each number of bins a frame, as shares of those with most, by low-pass and motion."""
+    for px in LOW_PASS_PX:
+        frames = np.rint(255.0 * moved_photograph("coffee", 31, 64, 64, px)).astype(np.uint8)
+        for hertz in LOW_PASS_HZ:
+            made = {
+                parts: simulate(
+                    frames, threshold_pos=0.2, bins=parts, grids_per_frame=1, frames_per_second=30.0,
+                    photoreceptor_hz=hertz, seed=SEED, dtype="int16",
+                ).array("event_counts").sum(dtype=np.int64)
+                for parts in PARTS
+            }  # fmt: skip
+            shares = {f"share_{parts}": float(made[parts] / made[PARTS[-1]]) for parts in PARTS}
+            yield {"measure": "low-pass", "motion_px_per_frame": px, "photoreceptor_hz": hertz, **shares}
 
 
 def filmed(path: Path) -> Iterator[dict[str, Any]]:
@@ -194,9 +214,14 @@ def measure(asked: argparse.Namespace) -> Report:
         pivot(scenes, {"scene": "count / voxel error at c = 0.2", "events_true": "events"}, "frame_rate_hz", "Hz"),
         pivot(photographs, {"motion_px_per_frame": title, "frame_rate_hz": "Hz"}, "threshold", "c ="),
     ]
+    low_pass = list(low_passed())
+    columns: list[Column] = [("photoreceptor_hz", "low-pass, Hz", "{:g}", 1)]
+    columns += [("motion_px_per_frame", "px a frame", "{:g}", 1)]
+    columns += [(f"share_{parts}", f"bins {parts}", "{:.1%}", 1) for parts in PARTS]
+    tables.append((low_pass, columns))
     if film:
         tables.append(pivot(film, {"every": "film, every n-th frame", "frame_rate_hz": "Hz"}, "threshold", "c ="))
-    records = [*scenes, *photographs, *film]
+    records = [*scenes, *photographs, *low_pass, *film]
     return Report(records, tables, missed=missed(records))
 
 

@@ -9,15 +9,12 @@ is then all of its frames, and every n-th one is seen.
 Bars: moving photographs (mean of three) at substep_px 1: 10 % signed and 30 % split in bins of a frame at 4.8 and 12 px
 a frame; in bins of 10 ms at 30 frames a second 45, 38 and 50 % signed at 2, 4 and 10 px, and never worse than linear at
 0.3 and 0.8 px.
-
-"predicted" is what ``v2v_server/motion/prediction.py`` predicts from the frames, in bins of a frame. Its constants
-(FITS) are least squares over the moving photographs; the other scenes and films check it.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -42,7 +39,7 @@ from tests.oracles.rendered import (
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_server.motion import levels_between, motions
-from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors, predict
+from v2v_server.motion.prediction import SUBSTEP_PX
 from v2v_server.simulation.voxel import FINE_STEPS, Levels
 from v2v_server.video.probe import probe
 
@@ -57,7 +54,6 @@ BARS = {
 }  # fmt: skip
 SLOW_PX = 1.0
 EVERY, VIDEO_STEPS = (4, 8), 8
-SETTINGS = (("linear", ""), ("divided", ", sub-steps"))
 _COLUMNS: tuple[Column, ...] = (
     ("scene", "scene", "{}", 1),
     ("px_per_frame", "px a frame", "{:g}", 1),
@@ -71,15 +67,6 @@ _COLUMNS: tuple[Column, ...] = (
     ("signed_divided", "signed", "{:.1%}", 1),
     ("split_divided", "split", "{:.1%}", 1),
 )
-_PREDICTED: tuple[Column, ...] = (
-    ("scene", "predicted", "{}", 1),
-    ("px_per_frame", "px a frame", "{:g}", 1),
-    ("frames_per_second", "frames/s", "{:g}", 1),
-    ("predicted_px_per_frame", "found", "{:.1f}", 1),
-    ("explained", "explained", "{:.0%}", 1),
-    *((f"predicted_{key}_{name}", f"{key}{title}", "{:.0%}", 1)
-      for name, title in SETTINGS for key in PredictedErrors._fields),
-)  # fmt: skip
 
 
 def light_of(frames: Frames, levels: Levels | None, seconds: Reals) -> tuple[Reals, Reals]:
@@ -105,38 +92,6 @@ def compared(frames: Frames, seconds: Reals, edges: Reals, true: Counts) -> dict
     return found
 
 
-def predicted(frames: Frames) -> dict[str, float]:
-    """Return the apparent and predicted errors of a clip."""
-    found = predict(frames)
-    record = {"predicted_px_per_frame": found.px_per_frame, "explained": found.explained}
-    record |= {f"apparent_{key}": value for key, value in found.apparent._asdict().items()}
-    for name, _ in SETTINGS:
-        record |= {f"predicted_{key}_{name}": value for key, value in found.errors(name)._asdict().items()}
-    return record
-
-
-def measured_loss(record: Mapping[str, Any], key: str, name: str) -> float:
-    """Return a measured error under the name of a predicted one: events lost are positive."""
-    return -float(record[f"count_{name}"]) if key == "lost" else float(record[f"{key}_{name}"])
-
-
-def fits(records: Records) -> Iterator[str]:
-    """Yield the least-squares fit of each true error of the photographs, and how far the predictions are off."""
-    framed = [record for record in records if "explained" in record]
-    fitted = [record for record in framed if record["scene"] in PHOTOGRAPHS]
-    for which, some in (("fitted", fitted), ("held out", [record for record in framed if record not in fitted])):
-        for name, _ in SETTINGS:
-            texts = []
-            for key in PredictedErrors._fields:
-                true = [measured_loss(record, key, name) for record in some]
-                wrong = np.subtract(true, [record[f"predicted_{key}_{name}"] for record in some])
-                texts.append(f"{key} {100 * np.sqrt(np.mean(wrong**2)):.1f} (most {100 * np.abs(wrong).max():.0f})")
-                if which == "fitted":
-                    slope, start = np.polyfit([record[f"apparent_{key}"] for record in some], true, 1)
-                    yield f"FITS {name} {key}: Fit({start:.3f}, {slope:.3f})"
-            yield f"predictions off by, {which}, {name}, points rms: {', '.join(texts)}"
-
-
 def rendered(side: int = 160, steps: int = 4) -> Iterator[dict[str, Any]]:
     """Yield one record for each scene, speed and bin."""
     seconds = np.arange(steps + 1) / FRAMES_PER_SECOND
@@ -152,7 +107,7 @@ def rendered(side: int = 160, steps: int = 4) -> Iterator[dict[str, Any]]:
                 yield {
                     "measure": "rendered", "scene": name, "px_per_frame": px, "bin": size,
                     "frames_per_second": FRAMES_PER_SECOND,
-                    **found, **(predicted(frames) if size == "frame" else {}),
+                    **found,
                 }  # fmt: skip
 
 
@@ -172,7 +127,7 @@ def filmed(path: Path) -> Iterator[dict[str, Any]]:
         found = compared(frames[::every], seconds[::every], seconds[::every], true)
         yield {
             "measure": "film", "scene": path.name, "bin": "frame",
-            "frames_per_second": facts.frames_per_second / every, **found, **predicted(frames[::every]),
+            "frames_per_second": facts.frames_per_second / every, **found,
         }  # fmt: skip
 
 
@@ -201,5 +156,4 @@ def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
     scenes = list(rendered())
     records = scenes + [each for path in asked.video for each in filmed(path)]
-    tables = [(records, _COLUMNS), ([each for each in records if "explained" in each], _PREDICTED)]
-    return Report(records, tables, list(fits(records)), missed(scenes))
+    return Report(records, [(records, _COLUMNS)], missed=missed(scenes))

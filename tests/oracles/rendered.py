@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage  # type: ignore[import-untyped]
@@ -29,6 +30,8 @@ OTHERS = ("gravel", "parallax", "occlusion", "rotation", "zoom", "plain", "thin"
 NAMES = (*PHOTOGRAPHS, *OTHERS)
 _LONGEST_SECONDS, _PATH_HZ = 4.0, 9600
 _FLICKER_HZ, _FLICKER_SHARE = 10.0, 0.3
+_EXPOSED = 16
+_LEAVES, _LEAVES_SIDE_PX, _LEAST_LEAF_PX, _LARGEST_LEAF_PX = 12_000, 512, 1.5, 60.0
 
 
 class Counts(NamedTuple):
@@ -54,14 +57,24 @@ class RenderedScene:
     Attributes:
         name: of NAMES.
         light: the picture [height, width], 0 .. 1, of a time in seconds (0 .. 4).
+        exposure: part of the time between two frames that a frame collects light in, around its own moment.
     """
 
     name: str
     light: Callable[[float], Reals]
+    exposure: float = 0.0
 
     def frames(self, frames_per_second: float, count: int) -> npt.NDArray[np.uint8]:
         """Return the first frames of a video: [count, height, width]."""
-        return np.stack([np.rint(255.0 * self.light(n / frames_per_second)).astype(np.uint8) for n in range(count)])
+        seen = np.stack([self._exposed(n / frames_per_second, self.exposure / frames_per_second) for n in range(count)])
+        return np.rint(255.0 * seen).astype(np.uint8)
+
+    def _exposed(self, seconds: float, lasting: float) -> Reals:
+        if not lasting:
+            return self.light(seconds)
+        moments = seconds + lasting * np.linspace(-0.5, 0.5, _EXPOSED)
+        mean: Reals = np.mean([self.light(moment) ** GAMMA for moment in moments], axis=0)
+        return mean ** (1.0 / GAMMA)
 
     def counts(self, edges_seconds: Reals, threshold: float, rendered_hz: float) -> Counts:
         """Return the true events between the edges of bins, from levels at ``rendered_hz``, linear in between."""
@@ -107,27 +120,27 @@ def rendered_scene(name: str, height: int, width: int, px_per_second: float) -> 
     reach = max(height, width) / 2
 
     def moved(seconds: float, share: float = 1.0) -> tuple[Reals, Reals]:
-        down, right = _path(seconds) * px_per_second * share
+        down, right = path(seconds) * px_per_second * share
         return y - down, x - right
 
     def parallax(seconds: float) -> Reals:
         front = moved(seconds)
-        cover = np.clip(0.5 + 8.0 * (_photo("coins", front[0] / 2, front[1] / 2) - 0.45), 0.0, 1.0)
-        return _photo("coffee", *moved(seconds, 1 / 3)) * (1 - cover) + _photo("camera", *front) * cover
+        cover = np.clip(0.5 + 8.0 * (photo("coins", front[0] / 2, front[1] / 2) - 0.45), 0.0, 1.0)
+        return photo("coffee", *moved(seconds, 1 / 3)) * (1 - cover) + photo("camera", *front) * cover
 
     def occlusion(seconds: float) -> Reals:
         front = moved(seconds)
         radius = np.hypot(front[0] / (0.5 * reach), front[1] / (0.35 * reach))
         cover = np.clip(0.5 + (1.0 - radius) * 0.35 * reach, 0.0, 1.0)
-        return _photo("camera", y, x) * (1 - cover) + _photo("coffee", *front) * cover
+        return photo("camera", y, x) * (1 - cover) + photo("coffee", *front) * cover
 
     def rotation(seconds: float) -> Reals:
         angle = px_per_second * seconds / reach
-        return _photo("coffee", y * math.cos(angle) - x * math.sin(angle), y * math.sin(angle) + x * math.cos(angle))
+        return photo("coffee", y * math.cos(angle) - x * math.sin(angle), y * math.sin(angle) + x * math.cos(angle))
 
     def zoom(seconds: float) -> Reals:
         smaller = math.exp(-px_per_second * seconds / reach)
-        return _photo("coins", y * smaller, x * smaller)
+        return photo("coins", y * smaller, x * smaller)
 
     def plain(seconds: float) -> Reals:
         down, right = moved(seconds)
@@ -147,13 +160,13 @@ def rendered_scene(name: str, height: int, width: int, px_per_second: float) -> 
 
     def flicker(seconds: float) -> Reals:
         lamp = 1.0 - _FLICKER_SHARE * (0.5 + 0.5 * math.sin(2 * math.pi * _FLICKER_HZ * seconds))
-        return _photo("coffee", *moved(seconds)) * lamp
+        return photo("coffee", *moved(seconds)) * lamp
 
     kinds = {
         "parallax": parallax, "occlusion": occlusion, "rotation": rotation, "zoom": zoom, "plain": plain,
         "thin": thin, "flicker": flicker,
     }  # fmt: skip
-    return RenderedScene(name, kinds.get(name) or (lambda seconds: _photo(name, *moved(seconds))))
+    return RenderedScene(name, kinds.get(name) or (lambda seconds: photo(name, *moved(seconds))))
 
 
 def _binned(events: Events, sign: int, edges: Reals, pixels: int) -> npt.NDArray[np.int64]:
@@ -165,7 +178,7 @@ def _binned(events: Events, sign: int, edges: Reals, pixels: int) -> npt.NDArray
     return counted.reshape(bins, pixels)
 
 
-def _path(seconds: float) -> Reals:
+def path(seconds: float) -> Reals:
     """Return (down, right) after a time on the winding path, in units of the speed."""
     table = _path_table()
     place = min(seconds * _PATH_HZ, len(table) - 1.000001)
@@ -183,11 +196,25 @@ def _path_table() -> Reals:
 
 @lru_cache(maxsize=8)
 def _spline(name: str) -> Reals:
-    spline: Reals = ndimage.spline_filter(photograph(name).astype(np.float64) / 255.0, mode="mirror")
+    picture = dead_leaves(int(name.removeprefix("leaves"))) if name.startswith("leaves") else photograph(name) / 255.0
+    spline: Reals = ndimage.spline_filter(picture, mode="mirror")
     return spline
 
 
-def _photo(name: str, y: Reals, x: Reals) -> Reals:
+def dead_leaves(seed: int) -> Reals:
+    """Return opaque discs that lie on each other, as many of each size as in photographs (r ** -3): 0 .. 1."""
+    rng, finer = np.random.default_rng(seed), 4
+    canvas = np.full((finer * _LEAVES_SIDE_PX,) * 2, 128, np.uint8)
+    low, high = _LEAST_LEAF_PX**-2, _LARGEST_LEAF_PX**-2
+    for radius in (low + rng.random(_LEAVES) * (high - low)) ** -0.5:
+        x, y = rng.integers(0, finer * _LEAVES_SIDE_PX, 2).tolist()
+        cv2.circle(canvas, (x, y), round(finer * radius), int(rng.integers(13, 243)), -1)
+    fine = canvas.reshape(_LEAVES_SIDE_PX, finer, _LEAVES_SIDE_PX, finer) / 255.0
+    picture: Reals = fine.mean(axis=(1, 3))
+    return picture
+
+
+def photo(name: str, y: Reals, x: Reals) -> Reals:
     """Return a photograph at places relative to its middle, mirrored beyond its border."""
     spline = _spline(name)
     place = [y + (spline.shape[0] - 1) / 2, x + (spline.shape[1] - 1) / 2]

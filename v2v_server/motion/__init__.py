@@ -17,13 +17,12 @@ All of it but the prediction is integer arithmetic, so that every host makes the
 
 from v2v_server.motion.clip import cells_of, levels_between, levels_of, load, substeps
 from v2v_server.motion.matching import Vectors, motion
-from v2v_server.motion.plane import MotionOfCuts, MotionOfPictures, motions
+from v2v_server.motion.plane import MotionOfCuts, motions
 from v2v_server.motion.pyramid import Cells, Pyramid
 
 __all__ = [
     "Cells",
     "MotionOfCuts",
-    "MotionOfPictures",
     "Pyramid",
     "Vectors",
     "cells_of",

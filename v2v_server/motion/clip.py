@@ -19,7 +19,7 @@ from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS
 from v2v_server.motion.lanes import CELL_PX
 from v2v_server.motion.matching import UNITS_PER_PX, Vectors
 from v2v_server.motion.plane import motions
-from v2v_server.motion.pyramid import Cells, compiled, padded
+from v2v_server.motion.pyramid import Cells, padded
 from v2v_server.motion.warping import between
 from v2v_server.simulation.draw import resized_size
 from v2v_server.simulation.view import FrameArray, Window, contrast_table, crop_place, crop_region, resized
@@ -130,48 +130,35 @@ def levels_between(
         return None
     shortest = math.ceil(substep_px * UNITS_PER_PX / 2)
     vectors = np.ascontiguousarray(vectors)
-    steps, counts = [], []
-    for step, (before, after) in enumerate(pairwise(source_index.tolist())):
-        if before != after and (count := substeps(vectors[after], substep_px)) > 1:
-            steps.append((step, after))
-            counts.append(count - 1)
-    if not steps:
+    divided = [
+        (step, after, count - 1)
+        for step, (before, after) in enumerate(pairwise(source_index.tolist()))
+        if before != after and (count := substeps(vectors[after], substep_px)) > 1
+    ]
+    if not divided:
         return None
+    counts = [count for _, _, count in divided]
     grey = np.empty((sum(counts), height, width), np.uint16)
     first, shown, later = 0, -1, pictures[:0]
-    for (_, after), count in zip(steps, counts, strict=True):
+    for _, after, count in divided:
         earlier = later if shown == after - 1 else padded(np.ascontiguousarray(pictures[after - 1]))
         shown, later = after, padded(np.ascontiguousarray(pictures[after]))
         between(earlier, later, vectors[after], shortest, top, left, grey[first : first + count], mirrored=mirrored)
         first += count
-    at = np.repeat([step for step, _ in steps], counts)
+    at = np.repeat([step for step, _, _ in divided], counts)
     share = np.concatenate([np.arange(1, count + 1) / (count + 1) for count in counts])
     return Levels(Moments(at, share), grey)
 
 
 def substeps(vectors: Vectors, substep_px: float) -> int:
     """Return the number of sub-steps of a step with this motion: 1 .. MOST_SUBSTEPS."""
-    shortest = math.ceil(substep_px * UNITS_PER_PX / 2)
-    moving = _moving_squares(vectors, max(shortest * shortest, 1))
+    squares = np.square(vectors, dtype=np.int64).sum(axis=0)
+    moving = squares[squares >= max(math.ceil(substep_px * UNITS_PER_PX / 2) ** 2, 1)]
     if len(moving) < _LEAST_SHARE * vectors[0].size or not len(moving):
         return 1
     which = int(len(moving) * (1 - _FASTEST_SHARE))
     longest = math.sqrt(np.partition(moving, which)[which]) / UNITS_PER_PX
     return 1 + int(min(longest / substep_px, MOST_SUBSTEPS - 1))  # the quotient may be infinite
-
-
-@compiled
-def _moving_squares(vectors, least):  # type: ignore[no-untyped-def]
-    """Return the squared lengths of at least ``least``."""
-    rows, columns = vectors.shape[1:]
-    squares, moving = np.empty(rows * columns, np.int64), 0
-    for row in range(rows):
-        for column in range(columns):
-            x, y = np.int64(vectors[0, row, column]), np.int64(vectors[1, row, column])
-            square = x * x + y * y
-            squares[moving] = square
-            moving += square >= least
-    return squares[:moving]
 
 
 def load() -> None:

@@ -59,15 +59,9 @@ def motion(first: Pyramid, second: Pyramid, cells: Cells | None = None) -> Vecto
         [2, rows, columns] of these cells.
     """
     cells = first.cells if cells is None else cells
-    found = motion_if_any(first, second, cells)
-    return np.zeros((2, cells.rows, cells.columns), np.int16) if found is None else found
-
-
-def motion_if_any(first: Pyramid, second: Pyramid, cells: Cells) -> Vectors | None:
-    """Return the motion of some cells; None if they all rest."""
     moves = _moving_cells(first, second, cells)
     if moves is None:
-        return None
+        return np.zeros((2, cells.rows, cells.columns), np.int16)
     one, other = first.levels, _scaled(first.levels, second.levels)
     needed = [cells]
     for level in one[1:]:
@@ -88,8 +82,6 @@ def _moving_cells(first: Pyramid, second: Pyramid, cells: Cells) -> npt.NDArray[
     if min(first.height, first.width) < BLOCK_PX:
         return np.ones(cells[2:], np.bool_)
     window, place = _blocks_of(cells, first.height, first.width)
-    if second.is_like(first, window):
-        return None
     moves = np.empty(cells[2:], np.bool_)
     return moves if _mark_moving(first.part(window), second.part(window), *place, moves) else None
 
@@ -103,12 +95,6 @@ def _blocks_of(cells: Cells, height: int, width: int) -> tuple[PixelRect, tuple[
     )
     window = top, left, bottom + BLOCK_PX - top, right + BLOCK_PX - left
     return window, (*cells[:2], top, left, height - BLOCK_PX, width - BLOCK_PX)
-
-
-def without_slow(vectors: Vectors, shortest: int) -> Vectors:
-    """Return vectors of any shape [..., 2, rows, columns] with those below a length, 1/UNITS_PER_PX px, set to zero."""
-    x, y = (vectors[..., axis, :, :].astype(np.int32) for axis in (0, 1))
-    return vectors * (x * x + y * y >= shortest * shortest)[..., None, :, :]
 
 
 def _parents(cells: Cells, level: GreyPicture) -> Cells:

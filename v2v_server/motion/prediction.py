@@ -1,19 +1,23 @@
-"""Predict the events that are lost between the frames of a clip, and those that sub-steps restore, from its frames.
+"""Predict the share of the events that is lost between the frames of a clip, without and with sub-steps, from them.
 
-Events are lost where the light of a pixel rises and falls again within a step. The levels along the motion show how
-often it does: the events of the frames alone are compared with those of the frames and the levels, in bins of a frame.
-The true errors, without and with sub-steps, are linear in these *apparent* errors (``FITS``). Only motion in px a frame
-counts; the frame rate has no influence beyond it.
+Events are lost where the light of a pixel rises and falls again within a step. The events of the frames alone, in bins
+of a frame, are compared with those of the frames and the levels along the motion. The true events are estimated as
+those of the latter times exp(sum of weight x feature), with weights fitted to rendered scenes (``_WEIGHTS``):
 
-A prediction holds where the motion can be followed. As a check, each frame is predicted along the motion from its two
-neighbours. Where that is hardly better than their mean, as with vibration and flicker, sub-steps restore little. Motion
-blur hides losses from the prediction.
+- gain: what the levels add, as a share of their events;
+- smear: the picture is smoother along the motion than across it, as motion blur makes it, and blur hides losses;
+- unsteady: the motion changes from step to step, as a shake does, whose turns lie between the frames;
+- flicker: steps brighten and darken as a whole in turns;
+- uncovered: something moves over a still picture. The levels move what lies beside it too, and make false events.
+
+Only motion in px a frame counts; the frame rate has no influence beyond it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+import operator
+from dataclasses import astuple, dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -21,44 +25,48 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_server.motion.clip import levels_between
-from v2v_server.motion.matching import UNITS_PER_PX, Vectors, motion, without_slow
+from v2v_server.motion.lanes import CELL_PX
+from v2v_server.motion.matching import UNITS_PER_PX
 from v2v_server.motion.plane import motions
-from v2v_server.motion.pyramid import Pyramid
-from v2v_server.motion.warping import between
 from v2v_server.simulation.intensity import fine_table, log_table
 from v2v_server.simulation.view import FrameArray
 from v2v_server.simulation.voxel import FINE_STEPS
+from v2v_server.system.compile_cache import cv2
 
 SUBSTEP_PX, THRESHOLD = 1.0, 0.2
 """``substep_px`` and contrast threshold that predictions are for."""
 _MOST_FRAMES = 33
 """Frames that a prediction is made from: a fraction of a second's work."""
-_SHORTEST = math.ceil(SUBSTEP_PX * UNITS_PER_PX / 2)
 _GAMMA, _LOG_EPS = 2.2, 1e-3
-_LEAST_EXPLAINED = 0.25
-_SLIGHT_LOSS = 0.05
+_WEIGHTS = (
+    (-0.03, (0.0, 0.16, 0.2, 0.05, -1.6)),
+    (0.0, (0.26, 0.28, 0.35, 0.17, -0.2)),
+    (0.1, (0.7, 0.32, 1.3, 0.25, 0.4)),
+)
+"""Constant and weights of Features, for the low end, the estimate and the high end: ``python -m bench loss``."""
+_SHARP, _SMEARED, _STEADY = 0.2, 0.5, 0.35
+"""Values that clips without blur, and without turns, reach too; and the smear that is not told from more."""
+_SLIGHT_LOSS, _UNSTEADY, _FLICKERS, _UNCOVERS = 0.05, 0.25, 0.3, 0.12
+_STILL_GREY, _TEXTURE_GREY = 3.0, 8.0
+"""Mean change, at most, and range of grey levels, at least, of a cell that rests and would show a motion."""
 
 
-class PredictedErrors(NamedTuple):
-    """Shares of the events: lost, of signed bins that are wrong, of bins of both polarities that are wrong."""
+class PredictedLoss(NamedTuple):
+    """A predicted share of the events, and the interval that held for nine of ten scenes of other kinds."""
 
-    lost: float
-    signed: float
-    split: float
-
-
-class Fit(NamedTuple):
-    """A true error as a function of the apparent one: start + slope x apparent."""
-
-    start: float
-    slope: float
+    low: float
+    likely: float
+    high: float
 
 
-FITS = {
-    "linear": (Fit(0.026, 1.088), Fit(0.085, 0.411), Fit(0.094, 0.922)),
-    "divided": (Fit(0.020, 0.220), Fit(0.088, -0.279), Fit(0.104, 0.130)),
-}
-"""By setting, in the order of PredictedErrors: moving photographs, as printed by ``python -m bench substeps``."""
+class Features(NamedTuple):
+    """What a loss depends on, see the module's docstring."""
+
+    gain: float
+    smear: float
+    unsteady: float
+    flicker: float
+    uncovered: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,62 +74,73 @@ class Prediction:
     """What a clip's frames say of the motion between them. Predictions of several clips can be added.
 
     Attributes:
-        speeds_px: motion of each cell and step that moves, px a frame.
         linear, divided: events of the frames alone, and with the levels along the motion.
-        net: sum of the magnitudes of the latter's signed bins.
-        signed_apart, split_apart: sums of the differences between both, signed and of both polarities.
-        along_apart, mean_apart: sums of the differences, in grey levels, between a frame and what its neighbours
-            predict, along the motion and as their mean.
+        moving, beside: of the latter, those in cells that move, and in those of them beside a still texture.
+        travelled: sum over the events in cells that move of the logarithm of their speed, px a frame.
+        paired, unsteady: events in cells that move in one of two following steps; their sum weighted by the change of
+            the motion, 0 (none) to 1 (it turns back, or stops).
+        flicker: sum of the magnitudes of the signed events of steps, less that of their sum.
+        along, across, along_twice, across_twice: sums of squared first and second derivatives of moving pictures.
     """
 
-    speeds_px: tuple[float, ...] = ()
     linear: float = 0.0
     divided: float = 0.0
-    net: float = 0.0
-    signed_apart: float = 0.0
-    split_apart: float = 0.0
-    along_apart: float = 0.0
-    mean_apart: float = 0.0
+    moving: float = 0.0
+    beside: float = 0.0
+    travelled: float = 0.0
+    paired: float = 0.0
+    unsteady: float = 0.0
+    flicker: float = 0.0
+    along: float = 0.0
+    across: float = 0.0
+    along_twice: float = 0.0
+    across_twice: float = 0.0
 
     def __add__(self, other: Prediction) -> Prediction:
-        return Prediction(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(Prediction)))
+        return Prediction(*map(sum, zip(astuple(self), astuple(other), strict=True)))
 
     @property
     def px_per_frame(self) -> float:
-        """Return the median motion of what moves; 0 where nothing does."""
-        return float(np.median(self.speeds_px)) if self.speeds_px else 0.0
+        """Return the geometric mean of the motion of what moves; 0 where nothing does."""
+        return math.exp(self.travelled / self.moving) if self.moving else 0.0
 
     @property
-    def explained(self) -> float:
-        """Return the share of the change beyond the mean of both neighbours that the motion explains: 0 .. 1."""
-        return max(0.0, 1.0 - self.along_apart / self.mean_apart) if self.mean_apart else 0.0
-
-    @property
-    def apparent(self) -> PredictedErrors:
-        """Return the errors of the frames alone if the levels along the motion were true."""
-        events, net = max(self.divided, 1.0), max(self.net, 1.0)
-        return PredictedErrors(
-            1.0 - self.linear / events if self.divided else 0.0, self.signed_apart / net, self.split_apart / events
+    def features(self) -> Features:
+        """Return what the loss depends on."""
+        ways = self.along * self.across_twice, self.across * self.along_twice
+        smear = math.log(ways[0] / ways[1]) if min(ways) > 0.0 else 0.0
+        return Features(
+            max(1.0 - self.linear / self.divided, 0.0) if self.divided else 0.0,
+            min(max(smear - _SHARP, 0.0) / (_SMEARED - _SHARP), 1.0) * math.log1p(self.px_per_frame),
+            max(self.unsteady / max(self.paired, 1.0) - _STEADY, 0.0),
+            self.flicker / max(self.linear, 1.0),
+            self.beside / max(self.divided, 1.0),
         )
 
     @property
     def is_slow(self) -> bool:
-        """Return whether sub-steps change so little that no loss is predicted."""
-        return self.apparent.lost < _SLIGHT_LOSS
+        """Return whether sub-steps change so little, and nothing else shows, that no loss is predicted."""
+        return self.features.gain < _SLIGHT_LOSS and self.loss().likely < 2.0 * _SLIGHT_LOSS
 
     @property
     def can_be_followed(self) -> bool:
-        """Return whether the motion explains the change of the picture, so that the predicted errors hold."""
-        return self.explained >= _LEAST_EXPLAINED
+        """Return whether the motion is steady enough, and the light, that sub-steps help."""
+        return self.features.unsteady < _UNSTEADY and self.features.flicker < _FLICKERS
 
-    def errors(self, setting: str) -> PredictedErrors:
-        """Return the predicted errors in bins of a frame.
+    @property
+    def uncovers(self) -> bool:
+        """Return whether something moves over a still picture, where sub-steps make false events."""
+        return self.features.uncovered > _UNCOVERS
+
+    def loss(self, *, divided: bool = False) -> PredictedLoss:
+        """Return the predicted loss in bins of a frame.
 
         Args:
-            setting: "linear", without sub-steps, or "divided", with sub-steps of SUBSTEP_PX.
+            divided: with sub-steps of SUBSTEP_PX.
         """
-        found = zip(FITS[setting], self.apparent, strict=True)
-        return PredictedErrors(*(min(max(fit.start + fit.slope * share, 0.0), 1.0) for fit, share in found))
+        kept = self.linear / self.divided if self.divided and not divided else 1.0
+        hidden = [sum(map(operator.mul, weights, self.features)) + start for start, weights in _WEIGHTS]
+        return PredictedLoss(*(min(max(1.0 - kept * math.exp(-each), 0.0), 1.0) for each in hidden))
 
 
 def predict(pictures: FrameArray) -> Prediction:
@@ -140,26 +159,62 @@ def predict(pictures: FrameArray) -> Prediction:
     levels = levels_between(pictures, (0, 0, height, width), np.arange(count), SUBSTEP_PX, vectors)
     fine = pictures.astype(np.uint16) * np.uint16(FINE_STEPS)
     alone = _signed_counts(fine)
+    net = alone.sum(axis=(1, 2), dtype=np.int64)
+    linear, flicker = float(np.abs(alone).sum()), float(np.abs(net).sum() - abs(net.sum()))
     if levels is None:
-        events = float(np.abs(alone).sum())
-        return Prediction((), events, events, events)
-    along = _signed_counts(np.insert(fine, levels.at.step + 1, levels.grey, axis=0))
+        return Prediction(linear, linear, flicker=flicker)
+    along = np.abs(_signed_counts(np.insert(fine, levels.at.step + 1, levels.grey, axis=0)))
     first = np.arange(count - 1) + np.searchsorted(levels.at.step, np.arange(count - 1))
     # Without the dtype NumPy makes a copy in int64.
-    rising = np.add.reduceat(np.maximum(along, 0), first, dtype=np.int16)
-    falling = -np.add.reduceat(np.minimum(along, 0), first, dtype=np.int16)
-    apart = [np.abs(np.maximum(sign * alone, 0) - true).sum() for sign, true in ((1, rising), (-1, falling))]
-    moving = _moving(without_slow(vectors, _SHORTEST))
-    guesses = [_guess(pictures[at - 1 : at + 2]) for at in range(1, count - 1)]
+    events = _by_cell(np.add, np.add.reduceat(along, first, dtype=np.int16))
+    moved = vectors[1:] / UNITS_PER_PX
+    moved *= np.hypot(moved[:, :1], moved[:, 1:]) >= SUBSTEP_PX / 2
+    speed = np.hypot(moved[:, 0], moved[:, 1])
+    moves = speed > 0.0
+    changed = _by_cell(np.add, cv2.absdiff(pictures[1:], pictures[:-1])) / CELL_PX**2
+    ranges = _by_cell(np.maximum, pictures[1:]) - _by_cell(np.minimum, pictures[1:])
+    rests = ~moves & (changed < _STILL_GREY) & (ranges > _TEXTURE_GREY)
+    beside = np.stack([cv2.dilate(each, np.ones((3, 3), np.uint8)) for each in rests.astype(np.uint8)]) > 0
+    kept = moves.any(axis=(1, 2))  # a repeated frame is no change of the motion
+    turned = np.hypot(*np.moveaxis(np.diff(moved[kept], axis=0), 1, 0))
+    both, weight = (each[kept][1:] + each[kept][:-1] for each in (speed, events))
+    weight = weight * (both > 0.0)
     return Prediction(
-        tuple(moving.tolist()),
-        float(np.abs(alone).sum()),
-        float(rising.sum() + falling.sum()),
-        float(np.abs(rising - falling).sum()),
-        float(np.abs(alone - rising + falling).sum()),
-        float(sum(apart)),
-        *(float(sum(guess)) for guess in (zip(*guesses, strict=True) if guesses else ((), ()))),
+        linear,
+        float(events.sum()),
+        float(events[moves].sum()),
+        float(events[moves & beside].sum()),
+        float((events[moves] * np.log(speed[moves])).sum()),
+        float(weight.sum()),
+        float((weight * turned / np.maximum(both, 1e-9)).sum()),
+        flicker,
+        *np.sum([_sharpness(*each) for each in zip(pictures, moved, strict=False)], axis=0).tolist(),
     )
+
+
+def _by_cell(of: np.ufunc, values: npt.NDArray[np.generic]) -> npt.NDArray[np.float64]:
+    """Return the values of the pixels of each cell, [n, rows, columns], brought together by a function."""
+    rows, columns = (np.arange(0, side, CELL_PX) for side in values.shape[1:])
+    together: npt.NDArray[np.float64] = of.reduceat(of.reduceat(values, rows, axis=1), columns, axis=2, dtype=float)
+    return together
+
+
+def _sharpness(picture: npt.NDArray[np.uint8], moved: npt.NDArray[np.float64]) -> list[float]:
+    """Return the sums of squared first derivatives along and across the motion [2, rows, columns], and of second ones.
+
+    Only where something moves.
+    """
+    height, width = picture.shape
+    x, y = (np.kron(each, np.ones((CELL_PX, CELL_PX)))[:height, :width] for each in moved)
+    speed = np.hypot(x, y)
+    x, y = (np.divide(each, speed, out=np.zeros_like(speed), where=speed > 0.0) for each in (x, y))
+    right, down = (cv2.Sobel(picture, cv2.CV_32F, *axes, ksize=1) / 2 for axes in ((1, 0), (0, 1)))
+    right2, down2 = (cv2.Sobel(picture, cv2.CV_32F, *axes, ksize=1) for axes in ((2, 0), (0, 2)))
+    mixed = cv2.Sobel(right, cv2.CV_32F, 0, 1, ksize=1) / 2
+    ways = ((x, y), (-y, x))
+    found = [a * right + b * down for a, b in ways]
+    found += [a * a * right2 + 2 * a * b * mixed + b * b * down2 for a, b in ways]
+    return [float(np.square(each).sum()) for each in found]
 
 
 def _signed_counts(fine: npt.NDArray[np.uint16]) -> npt.NDArray[np.int16]:
@@ -175,20 +230,3 @@ def _signed_counts(fine: npt.NDArray[np.uint16]) -> npt.NDArray[np.int16]:
         fired[...] = np.trunc(residual / THRESHOLD)
         residual -= fired * np.float32(THRESHOLD)
     return counts
-
-
-def _moving(vectors: Vectors) -> npt.NDArray[np.float64]:
-    """Return the lengths, px, of the vectors that are not zero."""
-    lengths: npt.NDArray[np.float64] = np.hypot(vectors[:, 0], vectors[:, 1], dtype=np.float64) / UNITS_PER_PX
-    return lengths[lengths > 0.0]
-
-
-def _guess(three: FrameArray) -> tuple[float, float]:
-    """Return how far the middle of three pictures is from what the others predict: along the motion, and as a mean."""
-    first, middle, last = three.astype(np.float64)
-    if np.array_equal(first, middle) or np.array_equal(middle, last):  # a repeated frame is not halfway
-        return 0.0, 0.0
-    guess = np.empty((1, *middle.shape), np.uint16)
-    before, after = (Pyramid.of(picture) for picture in (three[0], three[2]))
-    between(before.levels[0], after.levels[0], motion(before, after), _SHORTEST, 0, 0, guess)
-    return float(np.abs(guess[0] / FINE_STEPS - middle).sum()), float(np.abs((first + last) / 2 - middle).sum())

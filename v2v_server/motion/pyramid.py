@@ -39,19 +39,11 @@ class Pyramid:
     Args:
         height, width: of the picture, pixels; at least CELL_PX each.
         read: returns a part (top, left, rows, columns) of it, [rows, columns] uint8, C-contiguous.
-        raw: returns the values that a part is made from, which are quicker to get; equal ones make equal parts.
     """
 
-    def __init__(
-        self,
-        height: int,
-        width: int,
-        read: Callable[[PixelRect], GreyPicture],
-        raw: Callable[[PixelRect], npt.NDArray[Any]] | None = None,
-    ) -> None:
-        self.height, self.width, self._read, self._raw = height, width, read, raw
+    def __init__(self, height: int, width: int, read: Callable[[PixelRect], GreyPicture]) -> None:
+        self.height, self.width, self._read = height, width, read
         self._part: tuple[PixelRect, GreyPicture] | None = None
-        self._bytes: tuple[PixelRect, bytes] | None = None
 
     @classmethod
     def of(cls, picture: GreyPicture) -> Pyramid:
@@ -63,17 +55,6 @@ class Pyramid:
 
         height, width = picture.shape
         return cls(height, width, part)
-
-    def is_like(self, other: Pyramid, window: PixelRect) -> bool:
-        """Return whether a part is known to equal that of another picture, without reading it."""
-        mine = self._raw_bytes(window)
-        return mine is not None and mine == other._raw_bytes(window)
-
-    def _raw_bytes(self, window: PixelRect) -> bytes | None:
-        """Return the values of a part; the last ones are kept, and compared faster than an array's rows."""
-        if self._raw is not None and (self._bytes is None or self._bytes[0] != window):
-            self._bytes = window, self._raw(window).tobytes()
-        return self._bytes and self._bytes[1]
 
     def part(self, window: PixelRect) -> GreyPicture:
         """Return a part of the picture; the last one is kept."""

@@ -199,11 +199,6 @@ class DecodedFrame(NamedTuple):
     signal: Signal
     codec: str
 
-    def raw(self, window: PixelRect) -> npt.NDArray[np.unsignedinteger]:
-        """Return a window of the upright picture as the decoder stores it, [rows, columns], without a copy."""
-        top, left, height, width = self.orientation.stored_window(window, self.height_px, self.width_px)
-        return self.samples[top : top + height, left : left + width]
-
     def part(self, window: PixelRect, signal: Signal = SDR) -> npt.NDArray[Any]:
         """Return levels of a window of the upright picture, [h, w] of the signal's dtype, in full range."""
         stored = self.orientation.stored_window(window, self.height_px, self.width_px)

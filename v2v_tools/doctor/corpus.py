@@ -62,9 +62,8 @@ def check_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, kin
 def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line]:
     found = catalogue.videos
     codecs = Counter(video.codec for video in found)
-    text = f"{len(found)} videos: {', '.join(f'{count} {codec}' for codec, count in codecs.most_common())}"
-    text += f"; {int(found.frames.sum())} frames that decode"
-    yield "ok", "corpus", text, ""
+    kinds = ", ".join(f"{count} {codec}" for codec, count in codecs.most_common())
+    yield "ok", "corpus", f"{len(found)} videos: {kinds}; {int(found.frames.sum())} frames that decode", ""
     if catalogue.refusals:
         text = f"{len(catalogue.refusals)} files cannot be used: {name_all(catalogue.refusals)}"
         change = "they are skipped: repair them, or leave them out of --videos"

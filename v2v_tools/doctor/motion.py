@@ -21,8 +21,6 @@ _LONGEST_SECONDS = 30.0
 """After this time no other video is begun."""
 _LONGEST_VIDEO_SECONDS = 90.0
 """The first one may compile the kernels."""
-_Fields = tuple[tuple[float, ...], float, float, float, float, float, float, float]
-"""Fields of a Prediction, in order."""
 
 
 def look_at_motion(
@@ -49,14 +47,12 @@ def look_at_motion(
     from v2v_tools.motion import describe_loss
 
     total = sum((Prediction(*each) for each in found.values()), Prediction())
-    change = ""
-    if not total.is_slow:
-        change = "more frames a second lose less"
-        if total.can_be_followed:
-            change += "; so does substep_px: 1 in the spec, for processor time"
+    change = "more frames a second lose less"
+    if total.can_be_followed and not total.uncovers:
+        change += "; so does substep_px: 1 in the spec, for processor time"
     loss = describe_loss(total, [each for id in found for each in defects.get(id, ())])
     text = f"{loss}; {_FRAMES} frames in the middle of {len(found)} videos"
-    yield "ok" if total.is_slow else "note", "motion", text.removeprefix("motion: "), change
+    yield ("ok", "motion", text.removeprefix("motion: "), "") if total.is_slow else ("note", "motion", text, change)
 
 
 def _middles(catalogue: Catalogue) -> Iterator[Excerpt]:
@@ -67,7 +63,7 @@ def _middles(catalogue: Catalogue) -> Iterator[Excerpt]:
             yield replace(each, window=(top + (rows - height) // 2, left + (columns - width) // 2, height, width))
 
 
-def _predicted(source: VideoSource, middle: Excerpt) -> _Fields | None:
+def _predicted(source: VideoSource, middle: Excerpt) -> tuple[float, ...] | None:
     """Return the fields of the prediction; None where the frames do not decode."""
     import numpy as np
 

@@ -19,7 +19,6 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_recipe, recipe_setting
 from v2v_protocol.write_aside import write_file, write_json
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.motion.prediction import SUBSTEP_PX, PredictedErrors
 from v2v_server.simulation.precision import warm_up
 from v2v_server.system.process import keep_freed_memory
 from v2v_server.video.rows import Rows
@@ -31,7 +30,6 @@ from v2v_tools.tradeoff.measures import (
     diversity,
     leases_of,
     making,
-    predicted_loss,
 )
 from v2v_tools.tradeoff.report import ERROR_KEY, best, error_fields, name_dominated, tables
 from v2v_tools.tradeoff.settings import BESIDE, SOURCE, STORES, ServeSetting, axes, full_model, open_forms, settings
@@ -134,20 +132,15 @@ def _measured(corpus: Mapping[str, Catalogue], compared: Sequence[ServeSetting])
         mine = [setting for setting in compared if models[setting] == model]
         show(f"comparing {len(mine)} settings with {model.way}", sys.stderr)
         sums = accuracy(leases[model], {setting.way: leases[setting.single] for setting in mine})
-        loss = predicted_loss(leases[model])
-        predicted = {}
-        if loss.can_be_followed or loss.is_slow:
-            predicted = {0.0: loss.errors("linear"), SUBSTEP_PX: loss.errors("divided")}
         found = []
         for setting in mine:
             spec, clips, source = setting.spec, corpus[setting.form], corpus[SOURCE]
-            errors, taken = predicted.get(spec.substep_px), seconds[setting.name]
+            taken = seconds[setting.name]
             found.append({
                 "measure": "setting", "name": setting.name, "way": setting.way, "form": setting.form,
                 "samples_per_decode": spec.samples_per_decode, "substep_px": spec.substep_px,
                 "tolerance": spec.tolerance, "bytes_ratio": _nbytes(clips) / _nbytes(source),
-                "bytes_per_video_second": _nbytes(clips) / _seconds(source), "px_per_frame": loss.px_per_frame,
-                **{f"predicted_{name}": errors and getattr(errors, name) for name in PredictedErrors._fields},
+                "bytes_per_video_second": _nbytes(clips) / _seconds(source),
                 "samples_per_core_second": 1.0 / taken, "cpu_seconds_per_sample": taken,
                 "speed_ratio": seconds[compared[0].name] / taken, **error_fields(sums[setting.way]),
             })  # fmt: skip

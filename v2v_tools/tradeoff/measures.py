@@ -33,10 +33,8 @@ from v2v_protocol.sample import DEFAULT_ARRAYS, SampleParams
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.motion.prediction import Prediction, predict
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.simulation.clip import simulate_clip
-from v2v_server.simulation.intensity import eight_bits
 from v2v_server.worker.arrays import SampleContext
 from v2v_server.worker.produce import decode_for, make_sample, plan_sample, sample_context
 from v2v_tools.remake import lease_for
@@ -130,12 +128,6 @@ def accuracy(model: Leases, others: Mapping[str, Leases]) -> dict[str, npt.NDArr
             for name, pair in (made | {NOISE_ROW: (exact, noisy), DRAW_ROW: (exact, redrawn)}).items():
                 sums[name][row] += compare(simulated(*pair), truth)
     return sums
-
-
-def predicted_loss(leases: Leases) -> Prediction:
-    """Predict what the first sample of each lease loses between its frames."""
-    views = (seen(leases, number)[0] for number in range(len(leases.each)))
-    return sum((predict(eight_bits(view.view, view.signal)) for view in views), Prediction())
 
 
 def diversity(leases: Leases) -> list[dict[str, Any]]:

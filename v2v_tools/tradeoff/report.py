@@ -43,8 +43,6 @@ _SETTINGS: _Columns = (
     ("bytes_ratio", "x disk", "{:.2f}", 1),
     ("bytes_per_video_second", "MB/s", "{:.2f}", 1e-6),
     (ERROR_KEY, f"voxels {ERROR_THRESHOLD:g}", "{:.2f}", 100),
-    ("predicted_lost", "lost", "{:.0f}", 100),
-    ("predicted_signed", "wrong", "{:.0f}", 100),
     ("dominated_by", "dominated by", "{}", 1),
 )
 _DIVERSITY: _Columns = (
@@ -70,7 +68,7 @@ def dominators(costs: Mapping[str, Costs]) -> dict[str, str | None]:
 
 def name_dominated(records: Sequence[dict[str, Any]]) -> None:
     """Add to each setting's record a setting that dominates it in speed, errors, diversity and disk space, or None."""
-    keys = ("cpu_seconds_per_sample", ERROR_KEY, "predicted_signed", "samples_per_decode", "bytes_per_video_second")
+    keys = ("cpu_seconds_per_sample", ERROR_KEY, "samples_per_decode", "bytes_per_video_second")
     # Without events there is no relative error, and no form is worse than another.
     found = dominators(
         {r["name"]: tuple(math.inf if r[key] is None else float(r[key]) for key in keys) for r in records}
@@ -133,8 +131,7 @@ def tables(records: Sequence[Record]) -> str:
     ways = list({record["way"]: record for record in reversed(of["setting"])}.values())[::-1]
     about = (
         f"CPU s/batch: of {BATCH} samples; x disk: of the source; MB/s: of video; voxels: error against the full "
-        "model, per cent\nlost, wrong: per cent of the events, predicted in bins of a frame at c = 0.2 beside a camera "
-        "that sees all motion; -: unpredictable\n"
+        "model, per cent\n"
     )
     parts = [format_table(listed, _SETTINGS) + about, format_table([*ways, *of["scale"]], _ERRORS)]
     if of["diversity"]:

@@ -8,10 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.oracles.rendered import rendered_scene
-from v2v_server.motion.matching import UNITS_PER_PX, motion, without_slow
+from v2v_server.motion.matching import UNITS_PER_PX, Vectors, motion
 from v2v_server.motion.pyramid import Pyramid
 
 HALF_PX = UNITS_PER_PX // 2
+
+
+def without_slow(vectors: Vectors, shortest: int) -> Vectors:
+    """Return vectors [2, rows, columns] with those below a length, 1/UNITS_PER_PX px, set to zero."""
+    return vectors * (np.square(vectors, dtype=np.int64).sum(axis=0) >= shortest * shortest)
 
 
 @pytest.mark.parametrize("px", [1.3, 4.0, 12.0])

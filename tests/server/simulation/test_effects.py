@@ -310,6 +310,19 @@ def test_the_low_pass_damps_a_sinusoid_by_its_gain(hertz: float, level: int) -> 
     assert gain == pytest.approx(1 / math.sqrt(1 + (hertz / corner) ** 2), rel=0.03)
 
 
+def test_more_bins_show_more_turns_of_the_low_pass_and_the_same_change() -> None:
+    frames = pan(21, 6.0)
+    one, six = (
+        simulate(
+            frames, threshold_pos=0.2, start_residual=0.0, bins=bins, grids_per_frame=1, frames_per_second=30.0,
+            photoreceptor_hz=100.0, dtype="int16",
+        ).array("event_counts").sum(axis=(0, 2), dtype=np.int64)
+        for bins in (1, 6)
+    )  # fmt: skip
+    assert one.sum() < six.sum() < 1.2 * one.sum()
+    assert np.abs((one[1] - one[0]) - (six[1] - six[0])).max() <= 1
+
+
 def test_dead_pixels_are_dead_and_no_others() -> None:
     frames = moving_frames(21, 40, 40)
     plain = simulate(frames, threshold_pos=0.2, noise_sigma=0.3, bins=20).voxels

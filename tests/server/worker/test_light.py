@@ -162,7 +162,7 @@ def test_deep_clips_offline(tmp_path: Path) -> None:
     with closing(open_catalogue(tmp_path / "clips", processes=0)) as catalogue:
         remaker = Remaker(catalogue, spec)
         made = remaker.made(0, 0, 0)
-        assert predicted_loss(made).errors("linear").lost >= 0
+        assert predicted_loss(made).loss().low >= 0
         whole = WholePictures(catalogue, spec).camera(remaker.sequence(0, 0, 0))
         (view,) = seen(Leases(tmp_path / "clips", [replace(made.lease, indices=(0, 1))]), 0)
     assert whole.voxels.any()

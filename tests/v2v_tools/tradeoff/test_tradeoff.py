@@ -284,7 +284,6 @@ def test_a_short_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert prepared["bytes_per_video_second"] / first["bytes_per_video_second"] == pytest.approx(
         prepared["bytes_ratio"]
     )
-    assert 0 < way["source, substep_px = 1, tolerance = 0"]["predicted_lost"] < first["predicted_lost"] < 1
     scale = {item["way"]: item["voxel_error_at_0.2"] for item in found if item["measure"] == "scale"}
     assert set(scale) == {NOISE_ROW, DRAW_ROW}
     assert min(scale.values()) > 0

@@ -1,11 +1,13 @@
 """Photoreceptor low-pass of f_white Hz: dP/dt = 2 pi f (L - P), f = f_white (i + 20/255) / (1 + 20/255).
 
-i is the light of the new frame (v2e). L is linear between frames (ESIM: Rebecq et al. 2018), for which a step of T
-seconds is exact:
+i is the light of the new frame (v2e). L is linear between frames (ESIM: Rebecq et al. 2018), for which P after a step
+of T seconds is exact, however bins divide the step:
 
     P' = P + a (L - P) + b (L' - L),    a = 1 - exp(-2 pi f T),    b = 1 - a / (2 pi f T)
 
-P takes the place of L in all that follows. It starts settled.
+P takes the place of L in all that follows. It starts settled. Within a segment (``voxel.py``) P bends, but its events
+are those of the net change, at even distances. Where P turns in a segment, events are missed; more bins miss fewer
+(``python -m bench physics``).
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls

@@ -34,10 +34,16 @@ class Motion(Plane):
 
     def maker(self) -> Callable[[DecodedPicture], Vectors]:
         """Return a function that returns the motion to each picture."""
-        from v2v_server.motion import MotionOfPictures, Pyramid
+        from v2v_server.motion import Pyramid, motion
 
-        following = MotionOfPictures()
-        return lambda picture: following.add(Pyramid.of(picture.grey))
+        last: Pyramid | None = None
+
+        def found(picture: DecodedPicture) -> Vectors:
+            nonlocal last
+            before, last = last, Pyramid.of(picture.grey)
+            return motion(before or last, last)
+
+        return found
 
     def read(self, files: Files, request: ClipRequest) -> list[Vectors | None]:
         """Return the motion of each cut, read where the files have it and otherwise found from the pixels."""
@@ -81,7 +87,7 @@ def watch_motion(request: ClipRequest) -> tuple[Watch, list[MotionOfCuts]]:
         return first_row + top, first_column + left, rows, columns
 
     def see(frame: DecodedFrame) -> None:
-        found[-1].add(Pyramid(height, width, lambda part: frame.part(place(part)), lambda part: frame.raw(place(part))))
+        found[-1].add(Pyramid(height, width, lambda part: frame.part(place(part))))
 
     def begin() -> Callable[[DecodedFrame], None]:
         found.append(MotionOfCuts(request.cuts))
