@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 CORE = ("v2v_protocol", "v2v_server", "v2v_tools", "v2v_client", "v2v_pictures", "v2v_recordings")
 # (statements, files that are not empty)
 LIMITS = {
-    "v2v_protocol": (2326, 23),
+    "v2v_protocol": (2326, 21),
     "v2v_server": (14614, 121),
     "v2v_tools": (2619, 29),
     "v2v_client": (1946, 16),
