@@ -31,6 +31,7 @@ BENCHES = {
     "sharing": "speed.sharing",
     "cache": "speed.cache",
     "store": "speed.store",
+    "photographs": "speed.photographs",
     "link": "speed.link",
     "physics": "accuracy.physics",
     "motion": "speed.motion",

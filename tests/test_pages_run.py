@@ -105,6 +105,9 @@ def test_documented_commands_run(
         pictures.mkdir(parents=True)
         for number, luma in enumerate(panned_luma(203, 128, 128)):
             Image.fromarray(luma).save(pictures / f"{number:08d}.png")
+    if any("photographs/" in line for line in lines):
+        (tmp_path / "photographs").mkdir()
+        Image.fromarray(panned_luma(1, 256, 256)[0]).save(tmp_path / "photographs/a.jpg")
     for line in lines:
         program, *given = shlex.split(line, comments=True)
         smaller = SMALLER.get(program, [])

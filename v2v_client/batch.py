@@ -87,7 +87,9 @@ class Batch(Drawn):
     frames_all        [B, steps + 1, 1, H, W] uint8, all frames that were simulated, the first included
     flow              [B, T, 2, H, W] float16, (x, y) px; flow[:, t] belongs to voxel t of the target sequence, and is
                       zero before ``flow_from``
-    flow_valid        [B, T, 1, H, W] uint8, 1 where forward and backward flow agree
+    flow_valid        [B, T, 1, H, W] uint8, 1 where forward and backward flow agree; of photographs, where both see it
+    tracks            [B, T + lead_frames, N, 3] float32, x and y (px of the crop) of points of photographs, and 1 where
+                      they are seen
     masks             [B, T, 1, H, W] uint8, T as for frames: classes; 255 in a sample without labels
     boxes             a list, see :attr:`boxes`
 

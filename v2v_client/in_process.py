@@ -68,7 +68,7 @@ class V2VDataset(Dataset[Sample]):
         rows: rows of each picture to use, as for ``v2v-serve --rows``.
         list_file: list file that restricts a folder.
         cache_dir: folder of the catalogue's index; None uses the user's cache.
-        videos_kind, rate: what a video is, as for ``v2v-serve --videos-kind`` and ``--rate``.
+        videos_kind, rate, photograph_seconds: what a video is, as for ``v2v-serve --videos-kind``.
         labels: see :class:`v2v_client.V2VStreamDataset`.
         options: ``preset`` and other fields of :class:`v2v_protocol.spec.StreamSpec`.
 
@@ -89,6 +89,7 @@ class V2VDataset(Dataset[Sample]):
         cache_dir: str | None = None,
         videos_kind: str = "videos",
         rate: float = 0.0,
+        photograph_seconds: float = 0.0,
         labels: Labels = "required",
         **options: Unpack[SpecOptions],
     ) -> None:
@@ -98,7 +99,7 @@ class V2VDataset(Dataset[Sample]):
         self._needs_labels = check_labels(labels)
         self.spec = StreamSpec.from_dict({**options, "recipe": read_recipe(recipe)})
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
-        self._source = (os.fspath(videos), rows, list_file, cache_dir, videos_kind, rate)
+        self._source = (os.fspath(videos), rows, list_file, cache_dir, (videos_kind, rate, photograph_seconds))
         self._maker: Any = None
         self._process = 0
         self._length = int(self._open().count)
@@ -168,8 +169,7 @@ def _open_remaker(
     rows: str,
     list_file: str | None,
     cache_dir: str | None,
-    videos_kind: str,
-    rate: float,
+    kind: tuple[str, float, float],
     spec: StreamSpec,
     arrays: tuple[str, ...],
 ) -> Any:
@@ -181,7 +181,7 @@ def _open_remaker(
             "in a checkout"
         ) from error
     return remake.open_remaker(
-        videos, rows=rows, list_file=list_file, cache_dir=cache_dir, kind=remake.VideosKind(videos_kind, rate),
+        videos, rows=rows, list_file=list_file, cache_dir=cache_dir, kind=remake.VideosKind(*kind),
         spec=spec, arrays=arrays,
     )  # fmt: skip
 

@@ -58,6 +58,7 @@ class Camera:
         quiet: as ``rates``, of the same draw without noise, or None: not measured.
         boxes: [T, n, 7], see ``v2v_protocol.sample.BOX_COLUMNS``, or None.
         masks: [T, H, W] uint8, classes, or None.
+        tracks: [T, N, 3], see ``v2v_protocol.sample.TRACK_COLUMNS``, or None.
         step_seconds: time between two frames that the pixels see; 0 or NaN where it is unknown.
     """
 
@@ -72,6 +73,7 @@ class Camera:
     quiet: npt.NDArray[np.float64] | None = None
     boxes: npt.NDArray[Any] | None = None
     masks: npt.NDArray[np.uint8] | None = None
+    tracks: npt.NDArray[Any] | None = None
     step_seconds: float = 0.0
 
     @classmethod
@@ -94,7 +96,7 @@ class Camera:
         if recipe is not None and recipe.grids_per_frame:
             voxels = voxels.reshape(-1, recipe.grids_per_frame * recipe.bins, *voxels.shape[2:])
         count = min(len(array) for array in (voxels, frames, flow) if array is not None)
-        boxes, masks = arrays.get("boxes"), arrays.get("masks")
+        boxes, masks, tracks = (arrays.get(name) for name in ("boxes", "masks", "tracks"))
         return cls(
             voxels[len(voxels) - count :],
             np.asarray(frames[len(frames) - count :]),
@@ -106,6 +108,7 @@ class Camera:
             whole,
             boxes=None if boxes is None else np.asarray(boxes[len(boxes) - count :]),
             masks=None if masks is None else np.asarray(masks[len(masks) - count :, 0]),
+            tracks=None if tracks is None else np.asarray(tracks[len(tracks) - count :]),
         )
 
     @property

@@ -1,6 +1,8 @@
-"""Draw boxes and masks over a panel."""
+"""Draw boxes, masks and tracks over a panel."""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +23,8 @@ _COLOURS: tuple[Rgb, ...] = (
 """Colours of the classes, in turn: none is the red or blue of events."""
 _TINT = 0.45
 _NO_OBJECT = (0, 255)
+_TRAIL_FRAMES = 4
+"""Frames before the shown one that the trail of a point goes through."""
 _TEXT_PT = 12
 
 
@@ -43,23 +47,32 @@ def tint(image: Image, mask: npt.NDArray[np.uint8]) -> Image:
 def labelled_panel(
     page: Canvas, camera: Camera, grid: int, x: int, y: int, image: Image, tile_px: int, *, with_text: bool = False
 ) -> None:
-    """Draw a panel with the boxes and the mask of one voxel grid's frame.
+    """Draw a panel with the boxes, the mask and the tracks of one voxel grid's frame.
 
     Args:
         camera: has the labels; without any, this is only the panel.
         grid: number of the voxel grid.
         x, y, tile_px: place and side of the panel, px.
         image: [H, W, 3], as large as the camera's frames.
-        with_text: write the class of each box.
+        with_text: write the class of each box, and draw the tracks.
     """
     if camera.masks is not None:
         image = tint(image, camera.masks[grid])
     page.panel(x, y, image, tile_px, tile_px)
-    if camera.boxes is None:
-        return
     height, width = image.shape[:2]
     scale = min(tile_px / width, tile_px / height)
     left, top = x + (tile_px - width * scale) / 2, y + (tile_px - height * scale) / 2
+    if camera.tracks is not None and with_text:
+        recent = camera.tracks[max(0, grid - _TRAIL_FRAMES) : grid + 1] * (scale, scale, 1) + (left, top, 0)
+        for number in np.flatnonzero(recent[-1, :, 2]):
+            colour = class_colour(int(number))
+            for (*before, was_seen), (*after, is_seen) in pairwise(recent[:, number]):
+                if was_seen and is_seen:
+                    page.line(*before, *after, colour, 2)
+            x0, y0, _ = recent[-1, number]
+            page.box(x0 - 2, y0 - 2, x0 + 2, y0 + 2, colour)
+    if camera.boxes is None:
+        return
     for x0, y0, x1, y1, category, *_ in camera.boxes[grid]:
         if category < 0:
             continue

@@ -202,7 +202,9 @@ def _legend(page: Canvas, cameras: Sequence[Camera], scale: Scale, top: int) -> 
     said = "threshold: the change of log brightness that makes an event, brighter / darker"
     page.text(x, y + 56, said, colour=canvas.SOFT)
     said = "pale bars of the strip: noise; a bar is as long as the square root of the events"
-    if any(camera.boxes is not None or camera.masks is not None for camera in cameras):
+    if any(camera.tracks is not None for camera in cameras):
+        said = "tints in a panel: patches; trails: points that are followed; pale bars of the strip: noise"
+    elif any(camera.boxes is not None or camera.masks is not None for camera in cameras):
         said += "; boxes and tints in a panel: labels, a colour a class"
     page.text(x, y + 80, said, colour=canvas.SOFT)
     if cameras[0].flow is not None:

@@ -64,6 +64,8 @@ BOX_COLUMNS = ("x0", "y0", "x1", "y1", "class", "track", "visible")
 
 Coordinates are continuous: pixel (row, column) covers column <= x < column + 1 and row <= y < row + 1. Class and track
 are whole numbers; a box without a track has -1. Rows without a box hold -1 in all columns."""
+TRACK_COLUMNS = ("x", "y", "visible")
+"""Columns of the array ``tracks``: the place in px of the crop, as for boxes, and 1 where the point is seen, else 0."""
 ArrayForm: TypeAlias = Callable[[Recipe, str], tuple[str, tuple[int, ...]]]
 
 
@@ -129,6 +131,9 @@ ARRAYS: dict[str, ArrayForm] = {
     "frames_u16": lambda recipe, _: ("uint16", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
     "flow": lambda recipe, _: ("float16", (recipe.voxels_per_clip, 2, *recipe.crop_px)),
     "flow_valid": lambda recipe, _: ("uint8", (recipe.voxels_per_clip, 1, *recipe.crop_px)),
+    "tracks": lambda recipe, _: (
+        "float32", (recipe.voxels_per_clip + recipe.lead_frames, recipe.track_points, len(TRACK_COLUMNS))
+    ),
     "boxes": FromSidecar(
         ".boxes.json",
         lambda recipe, _: (
@@ -145,7 +150,7 @@ ARRAYS: dict[str, ArrayForm] = {
 }  # fmt: skip
 """Arrays a consumer may request: dtype and shape for one sample (no batch dimension), by the recipe and the spec's
 ``voxel_dtype``. ``v2v_server.worker.arrays`` makes them, ``Batch.arrays`` has them. Flow is px in (x, y); flow_valid is
-1 where forward and backward flow agree.
+1 where forward and backward flow agree, and of photographs, whose flow is exact, where the point is seen at both ends.
 
 event_counts are the negative (0) and positive (1) events of each bin: one array with an axis of polarity, because
 RVT's stacked histogram and the input of a spiking network are then views of it, with one name and one buffer. Its dtype
@@ -153,8 +158,10 @@ is that of the voxels, so that ``counts[:, 1] - counts[:, 0]`` does not wrap. vo
 the two bins next to its time (Zhu et al. 2019). time_surface is the age of a pixel's last negative (0) and positive (1)
 event at the end of each bin, seconds; infinity before its first one in the clip.
 
-frames_rgb are the frames in colour; frames_all are all frames that are simulated, the first included. boxes and masks
-belong to the frames of the same number. masks hold classes; 255 marks a sample without labels."""
+frames_rgb are the frames in colour; frames_all are all frames that are simulated, the first included. boxes, masks
+and tracks belong to the frames of the same number. masks hold classes; 255 marks a sample without labels. Masks of
+photographs need no sidecar: 0 is the photograph, 1 and 2 the patches in front of it. tracks follow ``track_points``
+points, and only photographs have them."""
 DEFAULT_ARRAYS = ("voxels", "frames")
 Layout: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
 """dtype and shape of each array of one sample, by name, in the order of the headers."""

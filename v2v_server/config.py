@@ -46,10 +46,15 @@ class ServeConfig:
     videos_kind: str = word(
         "videos",
         PIXEL_KINDS,
-        "what a video is: videos is a file; sequences is a folder, or a zip archive, of numbered pictures",
+        "what a video is: videos is a file; sequences is a folder, or a zip archive, of numbered pictures; photographs "
+        "is a picture that the camera moves over",
     )
     rate: float = number(
-        0.0, 0.0, HIGHEST_RATE_HZ, "rate of picture sequences without time stamps; 0: unknown", unit="Hz", metavar="N"
+        0.0, 0.0, HIGHEST_RATE_HZ,
+        "rate of picture sequences without time stamps, 0: unknown; of photographs, 0: 60", unit="Hz", metavar="N",
+    )  # fmt: skip
+    photograph_seconds: float = number(
+        0.0, 0.0, 1e6, "time for which each photograph is shown; 0: 10", unit="s", metavar="S"
     )
     rows: str = text("full", "rows of each picture to use: full, top:0.54 (WebVid), top:180px, 0.1:0.6", metavar="ROWS")
     cache_dir: str = text(

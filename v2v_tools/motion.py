@@ -83,7 +83,9 @@ def describe_start(events: npt.NDArray[np.float64]) -> str:
 
 
 def predicted_loss(made: RemadeSample) -> Prediction:
-    """Predict what a sample loses between its frames."""
+    """Predict what a sample loses between its frames; nothing where they are rendered, whose motion is known."""
+    if made.decoded.clip.is_view:
+        return Prediction()
     plan, recipe = made.decoded.plan, made.decoded.plan.spec.recipe
     frames = eight_bits(made.decoded.clip.frames, made.decoded.clip.signal)
     return predict(apply_view(without_margin(frames, plan.params, recipe, plan.margin_px), plan.params, recipe))

@@ -61,3 +61,20 @@ def test_pages_and_films_show_labels() -> None:
             plain, shown = draw([clip], "a"), draw([labelled], "a")
             assert plain.shape == shown.shape
             assert (plain != shown).any()
+
+
+def test_tracks_are_drawn_where_they_are_seen() -> None:
+    clip = camera(np.ones((3, 2, 12, 16), np.int8))
+    tracks = np.zeros((len(clip.frames), 2, 3), np.float32)
+    tracks[:, 0] = [(4 + 2 * at, 6, at != 2) for at in range(len(clip.frames))]
+    followed = dataclasses.replace(clip, tracks=tracks)
+    image, drawn = np.full((12, 16, 3), 255, np.uint8), []
+    for each, grid, with_text in ((clip, 0, True), (followed, 0, True), (followed, 2, True), (followed, 0, False)):
+        page = Canvas(164, 164)
+        labelled_panel(page, each, grid, 2, 2, image, 160, with_text=with_text)
+        drawn.append(page.image())
+    plain, seen, hidden, events = drawn
+    rows, columns = np.nonzero((seen != plain).any(axis=-1))
+    assert (round(rows.mean() - 0.5) - 22, round(columns.mean() - 0.5) - 2) == (59, 39), "a dot around its place"
+    assert np.array_equal(hidden, plain)
+    assert np.array_equal(events, plain)

@@ -575,6 +575,7 @@ def _table(broker: Broker, spec: StreamSpec) -> SequenceTable:
         recipe.crop_width_px,
         recipe.resize_scale,
         recipe.light,
+        recipe.is_world,
         spec.flow_margin_px,
         spec.substep_px > 0.0,
         spec.voxel_dtype,

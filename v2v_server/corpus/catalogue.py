@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import CorpusError, IndexUnreadable, VideoChanged
+from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
@@ -43,9 +43,18 @@ from v2v_server.corpus.sources.source import (
     is_said,
     open_source,
 )
-from v2v_server.corpus.videos import NO_THRESHOLDS, CorpusFacts, Thresholds, Videos, VideoTable, joined, missing_arrays
+from v2v_server.corpus.videos import (
+    NO_THRESHOLDS,
+    CorpusFacts,
+    Thresholds,
+    Videos,
+    VideoTable,
+    joined,
+    missing_arrays,
+    unknown_arrays,
+)
 from v2v_server.store.format import PIECE_FRAMES
-from v2v_server.store.pixels import VIDEOS, VideosKind
+from v2v_server.store.pixels import VIDEOS, VideosKind, kind_of
 from v2v_server.store.reader import STORE_FORMAT
 from v2v_server.system.process import cache_folder, without_collections
 from v2v_server.system.status_fields import gauge, text
@@ -401,8 +410,13 @@ class Catalogue:
     def facts(self) -> CorpusFacts:
         """What is known in memory: all that a server's dispatcher needs."""
         ids = self.videos.ids if not self._absent else [id for id in self.videos.ids if id not in self._absent]
-        missing = {} if self.prepared is None else missing_arrays(self.source, ids)
+        missing = unknown_arrays(self.kind) | ({} if self.prepared is None else missing_arrays(self.source, ids))
         return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars, missing)
+
+    @property
+    def kind(self) -> str:
+        """Return what its videos are, one of :data:`v2v_server.store.pixels.PIXEL_KINDS`."""
+        return kind_of(self.videos.ids[0])
 
     def part(self) -> CorpusPart:
         """Return what the status says of it."""
@@ -500,7 +514,10 @@ def open_catalogue(
     Raises:
         CorpusError: the folder or list is missing, unreadable or malformed, or has no usable video.
         IndexUnreadable: the index cannot be read any more after the probes.
+        UsageError: ``scene``, and the videos are photographs.
     """
+    if scene and kind.is_rendered:
+        raise UsageError("--scene auto leaves out defects of videos, which photographs do not have: set it to off")
     opened = open_source(source, SourceOptions(list_file, copies, copies_gib, cache_dir, kind))
     corpus = list_corpus(opened, rows, notice)
     scenes = SceneCollection(corpus.rows) if scene else None
@@ -572,7 +589,7 @@ def _snapshot(
         videos = Videos(table, thresholds, split)
         if died := sorted(unknown - absent):
             notes = [*notes, f"{len(died)} videos crash the decoder that analyses their scenes: {died[0]}"]
-    marks = dict(zip(videos.ids, videos.fingerprints, strict=True))
+    marks = {} if source.kind.is_rendered else dict(zip(videos.ids, videos.fingerprints, strict=True))
     endings = sidecar_endings(tuple(ARRAYS))
     sidecars, said = collect_sidecars(source, store, marks, videos.shape, endings, processes, notice)
     notes = [*notes, *said]

@@ -15,7 +15,7 @@ import numpy as np
 from v2v_protocol.errors import VideoError, VideoUnreadable
 from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.pixels import open_pixels
+from v2v_server.store.pixels import kind_of, open_pixels
 from v2v_server.system.isolate import Died, run_twice
 from v2v_server.video.fingerprint import fingerprint
 from v2v_server.video.probe import VideoFacts
@@ -41,11 +41,13 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
 
     A file that cannot be read gets the size -1, which no file has: it is probed again at the next start.
     """
+    if kind_of(id) == "photographs" and not source.kind.is_rendered:
+        return IndexRow(id, -1, problem="is a picture: add --videos-kind photographs")
     try:
         before = source.state(id)
         with source.open_local(id, "") as path:
             mark = fingerprint(path)
-            facts = _at_rate(_facts(path, source.kind.videos_kind), source.rate(id))
+            facts = _timed(_facts(path, source.kind.videos_kind), source, id)
         name = facts.made_of or (f"{mark}-{facts.content}" if facts.content else mark)
         if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
@@ -80,12 +82,16 @@ def facts_of(path: Path, kind: str = "videos") -> VideoFacts:
         return pixels.facts()
 
 
-def _at_rate(facts: VideoFacts, rate: float) -> VideoFacts:
-    """Return the facts of pictures that follow each other at a rate, Hz, if they do not state their times."""
+def _timed(facts: VideoFacts, source: VideoSource, id: str) -> VideoFacts:
+    """Return the facts of pictures that follow each other at a rate that the user states, if they state no times; those
+    of a photograph, of all frames that it is shown for.
+    """
+    rate, frames = source.rate(id), source.kind.frames if source.kind.is_rendered else facts.frames
     if not rate or facts.index.seekable:
         return facts
-    index = facts.index.timed(np.rint(np.arange(facts.frames) * 1e9 / rate).astype(np.int64))
-    return replace(facts, frames_per_second=rate, index=index, content=f"{facts.content}@{rate:g}")
+    index = facts.index.timed(np.rint(np.arange(frames) * 1e9 / rate).astype(np.int64))
+    content = f"{facts.content}@{rate:g}"
+    return replace(facts, frames=frames, frames_per_second=rate, index=index, content=content)
 
 
 def _facts(path: Path, kind: str) -> VideoFacts:

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.persisted import FloatOrNaN, Persisted
-from v2v_protocol.sample import ARRAYS, sidecar_endings
+from v2v_protocol.sample import ARRAYS, FromSidecar, sidecar_endings
 from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import PIECE, Pieces, clip_pieces, firsts_of, sides_of
 from v2v_server.corpus.sidecars import Sidecars
@@ -474,9 +474,21 @@ def missing_arrays(source: VideoSource, ids: Sequence[str]) -> dict[str, str]:
     """
     some = ids[:: max(1, len(ids) // _ASKED)]
     return {
-        plane.serves: f"the plane {name}, which these prepared videos do not have: {plane.remedy}"
+        plane.serves: f"the plane {name}, which these prepared videos do not have: {plane.remedy}, or serve the videos "
+        "that they were prepared from"
         for name, plane in PLANES.items()
         if plane.serves in ARRAYS and not (source.is_local and all(_has_plane(source, id, name) for id in some))
+    }
+
+
+def unknown_arrays(kind: str) -> dict[str, str]:
+    """Return the arrays that cannot be made from any video of a kind, with the remedy."""
+    if kind != "photographs":
+        return {"tracks": "--videos-kind photographs, where all motion is known: ask for flow, which is estimated"}
+    labels = {name for name, form in ARRAYS.items() if isinstance(form, FromSidecar) and name != "masks"}
+    return {
+        "frames_rgb": "the colour of a video, and photographs are rendered in grey: ask for frames",
+        **dict.fromkeys(labels, "labels beside a video, and photographs move: ask for masks and tracks"),
     }
 
 
@@ -498,7 +510,7 @@ class CorpusFacts:
         digest: names this snapshot.
         scene_digest: names this snapshot together with the statistics of its videos; None without them.
         sidecars: the files beside the videos, by ending.
-        missing: arrays that cannot be made from the prepared videos, with the remedy.
+        missing: what arrays need that cannot be made from these videos, with the remedy.
     """
 
     videos: Sequence[VideoEntry]
@@ -516,9 +528,7 @@ class CorpusFacts:
         """
         for name in arrays:
             if name in self.missing:
-                raise UsageError(
-                    f"arrays: {name} needs {self.missing[name]}, or serve the videos that they were prepared from"
-                )
+                raise UsageError(f"arrays: {name} needs {self.missing[name]}")
 
     def sidecars_of(self, video: str, arrays: tuple[str, ...]) -> dict[str, str]:
         """Return the fingerprints of a video's sidecars that these arrays are made from, by ending."""

@@ -127,12 +127,14 @@ def prepare(
         CorpusError: source and destination overlap, the destination holds something else or was prepared with other
             settings or from another source, a prepared file cannot be read, another process works there, the source is
             a prepared folder itself, or the disk is too full.
-        UsageError: a number of processes below 0, or an unknown size.
+        UsageError: a number of processes below 0, an unknown size, or photographs.
     """
     if processes < 0:
         raise UsageError(f"{processes} processes: give 0 or more")
     if size not in SIZES:
         raise UsageError(f"size {size!r}: choose one of {', '.join(SIZES)}")
+    if catalogue.source.kind.is_rendered:
+        raise UsageError("photographs are rendered for each sample, so there is nothing to prepare: serve them")
     tell = progress or (lambda done, total, made, expected: None)
     total = sum(video.frames for video in catalogue.videos)
     tell(0, total, 0, 0)

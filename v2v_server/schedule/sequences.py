@@ -30,6 +30,7 @@ from v2v_server.corpus.scenes.scene import MOST_ANALYSED_FRAMES, NO_BARS, Flag, 
 from v2v_server.corpus.videos import SplitVideos, VideoEntry
 from v2v_server.corpus.videos import Videos as CatalogueVideos
 from v2v_server.simulation.draw import admits, smallest_scale
+from v2v_server.store.pixels import kind_of
 from v2v_server.video.rows import Rows
 
 _SKIPPED = {
@@ -274,11 +275,13 @@ class SequenceTable:
         videos: number of videos that give at least one.
 
     Raises:
-        UsageError: the spec asks for scenes and the catalogue has no scene statistics.
+        UsageError: the spec asks for scenes and the catalogue has no scene statistics, or it is for another kind of
+            videos.
     """
 
     def __init__(self, videos: _Videos, rows: Rows, spec: StreamSpec, columns: Columns | None = None) -> None:
         self._all, self._rows, self._spec, self._columns = videos, rows, spec, columns or Columns(videos)
+        _check_kind(spec, kind_of(videos[0].id) if len(videos) else "videos")
         if spec.scene != "off" and self._columns.split is None:
             raise UsageError(
                 f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '
@@ -372,6 +375,20 @@ class SequenceTable:
         sequences = SplitSequences(split, counts[at], of_split, spec, columns.size[split.numbers], suits)
         counts[at] = sequences.counts
         return counts, sequences
+
+
+def _check_kind(spec: StreamSpec, kind: str) -> None:
+    """Check that the spec suits what the videos are.
+
+    Raises:
+        UsageError: it does not.
+    """
+    if spec.recipe.is_world and kind != "photographs":
+        raise UsageError(
+            f"the recipe's world fields are for photographs, these are {kind}: add --videos-kind photographs"
+        )
+    if kind == "photographs" and not spec.recipe.is_world:
+        raise UsageError("photographs stand still under this recipe: set world fields, as --preset worlds does")
 
 
 class Refusals(Sequence[Refusal]):
@@ -478,11 +495,17 @@ def _frame_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec) -> tuple[int, 
     whole, crop = (bottom - top) * video.width_px, recipe.crop_height_px * recipe.crop_width_px
     read, sides = crop, 2 * max(spec.flow_margin_px, MARGIN_PX if spec.substep_px else 0)
     window = min(whole, (recipe.crop_height_px + sides) * (recipe.crop_width_px + sides))
-    if recipe.resize_scale != (1.0, 1.0):
+    is_rendered = kind_of(video.id) == "photographs"
+    if is_rendered:
+        window = crop
+    elif recipe.resize_scale != (1.0, 1.0):
         read = window = whole
     elif spec.flow_margin_px < 0:
         window = whole
-    depth, held = 1 if recipe.light == "sdr" else 2, samples + (1 if spec.scene == "off" else samples)
+    depth, held = (
+        1 if recipe.light == "sdr" and not is_rendered else 2,
+        samples + (1 if spec.scene == "off" else samples),
+    )
     seen = 2 * depth + np.dtype(spec.voxel_dtype).itemsize + (2 * (MOST_SUBSTEPS - 1) if spec.substep_px else 0)
     return read * samples, depth * window * held + seen * crop
 

@@ -112,6 +112,8 @@ class Variant(NamedTuple):
     """Whether steps have sub-steps, whose levels the kernels of ``v2v_server.motion`` make."""
     bits: int = 8
     """More than 8: for frames of uint16."""
+    is_rendered: bool = False
+    """Whether its frames are rendered by the kernels of ``v2v_server.worlds``."""
 
     def __str__(self) -> str:
         kind = f"{' by the general kernel' if self.is_general else ''}{' with sub-steps' if self.is_divided else ''}"

@@ -9,6 +9,7 @@ reader       store files, opened; read a clip from some of them
 pixels       what frames are read from: the protocol, and its kinds
 video_file   a video, decoded
 picture_sequence  a folder or archive of numbered pictures, decoded
+photograph   a photograph, whose frames are rendered for each sample
 quota        a folder that many processes fill up to a limit: the cache, and copies of videos in object storage
 cache        a folder of pieces that are stored when they are first decoded
 """

@@ -26,6 +26,7 @@ from v2v_protocol.errors import VideoError
 from v2v_protocol.programs import printable
 from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_server.labels.formats import frame_of
+from v2v_server.store.pixels import IMAGE_SUFFIXES
 from v2v_server.store.video_file import VideoFile
 from v2v_server.video.collect import Stack
 from v2v_server.video.fingerprint import TIMES, files_in, unreadable
@@ -35,15 +36,16 @@ from v2v_server.video.orientation import Orientation
 from v2v_server.video.probe import VideoFacts
 from v2v_server.video.source import LARGEST_PICTURE_PX, reason
 
-_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
-LOOKED_FOR = f"folders and .zip archives of numbered {' '.join(sorted(_SUFFIXES))}"
-_CODECS = {
+LOOKED_FOR = f"folders and .zip archives of numbered {' '.join(sorted(IMAGE_SUFFIXES))}"
+PICTURE_CODECS = {
     b"\x89PNG": "png", b"\xff\xd8\xff": "mjpeg", b"II*\0": "tiff", b"MM\0*": "tiff", b"RIFF": "webp", b"BM": "bmp",
 }  # fmt: skip
 """FFmpeg's name of the decoder, by the first bytes of a file."""
-_ORIENTATION, _MIRRORED = 0x0112, (2, 4, 5, 7)
-"""Exif's tag of the orientation, and its values that PyAV cannot tell from turned ones."""
-_LARGEST_FILE_BYTES = 8 * LARGEST_PICTURE_PX + (1 << 20)
+ORIENTATION = 0x0112
+"""Exif's tag of the orientation."""
+_MIRRORED = (2, 4, 5, 7)
+"""Orientations that PyAV cannot tell from turned ones."""
+LARGEST_PICTURE_FILE_BYTES = 8 * LARGEST_PICTURE_PX + (1 << 20)
 """Most bytes that are read of a file: a picture of the most pixels and 16 bits without compression."""
 
 
@@ -53,7 +55,7 @@ def id_of(path: str) -> str:
     """
     suffix, folder = PurePosixPath(path).suffix.lower(), f"{posixpath.dirname(path)}/"
     is_sidecar = any(ending in folder for ending in sidecar_endings(tuple(ARRAYS)) if ending.endswith("/"))
-    return path if suffix == ".zip" else folder if suffix in _SUFFIXES and not is_sidecar else ""
+    return path if suffix == ".zip" else folder if suffix in IMAGE_SUFFIXES and not is_sidecar else ""
 
 
 class PictureSequence(VideoFile):
@@ -75,7 +77,7 @@ class PictureSequence(VideoFile):
                 if looks[-1] != looks[0]:
                     raise ValueError(f"is {looks[-1]}, and {pictures[0]} {looks[0]}: give all one size and format")
             self._at = 0, pictures[0]
-            head, codec = _decoded(read(pictures[0]))
+            head, codec = decode_picture(read(pictures[0]))
             times = self._times(files, pictures, read)
         lies = Orientation.of(head)
         index = unseekable(len(pictures), (1, 1), *lies.size(head.height, head.width), lies)
@@ -103,7 +105,7 @@ class PictureSequence(VideoFile):
             pictures = self._pictures(files)
             for frame in range(wanted.start, index.end, wanted.stride):
                 self._at = frame, pictures[frame]
-                picture, codec = _decoded(read(pictures[frame]))
+                picture, codec = decode_picture(read(pictures[frame]))
                 picture.pts = int(index.pts[frame - index.first]) if index.seekable else None
                 stack.codec, stack.seen, stack.name = codec, frame, f"{pictures[frame]}: "
                 yield picture
@@ -117,24 +119,16 @@ class PictureSequence(VideoFile):
             VideoUnreadable: the system reports an error.
         """
         path, self._at = os.fspath(self._path), (None, "")
-        try:
-            with nullcontext() if os.path.isdir(path) else ZipFile(path) as packed:
+        is_folder = os.path.isdir(path)
+        with errors_of_pictures(path, lambda: self._at), nullcontext() if is_folder else ZipFile(path) as packed:
 
-                def read(name: str) -> bytes:
-                    with packed.open(name) if packed else Path(path, name).open("rb") as file:
-                        # Memory for all bytes that are asked for is allocated first, except by zipfile.
-                        size = _LARGEST_FILE_BYTES if packed else os.fstat(file.fileno()).st_size
-                        return file.read(min(size, _LARGEST_FILE_BYTES))
+            def read(name: str) -> bytes:
+                with packed.open(name) if packed else Path(path, name).open("rb") as file:
+                    # Memory for all bytes that are asked for is allocated first, except by zipfile.
+                    size = LARGEST_PICTURE_FILE_BYTES if packed else os.fstat(file.fileno()).st_size
+                    return file.read(min(size, LARGEST_PICTURE_FILE_BYTES))
 
-                yield packed.namelist() if packed else [name for name, _ in files_in(path)], read
-        except VideoError:
-            raise
-        except Exception as error:  # zipfile and Pillow have no common class of them
-            if isinstance(error, OSError) and error.errno and not isinstance(error, av.FFmpegError):
-                raise unreadable(path, error) from error
-            frame, name = self._at
-            why = "is damaged, or of a format that is not read" if isinstance(error, OSError) else reason(error)
-            raise VideoError(path, frame, f"{printable(name)}: {why}".removeprefix(": ")) from None
+            yield packed.namelist() if packed else [name for name, _ in files_in(path)], read
 
     def _pictures(self, files: list[str]) -> list[str]:
         """Return the names of the pictures by number, which follow each other."""
@@ -168,9 +162,33 @@ class PictureSequence(VideoFile):
         return times.astype(np.int64)
 
 
-def _decoded(data: bytes) -> tuple[VideoFrame, str]:
+@contextmanager
+def errors_of_pictures(path: str, at: Callable[[], tuple[int | None, str]]) -> Iterator[None]:
+    """Turn any error of the system, a decoder or a check into one of a video, until the end of the context.
+
+    Args:
+        path: of the video.
+        at: returns the current frame, and the name of its picture in the video.
+
+    Raises:
+        VideoError: a picture is damaged, or not of a form that is read.
+        VideoUnreadable: the system reports an error.
+    """
+    try:
+        yield
+    except VideoError:
+        raise
+    except Exception as error:  # zipfile and Pillow have no common class of them
+        if isinstance(error, OSError) and error.errno and not isinstance(error, av.FFmpegError):
+            raise unreadable(path, error) from error
+        frame, name = at()
+        why = "is damaged, or of a format that is not read" if isinstance(error, OSError) else reason(error)
+        raise VideoError(path, frame, f"{printable(name)}: {why}".removeprefix(": ")) from None
+
+
+def decode_picture(data: bytes) -> tuple[VideoFrame, str]:
     """Return a decoded picture, and FFmpeg's name of its format."""
-    codec = next((codec for magic, codec in _CODECS.items() if data.startswith(magic)), "png")
+    codec = next((codec for magic, codec in PICTURE_CODECS.items() if data.startswith(magic)), "png")
     decoder: Any = av.CodecContext.create(codec, "r")
     decoder.thread_type, decoder.thread_count = "NONE", 1
     # Without "explode" the rest of a truncated JPEG is filled up with grey; with it, some sound TIFF files fail.
@@ -186,7 +204,7 @@ def _look(data: bytes) -> str:
     from PIL import Image  # only a catalogue needs it
 
     with Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "TIFF", "WEBP", "BMP")) as picture:
-        turned = Image.Image.getexif(picture).get(_ORIENTATION, 1)  # that of PNG files would decode the picture
+        turned = Image.Image.getexif(picture).get(ORIENTATION, 1)  # that of PNG files would decode the picture
         if turned in _MIRRORED:
             raise ValueError("is mirrored by its Exif orientation: convert it to a plain one")
         transparent = "; its transparency is left out" if picture.has_transparency_data else ""

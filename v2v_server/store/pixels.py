@@ -6,6 +6,7 @@ None for another form.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,11 +26,14 @@ if TYPE_CHECKING:  # a server's command line, which names the kinds, starts with
 PIXEL_KINDS: Mapping[str, tuple[str, ...]] = {
     "videos": ("reader", "video_file"),
     "sequences": ("reader", "picture_sequence"),
+    "photographs": ("photograph",),
 }
 """What a video of a corpus is, by ``--videos-kind``: the files here, in the order in which they are asked. The last one
 takes any path. It has ``id_of(path)``, the id of the video that a file belongs to, and ``LOOKED_FOR``, for people."""
 
+IMAGE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 HIGHEST_RATE_HZ = 1e6
+LONGEST_PHOTOGRAPH_FRAMES = 2**17
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,32 +42,58 @@ class VideosKind:
 
     Attributes:
         videos_kind: one of :data:`PIXEL_KINDS`.
-        rate: of picture sequences without time stamps, Hz; 0: unknown.
+        rate: of picture sequences without time stamps, Hz, 0: unknown; of photographs, 0: 60.
+        photograph_seconds: for which a photograph is shown, 0: 10.
 
     Raises:
-        UsageError: there is no such kind, or it has no such rate.
+        UsageError: there is no such kind, or it has no such rate or duration.
     """
 
     videos_kind: str = "videos"
     rate: float = 0.0
+    photograph_seconds: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.videos_kind not in PIXEL_KINDS or not 0 <= self.rate <= (HIGHEST_RATE_HZ if self.has_parts else 0):
+        highest_hz = 0.0 if self.videos_kind == "videos" else HIGHEST_RATE_HZ
+        longest = math.inf if self.is_rendered else 0.0
+        is_within = 0 <= self.rate <= highest_hz and 0 <= self.photograph_seconds <= longest
+        if self.videos_kind not in PIXEL_KINDS or not is_within:
             what = f"--videos-kind {self.videos_kind}, --rate {self.rate:g}"
+            what += f", --photograph-seconds {self.photograph_seconds:g}" * (self.photograph_seconds != 0)
             raise UsageError(
                 f"{what}: choose one of {', '.join(PIXEL_KINDS)}; sequences can have a rate up to "
-                f"{HIGHEST_RATE_HZ:g} Hz"
+                f"{HIGHEST_RATE_HZ:g} Hz, and photographs a rate and a duration"
+            )
+        if self.is_rendered and not 2 <= self.frames <= LONGEST_PHOTOGRAPH_FRAMES:
+            raise UsageError(
+                f"--photograph-seconds {self.photograph_seconds or 10:g} at --rate {self.rendered_hz:g} gives {self.frames} frames: "
+                f"give 2 to {LONGEST_PHOTOGRAPH_FRAMES}"
             )
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> VideosKind:
         """Return the kind of a command's flags; None stands for a default."""
-        return cls(given["videos_kind"] or "videos", given["rate"] or 0.0)
+        return cls(given["videos_kind"] or "videos", given["rate"] or 0.0, given["photograph_seconds"] or 0.0)
 
     @property
     def has_parts(self) -> bool:
         """Return whether a video is a folder or an archive of files."""
         return self.videos_kind == "sequences"
+
+    @property
+    def is_rendered(self) -> bool:
+        """Return whether frames are rendered for each sample, so that a video is no more than a picture."""
+        return self.videos_kind == "photographs"
+
+    @property
+    def rendered_hz(self) -> float:
+        """Return the rate of photographs."""
+        return self.rate or 60.0
+
+    @property
+    def frames(self) -> int:
+        """Return the number of frames of a photograph, those at the beginning and the end included."""
+        return 1 + math.floor(min((self.photograph_seconds or 10.0) * self.rendered_hz, 1e15) + 0.5)
 
     @property
     def form(self) -> Any:
@@ -83,7 +113,7 @@ class Pixels(Protocol):
     of its index or picture. A frame is delivered exactly, or not at all.
 
     Attributes:
-        is_stored: whether its frames are decoded already, so that a cache gains nothing.
+        is_stored: whether a cache gains nothing: its frames are decoded already, or differ from sample to sample.
     """
 
     is_stored: bool
@@ -112,7 +142,10 @@ def signal_of(pixels: Pixels, index: FrameIndex) -> Signal:
 
 def kind_of(id: str) -> str:
     """Return what a catalogued video is, one of :data:`PIXEL_KINDS`."""
-    return "sequences" if id.lower().endswith(("/", ".zip")) else "videos"
+    lower = id.lower()
+    if lower.endswith(("/", ".zip")):
+        return "sequences"
+    return "photographs" if lower.endswith(tuple(IMAGE_SUFFIXES)) else "videos"
 
 
 @contextmanager

@@ -26,9 +26,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 SOURCES = Path(__file__).parents[1] / "simulation"
-"""The folder of the pixel kernels; with the one beside it named "motion" it has all files that a kernel may use."""
+"""The folder of the pixel kernels; with "motion" and "worlds" beside it, it has all files that a kernel may use."""
 
-_FOLDERS = SOURCES, SOURCES.with_name("motion")
+_FOLDERS = SOURCES, SOURCES.with_name("motion"), SOURCES.with_name("worlds")
 
 PROCESSORS = Path("/proc/cpuinfo")
 """Linux's description of the processors. Asking LLVM, as numba does, would load it in every process."""

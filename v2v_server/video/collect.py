@@ -12,6 +12,8 @@ import numpy.typing as npt
 from av.video.frame import VideoFrame
 
 from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.sample import SampleParams
+from v2v_protocol.spec import StreamSpec
 from v2v_server.video.colour.chroma import DEFAULT_MATRIX, Chroma, ChromaCut, ChromaStack
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.luma import MIXED, SDR, TRANSFERS, BeyondBits, LumaFormat, Signal, copy_luma, luma_plane, stretch
@@ -44,6 +46,19 @@ class Cut:
     still: PixelRect | None = None
 
 
+class SampleView(NamedTuple):
+    """What a cut is for, where its frames are rendered.
+
+    Attributes:
+        spec, params: the stream's spec and the sample's draw.
+        arrays: requested arrays, by name.
+    """
+
+    spec: StreamSpec
+    params: SampleParams
+    arrays: tuple[str, ...]
+
+
 @dataclass(frozen=True, slots=True)
 class ClipRequest:
     """What is wanted of the frames of a video.
@@ -58,6 +73,7 @@ class ClipRequest:
             whatever the file states.
         samples: (seed, epoch, index) of the sample of each cut, for pixels that differ from sample to sample; empty
             where no sample is made.
+        views: what they are for, for pixels that render the camera's view and know what moves in it.
     """
 
     index: FrameIndex
@@ -67,6 +83,7 @@ class ClipRequest:
     rows: tuple[int, int] | None = None
     most_bits: int | None = None
     samples: tuple[tuple[int, int, int], ...] = ()
+    views: tuple[SampleView, ...] = ()
 
     @property
     def count(self) -> int:

@@ -55,6 +55,8 @@ class DecodedClip:
         motion: [count, 2, rows, columns] int16, the motion to each frame from the one before in the cells of its cut
             (:mod:`v2v_server.motion`), zero for the first; None if it was not asked for.
         arrays: arrays of the sample that come with the pixels, by name, as they are delivered.
+        is_view: whether the frames are what the camera of the sample sees, so that its view is not applied.
+        levels: :class:`v2v_server.simulation.voxel.Levels` between these frames; None without.
     """
 
     frames: npt.NDArray[Any]
@@ -66,6 +68,8 @@ class DecodedClip:
     signal: Signal = SDR
     motion: npt.NDArray[np.int16] | None = None
     arrays: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+    is_view: bool = False
+    levels: Any = None  # of a package above this one
 
 
 Way = Callable[[Stack], Generator[VideoFrame, None, None]]

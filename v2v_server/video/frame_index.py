@@ -115,7 +115,7 @@ class FrameIndex:
     def timed(self, pts: npt.NDArray[np.int64]) -> FrameIndex:
         """Return the index of the same frames with time stamps, [n] nanoseconds; decoding may begin at each."""
         return replace(
-            self, pts=pts, keyframes=np.arange(self.first, self.end), keyframe_dts=np.full(len(pts), NO_TIMESTAMP),
+            self, pts=pts, keyframes=self.first + np.arange(len(pts)), keyframe_dts=np.full(len(pts), NO_TIMESTAMP),
             time_base=(1, 10**9), seekable=True,
         )  # fmt: skip
 

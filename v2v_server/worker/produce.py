@@ -60,7 +60,8 @@ from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache, Cached
-from v2v_server.video.collect import ClipRequest, Cut
+from v2v_server.store.pixels import kind_of
+from v2v_server.video.collect import ClipRequest, Cut, SampleView
 from v2v_server.video.colour.chroma import ChromaCut
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.luma import MIXED, MOST_BITS, SDR
@@ -195,15 +196,17 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
     flow: FlowSettings | None = None
     still_px: int | None = 0
     flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture, place)
-    if not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
+    is_rendered = kind_of(lease.video) == "photographs"
+    if not is_rendered and not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
         flow = FlowSettings.of(spec)
         if flow_plan is not None and flow_plan.still:
             flow = replace(flow, margin_px=0)
         still_px = flow.margin_px
-    margin_px = max(still_px, MARGIN_PX) if spec.substep_px and still_px is not None else still_px
+    has_motion = spec.substep_px > 0 and not is_rendered
+    margin_px = max(still_px, MARGIN_PX) if has_motion and still_px is not None else still_px
     window, still = (source_window(params, recipe, picture, margin) for margin in (margin_px, still_px))
     chroma = chroma_cut(lease, params, spec, frames, source) if "frames_rgb" in lease.arrays else None
-    cells = cells_of(params, recipe, within_rows(lease, frames.sides)) if spec.substep_px else None
+    cells = cells_of(params, recipe, within_rows(lease, frames.sides)) if has_motion else None
     cut = Cut(frames.count(int(source[-1]) + 1), window, chroma, cells, still)
     return SamplePlan(spec, params, source, frames, cut, margin_px, flow, flow_plan)
 
@@ -231,6 +234,7 @@ def decode_for(
             frame_index(lease, frames.span), lease.start_frame, tuple(plan.cut for plan in plans), frames.stride or 1,
             Rows.parse(lease.rows).bounds(lease.height_px), _most_bits(plans[0].spec),
             tuple((lease.seed, lease.epoch, index) for index in indices),
+            tuple(SampleView(plan.spec, plan.params, lease.arrays) for plan in plans),
         )  # fmt: skip
         with source.open_pixels(lease.video, lease.fingerprint) as pixels:
             if cache is not None and not pixels.is_stored:
@@ -361,7 +365,7 @@ def sample_context(
     """
     plan = decoded.plan
     params, recipe = plan.params, plan.spec.recipe
-    frames, signal, flow, levels = decoded.clip.frames, decoded.clip.signal, None, None
+    frames, signal, flow, levels = decoded.clip.frames, decoded.clip.signal, None, decoded.clip.levels
     if plan.flow is not None and into and "flow" not in decoded.clip.arrays:  # events need no flow
         methods = () if plan.flow_plan is None else plan.flow_plan.methods
         part = without_margin(frames, params, recipe, plan.margin_px, plan.flow.margin_px)
@@ -376,7 +380,9 @@ def sample_context(
     # An array must not make a video unusable for the others: without a rate, it is left empty.
     is_timed = recipe.needs_seconds or (bool(lease.frames_per_second) and needs_seconds(into))
     seconds, irregular = _step_seconds(lease, decoded) if is_timed else (None, 0)
-    view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe, signal)
+    view = frames
+    if not decoded.clip.is_view:
+        view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe, signal)
     clip = SourceClip(
         lease.start_frame,
         decoded.clip.seconds,
@@ -425,17 +431,20 @@ def _decoder(clip: DecodedClip) -> str:
 def kernels_of(lease: Lease) -> frozenset[Variant]:
     """Return the compiled kernels that a lease's sample may need."""
     made = tuple(name for name in NAMES if name in lease.arrays)
-    return _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds, made) if made else frozenset()
+    kind = kind_of(lease.video)
+    return _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds, made, kind) if made else frozenset()
 
 
 @lru_cache(maxsize=64)
 def _variants(
-    canonical: bytes, frames_per_second: float, thresholds: tuple[float, ...], arrays: tuple[str, ...]
+    canonical: bytes, frames_per_second: float, thresholds: tuple[float, ...], arrays: tuple[str, ...], kind: str
 ) -> frozenset[Variant]:
     spec = _spec(canonical)
     step_seconds = spec.recipe.frame_stride / frames_per_second
     levels_per_step = MOST_SUBSTEPS - 1 if spec.substep_px else 0
     found = variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds), arrays, levels_per_step)
+    if kind == "photographs":
+        found = frozenset(variant._replace(is_divided=False, bits=MOST_BITS, is_rendered=True) for variant in found)
     if not spec.tolerance:
         return found
     return found | {variant._replace(is_general=False, is_divided=False) for variant in found}

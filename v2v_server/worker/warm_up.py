@@ -33,6 +33,7 @@ from v2v_server.simulation.pixel import simulate_pixels
 from v2v_server.simulation.precision import Variant, load, warm_up
 from v2v_server.system.compile_cache import sources_digest
 from v2v_server.system.process import die_with_parent
+from v2v_server.worlds.clip import load as load_worlds
 
 _LONGEST_WAIT_SECONDS = 300.0
 _POLL_SECONDS = 0.1
@@ -57,6 +58,7 @@ def load_in_turn(variant: Variant) -> None:
                 variant.precision,
                 int(variant.is_divided),
                 variant.bits,
+                int(variant.is_rendered),
             )
             _compile_apart(*map(str, kind))
         _load(variant)
@@ -72,6 +74,8 @@ def _load(variant: Variant) -> None:
     load(variant)
     if variant.is_divided:
         load_motion()
+    if variant.is_rendered:
+        load_worlds()
 
 
 def load_kernels() -> None:
@@ -166,6 +170,6 @@ def _lock(path: Path, longest_wait_seconds: float) -> Iterator[None]:
 if __name__ == "__main__":
     die_with_parent(int(sys.argv[1]))
     if asked := sys.argv[2:]:
-        _load(Variant(asked[0], asked[1] == "1", asked[2], asked[3] == "1", int(asked[4])))
+        _load(Variant(asked[0], asked[1] == "1", asked[2], asked[3] == "1", int(asked[4]), asked[5] == "1"))
     else:
         load_kernels()

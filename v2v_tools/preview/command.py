@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "sources", nargs="+", metavar="VIDEO|DIR",
         help="a video, a folder of videos, or a list file; with several, each gets a FILE-NAME of its own",
     )  # fmt: skip
-    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "cache_dir")
+    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "photograph_seconds", "cache_dir")
     out = parser.group("Output")
     parser.add_output(
         "Output", "--out", PICTURE_SUFFIXES, f"picture, film or page: {', '.join(PICTURE_SUFFIXES)}", required=True
@@ -72,7 +72,8 @@ def _run(arguments: argparse.Namespace) -> None:
         recipe = recipe_setting(name, arguments.set)
         looks = [Shot("", recipe, seed) for seed in range(first, first + count)]
         what = f'virtual cameras drawn from the recipe "{Path(name).stem}"'
-    if arguments.seed is None:
+    kind = VideosKind.of(vars(arguments))
+    if arguments.seed is None and not kind.is_rendered:
         what += ", chosen where something moves"
     stem, names = arguments.out.stem, [Path(source).stem for source in arguments.sources]
     named = {
@@ -94,7 +95,7 @@ def _run(arguments: argparse.Namespace) -> None:
             with_flow=not arguments.no_flow,
             moments=arguments.moments,
             cache_dir=arguments.cache_dir,
-            kind=VideosKind.of(vars(arguments)),
+            kind=kind,
         )
 
 

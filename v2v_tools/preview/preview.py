@@ -112,7 +112,7 @@ def preview(
     try:
         first = _fitted_stream(catalogue, spec, shots[0].recipe)
         wholes = WholePictures(catalogue, first)
-        if find_motion:
+        if find_motion and not kind.is_rendered:
             shots, note = _moving(shots, Remaker(catalogue, first), wholes)
             say(note)
         with Progress("simulating", "cameras") as progress:
@@ -122,8 +122,10 @@ def preview(
                 loss += lost
                 started = started + events
                 progress(len(cameras), len(shots))  # the first may include compiling; the estimate begins after it
-        whole = wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
-        shown = sorted({camera.provenance.video for camera in cameras}) if first.scene == "off" else ()
+        # A photograph stands still, apart from what each camera sees of it.
+        whole = None if kind.is_rendered else wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
+        looks = first.scene == "off" and not kind.is_rendered
+        shown = sorted({camera.provenance.video for camera in cameras}) if looks else ()
         defects = [each for id in shown for each in defects_of_video(catalogue, id)]
     finally:
         catalogue.close()
@@ -131,7 +133,8 @@ def preview(
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(shots) else 'all cameras'}: {note}")
     say(f"{describe_start(started)} (recipe field start)")
-    say(describe_loss(loss, defects))
+    if not kind.is_rendered:
+        say(describe_loss(loss, defects))
     write_file(out, _content(out.suffix.lower(), whole, cameras, title, moments))
     say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
 
@@ -173,7 +176,7 @@ def _sequence_of(catalogue: Catalogue, provenance: Provenance) -> VideoSequence:
     return VideoSequence(video, provenance.start_frame)
 
 
-def _content(kind: str, whole: Camera, cameras: Sequence[Camera], title: str, moments: int) -> bytes | str:
+def _content(kind: str, whole: Camera | None, cameras: Sequence[Camera], title: str, moments: int) -> bytes | str:
     if kind == ".png":
         return png_bytes(draw_sheet(cameras, title, moments=moments, whole=whole))
     grids, bins = cameras[0].voxels.shape[:2]
@@ -208,6 +211,8 @@ def _camera(
         notes.setdefault(note, []).append(title)
     sidecars = catalogue.sidecars
     labels = [name for name in LABELS if any(sidecars[each].fingerprints for each in sidecar_endings((name,)))]
+    if catalogue.kind == "photographs":
+        labels = ["masks", "tracks"]
     arrays = ("voxels", "frames", *(("flow",) if with_flow else ()), *labels)
     made = Remaker(catalogue, stream, arrays).made(shot.seed, 0, 0)
     provenance = made.sample.provenance

@@ -148,8 +148,11 @@ def look_at_pictures(
     Returns:
         the defects that were found, by id.
     """
-    if not catalogue.source.is_local:
-        yield "ok", "pictures", "not looked at: these videos lie on another host", ""
+    if not catalogue.source.is_local or catalogue.source.kind.is_rendered:
+        why = (
+            "these videos lie on another host" if not catalogue.source.is_local else "photographs have no such defects"
+        )
+        yield "ok", "pictures", f"not looked at: {why}", ""
         return {}
     looked = _found(catalogue.source, spread_excerpts(catalogue, _MOST_VIDEOS, _LONGEST_SECONDS), usable_cores())
     looked = Progress.over("looking at pictures", "videos", looked, min(_MOST_VIDEOS, len(catalogue.videos)))
@@ -196,7 +199,7 @@ def check_in_background(
     Returns:
         the thread; None where nothing is looked at, as for a corpus on another host.
     """
-    if spec.scene != "off" or not catalogue.source.is_local:
+    if spec.scene != "off" or not catalogue.source.is_local or catalogue.source.kind.is_rendered:
         return None
     excerpts = list(
         spread_excerpts(catalogue, _SERVED_VIDEOS, _LONGEST_SECONDS)

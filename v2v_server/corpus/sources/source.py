@@ -13,6 +13,7 @@ On remote storage each question about a file is a round trip, most of it waiting
 from __future__ import annotations
 
 import os
+import zlib
 from abc import ABC, abstractmethod
 from array import array
 from collections import Counter, deque
@@ -258,10 +259,12 @@ class VideoSource(ABC):
 
     def rate(self, id: str) -> float:
         """Return the rate of a video that does not state one, Hz; 0 if it is unknown."""
-        return self.rates.get(id, self.kind.rate)
+        return self.kind.rendered_hz if self.kind.is_rendered else self.rates.get(id, self.kind.rate)
 
     def mark(self, id: str) -> int:
         """Return a number for the state of a video, which changes with the rate that is stated for it."""
+        if self.kind.is_rendered:
+            return 1 + zlib.crc32(f"{self.kind.rendered_hz} {self.kind.frames}".encode())
         return 1 + int(1e6 * self.rate(id)) if self.kind.has_parts else 0
 
     def state_of_parts(self, id: str, files: Sequence[tuple[str, FileState]]) -> FileState:

@@ -1,0 +1,110 @@
+"""Measure the processor time of a sample of photographs, beside one of the paper's recipe from a dense store.
+
+    python -m bench photographs --photographs DIR --videos DIR
+
+Both have voxels and frames, of 128 x 128 px, and are made in this process, decoding included, in turns. Those of
+photographs have two patches. With ``truth`` they also have flow, flow_valid, masks and tracks. Each time is the mean
+over the samples of a turn, the fastest turn; a ratio is the median over the turns.
+
+Bar: without truth, at most 3.5 times a sample from the store.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from itertools import count, islice
+from pathlib import Path
+from typing import Any
+
+from bench.frame import Column, Report, add_whole, beyond, progress
+from v2v_protocol.command import Parser
+from v2v_protocol.sample import DEFAULT_ARRAYS
+from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.prepare.prepare import prepare
+from v2v_server.store import photograph
+from v2v_server.store.pixels import VideosKind
+from v2v_server.worlds.clip import TRUTH
+from v2v_server.worlds.world import draw_world
+from v2v_tools.remake import RemadeSample, Remaker
+
+MOST_TIMES = 3.5
+PATCHES = 2
+_COLUMNS: tuple[Column, ...] = (
+    ("samples", "samples", "{}", 1.0),
+    ("cpu_seconds", "cpu ms", "{:.1f}", 1e3),
+    ("ratio", "x dense store", "{:.2f}", 1.0),
+)
+
+
+def patches_of(made: RemadeSample) -> int:
+    """Return how many patches a sample of a photograph has."""
+    lease, plan = made.lease, made.decoded.plan
+    size = lease.height_px, lease.width_px
+    names = {"seed": lease.seed, "epoch": lease.epoch, "index": lease.indices[0]}
+    world = draw_world(plan.spec.recipe, plan.params, **names, picture_px=size, seconds=(0.0, 1.0))
+    return len(world.layers) - 1
+
+
+def seconds_of(remaker: Remaker, seeds: list[int]) -> float:
+    """Return the mean processor time of the first sample of each seed, decoding included."""
+    begun = time.process_time()
+    for seed in seeds:
+        photograph.kept_photographs.clear()
+        remaker.sample(seed, 0, 0)
+    return (time.process_time() - begun) / len(seeds)
+
+
+def turns(asked: argparse.Namespace, folder: Path) -> Iterator[dict[str, float]]:
+    """Yield the times of each turn, by what is made."""
+    with closing(open_catalogue(asked.videos, processes=0)) as videos:
+        progress("preparing the dense store")
+        prepare(videos, folder / "store", "dense", processes=0)
+    kind, spec = VideosKind("photographs"), StreamSpec.from_dict({"preset": "worlds"})
+    spec = StreamSpec.from_dict({"recipe": spec.recipe.replace(world_patches=PATCHES)})
+    with (
+        closing(open_catalogue(folder / "store", cache_dir=folder, processes=0)) as store,
+        closing(open_catalogue(asked.photographs, cache_dir=folder, kind=kind, processes=0)) as photographs,
+    ):
+        plain = Remaker(photographs, spec)
+        moving = (seed for seed in count() if patches_of(plain.made(seed, 0, 0)) == PATCHES)
+        seeds = list(islice(moving, asked.samples))
+        works = {
+            "dense store": (Remaker(store, StreamSpec()), list(range(asked.samples))),
+            "photographs": (plain, seeds),
+            "photographs, truth": (Remaker(photographs, spec, (*DEFAULT_ARRAYS, *TRUTH)), seeds),
+        }
+        for remaker, some in works.values():
+            seconds_of(remaker, some)  # loads or compiles the kernels
+        for turn in range(asked.turns):
+            progress(f"turn {turn + 1} of {asked.turns}")
+            yield {name: seconds_of(*work) for name, work in works.items()}
+
+
+def add_flags(parser: Parser) -> None:
+    """Add the bench's flags."""
+    parser.add_argument("--photographs", required=True, metavar="DIR", help="photographs")
+    parser.add_argument("--videos", required=True, metavar="DIR", help="videos for the store")
+    add_whole(parser, "--samples", 24, "samples of a turn")
+    add_whole(parser, "--turns", 5, "turns")
+
+
+def measure(asked: argparse.Namespace) -> Report:
+    """Run the bench."""
+    with tempfile.TemporaryDirectory(prefix="v2v-photographs-") as folder:
+        made = list(turns(asked, Path(folder)))
+    records: list[dict[str, Any]] = [
+        {
+            "samples": name,
+            "cpu_seconds": min(turn[name] for turn in made),
+            "ratio": statistics.median(turn[name] / turn["dense store"] for turn in made),
+        }
+        for name in made[0]
+    ]
+    missed = beyond("photographs", records[1], most={"ratio": MOST_TIMES})
+    return Report(records, [(records, _COLUMNS)], [], missed)

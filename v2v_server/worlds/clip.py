@@ -1,0 +1,103 @@
+"""The clip of a sample: its frames and the levels between them as its camera sees them, with what is known exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol.recipe import preset
+from v2v_protocol.sample import array_layout, new_arrays
+from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
+from v2v_server.simulation.draw import draw
+from v2v_server.simulation.view import apply_view, contrast_table
+from v2v_server.video.collect import BIT_EXACT_CODECS, SampleView
+from v2v_server.video.decode import DecodedClip
+from v2v_server.video.luma import MOST_BITS, Signal
+from v2v_server.worlds.render import (
+    PhotoPyramid,
+    flow_of,
+    levels_between,
+    masks_of,
+    pyramid_of,
+    render,
+    tracks_of,
+)
+from v2v_server.worlds.world import Doubles, World, draw_world
+
+_FLOW = "flow", "flow_valid"
+TRUTH = (*_FLOW, "masks", "tracks")
+"""Arrays of a sample that are known exactly."""
+
+
+def render_clip(
+    pyramid: PhotoPyramid,
+    picture_px: tuple[int, int],
+    times: Doubles,
+    sample: tuple[int, int, int],
+    view: SampleView,
+    codec: str = "",
+) -> DecodedClip:
+    """Render what the camera of a sample sees, and the requested arrays that are known.
+
+    Args:
+        pyramid, picture_px: the usable part of the photograph; its height and width.
+        times: [n] presentation times of the frames.
+        sample: (seed, epoch, index).
+        view: of the sample.
+        codec: the format of the photograph's file.
+    """
+    spec, params, recipe = view.spec, view.params, view.spec.recipe
+    seed, epoch, index = sample
+    seconds = times - times[0]
+    world = draw_world(
+        recipe, params, seed=seed, epoch=epoch, index=index, picture_px=picture_px, seconds=(0.0, seconds[-1])
+    )  # fmt: skip
+    ends = params.ends(recipe)
+    source = params.source_index(int(ends[-1]))
+    signal, seen = Signal(MOST_BITS), replace(params, scale=1.0)
+    levels = None
+    if spec.substep_px:
+        levels = levels_between(pyramid, world, seconds, source, spec.substep_px, MOST_SUBSTEPS)
+    if levels is not None and params.contrast:
+        table = contrast_table(params.contrast, signal.white)
+        levels = levels._replace(grey=np.stack([table[level] for level in levels.grey]))
+    frames = apply_view(render(pyramid, world, seconds), seen, recipe, signal)
+    known = tuple(name for name in TRUTH if name in view.arrays)
+    arrays = _truth(world, seconds[source[ends]], spec, known) if known else {}
+    return DecodedClip(
+        frames, times, codec, codec in BIT_EXACT_CODECS, signal=signal, arrays=arrays, is_view=True, levels=levels
+    )
+
+
+def _truth(world: World, ends: Doubles, spec: StreamSpec, names: tuple[str, ...]) -> dict[str, npt.NDArray[Any]]:
+    """Return arrays of :data:`TRUTH`.
+
+    Args:
+        ends: [spans + 1] moments from one delivered frame to the next, the first of all included.
+    """
+    arrays, shown = new_arrays(array_layout(spec.recipe, spec.voxel_dtype, names)), ends[spec.recipe.first_frame :]
+    if "tracks" in arrays:
+        arrays["tracks"][:] = tracks_of(world, shown)
+    if "masks" in arrays:
+        arrays["masks"][:] = [masks_of(world, moment) for moment in shown]
+    if not arrays.keys().isdisjoint(_FLOW):
+        order = 1 if spec.flow_direction == "forward" else -1
+        for voxel, span in enumerate(pairwise(ends[spec.recipe.lead_voxels :].tolist())):
+            found = dict(zip(_FLOW, flow_of(world, *span[::order]) if voxel >= spec.flow_from else (0, 0), strict=True))
+            for name in arrays.keys() & found.keys():
+                arrays[name][voxel] = found[name]
+    return arrays
+
+
+def load() -> None:
+    """Load from numba's cache, or compile, what renders photographs."""
+    fields = {"voxels_per_clip": 1, "bins": 1, "crop_height_px": 16, "crop_width_px": 16, "track_points": 1}
+    recipe = preset("worlds").replace(**fields, flip_probability=0.0, pause_probability=0.0)
+    params = draw(recipe, seed=0, epoch=0, index=0, picture_height_px=16, picture_width_px=16, video_id="")
+    grey = np.zeros((16, 16), np.uint8)
+    view = SampleView(StreamSpec(recipe), params, TRUTH)
+    render_clip(pyramid_of(grey), grey.shape, np.array([0.0, 1.0]), (0, 0, 0), view)
