@@ -122,6 +122,15 @@ def _level(row: Longs, column: Longs, key: int) -> Longs:
     return level
 
 
+def write_photographs(folder: Path) -> None:
+    """Write two photographs, each a texture between coarse tiles."""
+    folder.mkdir()
+    row, column = np.mgrid[:73, :90].astype(np.int64)
+    for key, name in enumerate(("a.png", "b.png"), 5):
+        tiles, texture = _level(row // 11, column // 13, key), _level(row // 2, column // 2, key + 9)
+        Image.fromarray(((tiles * 3 + texture) // 4).astype(np.uint8)).save(folder / name)
+
+
 def boxes_text(frames: int) -> str:
     """Return three boxes a frame, in COCO-VID: the square, and two parts of it."""
     images = [{"id": frame, "frame_id": frame} for frame in range(frames)]

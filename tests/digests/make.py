@@ -101,7 +101,7 @@ def main() -> int:
 
 def _one(ways: Ways, row: Row, expected: Made | None) -> tuple[Made, list[str]]:
     """Return a row from the videos, and what differs: from the table, or in another way from the videos."""
-    found = {way: make(row) for way, make in ways.all.items()}
+    found = {way: make(row) for way, make in ways.of(row).items()}
     first = found["video"]
     against = first if expected is None else expected
     return first, [f"{way}: {each}" for way, one in found.items() for each in compared(against, one)]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tests.digests.clips import write_clips, write_lossy
+from tests.digests.clips import write_clips, write_lossy, write_photographs
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
@@ -26,6 +26,7 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.prepare import prepare
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.store.cache import Cache, make_cache
+from v2v_server.store.pixels import VideosKind
 from v2v_server.video.rows import Rows
 from v2v_server.worker.produce import decode_for, make_sample, open_sidecars
 from v2v_tools.remake import lease_for
@@ -66,6 +67,7 @@ class Row:
 STEADY = {"pause_probability": 0.0, "flip_probability": 0.0}
 FINE = {"threshold": (0.1, 0.2)}
 AUTO = {"scene": "auto"}
+_TRUTH = ("flow", "flow_valid", "masks", "tracks")
 PORTABLE: Mapping[str, Row] = {
     "paper": Row("paper"),
     "largest seed and epoch": Row("paper", seed=LARGEST_SEED, epoch=LARGEST_EPOCH),
@@ -114,6 +116,21 @@ PORTABLE: Mapping[str, Row] = {
     "tolerance of leak": Row(FINE | {"leak_hz": (0.05, 20.0)}, ("voxels",), {"tolerance": 0.4}, count=9),
     "scene": Row({}, ("voxels", "frames", "frames_rgb", "boxes"), AUTO | {"still_share": 0.5}, count=6),
     "keep_defects": Row({}, spec=AUTO | {"keep_defects": "bars,cuts,duplicates"}, count=6),
+    "worlds": Row("worlds", ("voxels", "frames", *_TRUTH), count=6),
+    "worlds with sub-steps": Row(
+        FINE
+        | {
+            "preset": "worlds",
+            "world_speed_px": (200.0, 600.0),
+            "world_patch_px": (6.0, 16.0),
+            "track_points": 8,
+            "world_plain_share": 0.4,
+            "resize_scale": (0.4, 1.2),
+        },
+        (*_EVENTS, "frames_all", *_TRUTH),
+        {"substep_px": 0.5, "flow_direction": "backward"},
+        count=6,
+    ),
     "quiet_share": Row({}, spec=AUTO | {"quiet_share": 0.3, "moving_share": 1.0, "substep_px": 1.0}, count=6),
 }
 """The same bytes on every host: the committed table."""
@@ -168,6 +185,7 @@ class Ways:
         write_clips(self.videos)
         if lossy:
             write_lossy(self.videos / "d.avi")
+        write_photographs(folder / "photographs")
         self._catalogues: dict[str, Catalogue] = {}
         self.all: Mapping[str, Callable[[Row], Made]] = {
             "video": self._plain("videos"),
@@ -177,6 +195,10 @@ class Ways:
             "cache, empty and full": self._cached,
         }
 
+    def of(self, row: Row) -> Mapping[str, Callable[[Row], Made]]:
+        """Return the ways of a row: all, or the one of photographs."""
+        return {"video": self._plain("photographs")} if row.stream.recipe.is_world else self.all
+
     def close(self) -> None:
         """Close the catalogues."""
         for catalogue in self._catalogues.values():
@@ -185,11 +207,12 @@ class Ways:
     def catalogue(self, name: str) -> Catalogue:
         """Return the catalogue of the videos, or of a store of this size, which is written first."""
         if name not in self._catalogues:
-            if name != "videos":
+            is_video = name != "photographs"
+            if name not in ("videos", "photographs"):
                 self._prepare(name)
-            rows = ROWS if name == "videos" else None
+            rows, kind = ROWS if name == "videos" else None, VideosKind() if is_video else VideosKind("photographs")
             self._catalogues[name] = open_catalogue(
-                self.folder / name, rows=rows, cache_dir=self.folder, processes=0, scene=True
+                self.folder / name, rows=rows, cache_dir=self.folder, processes=0, scene=is_video, kind=kind
             )
         return self._catalogues[name]
 
@@ -204,7 +227,7 @@ class Ways:
     def _plain(self, name: str) -> Callable[[Row], Made]:
         def make(row: Row) -> Made:
             samples = samples_of(self.catalogue(name), row)
-            if name != "videos":
+            if name not in ("videos", "photographs"):
                 assert all(sample.provenance.decoder.endswith(", from the store") for sample in samples)
             return made(samples)
 

@@ -1,15 +1,28 @@
 """Pictures and truth of a world by its definition, point by point in float64: ``v2v_server/worlds`` written again with
 numpy's and scipy's own functions, without homographies and without its kernels.
+
+    python -m tests.oracles.worlds
+
+prints how far the events of a moving pattern are from its exact crossings.
 """
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage  # type: ignore[import-untyped]
 from scipy.interpolate import BSpline  # type: ignore[import-untyped]
 
-from v2v_server.worlds.world import World
+from tests.oracles.rendered import GAMMA, LOG_EPS, START_LOG_UNITS, Counts, Errors, counts_of, errors, log_levels
+from v2v_protocol.recipe import PRESETS
+from v2v_protocol.spec import MOST_SUBSTEPS
+from v2v_server.simulation import simulate
+from v2v_server.simulation.draw import draw
+from v2v_server.simulation.kernels import fill
+from v2v_server.worlds.render import levels_between, pyramid_of, render
+from v2v_server.worlds.world import World, draw_world
 
 Reals = npt.NDArray[np.float64]
 
@@ -155,3 +168,66 @@ def _way(moved: float, reach: float, start: float) -> float:
         return sign * float(np.sign(phase)) * (abs(phase) - 8.0 * over**2)
 
     return quarter * (place((moved + start) / quarter) - place(start / quarter))
+
+
+def event_errors(
+    grey: tuple[float, float], period_px: float, speed_px: float, threshold: float, hz: float, substep_px: float
+) -> Errors:
+    """Return how far the events of each frame step of a moving pattern are from its exact crossings.
+
+    The pattern is the photograph's, bilinear between its pixels: its light is known at any time, to 53 bits.
+
+    Args:
+        grey: darkest and brightest level of the pattern, two crossed sines.
+        period_px: of them.
+        speed_px: px a second.
+        threshold: of both polarities.
+        hz: frames a second.
+        substep_px: 0 for none.
+    """
+    size, steps = 240, 8
+
+    y, x = np.mgrid[:size, :size] + 0.5
+    waves = np.sin(2 * np.pi * x / period_px) + np.sin(2 * np.pi * y / period_px + 1.0)
+    light = (grey[0] + grey[1]) / 2 + (grey[1] - grey[0]) / 4 * waves
+    photograph = np.floor(light * (65535 / 255) + 0.5).astype(np.uint16)
+    recipe = PRESETS["noise-free"].replace(crop_height_px=24, crop_width_px=24, world_speed_px=speed_px)
+    params = draw(recipe, seed=1, epoch=0, index=0, picture_height_px=size, picture_width_px=size, video_id="")
+    params = dataclasses.replace(params, flip=False)
+    seconds = np.arange(steps + 1) / hz
+    world = draw_world(
+        recipe, params, seed=1, epoch=0, index=0, picture_px=(size, size), seconds=(0.0, float(seconds[-1]))
+    )
+    pyramid = pyramid_of(photograph)
+    made = simulate(
+        render(pyramid, world, seconds), threshold_pos=threshold, bins=1, gamma=GAMMA, log_eps=LOG_EPS, bits=12,
+        start_residual=START_LOG_UNITS, dtype="float32",
+    )  # fmt: skip
+    given = made.given
+    if substep_px:
+        between = levels_between(pyramid, world, seconds, np.arange(steps + 1), substep_px, MOST_SUBSTEPS)
+        given = dataclasses.replace(given, levels=between)
+    counts = fill(given, made.real, {"event_counts": None})[0]["event_counts"].reshape(steps, 2, -1).astype(np.int64)
+    oracle = Oracle(world, photograph)
+    times = np.linspace(0.0, seconds[-1], steps * 64 + 1)
+    levels = np.stack([log_levels(oracle.picture(time) / 4095).ravel() for time in times.tolist()])
+    return errors(Counts(counts[:, 1], counts[:, 0]), counts_of(levels, times, seconds, threshold))
+
+
+def main() -> None:
+    """Print the table."""
+    print("| grey | period px | px a frame | c | signed | count | signed with sub-steps of 1 px | count |")
+    print("|---|---|---|---|---|---|---|---|")
+    for grey in ((40.0, 250.0), (2.0, 60.0)):
+        for period in (8.0, 32.0, 100.0):
+            for speed in (0.5, 2.0, 8.0):
+                for threshold in (0.1, 0.3):
+                    found = [event_errors(grey, period, 60 * speed, threshold, 60.0, substep) for substep in (0.0, 1.0)]
+                    figures = " | ".join(f"{each.signed:.1%} | {each.count:+.1%}" for each in found)
+                    print(
+                        f"| {grey[0]:g} to {grey[1]:g} | {period:g} | {speed:g} | {threshold} | {figures} |", flush=True
+                    )
+
+
+if __name__ == "__main__":
+    main()

@@ -18,12 +18,14 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.simulation.view import Window
+from v2v_server.simulation.vectors import use_widest_vectors
 from v2v_server.simulation.voxel import Levels, Moments
 from v2v_server.worlds.world import Doubles, World
 
 WHITEST = 4095
 """The highest level of a rendered picture."""
+_LEAST_PART = 2.0**-14
+"""Less of a coarser level changes no level by a half, and a picture in its own size needs none."""
 _LEAST_DEPTH = 2.0**-6
 """A place that is farther away, or behind the camera, counts as that far: only what is never seen can be."""
 compiled: Any = numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -57,21 +59,18 @@ def pyramid_of(grey: npt.NDArray[Any]) -> PhotoPyramid:
     return PhotoPyramid(np.concatenate([level.ravel() for level in levels]), first, sizes)
 
 
-def render(
-    pyramid: PhotoPyramid, world: World, seconds: Doubles, window: Window | None = None
-) -> npt.NDArray[np.uint16]:
+def render(pyramid: PhotoPyramid, world: World, seconds: Doubles) -> npt.NDArray[np.uint16]:
     """Return the pictures of a world.
 
     Args:
         pyramid: of its photograph.
         world: the draw.
         seconds: [n] moments.
-        window: the part to render, px of the picture (``world.py``), which it may leave; None: the crop.
 
     Returns:
-        [n, h, w] uint16, 0 .. WHITEST, not mirrored.
+        [n, H, W] uint16, the crop, 0 .. WHITEST, not mirrored.
     """
-    top, left, height, width = world.crop if window is None else window
+    top, left, height, width = world.crop
     out, places, outlines = np.empty((len(seconds), height, width), np.uint16), world.places(seconds), world.outlines
     back, shown = _inverse(places)
     shown[:, 0] = np.maximum(shown[:, 0], 1 << world.focus)
@@ -217,27 +216,34 @@ def _taken(places: Doubles, x: Doubles, y: Doubles) -> tuple[Doubles, Doubles]:
 
 
 @compiled
-def _cover(outline, x, y):
+def _numbers(outline):
+    """Return an outline as numbers: a loop that reads them from an array becomes no vector instructions."""
+    size = 1.0 / outline[2]
+    return outline[0], outline[1], size, outline[3], outline[4], outline[5], outline[6], outline[7], outline[8]
+
+
+@compiled
+def _cover(numbers, x, y):
     """Return the share of what is behind a patch that it covers at a place of the photograph (``world.Layer``)."""
-    a, b = (x - outline[0]) / outline[2], (y - outline[1]) / outline[2]
-    real, imaginary = a * a - b * b, 2.0 * a * b
-    square = a * a + b * b
-    q = (outline[3] * square + outline[4] * real + outline[5] * imaginary) * square
-    q += outline[6] * (a * real - b * imaginary) + outline[7] * (a * imaginary + b * real)
-    u = min(max(outline[8] * (1.0 - q) + 0.5, 0.0), 1.0)
+    middle_x, middle_y, size, k, c2, s2, c3, s3, slope = numbers
+    a, b = (x - middle_x) * size, (y - middle_y) * size
+    real, imaginary, square = a * a - b * b, 2.0 * a * b, a * a + b * b
+    q = (k * square + c2 * real + s2 * imaginary) * square
+    q += c3 * (a * real - b * imaginary) + s3 * (a * imaginary + b * real)
+    u = min(max(slope * (1.0 - q) + 0.5, 0.0), 1.0)
     return u * u * (3.0 - 2.0 * u)
 
 
 @compiled
 def _along(place, x, y, across, down, count):
     """Write the places of the photograph that a row shows."""
-    across_y = place[0, 1] * y + place[0, 2]
-    down_y, depth_y = place[1, 1] * y + place[1, 2], place[2, 1] * y + place[2, 2]
+    across_x, across_1 = place[0, 0], place[0, 1] * y + place[0, 2]
+    down_x, down_1 = place[1, 0], place[1, 1] * y + place[1, 2]
+    depth_x, depth_1 = place[2, 0], place[2, 1] * y + place[2, 2]
     for i in range(count):
         column = x + np.float64(np.int32(i))
-        share = 1.0 / (place[2, 0] * column + depth_y)
-        across[i] = (place[0, 0] * column + across_y) * share
-        down[i] = (place[1, 0] * column + down_y) * share
+        share = 1.0 / (depth_x * column + depth_1)
+        across[i], down[i] = (across_x * column + across_1) * share, (down_x * column + down_1) * share
 
 
 @compiled
@@ -267,6 +273,7 @@ def _read(grey, first, pitch, columns, rows, x, y, found, count):
 @compiled
 def _render(grey, first, size, places, shown, boxes, outlines, top, left, doubles, singles, wholes, picture, out):
     """Render in memory of the caller; ``top`` and ``left`` are the middle of the first pixel."""
+    use_widest_vectors()  # type: ignore[call-arg]
     across, down, share = doubles[0], doubles[1], doubles[2]
     x, y, found, coarse = singles[0], singles[1], singles[2], singles[3]
     columns, rows = wholes[0], wholes[1]
@@ -275,7 +282,7 @@ def _render(grey, first, size, places, shown, boxes, outlines, top, left, double
             level, part = 0, shown[number, layer]
             while part >= 2.0 and level < len(size) - 1:
                 level, part = level + 1, part * 0.5
-            blends = part > 1.0 and level < len(size) - 1
+            blends = part > 1.0 + _LEAST_PART and level < len(size) - 1
             begin, end = boxes[number, layer, 2], boxes[number, layer, 3]
             count = max(end - begin, 0)
             for row in range(boxes[number, layer, 0], boxes[number, layer, 1]):
@@ -290,18 +297,19 @@ def _render(grey, first, size, places, shown, boxes, outlines, top, left, double
                     weight = np.float32(part - 1.0)
                     for i in range(count):
                         found[i] += (coarse[i] - found[i]) * weight
+                line = picture[row, begin:end]
                 if layer == 0:
-                    for i in range(count):
-                        picture[row, i] = found[i]
+                    line[:] = found
                     continue
+                numbers = _numbers(outlines[layer - 1])
                 for i in range(count):
-                    share[i] = _cover(outlines[layer - 1], across[i], down[i])
+                    share[i] = _cover(numbers, across[i], down[i])
                 for i in range(count):
-                    behind = picture[row, begin + i]
-                    picture[row, begin + i] = behind + (found[i] - behind) * np.float32(share[i])
+                    line[i] += (found[i] - line[i]) * np.float32(share[i])
         for row in range(out.shape[1]):
-            for i in range(out.shape[2]):
-                out[number, row, i] = np.uint16(np.int32(picture[row, i] + np.float32(0.5)))
+            line, levels = picture[row], out[number, row]
+            for i in range(len(levels)):
+                levels[i] = np.uint16(np.int32(line[i] + np.float32(0.5)))
 
 
 @compiled
@@ -317,7 +325,7 @@ def _front(places, outlines, x, y, behind):
     """Return the frontmost layer at a place of the picture; ``behind`` if none in front of that layer covers it."""
     for layer in range(len(outlines), behind, -1):
         across, down = _taken_one(places[layer], x, y)
-        if _cover(outlines[layer - 1], across, down) >= 0.5:
+        if _cover(_numbers(outlines[layer - 1]), across, down) >= 0.5:
             return layer
     return behind
 

@@ -27,8 +27,7 @@ from packaging.requirements import Requirement
 from v2v_protocol.command import FAILED, Parser, run_command, version_of
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
-from v2v_server.config import ServeConfig
-from v2v_server.store.pixels import VideosKind
+from v2v_server.store.pixels import PIXEL_KINDS, VideosKind
 from v2v_server.system.process import control_groups, usable_cores
 from v2v_server.system.sandbox import can_confine
 
@@ -262,7 +261,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--recipe", metavar="NAME", default="paper", help="recipe to check the videos against (default paper)"
     )
     what.add_argument("--port", type=int, default=5555, metavar="N", help="port that a server would use (default 5555)")
-    parser.add_settings(ServeConfig, "rows", "videos_kind", "rate", "photograph_seconds", "cache_dir")
+    what.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
+    what.add_argument("--videos-kind", choices=PIXEL_KINDS, help="what a video is, as for v2v-serve (default videos)")
+    what.add_argument("--rate", type=float, metavar="N", help="rate of picture sequences, or of photographs, Hz")
+    what.add_argument("--photograph-seconds", type=float, metavar="S", help="time for which each photograph is shown")
+    what.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     return run_command(parser, _run, argv, failures=(V2VError,))
 
 

@@ -15,7 +15,6 @@ from tests.oracles.known_motion import photograph
 from tests.oracles.worlds import Oracle
 from v2v_protocol.recipe import PRESETS, Recipe
 from v2v_server.simulation.draw import draw
-from v2v_server.simulation.view import Window
 from v2v_server.worlds.render import (
     WHITEST,
     PhotoPyramid,
@@ -173,7 +172,7 @@ def test_no_draw_changes_another() -> None:
 def test_any_photograph_and_any_draw_give_levels_and_numbers(
     height: int, width: int, deep: bool, index: int, tilt: float, scale: float
 ) -> None:
-    """Sides down to one pixel, a window beyond the picture, the most extreme motion."""
+    """Sides down to one pixel, the most extreme motion."""
     random = np.random.default_rng(index)
     grey = random.integers(0, 65536 if deep else 256, (height, width), np.uint16 if deep else np.uint8)
     recipe = RECIPE.replace(
@@ -182,7 +181,7 @@ def test_any_photograph_and_any_draw_give_levels_and_numbers(
     )  # fmt: skip
     world = world_of(recipe, index, grey)
     times = np.array([-1.0, 0.0, 0.7, 2.0, 5.0])
-    pictures = render(pyramid_of(grey), world, times, Window(-9, 70, 11, 13))
+    pictures = render(pyramid_of(grey), world, times)
     low, high = int(grey.min()), int(grey.max())
     white = 65535 if deep else 255
     assert pictures.min() >= low * WHITEST // white
