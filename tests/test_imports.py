@@ -57,7 +57,8 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 
 FLOORS = (
-    "system", "keys", "video", "simulation", "labels", "motion", "flow", "worlds", "store", "config", "corpus", "schedule",
+    "system", "keys", "video", "simulation", "labels", "motion", "flow", "worlds", "store", "config", "corpus",
+    "schedule",
     "quarantine", "sharing",
     "broker",
     "worker", "supervise", "status", "prepare", "page",

@@ -66,9 +66,9 @@ def labelled_panel(
         recent = camera.tracks[max(0, grid - _TRAIL_FRAMES) : grid + 1] * (scale, scale, 1) + (left, top, 0)
         for number in np.flatnonzero(recent[-1, :, 2]):
             colour = class_colour(int(number))
-            for (*before, was_seen), (*after, is_seen) in pairwise(recent[:, number]):
-                if was_seen and is_seen:
-                    page.line(*before, *after, colour, 2)
+            for before, after in pairwise(recent[:, number]):
+                if before[2] and after[2]:
+                    page.line(before[0], before[1], after[0], after[1], colour, 2)
             x0, y0, _ = recent[-1, number]
             page.box(x0 - 2, y0 - 2, x0 + 2, y0 + 2, colour)
     if camera.boxes is None:

@@ -66,8 +66,8 @@ class VideosKind:
             )
         if self.is_rendered and not 2 <= self.frames <= LONGEST_PHOTOGRAPH_FRAMES:
             raise UsageError(
-                f"--photograph-seconds {self.photograph_seconds or 10:g} at --rate {self.rendered_hz:g} gives {self.frames} frames: "
-                f"give 2 to {LONGEST_PHOTOGRAPH_FRAMES}"
+                f"--photograph-seconds {self.photograph_seconds or 10:g} at --rate {self.rendered_hz:g} gives "
+                f"{self.frames} frames: give 2 to {LONGEST_PHOTOGRAPH_FRAMES}"
             )
 
     @classmethod

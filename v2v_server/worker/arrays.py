@@ -220,6 +220,16 @@ def _shown(context: SampleContext, numbers: npt.NDArray[np.int64], out: npt.NDAr
         np.take(tone_table(context.recipe.gamma, context.signal), context.view[numbers], out=out[:, 0], mode="clip")
 
 
+@makes("tracks")
+def tracks(context: SampleContext, out: npt.NDArray[Any]) -> None:
+    """Raise an error: the clips of photographs come with tracks, and other videos have none.
+
+    Raises:
+        VideoError: always.
+    """
+    raise VideoError(context.video, None, "has no tracks: ask for flow, or serve photographs")
+
+
 @makes("flow")
 def flow(context: SampleContext, out: npt.NDArray[Any]) -> None:
     """Fill in the flow over each voxel."""

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
-from v2v_server.config import ServeConfig
-from v2v_server.store.pixels import VideosKind
+from v2v_server.store.pixels import PIXEL_KINDS, VideosKind
 from v2v_tools.doctor.machine import BAD, NOTE, look_around
 
 
@@ -28,7 +27,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--recipe", metavar="NAME", default="paper", help="recipe to check the videos against (default paper)"
     )
     what.add_argument("--port", type=int, default=5555, metavar="N", help="port that a server would use (default 5555)")
-    parser.add_settings(ServeConfig, "rows", "videos_kind", "rate", "photograph_seconds", "cache_dir")
+    what.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
+    what.add_argument("--videos-kind", choices=PIXEL_KINDS, help="what a video is, as for v2v-serve (default videos)")
+    what.add_argument("--rate", type=float, metavar="N", help="rate of picture sequences, or of photographs, Hz")
+    what.add_argument("--photograph-seconds", type=float, metavar="S", help="time for which each photograph is shown")
+    what.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     return run_command(parser, _run, argv, failures=(V2VError,))
 
 
@@ -37,7 +40,7 @@ def _run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--port {arguments.port}: give 1 to 65535")
     found_bad = has_defects = False
     for finding in look_around(
-        arguments.port, arguments.videos, arguments.recipe, arguments.rows or "full", arguments.cache_dir,
+        arguments.port, arguments.videos, arguments.recipe, arguments.rows, arguments.cache_dir,
         VideosKind.of(vars(arguments)),
     ):  # fmt: skip
         found_bad = found_bad or finding.level == BAD

@@ -30,6 +30,7 @@ from v2v_server.schedule.sequences import SequenceTable
 from v2v_server.store import photograph
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.photograph import Photograph, id_of
+from v2v_server.store.picture_sequence import decode_picture
 from v2v_server.store.pixels import LONGEST_PHOTOGRAPH_FRAMES, VideosKind, kind_of
 from v2v_server.video.collect import ClipRequest, Cut
 
@@ -45,7 +46,8 @@ Grey = npt.NDArray[np.uint8]
 def picture() -> Grey:
     from skimage import data
 
-    shown: Grey = np.array(data.camera()[::3, ::2])
+    camera: Any = data.camera
+    shown: Grey = np.array(camera()[::3, ::2])
     return shown
 
 
@@ -220,8 +222,13 @@ def test_siblings_share_a_photograph_and_not_a_scene(catalogue: Catalogue, tmp_p
 def test_photographs_are_decoded_once_within_a_bound(
     catalogue: Catalogue, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    decoded, decode = list[int](), photograph.decode_picture
-    monkeypatch.setattr(photograph, "decode_picture", lambda data: decoded.append(len(data)) or decode(data))
+    decoded = list[int]()
+
+    def decode(data: bytes) -> Any:
+        decoded.append(len(data))
+        return decode_picture(data)
+
+    monkeypatch.setattr(photograph, "decode_picture", decode)
     monkeypatch.setattr(photograph, "kept_photographs", {})
     for name in ("a.png", "b.jpg", "a.png", "b.jpg"):
         still(folder / name, catalogue)
@@ -237,7 +244,7 @@ def test_photographs_are_decoded_once_within_a_bound(
 @pytest.mark.parametrize("scale", [1.0, 0.7, 1.6])
 def test_flow_leads_from_frame_to_frame(catalogue: Catalogue, direction: str, scale: float) -> None:
     """What a pixel shows is shown where its flow leads, and tracks go there."""
-    from scipy.ndimage import map_coordinates
+    from scipy.ndimage import map_coordinates  # type: ignore[import-untyped]
 
     recipe = {"preset": "worlds", **FAST, "lead_frames": 1, "resize_scale": (scale, scale), "world_plain_share": 0.0}
     row = Row(recipe, ("frames", "flow", "flow_valid", "masks", "tracks"), {"flow_direction": direction}, count=4)
