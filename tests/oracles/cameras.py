@@ -162,7 +162,7 @@ def _record(
             now = math.log(log_eps + light)
             change = now - before
             if corner_hz > 0.0:
-                turns = 2 * math.pi * corner_hz * dt * (light + 0.1) / 1.1
+                turns = 2 * math.pi * corner_hz * dt * (light + 20 / 255) / (1 + 20 / 255)
                 a = 1.0 - math.exp(-turns)
                 change = a * (before - seen) + (1.0 - a / turns) * (now - before)
                 seen += change

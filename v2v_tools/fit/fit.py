@@ -14,7 +14,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_recordings.items import ConvertOptions, Light, ReadProgress
 from v2v_tools.fit import estimators, regression
-from v2v_tools.fit.increments import Still, increments_of, intervals_us, still_time
+from v2v_tools.fit.increments import increments_of, intervals_us, is_still, still_time
 from v2v_tools.fit.interval import Doubles, Estimate, unknown
 from v2v_tools.fit.recording import Recorded, read_recording
 from v2v_tools.fit.statistics import Panels, panels_of, simulate_recording
@@ -135,7 +135,8 @@ def _estimates(given: Recorded, is_blank: bool, static: bool = False) -> dict[st
         made |= {name: unknown(f"{note}, or a static scene (--static)") for name in noise}
         return made | {"dead_pixel_share": estimators.dead_pixels(given, blocks)}
     refractory_seconds = period.value if period.told else 0.0
-    still = still_time(given, light)
+    at_rest = is_still(given)
+    still = still_time(given, at_rest, light)
     is_hot = estimators.hot_mask(still)
     increments = increments_of(given, refractory_seconds, longest_us)
     usual = ~is_hot[increments.pixel]
@@ -161,12 +162,13 @@ def _estimates(given: Recorded, is_blank: bool, static: bool = False) -> dict[st
         note = f"{made['hot_pixel_sigma'].note}; in units of a threshold of {USUAL_THRESHOLD}"
         made["hot_pixel_sigma"] = dataclasses.replace(made["hot_pixel_sigma"], note=note)
     made["dead_pixel_share"] = estimators.dead_pixels(given, blocks)
-    made["leak_hz"] = _matched_leak(given, values, surplus, blocks, light)
+    made["leak_hz"] = _matched_leak(given, values, surplus, blocks, at_rest)
     return {name: dataclasses.replace(one, low=0.0) if one.is_absent else one for name, one in made.items()}
 
 
 def _matched_leak(
-    given: Recorded, camera: dict[str, float], surplus: Estimate, blocks: npt.NDArray[np.int64], light: Doubles
+    given: Recorded, camera: dict[str, float], surplus: Estimate, blocks: npt.NDArray[np.int64],
+    at_rest: npt.NDArray[np.bool_],
 ) -> Estimate:
     """Find the leak with which the simulation has the surplus of brighter events that was measured.
 
@@ -179,7 +181,7 @@ def _matched_leak(
     found = []
     for number, leak in enumerate(_LEAKS_HZ):
         simulated = simulate_recording(given, camera | {"leak_hz": float(leak)}, 10 + number)
-        still: Still = still_time(simulated, light)
+        still = still_time(simulated, at_rest, given.known_light.of(np.arange(256.0)))
         found.append(estimators.noise_rates(still, blocks, np.zeros(len(blocks), bool))[1].value)
     rising = np.maximum.accumulate(np.array(found)) + 1e-9 * np.arange(len(found))
     # The simulation is as noisy as the recording.

@@ -11,8 +11,10 @@ change lasted I and was seen for I - r: the second event counts I / (I - r).
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
+import cv2
 import numba
 import numpy as np
 import numpy.typing as npt
@@ -24,8 +26,8 @@ DARKEST_GREY, BRIGHTEST_GREY = 4, 251
 """Grey levels outside are clipped, or too coarse in log intensity."""
 _LONGEST_SECONDS = 0.5
 """Longest increment: noise accumulates with time."""
-STILL_SECONDS = 0.5
-"""A recording that stands still as a whole for this long needs no other still time."""
+_SETTLE_SECONDS, _AROUND_PX = 0.1, 5
+"""Time before a still step in which a pixel sees no change either; side of the square of its neighbours."""
 _MOST_WEIGHT = 10.0
 MOST_INCREMENTS = 1_500_000
 """Of a recording with more, every n-th pixel is measured."""
@@ -95,38 +97,68 @@ def increments_of(recording: Recorded, refractory_seconds: float, longest_us: fl
     )  # fmt: skip
 
 
-def still_time(recording: Recorded, light: Doubles, settle_seconds: float = 0.1) -> Still:
-    """Return the time in which a pixel sees no change, and its events in it.
+def is_still(recording: Recorded) -> npt.NDArray[np.bool_]:
+    """Return in which steps between frames a pixel sees no motion: [n - 1, P].
+
+    Its grey level stays within the noise of the frames from shortly before the step to the frame after it. And the
+    pixels around it fire no more than pixels at rest do: noise of pixels is independent, while motion too slow or too
+    dark for a grey level, and a low-pass that still settles, reach neighbours too.
+    """
+    frames, shape = recording.frames, (max(len(recording.frames) - 1, 0), len(recording.pixels))
+    if len(frames) < 4:
+        return np.zeros(shape, np.bool_)
+    differences = np.abs(np.diff(frames[:, :: max(1, shape[1] // 4096)].astype(np.int16), axis=0))
+    tolerance = 1.0 + 2.0 * float(np.median(differences, axis=1).min())
+    before = math.ceil(1e6 * _SETTLE_SECONDS / np.median(np.diff(recording.frame_us)))
+    window, anchor = np.ones((before + 3, 1), np.uint8), (0, before)
+    spread = cv2.dilate(frames, window, anchor=anchor) - cv2.erode(frames, window, anchor=anchor)
+    still = spread[:-1] <= tolerance
+    still[:before] = False
+    around = _events_around(recording)
+    # Half of the still time is the quietest half; its limit is reached by noise alone.
+    limit = np.median(around[still]) if still.any() else 0.0
+    return still & (around <= limit)
+
+
+def _events_around(recording: Recorded) -> npt.NDArray[np.float32]:
+    """Return the events of the pixels around each pixel, per step and its neighbours in time: [n - 1, P]."""
+    around = np.empty((len(recording.frames) - 1, len(recording.pixels)), np.float32)
+    counts = events_of_steps(recording).sum(axis=0)
+    picture = np.zeros((2, recording.height_px, recording.width_px), np.float32)
+    flat = picture.reshape(2, -1)
+    flat[1, recording.pixels] = 1.0
+    known = cv2.boxFilter(picture[1], -1, (_AROUND_PX,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    others = np.maximum(known.ravel()[recording.pixels] - 1.0, 1.0)
+    for step in range(len(around)):
+        own = counts[max(step - 1, 0) : step + 2].sum(axis=0)
+        flat[0, recording.pixels] = own
+        near = cv2.boxFilter(picture[0], -1, (_AROUND_PX,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        around[step] = (near.ravel()[recording.pixels] - own) / others
+    return around
+
+
+def events_of_steps(recording: Recorded) -> npt.NDArray[np.int64]:
+    """Return the darker and the brighter events of each step between frames and each pixel: [2, n - 1, P]."""
+    steps, pixels = len(recording.frames) - 1, len(recording.pixels)
+    owner = np.repeat(np.arange(pixels), np.diff(recording.first))
+    step = np.searchsorted(recording.frame_us, recording.t_us, side="right") - 1
+    inside = (step >= 0) & (step < steps)
+    place = (recording.p[inside] * steps + step[inside]) * pixels + owner[inside]
+    return np.bincount(place, minlength=2 * steps * pixels).reshape(2, steps, pixels)
+
+
+def still_time(recording: Recorded, still: npt.NDArray[np.bool_], light: Doubles) -> Still:
+    """Return the time in which a pixel sees no motion, and its events in it.
 
     Args:
+        still: see :func:`is_still`.
         light: [256] light of each grey level.
-        settle_seconds: time after a change that does not count.
     """
-    shape = len(recording.pixels), 4
-    still = Still(*(np.zeros(shape) for _ in Still._fields))
-    if len(recording.frames) < 4:
-        return still
-    tolerance, usable = _still_steps(recording)
-    quarter = _quarter(recording, recording.frame_us)
-    _walk_still(
-        recording.first, recording.t_us, recording.p, recording.frames, recording.frame_us, light, tolerance, usable,
-        1e6 * settle_seconds, quarter, *still,
-    )  # fmt: skip
-    return still
-
-
-def _still_steps(recording: Recorded) -> tuple[float, npt.NDArray[np.bool_]]:
-    """Return the largest change of grey level that is noise of the frames, and which steps between frames may count.
-
-    Where the whole picture stands still for long enough, only that time counts: elsewhere changes below a grey level
-    may go on.
-    """
-    some = recording.frames[:, :: max(1, recording.frames.shape[1] // 4096)].astype(np.int16)
-    differences = np.abs(np.diff(some, axis=0))
-    tolerance = 1.0 + 2.0 * float(np.median(differences, axis=1).min())
-    still = (differences > tolerance).mean(axis=1) < 0.05
-    enough = still.sum() * np.median(np.diff(recording.frame_us)) >= 1e6 * STILL_SECONDS
-    return tolerance, np.append(still if enough else np.ones(len(still), bool), False)
+    steps = np.diff(recording.frame_us)[:, None] * 1e-6 * still
+    off, on = events_of_steps(recording) * still
+    columns = steps, steps * light[recording.frames[:-1]], on, off
+    quarter = _quarter(recording, recording.frame_us[:-1])
+    return Still(*(np.stack([part[quarter == q].sum(axis=0) for q in range(4)], axis=1) for part in columns))
 
 
 def intervals_us(recording: Recorded) -> Doubles:
@@ -178,35 +210,3 @@ def _walk_frames(first, t, p, frames, frame_us, stride, longest_us, refractory_u
             else:
                 off += weight
     return made
-
-
-@numba.njit(cache=True)
-def _walk_still(first, t, p, frames, frame_us, light, tolerance, usable, settle_us, quarter, seconds, lit, on, off):
-    count = len(frame_us)
-    for i in range(len(first) - 1):
-        begin, event = 0, first[i]
-        low = high = float(frames[0, i])
-        for frame in range(1, count + 1):
-            grey = float(frames[frame, i]) if frame < count else -1e9
-            if usable[frame - 1] and max(high, grey) - min(low, grey) <= tolerance:
-                low, high = min(low, grey), max(high, grey)
-                continue
-            # The last step of a run is left out: a change may begin before the frame that shows it.
-            last = frame - 2 if frame < count else frame - 1
-            run = begin
-            while run < last and frame_us[run] < frame_us[begin] + settle_us:
-                run += 1
-            for k in range(run, last):
-                q = quarter[k]
-                length = (frame_us[k + 1] - frame_us[k]) * 1e-6
-                seconds[i, q] += length
-                lit[i, q] += length * light[int(low)]
-                while event < first[i + 1] and t[event] < frame_us[k]:
-                    event += 1
-                while event < first[i + 1] and t[event] < frame_us[k + 1]:
-                    if p[event]:
-                        on[i, q] += 1
-                    else:
-                        off[i, q] += 1
-                    event += 1
-            begin, low, high = frame, grey, grey

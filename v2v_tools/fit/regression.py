@@ -1,6 +1,6 @@
 """Fit thresholds, low-pass and dark floor to increments by least squares, and judge a fit by its likelihood.
 
-A pixel's level P follows log intensity L by tau dP/dt = L - P, tau = 1 / (2 pi f (i + 0.1) / 1.1) for light i. Between
+A pixel's level P follows log intensity L by tau dP/dt = L - P, tau = 1 / (2 pi f (i + 20/255) / (1 + 20/255)) for light i. Between
 two frames P changes by c+ on - c- off, so that
 
     change of L = c+ on - c- off + tau (change of dP/dt) + drift x time + rounding of the grey levels
@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from v2v_server.simulation.effects.photoreceptor import DARKEST
 from v2v_tools.fit.increments import Increments, increments_of
 from v2v_tools.fit.interval import Doubles, Estimate, bootstrap, sums_by_block, unknown
 from v2v_tools.fit.recording import Recorded
@@ -29,8 +30,6 @@ SYSTEMATIC = {
     "refractory_seconds": 0.25,
 }
 """Errors, as shares, that a bootstrap does not see: seen on simulated cameras (``python -m bench fit``)."""
-_DARKEST = 0.1
-"""Light that the corner frequency keeps in the dark (``effects/photoreceptor.py``)."""
 LEAST_INCREMENTS = 1000
 _SOLVED = ("threshold_pos", "threshold_neg", "photoreceptor_hz")
 _CLOCK_SECONDS = 2e-5
@@ -104,7 +103,7 @@ def _rows(given: Increments, log_eps: float, solved: Doubles) -> tuple[Doubles, 
     change = np.log(log_eps + light[1]) - np.log(log_eps + light[0])
     sensitivity = given.slope / (light + log_eps)
     positive, negative = np.maximum(solved[:2], 1e-4)
-    lag = given.speed * (1.0 + _DARKEST) / (2.0 * math.pi * (light + _DARKEST))
+    lag = given.speed * (1.0 + DARKEST) / (2.0 * math.pi * (light + DARKEST))
     lag = lag * np.where(given.speed > 0, positive, negative)
     counted = np.abs(given.on) + np.abs(given.off)
     columns = np.stack([given.on, -given.off, lag[1] - lag[0], given.seconds], axis=1)

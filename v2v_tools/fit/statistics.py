@@ -14,7 +14,7 @@ from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.kernels import list_events
 from v2v_server.video.luma import SDR, Signal
-from v2v_tools.fit.increments import intervals_us, still_time
+from v2v_tools.fit.increments import intervals_us, is_still, still_time
 from v2v_tools.fit.interval import Doubles
 from v2v_tools.fit.recording import Recorded
 
@@ -81,7 +81,7 @@ def panels_of(recording: Recorded, light: Doubles, begin_us: int, end_us: int) -
     inside = (recording.t_us >= begin_us) & (recording.t_us < end_us)
     mean_grey = recording.frames.mean(axis=0) if len(recording.frames) else np.full(count, 128.0)
     bright = np.searchsorted(BRIGHTNESS_EDGES, mean_grey, side="right") - 1
-    events, still, gaps = owner[inside], still_time(recording, light), intervals_us(recording)
+    events, still, gaps = owner[inside], still_time(recording, is_still(recording), light), intervals_us(recording)
     number = np.searchsorted(INTERVAL_EDGES_US, gaps[0], side="right") - 1
     totals = np.searchsorted(COUNT_EDGES, np.bincount(events, minlength=count), side="right") - 1
     noise = np.concatenate([still.off.sum(axis=1), still.on.sum(axis=1)])

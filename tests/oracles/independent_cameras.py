@@ -1,0 +1,227 @@
+"""Cameras that share no code and no step with the product or with ``cameras.py``, for judging what ``v2v-fit`` tells.
+
+From the equations, in float64, for all pixels at once and event by event:
+
+    L = log(log_eps + light),   dP/dt = 2 pi f (L - P),   f = corner (light + 20/255) / (1 + 20/255)
+
+Light is linear between the pictures of a film, and P between steps of about a millisecond. A pixel fires where P and
+its leak have moved by its own threshold since its last event, and sees nothing during its refractory period. Shot noise
+is a Poisson process for each polarity; an event of it restarts the pixel. It obeys the refractory period, as in a
+sensor, or ignores it, as in many simulators (v2e before its version 1.5, this product's kernel).
+
+Scenes are photographs that move on a smooth path, and clips whose frames are blended. The cameras and scenes on which
+the fit was tuned (:data:`TUNING`) are others than those that it is reported on (:data:`REPORT`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage  # type: ignore[import-untyped]
+
+from tests.oracles.cameras import Film, TrueCamera
+from tests.oracles.known_motion import photograph
+
+Doubles = npt.NDArray[np.float64]
+HEIGHT_PX, WIDTH_PX = 64, 96
+GAMMA = 2.2
+_DARKEST = 20 / 255
+_HZ, _STEPS_A_PICTURE, _PICTURES_A_FRAME = 240, 4, 8
+_BLENDED = 10
+"""Pictures made of one frame of a clip, which has 24 to 30 frames a second."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One recording of a list.
+
+    Attributes:
+        scene: photograph, or file name of a clip.
+        seed: of camera and motion.
+        ignores: noise ignores the refractory period.
+        still: seconds without motion at the end.
+    """
+
+    scene: str
+    seed: int
+    ignores: bool
+    still: float = 1.5
+
+    @property
+    def camera(self) -> TrueCamera:
+        """Parameters drawn for this case; a fifth to a third of the effects are off."""
+        rng = np.random.default_rng(self.seed)
+
+        def between(low: float, high: float, off: float = 0.0) -> float:
+            value = math.exp(rng.uniform(math.log(low), math.log(high)))
+            return 0.0 if rng.random() < off else value
+
+        positive = between(0.12, 0.35)
+        return TrueCamera(
+            positive, positive * between(0.75, 1.33), threshold_mismatch_sigma=between(0.03, 0.12, off=0.3),
+            shot_noise_hz=between(0.3, 6.0, off=0.15), leak_hz=between(0.1, 1.0, off=0.3),
+            refractory_seconds=between(2e-4, 2e-3, off=0.2), photoreceptor_hz=between(30.0, 300.0, off=0.3),
+            log_eps=between(2e-3, 3e-2),
+        )  # fmt: skip
+
+    def film(self, clips: Path) -> Film:
+        """Render the scene, or read it from a folder of clips."""
+        if "." in self.scene:
+            return _blended(clips / self.scene, self.seed, self.still)
+        return _moving(self.scene, self.seed, self.still)
+
+
+def _cases(seed: int, scenes: tuple[str, ...], stills: tuple[float, ...]) -> tuple[Case, ...]:
+    """Return two cases of each scene: noise that obeys and noise that ignores the refractory period."""
+    pairs = itertools.product(scenes, (False, True))
+    return tuple(
+        Case(scene, seed + number, ignores, stills[number % len(stills)])
+        for number, (scene, ignores) in enumerate(pairs)
+    )
+
+
+TUNING = _cases(
+    1000, ("camera", "chelsea", "gravel", "carphone_pristine.mp4", "rocket", "camera", "chelsea", "rocket", "gravel"),
+    (1.5, 1.0, 2.0),
+)  # fmt: skip
+REPORT = _cases(
+    2000, ("coffee", "astronaut", "coins", "bikes.mp4", "bigbuckbunny.mp4", "brick", "astronaut", "coffee"),
+    (1.5, 1.0, 2.0),
+)  # fmt: skip
+
+
+def record_independently(film: Film, camera: TrueCamera, ignores: bool, seed: int) -> dict[str, npt.NDArray[Any]]:
+    """Return what a camera records.
+
+    Returns:
+        ``frames`` [n, height, width] uint8, ``frame_us`` [n] int64; in order of time ``t`` [N] int64 microseconds,
+        ``x``, ``y``, ``p`` [N].
+    """
+    count, height, width = film.grey.shape
+    pixels = _Pixels(camera, ignores, height * width, seed)
+    light = film.grey.reshape(count, -1).astype(np.float64) ** GAMMA
+    dt = 1.0 / film.hz / _STEPS_A_PICTURE
+    shares = np.arange(1, _STEPS_A_PICTURE + 1) / _STEPS_A_PICTURE
+    pixels.settle(light[0])
+    for picture, share in itertools.product(range(count - 1), shares):
+        pixels.step(light[picture] + share * (light[picture + 1] - light[picture]), dt)
+    seconds, place, p = (np.concatenate(column) for column in zip(*pixels.events, strict=True))
+    order = np.argsort(seconds, kind="stable")
+    y, x = np.divmod(place[order], width)
+    shown = np.arange(0, count, _PICTURES_A_FRAME)
+    return {
+        "frames": np.rint(255 * film.grey[shown]).astype(np.uint8),
+        "frame_us": np.rint(1e6 * shown / film.hz).astype(np.int64),
+        "t": (1e6 * seconds[order]).astype(np.int64), "x": x, "y": y, "p": p[order],
+    }  # fmt: skip
+
+
+class _Pixels:
+    """The state of all pixels of a camera, and the events that they fired: seconds, place, brighter."""
+
+    def __init__(self, camera: TrueCamera, ignores: bool, count: int, seed: int) -> None:
+        self._camera, self._ignores, self._rng = camera, ignores, np.random.default_rng(seed)
+        nominal = np.array([[camera.threshold_pos], [camera.threshold_neg]])
+        spread = 1.0 + camera.threshold_mismatch_sigma * self._rng.standard_normal((2, count))
+        self._on, self._off = nominal * np.maximum(spread, 0.3)
+        self._moved = self._rng.triangular(-self._off, 0.0, self._on)
+        self._blind_until = np.full(count, -1.0)
+        self._now = 0.0
+        self.events: list[tuple[Doubles, npt.NDArray[np.int64], npt.NDArray[np.bool_]]] = []
+
+    def settle(self, light: Doubles) -> None:
+        """Start in this light."""
+        self._level = np.log(self._camera.log_eps + light)
+
+    def step(self, light: Doubles, dt: float) -> None:
+        """Advance by a step that ends in this light."""
+        level, target = self._level, np.log(self._camera.log_eps + light)
+        corner = self._camera.photoreceptor_hz * (light + _DARKEST) / (1.0 + _DARKEST)
+        passed = 1.0 - np.exp(-2.0 * math.pi * corner * dt) if self._camera.photoreceptor_hz else 1.0
+        self._level = level + passed * (target - level)
+        slope = (self._level - level) / dt + self._camera.leak_hz * self._camera.threshold_pos
+        end = self._now + dt
+        rate = self._camera.shot_noise_hz * (1.0 - 0.75 * light)
+        noisy = np.flatnonzero(self._rng.random(len(light)) < rate * dt)
+        everyone = np.arange(len(light))
+        begin = np.full(len(light), self._now)
+        if len(noisy):
+            at = self._now + dt * self._rng.random(len(noisy))
+            self._cross(noisy, begin[noisy], at, slope[noisy])
+            fires = self._ignores | (at >= self._blind_until[noisy])
+            noisy, at = noisy[fires], at[fires]
+            self._moved[noisy] = 0.0
+            self._fire(noisy, at, self._rng.random(len(noisy)) < 0.5, is_noise=True)
+            begin[noisy] = at
+            refused = np.setdiff1d(everyone, noisy, assume_unique=True)
+            self._cross(refused, begin[refused], np.full(len(refused), end), slope[refused])
+            self._cross(noisy, at, np.full(len(noisy), end), slope[noisy])
+        else:
+            self._cross(everyone, begin, np.full(len(light), end), slope)
+        self._now = end
+
+    def _cross(self, who: npt.NDArray[np.int64], begin: Doubles, end: Doubles, slope: Doubles) -> None:
+        """Let pixels move at a steady pace from one time to another, and fire what they cross."""
+        while len(who):
+            begin = np.maximum(begin, self._blind_until[who])
+            seen = np.maximum(end - begin, 0.0)
+            limit = np.where(slope > 0, self._on[who], -self._off[who])
+            wait = np.maximum((limit - self._moved[who]) / np.where(slope == 0, 1e-30, slope), 0.0)
+            fires = (wait < seen) & (slope != 0)
+            rest = ~fires
+            self._moved[who[rest]] += slope[rest] * seen[rest]
+            who, begin, end, slope = who[fires], (begin + wait)[fires], end[fires], slope[fires]
+            self._moved[who] = 0.0
+            self._fire(who, begin, slope > 0)
+
+    def _fire(
+        self, who: npt.NDArray[np.int64], at: Doubles, is_on: npt.NDArray[np.bool_], is_noise: bool = False
+    ) -> None:
+        self.events.append((at, who, is_on))
+        if not (is_noise and self._ignores):
+            self._blind_until[who] = at + self._camera.refractory_seconds
+
+
+def _moving(name: str, seed: int, still: float, moving: float = 2.0) -> Film:
+    """Render a photograph on a path of two sines, then at rest."""
+    rng = np.random.default_rng(10_000 + seed)
+    picture = cv2.GaussianBlur(photograph(name).astype(np.float64) / 255.0, (0, 0), 0.7)
+    spline = ndimage.spline_filter(picture, mode="mirror")
+    speed, turn = np.exp(rng.uniform(np.log(40.0), np.log(130.0))), rng.uniform(0.0, math.pi)
+    hz = rng.uniform(0.35, 0.8, 2)
+    corner = np.array(picture.shape) / 2 - (HEIGHT_PX / 2, WIDTH_PX / 2) + rng.uniform(-40.0, 40.0, 2)
+    y, x = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX].astype(np.float64)
+    moment = np.arange(round(moving * _HZ) + 1)[:, None] / _HZ
+    path = speed / (2 * math.pi * hz) * np.sin(2 * math.pi * hz * moment + [turn, 1.3 * turn])
+    at: Callable[[Doubles], Doubles] = lambda place: ndimage.map_coordinates(  # noqa: E731
+        spline, [y + corner[0] + place[0], x + corner[1] + place[1]], mode="mirror", prefilter=False
+    )
+    pictures = [np.clip(at(place), 0.0, 1.0) for place in path]
+    return Film(np.stack(pictures + [pictures[-1]] * round(still * _HZ)), _HZ)
+
+
+def _blended(path: Path, seed: int, still: float, moving: float = 2.0) -> Film:
+    """Read a part of a clip, its frames blended, and let it rest at the end."""
+    with av.open(str(path)) as container:
+        rate = float(container.streams.video[0].average_rate or 25)
+        frames = [frame.to_ndarray(format="gray") for frame in container.decode(video=0)]
+    first = int(np.random.default_rng(10_000 + seed).integers(len(frames) - moving * rate - 1))
+    small = []
+    for frame in frames[first : first + round(moving * rate) + 1]:
+        height = min(frame.shape[0], frame.shape[1] * HEIGHT_PX // WIDTH_PX)
+        top, left = (frame.shape[0] - height) // 2, (frame.shape[1] - height * WIDTH_PX // HEIGHT_PX) // 2
+        part = frame[top : top + height, left : left + height * WIDTH_PX // HEIGHT_PX]
+        small.append(cv2.resize(part, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA) / 255.0)
+    shares = np.arange(_BLENDED) / _BLENDED
+    pictures = [one + share * (two - one) for one, two in itertools.pairwise(small) for share in shares]
+    hz = round(rate * _BLENDED)
+    return Film(np.stack([*pictures, small[-1]] + [small[-1]] * round(still * hz)), hz)
