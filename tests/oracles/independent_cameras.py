@@ -140,14 +140,20 @@ class _Pixels:
 
     def settle(self, light: Doubles) -> None:
         """Start in this light."""
-        self._level = np.log(self._camera.log_eps + light)
+        self._level = self._aim = np.log(self._camera.log_eps + light)
 
     def step(self, light: Doubles, dt: float) -> None:
         """Advance by a step that ends in this light."""
         level, target = self._level, np.log(self._camera.log_eps + light)
-        corner = self._camera.photoreceptor_hz * (light + _DARKEST) / (1.0 + _DARKEST)
-        passed = 1.0 - np.exp(-2.0 * math.pi * corner * dt) if self._camera.photoreceptor_hz else 1.0
-        self._level = level + passed * (target - level)
+        if self._camera.photoreceptor_hz:
+            corner = self._camera.photoreceptor_hz * (light + _DARKEST) / (1.0 + _DARKEST)
+            tau = 1.0 / (2.0 * math.pi * corner)
+            # The solution for an L that rises steadily: it lags by tau, and what differs from that decays.
+            lag = tau * (target - self._aim) / dt
+            self._level = target - lag + (level - self._aim + lag) * np.exp(-dt / tau)
+        else:
+            self._level = target
+        self._aim = target
         slope = (self._level - level) / dt + self._camera.leak_hz * self._camera.threshold_pos
         end = self._now + dt
         rate = self._camera.shot_noise_hz * (1.0 - 0.75 * light)

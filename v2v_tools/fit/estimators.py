@@ -25,7 +25,7 @@ OFFSETS_US = np.arange(-15_000, 15_001, 1000)
 _WIDEST_OFFSET_SECONDS = 0.004
 _MOST_STEPS, _MOST_COUNT, _DARK = 32, 5, 0.03
 _GLITCHES = 3e-5
-_MANY_SHORT, _EDGE = 100, 0.01
+_MANY_SHORT, _EDGE, _REACH = 100, 0.01, 1.3
 
 
 def mismatch(fitted: Regression, given: Increments, blocks: npt.NDArray[np.int64]) -> Estimate:
@@ -58,7 +58,7 @@ def mismatch(fitted: Regression, given: Increments, blocks: npt.NDArray[np.int64
     columns += [parts[0][0] * parts[1][0] * both, parts[0][2] * parts[1][2] * both]
     on, on_weight, off, off_weight, cross, cross_weight = columns
     table = np.stack([on + off, on_weight + off_weight, cross, cross_weight], axis=1)
-    sums = sums_by_block(blocks, table, int(blocks.max()) + 1)
+    sums = sums_by_block(blocks, table)
     if min(sums[:, 1].sum(), sums[:, 3].sum()) < LEAST_INCREMENTS:
         return unknown("too few pixels with several changes in both directions")
 
@@ -84,8 +84,7 @@ def noise_rates(
         return unknown(note), unknown(note)
     block = (blocks[:, None] * 4 + np.arange(4)).ravel()
     columns = [part * ~is_hot[:, None] for part in (still.on, still.off, still.seconds, still.light)]
-    sums = sums_by_block(block, np.stack([column.ravel() for column in columns], axis=1), 4 * (int(blocks.max()) + 1))
-    sums = sums[sums[:, 2] > 0]
+    sums = sums_by_block(block, np.stack([column.ravel() for column in columns], axis=1), 4)
 
     def solve(s: Doubles) -> Doubles:
         on, off, time, lit = s
@@ -108,20 +107,32 @@ def refractory(gaps_us: Doubles) -> Estimate:
     """Estimate the refractory period, s, from intervals between events of a pixel.
 
     Near the end r of the distribution, P(interval < x) = (x - r) ** a, r and a unknown: likelihood of the smallest.
+    Noise that ignores the period makes shorter intervals, evenly long and of any two signs: the period lies below their
+    end, and its lower end is not seen.
     """
     if gaps_us.shape[1] < 1000:
         return unknown(f"{gaps_us.shape[1]} intervals between events; needs 1000")
+    in_order = np.argsort(gaps_us[0])
+    gaps, is_same = gaps_us[0, in_order], gaps_us[1, in_order] > 0
     # A few events of a recording may have wrong times.
-    glitches = int(_GLITCHES * gaps_us.shape[1])
-    gaps_us = gaps_us[:, gaps_us[0] >= np.partition(gaps_us[0], glitches)[glitches]]
-    gaps, is_same = gaps_us[0], gaps_us[1] > 0
-    shortest = float(gaps.min())
+    glitches = int(_GLITCHES * len(gaps))
+    edges = np.geomspace(25.0, 1e4, 100)
+    below, beyond = np.searchsorted(gaps, edges), np.searchsorted(gaps, _REACH * edges)
+    expected = (_REACH - 1) * below
+    end = int(np.argmax(beyond - below > 2 * expected + 5 * np.sqrt(expected) + 20))
+    floor = int(below[end])
+    half = np.searchsorted(gaps, edges[end] / 2)
+    if floor > 10 + 3 * glitches and 0.35 < half / floor < 0.65 and 0.3 < is_same[:floor].mean() < 0.7:
+        note = f"{floor} intervals of noise that ignores it, and the first others after {edges[end]:.0f} us"
+        return Estimate(0.0, 0.0, _REACH * edges[end] * 1e-6, 1e-4, note)
+    gaps, is_same = gaps[glitches:], is_same[glitches:]
+    shortest = float(gaps[0])
     count = int(np.clip(np.count_nonzero(gaps <= 1.1 * shortest + 20), 20, 2000))
-    smallest = np.sort(np.partition(gaps, count)[: count + 1]) + 0.5
+    smallest = gaps[: count + 1] + 0.5
     if smallest[0] < 30.0:
         return Estimate(0.0, 0.0, smallest[0] * 1e-6, 1e-4, f"shortest interval {smallest[0]:.0f} us")
     note = f"shortest of {len(gaps)} intervals {shortest:.0f} us"
-    apart_by_sign = [np.sort(gaps[chosen])[:5] for chosen in (is_same, ~is_same)]
+    apart_by_sign = [gaps[chosen][:5] for chosen in (is_same, ~is_same)]
     if min(map(len, apart_by_sign)) < 5 or abs(np.diff([part[4] for part in apart_by_sign])[0]) > 0.15 * shortest + 20:
         # The fastest edge of the scene ends the intervals too, but at another value where the polarity turns.
         return Estimate(0.0, 0.0, shortest * 1e-6, 1e-4, f"at most that: {note}, which the scene's speed may explain")
@@ -170,7 +181,7 @@ def hot_pixels(
     least = min(thresholds) * (usual * length + 5 * math.sqrt(usual * length) + 5) / length
     table = np.stack([seen, hot, np.zeros(len(seen))], axis=1).astype(np.float64)
     table[hot, 2] = np.minimum(drift, 1e4) ** 2
-    sums = sums_by_block(blocks, table, int(blocks.max()) + 1)
+    sums = sums_by_block(blocks, table)
 
     def solve(s: Doubles) -> Doubles:
         pixels, count, squares = s
@@ -209,7 +220,7 @@ def dead_pixels(recording: Recorded, blocks: npt.NDArray[np.int64]) -> Estimate:
     if active.sum() < 500:
         return unknown(f"{active.sum()} pixels have active neighbours; needs 500")
     silent = active & (counts.ravel()[recording.pixels] == 0)
-    sums = sums_by_block(blocks, np.stack([active, silent], axis=1).astype(np.float64), int(blocks.max()) + 1)
+    sums = sums_by_block(blocks, np.stack([active, silent], axis=1).astype(np.float64))
     value, low, high = bootstrap(sums, lambda s: np.array([s[1] / max(s[0], 1.0)]))
     most = float(silent.sum() + 2.5 + 1.645 * math.sqrt(silent.sum())) / float(active.sum())
     note = f"{silent.sum()} of {active.sum()} pixels with active neighbours are silent"
@@ -239,7 +250,7 @@ def frame_offset(recording: Recorded) -> Estimate:
             inside = (at >= frame_us[step] + offset) & (at < frame_us[step + 1] + offset)
             count = np.bincount(pixel[inside], sign[inside], len(change))
             count = np.clip(count, -_MOST_COUNT, _MOST_COUNT) * seen
-            sums[:, number] += sums_by_block(blocks, np.stack([change * count, count**2], axis=1), 64)
+            sums[:, number] += sums_by_block(blocks, np.stack([change * count, count**2], axis=1))
     seconds = np.asarray(OFFSETS_US * 1e-6, np.float64)
     value, low, high = bootstrap(
         sums, lambda s: np.array([summit(seconds, s[:, 0] / np.sqrt(np.maximum(s[:, 1], 1e-9)))])

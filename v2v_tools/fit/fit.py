@@ -15,7 +15,7 @@ from v2v_protocol.errors import UsageError
 from v2v_recordings.items import ConvertOptions, Light, ReadProgress
 from v2v_tools.fit import estimators, regression
 from v2v_tools.fit.increments import increments_of, intervals_us, is_still, still_time
-from v2v_tools.fit.interval import Doubles, Estimate, unknown
+from v2v_tools.fit.interval import Doubles, Estimate, bootstrap, sums_by_block, unknown
 from v2v_tools.fit.recording import Recorded, read_recording
 from v2v_tools.fit.statistics import Panels, panels_of, simulate_recording
 
@@ -162,13 +162,13 @@ def _estimates(given: Recorded, is_blank: bool, static: bool = False) -> dict[st
         note = f"{made['hot_pixel_sigma'].note}; in units of a threshold of {USUAL_THRESHOLD}"
         made["hot_pixel_sigma"] = dataclasses.replace(made["hot_pixel_sigma"], note=note)
     made["dead_pixel_share"] = estimators.dead_pixels(given, blocks)
-    made["leak_hz"] = _matched_leak(given, values, surplus, blocks, at_rest)
+    made["leak_hz"] = _matched_leak(given, values, surplus, blocks, at_rest, is_hot)
     return {name: dataclasses.replace(one, low=0.0) if one.is_absent else one for name, one in made.items()}
 
 
 def _matched_leak(
     given: Recorded, camera: dict[str, float], surplus: Estimate, blocks: npt.NDArray[np.int64],
-    at_rest: npt.NDArray[np.bool_],
+    at_rest: npt.NDArray[np.bool_], is_hot: npt.NDArray[np.bool_],
 ) -> Estimate:
     """Find the leak with which the simulation has the surplus of brighter events that was measured.
 
@@ -178,22 +178,25 @@ def _matched_leak(
     if not math.isfinite(surplus.value):
         return surplus
     camera = camera | {"hot_pixel_share": 0.0, "dead_pixel_share": 0.0}
-    found = []
-    for number, leak in enumerate(_LEAKS_HZ):
-        simulated = simulate_recording(given, camera | {"leak_hz": float(leak)}, 10 + number)
-        still = still_time(simulated, at_rest, given.known_light.of(np.arange(256.0)))
-        found.append(estimators.noise_rates(still, blocks, np.zeros(len(blocks), bool))[1].value)
-    rising = np.maximum.accumulate(np.array(found)) + 1e-9 * np.arange(len(found))
-    # The simulation is as noisy as the recording.
-    reach = math.sqrt(2.0)
-    wanted = (
-        surplus.value, surplus.value - reach * (surplus.value - surplus.low),
-        surplus.value + reach * (surplus.high - surplus.value),
-    )  # fmt: skip
-    value, low, high = (float(np.interp(end, rising, _LEAKS_HZ)) for end in wanted)
-    if wanted[2] > rising[-1]:
-        high = math.inf
-    made = Estimate(value, low, high, 0.05, f"simulated with leaks up to 4 Hz; {surplus.note}")
+    # The same noise in all simulations: they differ by their leak alone.
+    simulated = [simulate_recording(given, camera | {"leak_hz": float(leak)}, 10) for leak in _LEAKS_HZ]
+    light = given.known_light.of(np.arange(256.0))
+    stills = [still_time(each, at_rest, light) for each in (given, *simulated)]
+    table = np.stack([stills[0].seconds, *(each.on - each.off for each in stills)], axis=2) * ~is_hot[:, None, None]
+    sums = sums_by_block((blocks[:, None] * 4 + np.arange(4)).ravel(), table.reshape(-1, table.shape[2]), 4)
+
+    def rates(s: Doubles) -> Doubles:
+        return np.asarray(np.maximum.accumulate(s[2:] / max(s[0], 1e-9)) + 1e-9 * np.arange(len(_LEAKS_HZ)))
+
+    def solve(s: Doubles) -> Doubles:
+        return np.interp([s[1] / max(s[0], 1e-9)], rates(s), _LEAKS_HZ)
+
+    value, low, high = (float(each[0]) for each in bootstrap(sums, solve))
+    rising = rates(sums.sum(axis=0))
+    # Beside much noise a leak hardly fires: it matters from where the simulation shows it.
+    negligible = max(0.05, float(np.interp(rising[0] + surplus.negligible, rising, _LEAKS_HZ)))
+    most = high if high < _LEAKS_HZ[-1] else math.inf
+    made = Estimate(value, max(low, 0.0), most, negligible, f"simulated with leaks up to 4 Hz; {surplus.note}")
     return made.moved(value, regression.SYSTEMATIC["leak_hz"] * value) if value > 0.0 else made
 
 
