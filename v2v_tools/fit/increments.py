@@ -40,7 +40,7 @@ class Increments(NamedTuple):
         pixel: index of the pixel.
         block: part of the time, 0 .. 3, of its first frame.
         seconds: duration.
-        grey: [2, M] grey level at both ends; light, slope: its light, 0 .. 1, and the change of light with the level.
+        light, slope: [2, M] light at both ends, 0 .. 1, and its change with the grey level.
         on, off: events, with fractions.
         speed: [2, M] signed events a second at both ends.
     """
@@ -48,31 +48,15 @@ class Increments(NamedTuple):
     pixel: npt.NDArray[np.int64]
     block: npt.NDArray[np.int64]
     seconds: Doubles
-    grey: Doubles
     on: Doubles
     off: Doubles
     speed: Doubles
     light: Doubles
     slope: Doubles
 
-    def take(self, which: npt.NDArray[Any]) -> Increments:
-        """Return some of the increments, by a mask or by places."""
+    def take(self, which: npt.NDArray[Any] | slice) -> Increments:
+        """Return some of the increments, by a mask or a slice."""
         return Increments(*(column[..., which] for column in self))  # type: ignore[arg-type]
-
-
-class Still(NamedTuple):
-    """Time in which the frames of a pixel show no change, by pixel and quarter of the recording: [P, 4] each.
-
-    Attributes:
-        seconds: duration.
-        light: sum of light x seconds, light 0 (black) .. 1 (white).
-        on, off: events.
-    """
-
-    seconds: Doubles
-    light: Doubles
-    on: Doubles
-    off: Doubles
 
 
 def increments_of(recording: Recorded, refractory_seconds: float, longest_us: float) -> Increments:
@@ -92,7 +76,7 @@ def increments_of(recording: Recorded, refractory_seconds: float, longest_us: fl
     pixel, begin, end, grey_1, grey_2, on, off, speed_1, speed_2 = table[:, :count]
     quarter, grey, light_of = _quarter(recording, begin), np.stack([grey_1, grey_2]), recording.known_light.of
     return Increments(
-        pixel.astype(np.int64), quarter, (end - begin) * 1e-6, grey, on, off, np.stack([speed_1, speed_2]),
+        pixel.astype(np.int64), quarter, (end - begin) * 1e-6, on, off, np.stack([speed_1, speed_2]),
         light_of(grey), light_of(grey + 0.5) - light_of(grey - 0.5),
     )  # fmt: skip
 
@@ -104,10 +88,8 @@ def is_still(recording: Recorded) -> npt.NDArray[np.bool_]:
     pixels around it fire no more than pixels at rest do: noise of pixels is independent, while motion too slow or too
     dark for a grey level, and a low-pass that still settles, reach neighbours too.
     """
-    frames, shape = recording.frames, (max(len(recording.frames) - 1, 0), len(recording.pixels))
-    if len(frames) < 4:
-        return np.zeros(shape, np.bool_)
-    differences = np.abs(np.diff(frames[:, :: max(1, shape[1] // 4096)].astype(np.int16), axis=0))
+    frames = recording.frames
+    differences = np.abs(np.diff(frames[:, :: max(1, frames.shape[1] // 4096)].astype(np.int16), axis=0))
     tolerance = 1.0 + 2.0 * float(np.median(differences, axis=1).min())
     before = math.ceil(1e6 * _SETTLE_SECONDS / np.median(np.diff(recording.frame_us)))
     window, anchor = np.ones((before + 3, 1), np.uint8), (0, before)
@@ -122,18 +104,14 @@ def is_still(recording: Recorded) -> npt.NDArray[np.bool_]:
 
 def _events_around(recording: Recorded) -> npt.NDArray[np.float32]:
     """Return the events of the pixels around each pixel, per step and its neighbours in time: [n - 1, P]."""
-    around = np.empty((len(recording.frames) - 1, len(recording.pixels)), np.float32)
     counts = events_of_steps(recording).sum(axis=0)
-    picture = np.zeros((2, recording.height_px, recording.width_px), np.float32)
-    flat = picture.reshape(2, -1)
-    flat[1, recording.pixels] = 1.0
-    known = cv2.boxFilter(picture[1], -1, (_AROUND_PX,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    others = np.maximum(known.ravel()[recording.pixels] - 1.0, 1.0)
+    around = np.empty(counts.shape, np.float32)
+    picture = np.zeros((recording.height_px, recording.width_px), np.float32)
     for step in range(len(around)):
         own = counts[max(step - 1, 0) : step + 2].sum(axis=0)
-        flat[0, recording.pixels] = own
-        near = cv2.boxFilter(picture[0], -1, (_AROUND_PX,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        around[step] = (near.ravel()[recording.pixels] - own) / others
+        picture.reshape(-1)[recording.pixels] = own
+        near = cv2.boxFilter(picture, -1, (_AROUND_PX,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        around[step] = near.ravel()[recording.pixels] - own
     return around
 
 
@@ -147,24 +125,24 @@ def events_of_steps(recording: Recorded) -> npt.NDArray[np.int64]:
     return np.bincount(place, minlength=2 * steps * pixels).reshape(2, steps, pixels)
 
 
-def still_time(recording: Recorded, still: npt.NDArray[np.bool_], light: Doubles) -> Still:
-    """Return the time in which a pixel sees no motion, and its events in it.
+def still_time(recording: Recorded, still: npt.NDArray[np.bool_]) -> Doubles:
+    """Return what a pixel shows while it sees no motion, in each quarter of the recording: [4, P, 4] float64.
+
+    Rows: seconds; light x seconds, light 0 (black) .. 1 (white); brighter events; darker events.
 
     Args:
         still: see :func:`is_still`.
-        light: [256] light of each grey level.
     """
-    steps = np.diff(recording.frame_us)[:, None] * 1e-6 * still
+    seconds = np.diff(recording.frame_us)[:, None] * 1e-6 * still
+    lit = seconds * recording.known_light.of(np.arange(256.0))[recording.frames[:-1]]
     off, on = events_of_steps(recording) * still
-    columns = steps, steps * light[recording.frames[:-1]], on, off
     quarter = _quarter(recording, recording.frame_us[:-1])
-    return Still(*(np.stack([part[quarter == q].sum(axis=0) for q in range(4)], axis=1) for part in columns))
+    columns = [[part[quarter == q].sum(axis=0) for q in range(4)] for part in (seconds, lit, on, off)]
+    return np.array(columns, np.float64).transpose(0, 2, 1)
 
 
 def intervals_us(recording: Recorded) -> Doubles:
     """Return the intervals between events of a pixel, and whether both are brighter or both darker: [2, M] float64."""
-    if len(recording.t_us) < 2:
-        return np.empty((2, 0))
     pixel = np.repeat(np.arange(len(recording.pixels)), np.diff(recording.first))
     same = np.diff(pixel) == 0
     gap = np.diff(recording.t_us)[same].astype(np.float64)
@@ -172,7 +150,8 @@ def intervals_us(recording: Recorded) -> Doubles:
 
 
 def _quarter(recording: Recorded, t_us: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    passed = (t_us - recording.begin_us) / max(1e6 * recording.seconds, 1.0)
+    begin_us, end_us = recording.frame_us[[0, -1]]
+    passed = (t_us - begin_us) / max(end_us - begin_us, 1)
     return np.clip((4 * passed).astype(np.int64), 0, 3)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -48,12 +49,11 @@ class Estimate:
         """Whether the value is too small to matter."""
         return self.told and self.high <= self.negligible
 
-    def moved(self, value: float, doubt: float = 0.0) -> Estimate:
-        """Return the estimate with another value, its interval scaled with it and widened by ``doubt``."""
-        scale = value / self.value if self.value > 0.0 else 1.0
-        low = value - math.hypot(scale * (self.value - self.low), doubt)
-        high = value + math.hypot(scale * (self.high - self.value), doubt)
-        return Estimate(value, max(low, 0.0), high, self.negligible, self.note)
+    def widened(self, share: float, more: float = 0.0) -> Estimate:
+        """Return the estimate with an interval that also has an error of this share of the value, and more."""
+        doubt = share * self.value + more
+        low, high = math.hypot(self.value - self.low, doubt), math.hypot(self.high - self.value, doubt)
+        return dataclasses.replace(self, low=max(self.value - low, 0.0), high=self.value + high)
 
 
 def unknown(note: str) -> Estimate:
@@ -75,7 +75,7 @@ def bootstrap(sums: npt.NDArray[Any], solve: Callable[[Doubles], Doubles]) -> tu
         the values [k], and the lower and upper ends of their intervals.
     """
     rng, blocks, flat = np.random.default_rng(0), len(sums), sums.reshape(len(sums), -1)
-    is_seen = flat.any(axis=1)
+    is_seen = np.asarray(flat.any(axis=1))
     filled = int(is_seen.sum())
     drawn = rng.multinomial(filled, np.full(filled, 1.0 / max(filled, 1)), size=DRAWS).astype(np.float64)
     value = solve(sums.sum(axis=0))

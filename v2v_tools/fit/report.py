@@ -95,16 +95,15 @@ def _of_frames(fitted: FittedCamera) -> list[str]:
     """Return what was assumed of the frames: their light and their times."""
     if not fitted.facts["frames"]:
         return []
-    offset, times = fitted.offset, f"their offset cannot be told: {fitted.offset.note}"
-    if math.isfinite(offset.value):
+    late, times = fitted.late, f"cannot be judged: {fitted.late.note}"
+    if math.isfinite(late.value):
         times = (
-            f"they fit the events best {1e3 * offset.value:.1f} ms later "
-            f"[{1e3 * offset.low:.1f}, {1e3 * offset.high:.1f}]"
+            f"they show the light of {1e3 * late.value:.1f} ms later "
+            f"[{1e3 * late.low:.1f}, {1e3 * late.high:.1f}], as blurred frames do too; --frame-offset adds to them"
         )
-    added = f"{1e3 * fitted.applied_seconds:.1f} ms" if fitted.applied_seconds else "nothing (see --shift-frames)"
     return [
         f"Light of the frames: {fitted.light.name}. The recipe is valid for it; its gamma is that of its videos",
-        f"Times of the frames: {times}; added: {added}",
+        f"Times of the frames: {times}",
     ]
 
 
