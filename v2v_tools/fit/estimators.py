@@ -139,7 +139,7 @@ def with_noise(period: Estimate, shot: Estimate, gaps_us: Doubles) -> Estimate:
     shorter = np.count_nonzero(gaps_us < 0.9e6 * period.low) if period.told else 0
     by_chance = _SHARE_OF_DARK * shot.value * period.low * len(gaps_us) if period.told and shot.told else 0.0
     if by_chance < _MOST_BY_CHANCE:
-        verdict = "whether noise obeys it cannot be told: too little of both"
+        verdict = "whether noise obeys it cannot be told: too few noise events"
     else:
         verdict = f"noise {'obeys' if shorter < by_chance / 4 else 'ignores'} it: {shorter} shorter intervals, "
         verdict += f"{by_chance:.0f} if noise ignored it"

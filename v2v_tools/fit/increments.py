@@ -104,25 +104,26 @@ def is_still(recording: Recorded) -> npt.NDArray[np.bool_]:
 
 def _events_around(recording: Recorded) -> npt.NDArray[np.float32]:
     """Return the events of the pixels around each pixel, per step and its neighbours in time: [n - 1, P]."""
-    counts = events_of_steps(recording).sum(axis=0)
-    around = np.empty(counts.shape, np.float32)
+    around = np.empty((len(recording.frames) - 1, len(recording.pixels)), np.float32)
+    step, owner, _ = _events_of_steps(recording)
+    counts = np.bincount(step * around.shape[1] + owner, minlength=around.size).reshape(around.shape)
     picture = np.zeros((recording.height_px, recording.width_px), np.float32)
-    for step in range(len(around)):
-        own = counts[max(step - 1, 0) : step + 2].sum(axis=0)
+    for number in range(len(around)):
+        own = counts[max(number - 1, 0) : number + 2].sum(axis=0)
         picture.reshape(-1)[recording.pixels] = own
         near = cv2.boxFilter(picture, -1, (_AROUND_PX,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        around[step] = near.ravel()[recording.pixels] - own
+        around[number] = near.ravel()[recording.pixels] - own
     return around
 
 
-def events_of_steps(recording: Recorded) -> npt.NDArray[np.int64]:
-    """Return the darker and the brighter events of each step between frames and each pixel: [2, n - 1, P]."""
-    steps, pixels = len(recording.frames) - 1, len(recording.pixels)
-    owner = np.repeat(np.arange(pixels), np.diff(recording.first))
+def _events_of_steps(
+    recording: Recorded,
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Return the step between frames, the pixel and the polarity of the events from the first to the last frame: [M]."""
+    owner = np.repeat(np.arange(len(recording.pixels)), np.diff(recording.first))
     step = np.searchsorted(recording.frame_us, recording.t_us, side="right") - 1
-    inside = (step >= 0) & (step < steps)
-    place = (recording.p[inside] * steps + step[inside]) * pixels + owner[inside]
-    return np.bincount(place, minlength=2 * steps * pixels).reshape(2, steps, pixels)
+    inside = (step >= 0) & (step < len(recording.frames) - 1)
+    return step[inside], owner[inside], recording.p[inside]
 
 
 def still_time(recording: Recorded, still: npt.NDArray[np.bool_]) -> Doubles:
@@ -133,12 +134,15 @@ def still_time(recording: Recorded, still: npt.NDArray[np.bool_]) -> Doubles:
     Args:
         still: see :func:`is_still`.
     """
-    seconds = np.diff(recording.frame_us)[:, None] * 1e-6 * still
-    lit = seconds * recording.known_light.of(np.arange(256.0))[recording.frames[:-1]]
-    off, on = events_of_steps(recording) * still
-    quarter = _quarter(recording, recording.frame_us[:-1])
-    columns = [[part[quarter == q].sum(axis=0) for q in range(4)] for part in (seconds, lit, on, off)]
-    return np.array(columns, np.float64).transpose(0, 2, 1)
+    quarter, pixels = _quarter(recording, recording.frame_us[:-1]), len(recording.pixels)
+    seconds = (np.diff(recording.frame_us)[:, None] * np.float32(1e-6) * still).astype(np.float32)
+    lit = seconds * recording.known_light.of(np.arange(256.0)).astype(np.float32)[recording.frames[:-1]]
+    times = [[part[quarter == q].sum(axis=0, dtype=np.float64) for q in range(4)] for part in (seconds, lit)]
+    step, owner, p = _events_of_steps(recording)
+    here = still[step, owner]
+    place = ((4 * (1 - p[here]) + quarter[step[here]]) * pixels) + owner[here]
+    events = np.bincount(place, minlength=8 * pixels).reshape(2, 4, pixels)
+    return np.concatenate([np.array(times), events]).transpose(0, 2, 1)
 
 
 def intervals_us(recording: Recorded) -> Doubles:

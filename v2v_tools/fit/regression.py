@@ -87,7 +87,8 @@ class Regression:
         low, high = value[:3] - np.hypot(value[:3] - low[:3], doubt), value[:3] + np.hypot(high[:3] - value[:3], doubt)
         self.positive, self.negative = (Estimate(value[k], low[k], high[k], 0.0, note) for k in range(2))
         corner, least, most = (max(float(end[2]), 0.0) for end in (value, low, high))
-        self.corner = Estimate(corner, least, most, 1.0 / 500.0, note)
+        seen = f"{note}, which show the light of {1e3 * self.late.value:.1f} ms later"
+        self.corner = Estimate(corner, least, most, 1.0 / 500.0, seen)
 
 
 class _Fit(NamedTuple):

@@ -82,10 +82,11 @@ def report_lines(fitted: FittedCamera, source: str) -> list[str]:
             unit = _UNITS.get(name) or settings_of(Recipe)[name].unit
             lines.append(f"  {name} = {value:.3g} [{low:.3g}, {high:.3g}] {unit}".rstrip() + f": {made.note}")
     lines.append("Left out:")
-    lines += [
-        f"  {name}: {why}" if fitted.estimates[name].told else f"  {name}: this recording cannot tell: {why}"
-        for name, why in fitted.left_out.items()
-    ]
+    for name, why in fitted.left_out.items():
+        made = fitted.estimates[name]
+        low, high = shown_interval(name, made)
+        between = f" ({low:.3g} to {high:.3g})" if math.isfinite(high - low) else ""
+        lines.append(f"  {name}: {why}" if made.told else f"  {name}: this recording cannot tell{between}: {why}")
     if {"threshold_pos", "threshold_neg"} <= fitted.camera.keys():
         lines.append("A recipe draws which polarity has the larger threshold: it keeps the ratio, not its direction.")
     return lines
