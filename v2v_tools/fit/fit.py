@@ -143,7 +143,9 @@ def _estimates(given: Recorded, is_blank: bool, static: bool) -> tuple[dict[str,
     made["hot_pixel_share"], made["hot_pixel_sigma"] = estimators.hot_pixels(
         still, is_hot, thresholds, refractory_seconds, blocks
     )
-    made["leak_hz"] = _matched_leak(given, values, still, blocks, at_rest, is_hot, shot)
+    made["leak_hz"] = unknown("needs the thresholds")
+    if static or fitted.positive.told:
+        made["leak_hz"] = _matched_leak(given, values, still, blocks, at_rest, is_hot, shot)
     made = {name: dataclasses.replace(one, low=0.0) if one.is_absent else one for name, one in made.items()}
     return made, fitted.late
 
@@ -163,7 +165,7 @@ def _matched_leak(
 
     def simulated(leak: float) -> Doubles:
         """Return the mean of some simulations; their noise is the same for every leak."""
-        made = [simulate_recording(given, camera | {"leak_hz": leak}, seed) for seed in _LEAK_SEEDS]
+        made = [simulate_recording(given, camera | {"leak_hz": leak}, seed, "triangular") for seed in _LEAK_SEEDS]
         return np.asarray(np.mean([still_time(each, at_rest) for each in made], axis=0))
 
     stills = np.stack([still, *map(simulated, _LEAKS_HZ.tolist())])
@@ -176,10 +178,13 @@ def _matched_leak(
     value, low, high = (
         float(each[0]) for each in bootstrap(sums, lambda s: np.interp([s[1] / max(s[0], 1e-9)], rates(s), _LEAKS_HZ))
     )
-    rising = rates(sums.sum(axis=0))
-    # Beside much noise a leak hardly fires: it matters from where the simulation shows it.
-    negligible = max(0.05, float(np.interp(rising[0] + _LEAST_SURPLUS_HZ, rising, _LEAKS_HZ)))
+    total = sums.sum(axis=0)
+    # Few events: those of a Poisson process that was not seen to fire.
+    high = max(high, float(np.interp((total[1] + 3.0) / max(total[0], 1e-9), rates(total), _LEAKS_HZ)))
     most = high if high < _LEAKS_HZ[-1] else math.inf
+    # Noise of s Hz resets the pixel, so that a leak of l Hz fires s / (exp(s / l) - 1) events a second.
+    noise = max(shot.value, 1e-3)
+    negligible = max(0.05, noise / math.log1p(noise / _LEAST_SURPLUS_HZ))
     made = Estimate(value, max(low, 0.0), most, negligible, f"simulated with leaks up to 4 Hz; {shot.note}")
     return made.widened(regression.SYSTEMATIC["leak_hz"])
 

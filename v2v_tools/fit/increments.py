@@ -119,7 +119,7 @@ def _events_around(recording: Recorded) -> npt.NDArray[np.float32]:
 def _events_of_steps(
     recording: Recorded,
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Return the step between frames, the pixel and the polarity of the events from the first to the last frame: [M]."""
+    """Return step between frames, pixel and polarity of the events from the first to the last frame: [M]."""
     owner = np.repeat(np.arange(len(recording.pixels)), np.diff(recording.first))
     step = np.searchsorted(recording.frame_us, recording.t_us, side="right") - 1
     inside = (step >= 0) & (step < len(recording.frames) - 1)
