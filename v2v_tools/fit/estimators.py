@@ -50,7 +50,7 @@ def mismatch(fitted: Regression, given: Increments, blocks: npt.NDArray[np.int64
         beside = np.flatnonzero((np.diff(pixel) == 0) & (np.diff(chosen) == 1))
         pair, pair_weight = product[beside] * product[beside + 1], (count[beside] * count[beside + 1]) ** 2
         of_pixel += [2 * np.bincount(pixel[beside], part, size) for part in (pair, pair_weight)]
-        parts.append(np.stack(of_pixel) * usual)
+        parts.append(np.stack(of_pixel).astype(np.float64) * usual)
     columns = []
     for one, squares, weight, fourth, near, near_weight in parts:
         scale = 1.0 / np.maximum(weight, 1e-9)  # a pixel counts by its events, not by the square of them

@@ -156,7 +156,7 @@ def intervals_us(recording: Recorded) -> Doubles:
 def _quarter(recording: Recorded, t_us: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
     begin_us, end_us = recording.frame_us[[0, -1]]
     passed = (t_us - begin_us) / max(end_us - begin_us, 1)
-    return np.clip((4 * passed).astype(np.int64), 0, 3)
+    return np.asarray(np.clip((4 * passed).astype(np.int64), 0, 3))
 
 
 @numba.njit(cache=True)
