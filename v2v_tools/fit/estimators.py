@@ -22,7 +22,7 @@ from v2v_tools.fit.regression import LEAST_INCREMENTS, SYSTEMATIC, Regression
 LEAST_SECONDS = 200.0
 """Pixel-seconds without a change that rates of noise need."""
 _GLITCHES = 3e-5
-_MANY_SHORT, _EDGE, _REACH = 100, 0.01, 1.3
+_MANY_SHORT, _EDGE, _LEAST_FLOOR, _BALANCED = 100, 0.01, 60, 0.2
 _MOST_BY_CHANCE, _SHARE_OF_DARK = 20.0, 0.7
 
 
@@ -105,14 +105,14 @@ def refractory(gaps_us: Doubles) -> Estimate:
     # A few events of a recording may have wrong times.
     glitches = int(_GLITCHES * len(gaps))
     edges = np.geomspace(25.0, 1e4, 100)
-    below, beyond = np.searchsorted(gaps, edges), np.searchsorted(gaps, _REACH * edges)
-    expected = (_REACH - 1) * below
-    end = int(np.argmax(beyond - below > 2 * expected + 5 * np.sqrt(expected) + 20))
-    floor = int(below[end])
-    half = np.searchsorted(gaps, edges[end] / 2)
-    if floor > 10 + 3 * glitches and 0.35 < half / floor < 0.65 and 0.3 < is_same[:floor].mean() < 0.7:
-        note = f"{floor} intervals of noise that ignores it, and the first others after {edges[end]:.0f} us"
-        return Estimate(0.0, 0.0, _REACH * edges[end] * 1e-6, 1e-4, note)
+    below, half = np.searchsorted(gaps, edges), np.searchsorted(gaps, edges / 2)
+    least = _LEAST_FLOOR + 3 * glitches
+    is_flat = np.abs(half - below / 2) <= 1 + 1.75 * np.sqrt(below)
+    end = int(np.argmin(is_flat | (below <= least))) or len(edges) - 1
+    floor = int(below[end - 1])
+    if floor > least and abs(is_same[:floor].mean() - 0.5) < _BALANCED:
+        note = f"{floor} intervals of noise that ignores it, which end before {edges[end]:.0f} us"
+        return Estimate(0.0, 0.0, float(edges[end]) * 1e-6, 1e-4, note)
     gaps, is_same = gaps[glitches:], is_same[glitches:]
     shortest = float(gaps[0])
     count = int(np.clip(np.count_nonzero(gaps <= 1.1 * shortest + 20), 20, 2000))

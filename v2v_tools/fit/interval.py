@@ -16,7 +16,7 @@ DRAWS, SIDE = 200, 8
 """Draws of a bootstrap; blocks along a side of the sensor."""
 LEVEL = 0.9
 """Probability with which an interval is meant to hold the truth."""
-_DEVIATIONS = 1.645
+_DEVIATIONS, _LARGEST_PIECE = 1.645, 0.65
 WIDEST = 0.5
 """An interval of more than this share to either side tells nothing."""
 
@@ -65,17 +65,18 @@ def bootstrap(sums: npt.NDArray[Any], solve: Callable[[Doubles], Doubles]) -> tu
     """Solve with all blocks, with blocks drawn with replacement, and without single pieces of the recording.
 
     Blocks drawn one by one show chance alone. Quarters of the sensor and of the time differ by more where the scene or
-    the model does: their spread (a jackknife) widens the interval.
+    the model does: their spread (a jackknife) widens the interval, unless one of them has most of the data.
 
     Args:
-        sums: [SIDE * SIDE * parts, ...] additive statistics: blocks of the sensor, each in parts of the time.
+        sums: [SIDE * SIDE * parts, ...] additive statistics: blocks of the sensor, each in parts of the time. The first
+            of them tells how much a block counts.
         solve: from the sum over blocks [...] to the values [k].
 
     Returns:
         the values [k], and the lower and upper ends of their intervals.
     """
     rng, blocks, flat = np.random.default_rng(0), len(sums), sums.reshape(len(sums), -1)
-    is_seen = np.asarray(flat.any(axis=1))
+    is_seen = np.asarray(flat.any(axis=1)) | (not flat.any())
     filled = int(is_seen.sum())
     drawn = rng.multinomial(filled, np.full(filled, 1.0 / max(filled, 1)), size=DRAWS).astype(np.float64)
     value = solve(sums.sum(axis=0))
@@ -84,8 +85,9 @@ def bootstrap(sums: npt.NDArray[Any], solve: Callable[[Doubles], Doubles]) -> tu
     space, time = np.divmod(np.arange(blocks), blocks // SIDE**2)
     half = np.zeros_like(value)
     for piece in (space // SIDE // (SIDE // 2) * 2 + space % SIDE // (SIDE // 2), time):
-        pieces = [each for each in range(4) if is_seen[piece == each].any()]
-        if len(pieces) > 1:
+        share = np.bincount(piece, np.abs(flat[:, 0]), 4)
+        pieces = np.flatnonzero(share)
+        if share.max() <= _LARGEST_PIECE * share.sum():
             without = np.array([solve(sums[piece != each].sum(axis=0)) for each in pieces])
             half = np.maximum(half, _DEVIATIONS * np.sqrt(without.var(axis=0) * (len(pieces) - 1)))
     return value, np.minimum(spread[0], value - half), np.maximum(spread[1], value + half)
