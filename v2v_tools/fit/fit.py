@@ -14,7 +14,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import V2VError
 from v2v_recordings.items import ConvertOptions, Light, ReadProgress
 from v2v_tools.fit import estimators, regression
-from v2v_tools.fit.increments import increments_of, intervals_us, is_still, still_time
+from v2v_tools.fit.increments import Increments, increments_of, intervals_us, is_still, still_time
 from v2v_tools.fit.interval import Doubles, Estimate, bootstrap, sums_by_block, unknown
 from v2v_tools.fit.recording import Recorded, read_recording
 from v2v_tools.fit.statistics import Panels, panels_of, simulate_recording
@@ -118,13 +118,23 @@ def _estimates(given: Recorded, is_blank: bool, static: bool) -> tuple[dict[str,
     period, longest_us = estimators.refractory(gaps_us), float(np.median(np.diff(given.frame_us)))
     if not static and not period.told and math.isfinite(period.high):
         period = regression.refractory_by_change(given, blocks, period, longest_us)
-    refractory_seconds = period.value if period.told else 0.0
+    refractory_seconds = period.value if math.isfinite(period.value) else 0.0
     at_rest = is_still(given)
     still = still_time(given, at_rest)
     is_hot = estimators.hot_mask(still)
-    increments = increments_of(given, refractory_seconds, longest_us)
-    increments = increments.take(~is_hot[increments.pixel] & (not static))
+
+    def usual(period_seconds: float) -> Increments:
+        increments = increments_of(given, period_seconds, longest_us)
+        return increments.take(~is_hot[increments.pixel] & (not static))
+
+    increments = usual(refractory_seconds)
     fitted = regression.Regression(increments, blocks)
+    positive, negative = fitted.positive, fitted.negative
+    if positive.told and not period.told and math.isfinite(period.high):
+        # What is lost in a period that is not known well passes for a larger threshold.
+        ends = [regression.Regression(usual(end), blocks) for end in (period.low, period.high)]
+        positive = positive.widened(0.0, abs(ends[1].positive.value - ends[0].positive.value) / 2)
+        negative = negative.widened(0.0, abs(ends[1].negative.value - ends[0].negative.value) / 2)
     shot = estimators.shot_noise(still, blocks, is_hot, static)
     if is_blank and shot.told:
         shot = dataclasses.replace(
@@ -132,7 +142,7 @@ def _estimates(given: Recorded, is_blank: bool, static: bool) -> tuple[dict[str,
             note=f"{shot.note}; without frames, for a mean light of 5 to 60 % of white's",
         )
     made = {
-        "threshold_pos": fitted.positive, "threshold_neg": fitted.negative, "log_eps": fitted.log_eps,
+        "threshold_pos": positive, "threshold_neg": negative, "log_eps": fitted.log_eps,
         "threshold_mismatch_sigma": estimators.mismatch(fitted, increments, blocks),
         "photoreceptor_hz": fitted.corner if fitted.positive.told else unknown("needs the thresholds"),
         "refractory_seconds": estimators.with_noise(period, shot, gaps_us[0]), "shot_noise_hz": shot,
