@@ -41,13 +41,14 @@ from tests.oracles.simulators import (
     correlation,
     counts_of,
     equations,
+    frame_offset,
     of_recipe,
+    part_of,
     within,
 )
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_recordings.items import ConvertOptions, Light
-from v2v_tools.fit.estimators import frame_offset
 from v2v_tools.fit.increments import BRIGHTEST_GREY
 from v2v_tools.fit.interval import Doubles
 from v2v_tools.fit.recording import Recorded, read_recording
@@ -80,7 +81,7 @@ def seen(path: Path) -> tuple[Recorded, str]:
         + (f"frames taken {moved / 1000:.1f} ms later" if moved else f"offset of the frames not told: {offset.note}")
         + f"; light: {given.light.name if given.light else 'not stated'}"
     )
-    return within(dataclasses.replace(given.part(usable), frame_us=given.frame_us + moved)), text
+    return within(dataclasses.replace(part_of(given, usable), frame_us=given.frame_us + moved)), text
 
 
 def judged(given: Recorded, true: Doubles, simulator: Simulator, draws: int) -> Iterator[dict[str, Any]]:

@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from tests.oracles.cameras import FRAMES_PER_SECOND
 from tests.oracles.dense import dense_events
@@ -19,11 +20,15 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec_flags import recipe_setting
 from v2v_recordings.items import Light
 from v2v_server.simulation.draw import draw
-from v2v_tools.fit.increments import intervals_us
-from v2v_tools.fit.interval import Doubles
+from v2v_tools.fit.increments import BRIGHTEST_GREY, intervals_us
+from v2v_tools.fit.interval import Doubles, Estimate, bootstrap, sums_by_block, unknown
 from v2v_tools.fit.recording import Recorded, recorded
+from v2v_tools.fit.regression import summit
 from v2v_tools.fit.statistics import INTERVAL_EDGES_US, simulate_recording
 
+OFFSETS_US = np.arange(-15_000, 15_001, 1000)
+_WIDEST_OFFSET_SECONDS = 0.004
+_MOST_STEPS, _MOST_COUNT, _DARK = 32, 5, 0.03
 ROWS = 16
 """Peers get the pixels as pictures of this height: the number of pixels is a multiple of it."""
 Simulator = Callable[[Recorded, float, int], Recorded]
@@ -40,6 +45,16 @@ def drawn(recipe: Recipe, seed: int) -> dict[str, float]:
         "noise_sigma": made.noise_sigma * hz**0.5, "hot_pixel_sigma": made.hot_pixel_sigma * hz,
         "hot_pixel_share": made.hot_pixel_count / (recipe.crop_height_px * recipe.crop_width_px),
     }  # fmt: skip
+
+
+def part_of(recording: Recorded, chosen: npt.NDArray[np.bool_]) -> Recorded:
+    """Return the recording of some of the pixels, chosen by a mask [P]."""
+    lengths = np.diff(recording.first)
+    events, frames = np.repeat(chosen, lengths), np.ascontiguousarray(recording.frames[:, chosen])
+    return dataclasses.replace(
+        recording, pixels=recording.pixels[chosen], first=np.concatenate([[0], np.cumsum(lengths[chosen])]),
+        t_us=recording.t_us[events], p=recording.p[events], frames=frames,
+    )  # fmt: skip
 
 
 def of_recipe(name: str) -> Simulator:
@@ -159,3 +174,37 @@ def within(given: Recorded) -> Recorded:
     inside = (given.t_us >= given.frame_us[0]) & (given.t_us < given.frame_us[-1])
     first = np.concatenate([[0], np.cumsum(inside)])[given.first]
     return dataclasses.replace(given, first=first, t_us=given.t_us[inside], p=given.p[inside])
+
+
+def frame_offset(recording: Recorded) -> Estimate:
+    """Estimate how much later than its time a frame was seen, s: where the correlation of changes of log intensity with
+    signed events is largest. Clipped levels are left out, and counts limited: lamps that flicker have many events, and
+    no frame shows them.
+    """
+    t, frame_us, reach = recording.t_us, recording.frame_us, OFFSETS_US[-1]
+    steps = np.flatnonzero((frame_us[:-1] - reach >= t.min()) & (frame_us[1:] + reach <= t.max()))
+    if not len(steps):
+        return unknown(f"no two frames have events for {reach / 1000:g} ms before and after them")
+    steps = steps[:: -(-len(steps) // _MOST_STEPS)]
+    owner, blocks = np.repeat(np.arange(len(recording.pixels)), np.diff(recording.first)), recording.blocks()
+    level = np.log(_DARK + recording.known_light.of(np.arange(256.0)))
+    sums = np.zeros((64, len(OFFSETS_US), 2))
+    for step in steps:
+        before, after = recording.frames[step : step + 2]
+        seen = np.maximum(before, after) <= BRIGHTEST_GREY
+        change = np.where(seen, level[after] - level[before], 0.0)
+        near = (t >= frame_us[step] - reach) & (t < frame_us[step + 1] + reach)
+        at, pixel, sign = t[near], owner[near], np.where(recording.p[near], 1.0, -1.0)
+        for number, offset in enumerate(OFFSETS_US):
+            inside = (at >= frame_us[step] + offset) & (at < frame_us[step + 1] + offset)
+            count = np.bincount(pixel[inside], sign[inside], len(change))
+            count = np.clip(count, -_MOST_COUNT, _MOST_COUNT) * seen
+            sums[:, number] += sums_by_block(blocks, np.stack([change * count, count**2], axis=1))
+    seconds = np.asarray(OFFSETS_US * 1e-6, np.float64)
+    value, low, high = bootstrap(
+        sums, lambda s: np.array([summit(seconds, s[:, 0] / np.sqrt(np.maximum(s[:, 1], 1e-9)))])
+    )
+    note = f"{len(steps)} steps between frames"
+    if high[0] - low[0] > _WIDEST_OFFSET_SECONDS or abs(value[0]) > seconds[-3]:
+        return unknown(f"the events fit no offset much better than others, by {note}")
+    return Estimate(float(value[0]), float(low[0]), float(high[0]), 0.0, note)

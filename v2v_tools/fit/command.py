@@ -15,7 +15,7 @@ from v2v_protocol.progress import Progress
 from v2v_protocol.spec_flags import read_yaml_mapping, recipe_setting
 from v2v_recordings.items import add_options, options_of
 from v2v_recordings.reading import FORMS
-from v2v_tools.fit.fit import FittedCamera, fit
+from v2v_tools.fit.fit import fit
 from v2v_tools.fit.lab import camera_of, measure, table
 from v2v_tools.fit.report import draw_fit, report_lines, write_recipe
 
@@ -36,9 +36,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     recording.add_argument("recording", nargs="?", metavar="RECORDING", help="file or folder with events; frames help")
     recording.add_argument("--static", action="store_true", help="nothing moved: all events are noise")
     add_options(recording)
-    recording.add_argument(
-        "--shift-frames", action="store_true", help="add the estimated offset to the times of the frames"
-    )
     parser.add_output(
         "Output", "--out", (".yaml", ".yml"), "recipe to write (.yaml); --recipe of the other commands reads it"
     )
@@ -60,36 +57,27 @@ def _run(arguments: argparse.Namespace) -> None:
     for flag, value in (("--sheet", arguments.sheet), ("--set", arguments.set)):
         if value and arguments.check is None:
             raise UsageError(f"{flag} needs --check")
-    for flag in ("--static", "--size", "--time-unit", "--picture", "--light", "--shift-frames"):
+    for flag in ("--static", "--size", "--time-unit", "--picture", "--light"):
         if arguments.recording is None and getattr(arguments, flag[2:].replace("-", "_")):
             raise UsageError(f"{flag} needs a RECORDING")
-    fitted = None if arguments.recording is None else _fit(arguments)
-    if arguments.check is None:
-        return
-    columns = {"recipe": measure(camera_of(recipe_setting(arguments.check, arguments.set)))}
-    if fitted is not None:
-        columns["recording"] = measure({"log_eps": 1e-3, "gamma": 2.2, **_thresholds(fitted)})
-    if arguments.sheet is not None:
-        columns["sheet"] = _sheet(arguments.sheet)
-    show(table(columns))
+    if arguments.recording is not None:
+        _fit(arguments)
+    if arguments.check is not None:
+        columns = {"recipe": measure(camera_of(recipe_setting(arguments.check, arguments.set)))}
+        if arguments.sheet is not None:
+            columns["sheet"] = _sheet(arguments.sheet)
+        show(table(columns))
 
 
-def _fit(arguments: argparse.Namespace) -> FittedCamera:
+def _fit(arguments: argparse.Namespace) -> None:
     options = options_of(arguments)
     source, out = Path(arguments.recording), arguments.out
     with Progress(source.name, "%") as progress:
-        fitted = fit(source, static=arguments.static, shift=arguments.shift_frames, options=options, progress=progress)
+        fitted = fit(source, static=arguments.static, options=options, progress=progress)
     show("\n".join(report_lines(fitted, source.name)))
     write_recipe(out, fitted, source.name)
     if arguments.picture is not None:
         write_png(arguments.picture, draw_fit(fitted, source.name))
-    return fitted
-
-
-def _thresholds(fitted: FittedCamera) -> dict[str, float]:
-    if "threshold_pos" not in fitted.camera:
-        raise UsageError("the recording cannot tell the thresholds, so it has no column: leave RECORDING out")
-    return {name: value for name, value in fitted.camera.items() if not name.startswith("hot_pixel")}
 
 
 def _sheet(file: str) -> dict[str, float]:

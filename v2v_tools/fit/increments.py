@@ -11,8 +11,10 @@ change lasted I and was seen for I - r: the second event counts I / (I - r).
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
+import cv2
 import numba
 import numpy as np
 import numpy.typing as npt
@@ -24,8 +26,8 @@ DARKEST_GREY, BRIGHTEST_GREY = 4, 251
 """Grey levels outside are clipped, or too coarse in log intensity."""
 _LONGEST_SECONDS = 0.5
 """Longest increment: noise accumulates with time."""
-STILL_SECONDS = 0.5
-"""A recording that stands still as a whole for this long needs no other still time."""
+_SETTLE_SECONDS, _AROUND_PX = 0.1, 5
+"""Time before a still step in which a pixel sees no change either; side of the square of its neighbours."""
 _MOST_WEIGHT = 10.0
 MOST_INCREMENTS = 1_500_000
 """Of a recording with more, every n-th pixel is measured."""
@@ -38,7 +40,7 @@ class Increments(NamedTuple):
         pixel: index of the pixel.
         block: part of the time, 0 .. 3, of its first frame.
         seconds: duration.
-        grey: [2, M] grey level at both ends; light, slope: its light, 0 .. 1, and the change of light with the level.
+        light, slope: [2, M] light at both ends, 0 .. 1, and its change with the grey level.
         on, off: events, with fractions.
         speed: [2, M] signed events a second at both ends.
     """
@@ -46,31 +48,15 @@ class Increments(NamedTuple):
     pixel: npt.NDArray[np.int64]
     block: npt.NDArray[np.int64]
     seconds: Doubles
-    grey: Doubles
     on: Doubles
     off: Doubles
     speed: Doubles
     light: Doubles
     slope: Doubles
 
-    def take(self, which: npt.NDArray[Any]) -> Increments:
-        """Return some of the increments, by a mask, [M], or by places, [n]."""
+    def take(self, which: npt.NDArray[Any] | slice) -> Increments:
+        """Return some of the increments, by a mask or a slice."""
         return Increments(*(column[..., which] for column in self))  # type: ignore[arg-type]
-
-
-class Still(NamedTuple):
-    """Time in which the frames of a pixel show no change, by pixel and quarter of the recording: [P, 4] each.
-
-    Attributes:
-        seconds: duration.
-        light: sum of light x seconds, light 0 (black) .. 1 (white).
-        on, off: events.
-    """
-
-    seconds: Doubles
-    light: Doubles
-    on: Doubles
-    off: Doubles
 
 
 def increments_of(recording: Recorded, refractory_seconds: float, longest_us: float) -> Increments:
@@ -90,49 +76,77 @@ def increments_of(recording: Recorded, refractory_seconds: float, longest_us: fl
     pixel, begin, end, grey_1, grey_2, on, off, speed_1, speed_2 = table[:, :count]
     quarter, grey, light_of = _quarter(recording, begin), np.stack([grey_1, grey_2]), recording.known_light.of
     return Increments(
-        pixel.astype(np.int64), quarter, (end - begin) * 1e-6, grey, on, off, np.stack([speed_1, speed_2]),
+        pixel.astype(np.int64), quarter, (end - begin) * 1e-6, on, off, np.stack([speed_1, speed_2]),
         light_of(grey), light_of(grey + 0.5) - light_of(grey - 0.5),
     )  # fmt: skip
 
 
-def still_time(recording: Recorded, light: Doubles, settle_seconds: float = 0.1) -> Still:
-    """Return the time in which a pixel sees no change, and its events in it.
+def is_still(recording: Recorded) -> npt.NDArray[np.bool_]:
+    """Return in which steps between frames a pixel sees no motion: [n - 1, P].
+
+    Its grey level stays within the noise of the frames from shortly before the step to the frame after it. And the
+    pixels around it fire no more than pixels at rest do: noise of pixels is independent, while motion too slow or too
+    dark for a grey level, and a low-pass that still settles, reach neighbours too.
+    """
+    frames = recording.frames
+    differences = np.abs(np.diff(frames[:, :: max(1, frames.shape[1] // 4096)].astype(np.int16), axis=0))
+    tolerance = 1.0 + 2.0 * float(np.median(differences, axis=1).min())
+    before = math.ceil(1e6 * _SETTLE_SECONDS / np.median(np.diff(recording.frame_us)))
+    window, anchor = np.ones((before + 3, 1), np.uint8), (0, before)
+    spread = cv2.dilate(frames, window, anchor=anchor) - cv2.erode(frames, window, anchor=anchor)
+    still = spread[:-1] <= tolerance
+    still[:before] = False
+    around = _events_around(recording)
+    # Half of the still time is the quietest half; its limit is reached by noise alone.
+    limit = np.median(around[still]) if still.any() else 0.0
+    return still & (around <= limit)
+
+
+def _events_around(recording: Recorded) -> npt.NDArray[np.float32]:
+    """Return the events of the pixels around each pixel, per step and its neighbours in time: [n - 1, P]."""
+    around = np.empty((len(recording.frames) - 1, len(recording.pixels)), np.float32)
+    step, owner, _ = _events_of_steps(recording)
+    counts = np.bincount(step * around.shape[1] + owner, minlength=around.size).reshape(around.shape)
+    picture = np.zeros((recording.height_px, recording.width_px), np.float32)
+    for number in range(len(around)):
+        own = counts[max(number - 1, 0) : number + 2].sum(axis=0)
+        picture.reshape(-1)[recording.pixels] = own
+        near = cv2.boxFilter(picture, -1, (_AROUND_PX,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        around[number] = near.ravel()[recording.pixels] - own
+    return around
+
+
+def _events_of_steps(
+    recording: Recorded,
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Return step between frames, pixel and polarity of the events from the first to the last frame: [M]."""
+    owner = np.repeat(np.arange(len(recording.pixels)), np.diff(recording.first))
+    step = np.searchsorted(recording.frame_us, recording.t_us, side="right") - 1
+    inside = (step >= 0) & (step < len(recording.frames) - 1)
+    return step[inside], owner[inside], recording.p[inside]
+
+
+def still_time(recording: Recorded, still: npt.NDArray[np.bool_]) -> Doubles:
+    """Return what a pixel shows while it sees no motion, in each quarter of the recording: [4, P, 4] float64.
+
+    Rows: seconds; light x seconds, light 0 (black) .. 1 (white); brighter events; darker events.
 
     Args:
-        light: [256] light of each grey level.
-        settle_seconds: time after a change that does not count.
+        still: see :func:`is_still`.
     """
-    shape = len(recording.pixels), 4
-    still = Still(*(np.zeros(shape) for _ in Still._fields))
-    if len(recording.frames) < 4:
-        return still
-    tolerance, usable = _still_steps(recording)
-    quarter = _quarter(recording, recording.frame_us)
-    _walk_still(
-        recording.first, recording.t_us, recording.p, recording.frames, recording.frame_us, light, tolerance, usable,
-        1e6 * settle_seconds, quarter, *still,
-    )  # fmt: skip
-    return still
-
-
-def _still_steps(recording: Recorded) -> tuple[float, npt.NDArray[np.bool_]]:
-    """Return the largest change of grey level that is noise of the frames, and which steps between frames may count.
-
-    Where the whole picture stands still for long enough, only that time counts: elsewhere changes below a grey level
-    may go on.
-    """
-    some = recording.frames[:, :: max(1, recording.frames.shape[1] // 4096)].astype(np.int16)
-    differences = np.abs(np.diff(some, axis=0))
-    tolerance = 1.0 + 2.0 * float(np.median(differences, axis=1).min())
-    still = (differences > tolerance).mean(axis=1) < 0.05
-    enough = still.sum() * np.median(np.diff(recording.frame_us)) >= 1e6 * STILL_SECONDS
-    return tolerance, np.append(still if enough else np.ones(len(still), bool), False)
+    quarter, pixels = _quarter(recording, recording.frame_us[:-1]), len(recording.pixels)
+    seconds = (np.diff(recording.frame_us)[:, None] * np.float32(1e-6) * still).astype(np.float32)
+    lit = seconds * recording.known_light.of(np.arange(256.0)).astype(np.float32)[recording.frames[:-1]]
+    times = [[part[quarter == q].sum(axis=0, dtype=np.float64) for q in range(4)] for part in (seconds, lit)]
+    step, owner, p = _events_of_steps(recording)
+    here = still[step, owner]
+    place = ((4 * (1 - p[here]) + quarter[step[here]]) * pixels) + owner[here]
+    events = np.bincount(place, minlength=8 * pixels).reshape(2, 4, pixels)
+    return np.concatenate([np.array(times), events]).transpose(0, 2, 1)
 
 
 def intervals_us(recording: Recorded) -> Doubles:
     """Return the intervals between events of a pixel, and whether both are brighter or both darker: [2, M] float64."""
-    if len(recording.t_us) < 2:
-        return np.empty((2, 0))
     pixel = np.repeat(np.arange(len(recording.pixels)), np.diff(recording.first))
     same = np.diff(pixel) == 0
     gap = np.diff(recording.t_us)[same].astype(np.float64)
@@ -140,8 +154,9 @@ def intervals_us(recording: Recorded) -> Doubles:
 
 
 def _quarter(recording: Recorded, t_us: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    passed = (t_us - recording.begin_us) / max(1e6 * recording.seconds, 1.0)
-    return np.clip((4 * passed).astype(np.int64), 0, 3)
+    begin_us, end_us = recording.frame_us[[0, -1]]
+    passed = (t_us - begin_us) / max(end_us - begin_us, 1)
+    return np.asarray(np.clip((4 * passed).astype(np.int64), 0, 3))
 
 
 @numba.njit(cache=True)
@@ -178,35 +193,3 @@ def _walk_frames(first, t, p, frames, frame_us, stride, longest_us, refractory_u
             else:
                 off += weight
     return made
-
-
-@numba.njit(cache=True)
-def _walk_still(first, t, p, frames, frame_us, light, tolerance, usable, settle_us, quarter, seconds, lit, on, off):
-    count = len(frame_us)
-    for i in range(len(first) - 1):
-        begin, event = 0, first[i]
-        low = high = float(frames[0, i])
-        for frame in range(1, count + 1):
-            grey = float(frames[frame, i]) if frame < count else -1e9
-            if usable[frame - 1] and max(high, grey) - min(low, grey) <= tolerance:
-                low, high = min(low, grey), max(high, grey)
-                continue
-            # The last step of a run is left out: a change may begin before the frame that shows it.
-            last = frame - 2 if frame < count else frame - 1
-            run = begin
-            while run < last and frame_us[run] < frame_us[begin] + settle_us:
-                run += 1
-            for k in range(run, last):
-                q = quarter[k]
-                length = (frame_us[k + 1] - frame_us[k]) * 1e-6
-                seconds[i, q] += length
-                lit[i, q] += length * light[int(low)]
-                while event < first[i + 1] and t[event] < frame_us[k]:
-                    event += 1
-                while event < first[i + 1] and t[event] < frame_us[k + 1]:
-                    if p[event]:
-                        on[i, q] += 1
-                    else:
-                        off[i, q] += 1
-                    event += 1
-            begin, low, high = frame, grey, grey

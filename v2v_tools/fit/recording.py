@@ -13,6 +13,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_recordings.items import ConvertOptions, EventChunk, Light, Note, Picture, ReadProgress, SensorSize
 from v2v_recordings.reading import read_items
+from v2v_tools.fit.interval import SIDE
 
 MOST_PIXELS = 1 << 15
 """Pixels whose events and frames are kept at first."""
@@ -67,26 +68,10 @@ class Recorded:
             )
         return self.light
 
-    @property
-    def begin_us(self) -> int:
-        """Time of the first event or frame."""
-        times = [int(column.min()) for column in (self.t_us, self.frame_us) if len(column)]
-        return min(times)
-
-    def blocks(self, side: int = 8) -> Longs:
-        """Return the block of each pixel, [P], 0 .. side * side - 1: the sensor in rows and columns of equal parts."""
+    def blocks(self) -> Longs:
+        """Return the block of each pixel, 0 .. SIDE * SIDE - 1: the sensor in rows and columns of equal parts."""
         y, x = np.divmod(self.pixels, self.width_px)
-        return np.asarray((y * side // self.height_px) * side + x * side // self.width_px)
-
-    def part(self, chosen: npt.NDArray[np.bool_]) -> Recorded:
-        """Return the recording of some of the pixels, chosen by a mask [P]."""
-        lengths = np.diff(self.first)
-        events = np.repeat(chosen, lengths)
-        first = np.concatenate([[0], np.cumsum(lengths[chosen])])
-        frames = np.ascontiguousarray(self.frames[:, chosen])
-        return dataclasses.replace(
-            self, pixels=self.pixels[chosen], first=first, t_us=self.t_us[events], p=self.p[events], frames=frames
-        )
+        return np.asarray((y * SIDE // self.height_px) * SIDE + x * SIDE // self.width_px)
 
 
 def chosen_pixels(height_px: int, width_px: int, most: int | None = None) -> Longs:

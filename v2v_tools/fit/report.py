@@ -82,10 +82,11 @@ def report_lines(fitted: FittedCamera, source: str) -> list[str]:
             unit = _UNITS.get(name) or settings_of(Recipe)[name].unit
             lines.append(f"  {name} = {value:.3g} [{low:.3g}, {high:.3g}] {unit}".rstrip() + f": {made.note}")
     lines.append("Left out:")
-    lines += [
-        f"  {name}: {why}" if fitted.estimates[name].told else f"  {name}: this recording cannot tell: {why}"
-        for name, why in fitted.left_out.items()
-    ]
+    for name, why in fitted.left_out.items():
+        made = fitted.estimates[name]
+        low, high = shown_interval(name, made)
+        between = f" ({low:.3g} to {high:.3g})" if math.isfinite(high - low) else ""
+        lines.append(f"  {name}: {why}" if made.told else f"  {name}: this recording cannot tell{between}: {why}")
     if {"threshold_pos", "threshold_neg"} <= fitted.camera.keys():
         lines.append("A recipe draws which polarity has the larger threshold: it keeps the ratio, not its direction.")
     return lines
@@ -95,16 +96,15 @@ def _of_frames(fitted: FittedCamera) -> list[str]:
     """Return what was assumed of the frames: their light and their times."""
     if not fitted.facts["frames"]:
         return []
-    offset, times = fitted.offset, f"their offset cannot be told: {fitted.offset.note}"
-    if math.isfinite(offset.value):
+    late, times = fitted.late, f"cannot be judged: {fitted.late.note}"
+    if math.isfinite(late.value):
         times = (
-            f"they fit the events best {1e3 * offset.value:.1f} ms later "
-            f"[{1e3 * offset.low:.1f}, {1e3 * offset.high:.1f}]"
+            f"they show the light of {1e3 * late.value:.1f} ms later "
+            f"[{1e3 * late.low:.1f}, {1e3 * late.high:.1f}], as blurred frames do too; --frame-offset adds to them"
         )
-    added = f"{1e3 * fitted.applied_seconds:.1f} ms" if fitted.applied_seconds else "nothing (see --shift-frames)"
     return [
         f"Light of the frames: {fitted.light.name}. The recipe is valid for it; its gamma is that of its videos",
-        f"Times of the frames: {times}; added: {added}",
+        f"Times of the frames: {times}",
     ]
 
 

@@ -14,7 +14,7 @@ from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.kernels import list_events
 from v2v_server.video.picture import SDR, Signal
-from v2v_tools.fit.increments import intervals_us, still_time
+from v2v_tools.fit.increments import intervals_us, is_still, still_time
 from v2v_tools.fit.interval import Doubles
 from v2v_tools.fit.recording import Recorded
 
@@ -74,22 +74,23 @@ def simulate_recording(
     )  # fmt: skip
 
 
-def panels_of(recording: Recorded, light: Doubles, begin_us: int, end_us: int) -> Panels:
-    """Measure the events between two times, microseconds. ``light``: [256], of each grey level."""
+def panels_of(recording: Recorded) -> Panels:
+    """Measure the events between the first and the last frame."""
+    begin_us, end_us = int(recording.frame_us[0]), int(recording.frame_us[-1])
     count = len(recording.pixels)
     owner = np.repeat(np.arange(count), np.diff(recording.first))
     inside = (recording.t_us >= begin_us) & (recording.t_us < end_us)
-    mean_grey = recording.frames.mean(axis=0) if len(recording.frames) else np.full(count, 128.0)
+    mean_grey = recording.frames.mean(axis=0)
     bright = np.searchsorted(BRIGHTNESS_EDGES, mean_grey, side="right") - 1
-    events, still, gaps = owner[inside], still_time(recording, light), intervals_us(recording)
+    events, gaps = owner[inside], intervals_us(recording)
+    seconds, _, on, off = still_time(recording, is_still(recording)).sum(axis=2)
     number = np.searchsorted(INTERVAL_EDGES_US, gaps[0], side="right") - 1
     totals = np.searchsorted(COUNT_EDGES, np.bincount(events, minlength=count), side="right") - 1
-    noise = np.concatenate([still.off.sum(axis=1), still.on.sum(axis=1)])
     sums = {
         "rates": np.bincount(8 * recording.p[inside] + bright[events], minlength=16),
         "exposure": np.bincount(bright, minlength=8) * (end_us - begin_us) * 1e-6,
-        "still": np.bincount(np.concatenate([bright, 8 + bright]), noise, 16),
-        "still_exposure": np.bincount(bright, still.seconds.sum(axis=1), 8),
+        "still": np.bincount(np.concatenate([bright, 8 + bright]), np.concatenate([off, on]), 16),
+        "still_exposure": np.bincount(bright, seconds, 8),
         "pixels": np.bincount(totals, minlength=9),
         "intervals": np.bincount(number + 22 * (gaps[1] < 0.5), minlength=44),
     }

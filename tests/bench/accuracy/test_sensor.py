@@ -14,6 +14,7 @@ import pytest
 
 from bench.accuracy import sensor
 from tests.oracles import simulators
+from tests.oracles.simulators import part_of
 from v2v_protocol.errors import UsageError
 from v2v_recordings.items import Light
 from v2v_tools.fit.recording import Recorded, recorded
@@ -88,7 +89,7 @@ def simulate(frames, fps, seed=0, pos_thres=0.2, neg_thres=0.2):
 def test_an_adapter_puts_events_where_the_package_saw_them(toys: Path, name: str, threshold: float) -> None:
     whole = given()
     # Every other tile, as of a sensor too large to keep: pixels are not neighbours.
-    asked = whole.part(whole.pixels % WIDTH < 32)
+    asked = part_of(whole, whole.pixels % WIDTH < 32)
     counts = simulators.counts_of(simulators.PEERS[name](asked, threshold, 0))
     np.testing.assert_array_equal(counts[1], np.diff(asked.frames.astype(int), axis=0) > 0)
     assert not counts[0].any()

@@ -16,21 +16,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.oracles.cameras import Film, TrueCamera, record, rendered_film
-from v2v_protocol.errors import UsageError
+from tests.oracles.simulators import frame_offset, part_of
+from v2v_protocol.errors import UsageError, V2VError
 from v2v_recordings.items import ConvertOptions, Light, SensorSize
 from v2v_server.config import recipe_setting
 from v2v_tools.fit import estimators
 from v2v_tools.fit import recording as recording_module
 from v2v_tools.fit.fit import FittedCamera, fit
-from v2v_tools.fit.increments import increments_of
-from v2v_tools.fit.interval import Estimate
+from v2v_tools.fit.increments import increments_of, is_still, still_time
+from v2v_tools.fit.interval import Estimate, bootstrap
 from v2v_tools.fit.recording import Recorded, chosen_pixels, read_recording, recorded
 from v2v_tools.fit.regression import Regression
-from v2v_tools.fit.report import draw_fit, recipe_fields, report_lines, write_recipe
+from v2v_tools.fit.report import draw_fit, report_lines, write_recipe
 from v2v_tools.fit.statistics import simulate_recording
 
 LIGHT = Light.parse("2.2")
 FAST = TrueCamera(0.2, 0.26, shot_noise_hz=3.0, leak_hz=0.0, refractory_seconds=5e-4, log_eps=0.01)
+IGNORING = TrueCamera(0.23, 0.21, shot_noise_hz=3.0, refractory_seconds=1e-3, log_eps=0.01, noise_ignores=True)
 SLOW = TrueCamera(0.25, 0.21, 0.12, 0.4, 0.6, 0.0, 60.0, log_eps=0.01)
 
 
@@ -46,7 +48,7 @@ def recording_of(camera: TrueCamera, film_seen: Film | None = None) -> Recorded:
     return recorded(height, width, made["t"], place, made["p"], made["frames"], made["frame_us"], light=LIGHT)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=3)
 def fitted(camera: TrueCamera) -> FittedCamera:
     return fit(recording_of(camera))
 
@@ -110,19 +112,86 @@ def test_the_picture_shows_measured_and_simulated() -> None:
     assert fitted(SLOW).simulated is not None
 
 
-@pytest.mark.slow
-def test_events_without_frames_tell_no_threshold() -> None:
-    given_recording = recording_of(FAST)
+def test_a_recording_without_frames_is_not_fitted() -> None:
+    rng = np.random.default_rng(0)
     alone = recorded(
-        48, 64, given_recording.t_us, np.repeat(given_recording.pixels, np.diff(given_recording.first)),
-        given_recording.p, np.empty((0, 48, 64), np.uint8), np.empty(0, np.int64),
+        8, 8, np.sort(rng.integers(0, 10**6, 999)), rng.integers(0, 64, 999), rng.random(999) < 0.5,
+        np.empty((0, 8, 8), np.uint8), np.empty(0, np.int64),
     )  # fmt: skip
-    made = fit(alone)
-    assert not made.estimates["threshold_pos"].told
-    assert "frames" in made.left_out["threshold_pos"]
-    assert made.estimates["refractory_seconds"].told
-    assert recipe_fields(made)["preset"] == "paper"
-    assert "threshold" not in recipe_fields(made)
+    with pytest.raises(V2VError, match=r"has 0 frames, and a fit needs 3: .* or give --static") as caught:
+        fit(alone)
+    assert not isinstance(caught.value, UsageError)
+
+
+@pytest.mark.slow
+def test_noise_that_ignores_the_refractory_period_does_not_hide_it() -> None:
+    made = fitted(IGNORING)
+    check(made.estimates, IGNORING, ("threshold_pos", "threshold_neg", "refractory_seconds", "shot_noise_hz"))
+    assert "noise ignores it" in made.estimates["refractory_seconds"].note
+    assert "noise obeys it" in fitted(FAST).estimates["refractory_seconds"].note
+
+
+def test_noise_is_that_of_pixels_whose_neighbours_are_quiet_too() -> None:
+    """Half of the sensor sees motion too dark for a grey level: its pixels fire together."""
+    rng, side, seconds, hz = np.random.default_rng(2), 40, 4, 4.0
+    light = LIGHT.of(np.array(100.0))
+    noise = rng.random((seconds * 1000, side, side)) < hz * (1 - 0.75 * light) / 1000
+    moving = np.zeros_like(noise)
+    moving[: seconds * 500 : 200, :, : side // 2] = True
+    at, y, x = np.nonzero(noise | moving)
+    frames = np.full((30 * seconds + 1, side, side), 100, np.uint8)
+    frame_us = np.linspace(0, 1e6 * seconds, len(frames)).astype(np.int64)
+    made = recorded(side, side, at * 1000, y * side + x, rng.random(len(at)) < 0.5, frames, frame_us, light=LIGHT)
+    still = still_time(made, is_still(made))
+    found = estimators.shot_noise(still, made.blocks(), np.zeros(side**2, np.bool_))
+    assert found.told
+    assert found.low <= hz <= found.high
+
+
+@pytest.mark.parametrize("late", [0, 2], ids=["in time", "8 ms late"])
+def test_late_frames_are_no_low_pass(late: int) -> None:
+    """The low-pass is slower in the dark, frames are as late everywhere."""
+    seen = rendered_film("camera", 48, 64, 70.0, moving=0.8, still=0.0)
+    for camera in (FAST, SLOW):
+        made = record(seen, camera, 1)
+        shown = np.minimum(np.arange(0, len(seen.grey), 8) + late, len(seen.grey) - 1)
+        place = made["y"].astype(np.int64) * 64 + made["x"]
+        frames = np.rint(255 * seen.grey[shown]).astype(np.uint8)
+        given_recording = recorded(48, 64, made["t"], place, made["p"], frames, made["frame_us"], light=LIGHT)
+        increments = increments_of(given_recording, camera.refractory_seconds, 33_333.0)
+        corner = Regression(increments, given_recording.blocks()).corner
+        inverse = 1 / camera.photoreceptor_hz if camera.photoreceptor_hz else 0.0
+        assert corner.is_absent != bool(inverse)
+        assert corner.is_absent or corner.low <= inverse
+        assert inverse <= corner.high
+
+
+def test_pieces_of_a_recording_that_differ_widen_an_interval() -> None:
+    rng = np.random.default_rng(1)
+    alike = np.stack([rng.normal(10.0, 0.1, 256), np.ones(256)], axis=1)
+    by_time = alike + np.stack([np.tile([-1.0, -0.3, 0.3, 1.0], 64), np.zeros(256)], axis=1)
+    widths = []
+    for sums in (alike, by_time):
+        value, low, high = bootstrap(sums, lambda s: np.array([s[0] / s[1]]))
+        assert low[0] < value[0] < high[0]
+        widths.append(high[0] - low[0])
+    assert widths[0] < 0.05
+    assert widths[1] > 1.0
+
+
+@settings(max_examples=20)
+@given(st.floats(3e-4, 3e-3), st.integers(0, 99))
+def test_intervals_of_noise_that_ignores_the_period_only_bound_it(period: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    same = rng.random(200_000) < 0.8
+    gaps = 1e6 * period + rng.exponential(5e3, len(same))
+    noisy = rng.random(len(same)) < 0.1
+    gaps = np.where(noisy, rng.exponential(3e4, len(same)), gaps)
+    same = np.where(noisy, rng.random(len(same)) < 0.5, same)
+    made = estimators.refractory(np.stack([gaps, same]))
+    assert "ignores" in made.note
+    assert made.low <= period <= made.high * 1.02
+    assert made.high < 1.5 * period
 
 
 @pytest.mark.slow
@@ -215,7 +284,7 @@ def test_a_long_recording_is_read_within_its_limits(tmp_path: Path, monkeypatch:
     assert 0 < part.frames.size <= made["frames"].size // 5
     assert part.seconds == pytest.approx(whole.seconds, rel=0.05)
     np.testing.assert_array_equal(part.counts, whole.counts)
-    mine = whole.part(np.isin(whole.pixels, part.pixels))
+    mine = part_of(whole, np.isin(whole.pixels, part.pixels))
     np.testing.assert_array_equal(part.frames, mine.frames)
     np.testing.assert_array_equal(np.diff(part.first), np.diff(mine.first))
 
@@ -251,7 +320,7 @@ def test_the_offset_of_the_frames_is_found(offset_ms: int, name: str) -> None:
         40, 40, (1e6 * fine[at + 1]).astype(np.int64), pixel, np.diff(steps, axis=0)[at, pixel] > 0,
         frames.reshape(-1, 40, 40), frame_us, light=light,
     )  # fmt: skip
-    found = estimators.frame_offset(made)
+    found = frame_offset(made)
     assert found.value == pytest.approx(offset_ms * 1e-3, abs=1e-3)
     assert found.low <= found.value <= found.high
 
@@ -265,8 +334,8 @@ def test_noise_tells_no_offset() -> None:
         light=LIGHT,
     )  # fmt: skip
     still = dataclasses.replace(made, frames=0 * made.frames + 90)
-    assert np.isnan(estimators.frame_offset(still).value)
-    found = estimators.frame_offset(made)
+    assert np.isnan(frame_offset(still).value)
+    found = frame_offset(made)
     assert np.isnan(found.value)
     assert "no offset much better" in found.note
 

@@ -28,14 +28,23 @@ def test_a_recording_of_events_becomes_a_recipe_and_a_picture(
     events: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recipe, picture = tmp_path / "camera.yaml", tmp_path / "camera.png"
-    assert main([str(events), "--out", str(recipe), "--picture", str(picture)]) == 0
+    assert main([str(events), "--static", "--out", str(recipe), "--picture", str(picture)]) == 0
     low, high = recipe_setting(str(recipe), ()).refractory_seconds
     assert low <= 2e-3 <= high
     printed = capsys.readouterr().out
-    assert "threshold_pos: this recording cannot tell: needs at least 3 frames" in printed
+    assert "threshold_pos: this recording cannot tell: 0 changes" in printed
     assert all(line in recipe.read_text() for line in printed.splitlines())
     with Image.open(picture) as page:
         assert page.width == 1400
+
+
+def test_a_recording_without_frames_leaves_no_file(
+    events: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = set(tmp_path.iterdir())
+    assert main([str(events), "--out", str(tmp_path / "camera.yaml"), "--picture", str(tmp_path / "camera.png")]) == 1
+    assert "has 0 frames, and a fit needs 3" in capsys.readouterr().err
+    assert set(tmp_path.iterdir()) == before
 
 
 @pytest.mark.parametrize(
