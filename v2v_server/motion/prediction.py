@@ -47,7 +47,7 @@ _WEIGHTS = (
 """Constant and weights of Features, for the low end, the estimate and the high end: ``python -m bench loss``."""
 _SHARP, _SMEARED, _STEADY = 0.2, 0.5, 0.35
 """Values that clips without blur, and without turns, reach too; and the smear that is not told from more."""
-_SLIGHT_LOSS, _UNSTEADY, _FLICKERS, _UNCOVERS = 0.05, 0.25, 0.3, 0.12
+_SLIGHT_LOSS, _UNSTEADY, _FLICKERS, _UNCOVERS = 0.05, 0.25, 0.55, 0.12
 _STILL_GREY, _TEXTURE_GREY = 3.0, 8.0
 """Mean change, at most, and range of grey levels, at least, of a cell that rests and would show a motion."""
 
