@@ -46,7 +46,7 @@ def scenes(group: str, kind: str) -> Iterator[dict[str, Any]]:
     edges = np.arange(STEPS + 1) / FRAMES_PER_SECOND
     for seen in scenes_of(kind):
         wrong, found = compared(seen.frames, edges, edges, seen.true), predict(seen.frames)
-        record = {"measure": "scene", "group": group, "kind": kind, "scene": seen.name}
+        record: dict[str, Any] = {"measure": "scene", "group": group, "kind": kind, "scene": seen.name}
         record |= {"px_per_frame": seen.px_per_frame, "kept_linear": found.linear / max(found.divided, 1.0)}
         for name in SETTINGS:
             loss = found.loss(divided=name == "divided")

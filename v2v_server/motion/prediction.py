@@ -6,7 +6,8 @@ those of the latter times exp(sum of weight x feature), with weights fitted to r
 
 - gain: what the levels add, as a share of their events;
 - smear: the picture is smoother along the motion than across it, as motion blur makes it, and blur hides losses;
-- unsteady: the motion changes from step to step, as a shake does, whose turns lie between the frames;
+- unsteady: the motion changes from step to step, as a shake does, whose turns lie between the frames; both weighted by
+  the share of the events that lie where something moves;
 - flicker: steps brighten and darken as a whole in turns;
 - uncovered: something moves over a still picture. The levels move what lies beside it too, and make false events.
 
@@ -40,13 +41,13 @@ _MOST_FRAMES = 33
 _GAMMA, _LOG_EPS = 2.2, 1e-3
 _WEIGHTS = (
     (-0.03, (0.0, 0.16, 0.2, 0.05, -1.6)),
-    (0.0, (0.26, 0.28, 0.35, 0.17, -0.2)),
-    (0.1, (0.7, 0.32, 1.3, 0.25, 0.4)),
+    (0.0, (0.26, 0.28, 0.44, 0.17, -0.2)),
+    (0.1, (0.7, 0.32, 1.4, 0.25, 0.4)),
 )
 """Constant and weights of Features, for the low end, the estimate and the high end: ``python -m bench loss``."""
 _SHARP, _SMEARED, _STEADY = 0.2, 0.5, 0.35
 """Values that clips without blur, and without turns, reach too; and the smear that is not told from more."""
-_SLIGHT_LOSS, _UNSTEADY, _FLICKERS, _UNCOVERS = 0.05, 0.25, 0.3, 0.12
+_SLIGHT_LOSS, _UNSTEADY, _FLICKERS, _UNCOVERS = 0.05, 0.25, 0.55, 0.12
 _STILL_GREY, _TEXTURE_GREY = 3.0, 8.0
 """Mean change, at most, and range of grey levels, at least, of a cell that rests and would show a motion."""
 
@@ -109,10 +110,11 @@ class Prediction:
         """Return what the loss depends on."""
         ways = self.along * self.across_twice, self.across * self.along_twice
         smear = math.log(ways[0] / ways[1]) if min(ways) > 0.0 else 0.0
+        moves = self.moving / max(self.divided, 1.0)  # few cells of a still clip "move", by noise
         return Features(
             max(1.0 - self.linear / self.divided, 0.0) if self.divided else 0.0,
-            min(max(smear - _SHARP, 0.0) / (_SMEARED - _SHARP), 1.0) * math.log1p(self.px_per_frame),
-            max(self.unsteady / max(self.paired, 1.0) - _STEADY, 0.0),
+            moves * min(max(smear - _SHARP, 0.0) / (_SMEARED - _SHARP), 1.0) * math.log1p(self.px_per_frame),
+            moves * max(self.unsteady / max(self.paired, 1.0) - _STEADY, 0.0),
             self.flicker / max(self.linear, 1.0),
             self.beside / max(self.divided, 1.0),
         )
