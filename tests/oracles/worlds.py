@@ -98,16 +98,16 @@ class Oracle:
         size = np.abs(z)
         q = k * size**4 + (c2 * (z**2).real + s2 * (z**2).imag) * size**2 + c3 * (z**3).real + s3 * (z**3).imag
         u = np.clip(slope * (1 - q) + 0.5, 0.0, 1.0)
-        return u**2 * (3 - 2 * u)
+        covered: Reals = u**2 * (3 - 2 * u)
+        return covered
 
     def picture(self, seconds: float) -> Reals:
         """Return the picture, [H, W], 0 .. 4095, not rounded."""
         x = self.grid()
         seen = np.zeros(x.shape[1:])
         for number in range(len(self.world.layers)):
-            place, share = self.place(seconds, number, x), 1.0
-            if number:
-                share = self.cover(number, place)
+            place = self.place(seconds, number, x)
+            share = self.cover(number, place) if number else np.ones(x.shape[1:])
             pixels = self.shown(seconds, number)
             pixels = max(pixels, 2.0**self.world.focus) if number == 0 else pixels
             level = min(int(np.floor(np.log2(max(pixels, 1.0)))), len(self.levels) - 1)
@@ -139,12 +139,14 @@ class Oracle:
             found |= np.abs(self.cover(number, self.place(seconds, number, x)) - 0.5) < 0.4
         return found
 
-    def followed(self, seconds: float, other: float, x: Reals) -> tuple[Reals, npt.NDArray[np.bool_], Reals]:
+    def followed(
+        self, seconds: float, other: float, x: Reals
+    ) -> tuple[Reals, npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
         """Return where what is in front at places of the picture is at another moment, [2, ...]; whether it is seen
         there; and the layer.
         """
         layer = self.front(seconds, x)
-        there = np.full(x.shape, np.nan)
+        there: Reals = np.full(x.shape, np.nan)
         for number in range(len(self.world.layers)):
             to = self.picture_place(other, number, self.place(seconds, number, x))
             there = np.where(layer == number, to, there)

@@ -313,18 +313,20 @@ def _render(grey, first, size, places, shown, boxes, outlines, top, left, double
 
 
 @compiled
-def _taken_one(place, x, y):
+def _taken_one(places, moment, layer, x, y):
     """Return a place through a homography (:func:`_taken`)."""
-    depth = max(place[2, 0] * x + place[2, 1] * y + place[2, 2], _LEAST_DEPTH)
-    across = place[0, 0] * x + place[0, 1] * y + place[0, 2]
-    return across / depth, (place[1, 0] * x + place[1, 1] * y + place[1, 2]) / depth
+    depth = places[moment, layer, 2, 0] * x + places[moment, layer, 2, 1] * y + places[moment, layer, 2, 2]
+    across = places[moment, layer, 0, 0] * x + places[moment, layer, 0, 1] * y + places[moment, layer, 0, 2]
+    down = places[moment, layer, 1, 0] * x + places[moment, layer, 1, 1] * y + places[moment, layer, 1, 2]
+    depth = max(depth, _LEAST_DEPTH)
+    return across / depth, down / depth
 
 
 @compiled
-def _front(places, outlines, x, y, behind):
+def _front(places, moment, outlines, x, y, behind):
     """Return the frontmost layer at a place of the picture; ``behind`` if none in front of that layer covers it."""
     for layer in range(len(outlines), behind, -1):
-        across, down = _taken_one(places[layer], x, y)
+        across, down = _taken_one(places, moment, layer, x, y)
         if _cover(_numbers(outlines[layer - 1]), across, down) >= 0.5:
             return layer
     return behind
@@ -333,12 +335,12 @@ def _front(places, outlines, x, y, behind):
 @compiled
 def _walk(at, points, places, back, outlines, top, left, height, width, layers, tracks):
     for point in range(len(points)):
-        start = at[min(point, len(at) - 1)]
+        start = min(point, len(at) - 1)
         x, y = points[point, 0] + left, points[point, 1] + top
-        layers[point] = layer = _front(start, outlines, x, y, 0)
-        across, down = _taken_one(start[layer], x, y)
+        layers[point] = layer = _front(at, start, outlines, x, y, 0)
+        across, down = _taken_one(at, start, layer, x, y)
         for moment in range(len(tracks)):
-            x, y = _taken_one(back[moment, layer], across, down)
+            x, y = _taken_one(back, moment, layer, across, down)
             is_inside = left <= x < left + width and top <= y < top + height
             tracks[moment, point, 0], tracks[moment, point, 1] = x - left, y - top
-            tracks[moment, point, 2] = is_inside and _front(places[moment], outlines, x, y, layer) == layer
+            tracks[moment, point, 2] = is_inside and _front(places, moment, outlines, x, y, layer) == layer

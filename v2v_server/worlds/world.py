@@ -126,8 +126,8 @@ class World:
         found[:, :, 2] = np.stack(depth, axis=1)[:, None]
         for number, layer in enumerate(self.layers):
             paced = since + knots[2 + number] * (_KNOT_SECONDS / 2)
-            way = [start + _to_and_fro(paced, *each, start)
-                   for *each, start in zip(layer.speed_px, layer.reach_px, layer.start_px, strict=True)]  # fmt: skip
+            ways = zip(layer.speed_px, layer.reach_px, layer.start_px, strict=True)
+            way = [start + _to_and_fro(paced, speed, reach, start) for speed, reach, start in ways]
             size = exponential(_to_and_fro(paced, layer.zoom, _ZOOM_REACH, 0.0)) / self.scale
             cosine, sine = (size * each for each in _turned(layer.turn * paced))
             x, y = knots[:2] - (way if number else [0.0])
@@ -220,7 +220,8 @@ def _to_and_fro(seconds: Doubles, speed: float, reach: float, start: float) -> D
     place = 0.25 - np.abs(turns - np.floor(turns) - 0.5)
     over = np.maximum(np.abs(place) - (0.25 - _ROUNDED), 0.0)
     place = place - np.copysign(over * over / (2.0 * _ROUNDED), place)
-    return 4.0 * reach * (place[:-1] - place[-1])
+    way: Doubles = 4.0 * reach * (place[:-1] - place[-1])
+    return way
 
 
 def _spline(knots: Doubles, at: Doubles) -> Doubles:
