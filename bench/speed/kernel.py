@@ -31,7 +31,7 @@ from v2v_protocol.command import Parser
 from v2v_server.simulation import simulate
 from v2v_server.system.process import keep_freed_memory
 
-BAR, EFFECTS_BAR = 40.0, 4.0
+BAR, EFFECTS_BAR = 33.0, 4.0
 STEPS, SIDE_PX, HOT_PIXELS = 200, 128, 16
 _CAMERA: dict[str, Any] = {"threshold_pos": 0.2, "threshold_neg": 0.25}
 _NOISE = {"noise_sigma": 0.05, "hot_pixel_count": HOT_PIXELS, "hot_pixel_sigma": 5.0, "seed": 1}

@@ -39,8 +39,8 @@ from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.prepare import prepare
 from v2v_server.video.probe import probe
 
-BARS = {("walking", "source"): 2.0, ("walking", "motion"): 5.0, ("still", "source"): 1.03, ("still", "motion"): 1.05}
-COLOUR_BARS = {("walking", "source"): 1.4, ("walking", "chroma"): 1.25}
+BARS = {("walking", "source"): 2.0, ("walking", "motion"): 5.0, ("still", "source"): 1.15, ("still", "motion"): 1.05}
+COLOUR_BARS = {("walking", "source"): 1.4, ("walking", "chroma"): 1.4}
 STILL_FRAMES, SUBSTEP_PX = 240, 1.0
 _COLUMNS: tuple[Column, ...] = (
     ("clip", "clip", "{}", 1),

@@ -51,10 +51,11 @@ from v2v_server.system.process import usable_cores
 from v2v_server.worker.produce import decode_for
 
 BASELINE, LIMIT = "released", "decode"
-# Least multiple of the baseline, by the clock and by processor time, on clips with a keyframe every 250 frames; of
+# Least multiple of the baseline, by the clock and by processor time, as docs/performance.md reports it, on clips with a
+# keyframe every 250 frames; of
 # `dense-12`, every 12. A label without a bar of its own has that of its part before the dash.
 BARS = {
-    "exact, source": 3.3,
+    "exact, source": 1.9,
     "exact, dense": 25.0,
     "exact, dense-12": 20.0,
     "exact, fast": 25.0,
