@@ -284,28 +284,35 @@ def _render(grey, first, size, places, shown, boxes, outlines, top, left, double
                 level, part = level + 1, part * 0.5
             blends = part > 1.0 + _LEAST_PART and level < len(size) - 1
             begin, end = boxes[number, layer, 2], boxes[number, layer, 3]
-            count = max(end - begin, 0)
             for row in range(boxes[number, layer, 0], boxes[number, layer, 1]):
-                _along(places[number, layer], left + begin, top + row, across, down, count)
+                _along(places[number, layer], left + begin, top + row, across, down, end - begin)
+                skip, count = 0, end - begin
+                if layer > 0:
+                    numbers = _numbers(outlines[layer - 1])
+                    for i in range(count):
+                        share[i] = _cover(numbers, across[i], down[i])
+                    # A patch is smaller than its box: what it does not cover is not read.
+                    while skip < count and share[skip] == 0.0:
+                        skip += 1
+                    while count > skip and share[count - 1] == 0.0:
+                        count -= 1
+                count -= skip
                 for finer in range(level + blends, level - 1, -1):
                     scale = 1.0 / (1 << finer)
-                    _split(across, size[0, 1], scale, size[finer, 1], columns, x, count)
-                    _split(down, size[0, 0], scale, size[finer, 0], rows, y, count)
+                    _split(across[skip:], size[0, 1], scale, size[finer, 1], columns, x, count)
+                    _split(down[skip:], size[0, 0], scale, size[finer, 0], rows, y, count)
                     into = coarse if finer > level else found
                     _read(grey, first[finer], size[finer, 1], columns, rows, x, y, into, count)
                 if blends:
                     weight = np.float32(part - 1.0)
                     for i in range(count):
                         found[i] += (coarse[i] - found[i]) * weight
-                line = picture[row, begin:end]
+                line, covered = picture[row, begin + skip : end], share[skip:]
                 if layer == 0:
                     line[:] = found
                     continue
-                numbers = _numbers(outlines[layer - 1])
                 for i in range(count):
-                    share[i] = _cover(numbers, across[i], down[i])
-                for i in range(count):
-                    line[i] += (found[i] - line[i]) * np.float32(share[i])
+                    line[i] += (found[i] - line[i]) * np.float32(covered[i])
         for row in range(out.shape[1]):
             line, levels = picture[row], out[number, row]
             for i in range(len(levels)):
