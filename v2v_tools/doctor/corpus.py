@@ -80,7 +80,8 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
     yield from _labels(catalogue)
     frames_needed = int(np.median(spec.recipe.sequence_at(found.frames_per_second))) + 1
     defects = yield from look_at_pictures(catalogue, frames_needed)
-    yield from look_at_motion(catalogue, defects)
+    if not catalogue.source.kind.is_rendered:  # as it stands, a photograph does not move
+        yield from look_at_motion(catalogue, defects)
     yield from _rates(found.frames_per_second, spec.recipe)
     table = SequenceTable(found, catalogue.rows, spec)
     useless = len(found) - table.videos
