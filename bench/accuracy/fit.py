@@ -55,7 +55,9 @@ def add_flags(parser: Parser) -> None:
     """Declare the flags."""
     add_whole(parser, "--cameras", max(len(REPORT), len(TUNING)), "number of cameras")
     clips = Path(".demo/videos")
-    parser.add_argument("--clips", type=Path, default=clips, metavar="DIR", help=f"make clips (default {clips})")
+    parser.add_argument(
+        "--clips", type=Path, default=clips, metavar="DIR", help=f"clips that make demo fetches (default {clips})"
+    )
     parser.add_argument("--tuning", action="store_true", help="the cameras and scenes on which the fit was tuned")
     parser.add_argument("--outside", action="store_true", help="cameras outside the family that is fitted")
 

@@ -87,7 +87,7 @@ def bootstrap(sums: npt.NDArray[Any], solve: Callable[[Doubles], Doubles]) -> tu
     for piece in (space // SIDE // (SIDE // 2) * 2 + space % SIDE // (SIDE // 2), time):
         share = np.bincount(piece, np.abs(flat[:, 0]), 4)
         pieces = np.flatnonzero(share)
-        if share.max() <= _LARGEST_PIECE * share.sum():
+        if 0 < share.max() <= _LARGEST_PIECE * share.sum():
             without = np.array([solve(sums[piece != each].sum(axis=0)) for each in pieces])
             half = np.maximum(half, _DEVIATIONS * np.sqrt(without.var(axis=0) * (len(pieces) - 1)))
     return value, np.minimum(spread[0], value - half), np.maximum(spread[1], value + half)
