@@ -1,10 +1,15 @@
 """Measure error and time of the optical flow methods on pictures of known motion.
 
     python -m bench flow --videos DIR --json flow.json
+    python -m bench flow --worlds 60 --json flow.json
 
 Textures are the photographs of scikit-image and, with ``--videos``, one frame of each video
 (`tests/oracles/known_motion.py`). Errors are endpoint errors over all pixels, hidden ones included. A 128x128 crop is
 estimated on the whole picture, on the crop with a margin, and on the crop alone. Times are CPU times of one thread.
+
+``--worlds`` measures the methods on that many drawn worlds instead (``v2v_server/worlds``): the pictures at both ends
+of a grid of the recipe `worlds`, estimated with the stream's margin of 64 px, beside the exact flow, by its length, and
+where something is hidden within 8 px.
 
 Bar: the default method's median error on pans and zooms of whole pictures is below 0.25 px.
 """
@@ -12,6 +17,7 @@ Bar: the default method's median error on pans and zooms of whole pictures is be
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,8 +32,12 @@ from tests.oracles.decoded import decode_luma
 from tests.oracles.known_motion import PHOTOGRAPHS, Grey, Scene, photograph, scenes
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import V2VError
+from v2v_protocol.recipe import preset
 from v2v_server.flow import AUTO, METHODS, Estimator, choose, estimator
+from v2v_server.simulation.draw import draw
 from v2v_server.video.probe import probe
+from v2v_server.worlds.render import WHITEST, flow_of, pyramid_of, render
+from v2v_server.worlds.world import draw_world
 
 HEIGHT_PX, WIDTH_PX, CROP_PX = 180, 596, 128
 MARGINS_PX = (64, 32, 0)
@@ -45,6 +55,19 @@ _COLUMNS: tuple[Column, ...] = (
     ("share_above_3px", "> 3 px", "{:.1%}", 1),
     ("boundary_error_mean_px", "boundary", "{:.2f}", 1),
     ("pan_zoom_error_median_px", "pan+zoom", "{:.3f}", 1),
+)
+
+LENGTHS_PX = (0.0, 0.5, 2.0, 8.0, 32.0, np.inf)
+HIDDEN_PX = 8
+FRAMES_PER_SECOND = 60.0
+_WORLD_COLUMNS: tuple[Column, ...] = (
+    ("method", "method", "{}", 1),
+    ("where", "exact flow", "{}", 1),
+    ("share", "pixels", "{:.1%}", 1),
+    ("error_mean_px", "mean px", "{:.2f}", 1),
+    ("error_median_px", "median", "{:.2f}", 1),
+    ("share_above_1px", "> 1 px", "{:.1%}", 1),
+    ("share_above_3px", "> 3 px", "{:.1%}", 1),
 )
 
 
@@ -111,12 +134,49 @@ def _error_fields(found: Sequence[tuple[npt.NDArray[np.float32], Scene, Any]]) -
     boundary = np.concatenate([each[scene.boundary[shown]] for each, scene, shown in found])
     smooth = [each.ravel() for each, scene, _ in found if scene.kind in ("pan", "zoom")]
     return {
+        **_figures(error),
+        "boundary_error_mean_px": float(boundary.mean()) if boundary.size else None,
+        "pan_zoom_error_median_px": float(np.median(np.concatenate(smooth))) if smooth else None,
+    }
+
+
+def beside_worlds(names: Sequence[str], count: int) -> list[dict[str, Any]]:
+    """Return one record for each method and length of the exact flow, and for places beside what is hidden."""
+    side, inner = CROP_PX + 2 * MARGINS_PX[0], slice(MARGINS_PX[0], MARGINS_PX[0] + CROP_PX)
+    recipe = preset("worlds").replace(crop_height_px=side, crop_width_px=side, flip_probability=0.0)
+    estimators, photographs = {name: estimator_of(name) for name in names}, [photograph(name) for name in PHOTOGRAPHS]
+    moments = np.arange(2) * recipe.bins * recipe.frames_per_bin / FRAMES_PER_SECOND
+    lengths, beside, errors = [], [], dict[str, list[Any]]({name: [] for name in names})
+    for number in range(count):
+        grey = photographs[number % len(photographs)]
+        params = draw(recipe, seed=1, epoch=0, index=number, picture_height_px=grey.shape[0],
+                      picture_width_px=grey.shape[1], video_id="")  # fmt: skip
+        world = draw_world(recipe, params, seed=1, epoch=0, index=number, picture_px=grey.shape, seconds=(-1.0, 1.0))
+        first, second = (render(pyramid_of(grey), world, moments) * (255.0 / WHITEST)).round().astype(np.uint8)
+        exact, valid = flow_of(world, *moments.tolist())
+        hidden = cv2.dilate(1 - valid[0], np.ones((2 * HIDDEN_PX + 1,) * 2, np.uint8))
+        lengths.append(np.hypot(*exact)[inner, inner])
+        beside.append(hidden[inner, inner] > 0)
+        for name, estimate in estimators.items():
+            error = np.linalg.norm(estimate(first, second) - exact.transpose(1, 2, 0), axis=-1)
+            errors[name].append(error[inner, inner])
+    length, near = np.stack(lengths), np.stack(beside)
+    bins = {f"{low:g} to {high:g} px": ~near & (low <= length) & (length < high)
+            for low, high in itertools.pairwise(LENGTHS_PX)}  # fmt: skip
+    return [
+        {"method": name, "where": where, "share": float(chosen.mean()), **_figures(np.stack(errors[name])[chosen])}
+        for name in names
+        for where, chosen in {**bins, "beside what is hidden": near}.items()
+        if chosen.any()
+    ]
+
+
+def _figures(error: npt.NDArray[np.floating[Any]]) -> dict[str, float]:
+    return {
         "error_mean_px": float(error.mean()),
         "error_median_px": float(np.median(error)),
         "share_above_1px": float((error > 1).mean()),
         "share_above_3px": float((error > 3).mean()),
-        "boundary_error_mean_px": float(boundary.mean()) if boundary.size else None,
-        "pan_zoom_error_median_px": float(np.median(np.concatenate(smooth))) if smooth else None,
     }
 
 
@@ -134,6 +194,7 @@ def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     parser.add_argument("--videos", type=Path, metavar="DIR", help="videos that give one frame each as texture")
     add_whole(parser, "--every", 1, "take every N-th pair")
+    parser.add_argument("--worlds", type=int, default=0, metavar="N", help="measure on N worlds, and on nothing else")
 
 
 def measure(asked: argparse.Namespace) -> Report:
@@ -144,6 +205,9 @@ def measure(asked: argparse.Namespace) -> Report:
         OSError: the folder cannot be read.
     """
     cv2.setNumThreads(1)
+    if asked.worlds:
+        found = beside_worlds((*METHODS, AUTO), asked.worlds)
+        return Report(found, [(found, _WORLD_COLUMNS)])
     pairs = scenes(textures(asked.videos), HEIGHT_PX, WIDTH_PX, every=asked.every)
     records: list[dict[str, Any]] = []
     for name in (*METHODS, AUTO):
