@@ -27,10 +27,10 @@ SMALLER = {
     "v2v-serve": ["--workers", "1", "--bind", "tcp://127.0.0.1:*", "--port-file", "port"],
     "v2v-train": ["--workers", "1", "--set", "stream.batch_size=1"],
     "v2v-prepare": ["--workers", "1"],
-    "v2v-tradeoff": ["--clips", "1", "--places", "1", "--forms", "lossless fast", "--budget-minutes", "0.1"],
+    "v2v-tradeoff": ["--clips", "1", "--forms", "lossless fast"],
 }
 CANNOT = {
-    r"^v2v-fit ": "recordings that may not be redistributed; tests/server/fit fits simulated ones",
+    r"^v2v-fit ": "recordings that may not be redistributed; tests/v2v_tools/fit fits simulated ones",
     r"^v2v-(serve|tradeoff) .*my_camera": "a recipe that v2v-fit writes",
     r"^v2v-convert ": "recordings that may not be redistributed",
     r"^v2v-eval ": "weights and recordings that may not be redistributed; the trainer's tests use synthetic ones",

@@ -8,9 +8,10 @@
     broker/       which worker makes which sample for which consumer
     quarantine.py sequences that brought workers down
     worker/       from a lease to its sample
-    schedule/     which sequence each index is made from
+    schedule.py   which sequence each index is made from
     corpus/       which videos exist
     store/        prepared clips, lossless
+    worlds/       photographs that move
     flow.py       optical flow
     simulation/   the virtual camera
     video/        from a file to luma

@@ -221,7 +221,7 @@ def _shown(context: SampleContext, numbers: npt.NDArray[np.int64], out: npt.NDAr
 
 @makes("tracks")
 def tracks(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Raise an error: the clips of photographs come with tracks, and other videos have none.
+    """Raise an error: the clips of photographs come with tracks, [T + lead_frames, N, 3], and other videos have none.
 
     Raises:
         VideoError: always.

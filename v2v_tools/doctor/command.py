@@ -274,7 +274,7 @@ def _run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--port {arguments.port}: give 1 to 65535")
     found_bad = has_defects = False
     for finding in run_checks(
-        arguments.port, arguments.videos, arguments.recipe, arguments.rows or "full", arguments.cache_dir,
+        arguments.port, arguments.videos, arguments.recipe, arguments.rows, arguments.cache_dir,
         VideosKind.of(vars(arguments)),
     ):  # fmt: skip
         found_bad = found_bad or finding.level == BAD

@@ -31,7 +31,7 @@ def mismatch(fitted: Regression, given: Increments, blocks: npt.NDArray[np.int64
 
     A pixel that sees the same edge again and again repeats its errors in both polarities, while its two thresholds are
     independent: products of residuals of opposite changes are subtracted. Pixels far from the others drift by
-    themselves.
+    themselves. ``blocks``: [P], block of each pixel.
     """
     if not fitted.positive.told or not fitted.negative.told:
         return unknown("needs the thresholds")
@@ -77,7 +77,10 @@ def mismatch(fitted: Regression, given: Increments, blocks: npt.NDArray[np.int64
 def shot_noise(
     still: Doubles, blocks: npt.NDArray[np.int64], is_hot: npt.NDArray[np.bool_], static: bool = False
 ) -> Estimate:
-    """Estimate shot noise, Hz, of a black pixel, both polarities. A leak fires brighter events, so the darker count."""
+    """Estimate shot noise, Hz, of a black pixel, both polarities. A leak fires brighter events, so the darker count.
+
+    ``still`` is [4, P, 4] (``still_time``); ``blocks`` and ``is_hot`` are [P], of each pixel.
+    """
     still = still * ~is_hot[:, None]
     seconds, _, on, off = still.sum(axis=(1, 2))
     if seconds < LEAST_SECONDS:
@@ -134,7 +137,7 @@ def refractory(gaps_us: Doubles) -> Estimate:
 def with_noise(period: Estimate, shot: Estimate, gaps_us: Doubles) -> Estimate:
     """Return the estimate of the period with a note of whether noise obeys it.
 
-    Noise that ignores it follows another event within the period by chance.
+    Noise that ignores it follows another event within the period by chance. ``gaps_us``: [M] intervals.
     """
     shorter = np.count_nonzero(gaps_us < 0.9e6 * period.low) if period.told else 0
     by_chance = _SHARE_OF_DARK * shot.value * period.low * len(gaps_us) if period.told and shot.told else 0.0
@@ -162,7 +165,10 @@ def hot_pixels(
     still: Doubles, is_hot: npt.NDArray[np.bool_], thresholds: tuple[float, float], refractory_seconds: float,
     blocks: npt.NDArray[np.int64],
 ) -> tuple[Estimate, Estimate]:  # fmt: skip
-    """Estimate the share of hot pixels and the deviation of their drift, log units a second."""
+    """Estimate the share of hot pixels and the deviation of their drift, log units a second.
+
+    ``still`` is [4, P, 4] (``still_time``); ``is_hot`` and ``blocks`` are [P], of each pixel.
+    """
     seconds, _, on, off = still.sum(axis=2)
     seen = seconds >= 0.3
     if seen.sum() < 500:

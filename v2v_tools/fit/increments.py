@@ -55,7 +55,7 @@ class Increments(NamedTuple):
     slope: Doubles
 
     def take(self, which: npt.NDArray[Any] | slice) -> Increments:
-        """Return some of the increments, by a mask or a slice."""
+        """Return some of the increments, by a mask, [M], or a slice."""
         return Increments(*(column[..., which] for column in self))  # type: ignore[arg-type]
 
 

@@ -69,7 +69,7 @@ class Recorded:
         return self.light
 
     def blocks(self) -> Longs:
-        """Return the block of each pixel, 0 .. SIDE * SIDE - 1: the sensor in rows and columns of equal parts."""
+        """Return the block of each pixel, [P], 0 .. SIDE * SIDE - 1: the sensor in rows and columns of equal parts."""
         y, x = np.divmod(self.pixels, self.width_px)
         return np.asarray((y * SIDE // self.height_px) * SIDE + x * SIDE // self.width_px)
 

@@ -18,7 +18,7 @@ import psutil
 import pytest
 
 from tests.waiting import until
-from v2v_server.simulation.precision import warm_up as module
+from v2v_server.worker import warm_up as module
 from v2v_server.worker.warm_up import one_compiles, warm_up_in_turn
 
 KEY = "key"

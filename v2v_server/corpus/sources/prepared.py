@@ -206,7 +206,7 @@ def _known(data: dict[str, Any]) -> dict[str, Any]:
 def write_manifest(
     root: Path, header: Header, videos: Iterable[PreparedVideo]
 ) -> Iterator[Callable[[PreparedVideo], None]]:
-    """Write a manifest: the known records in one piece; yield what appends one more, and waits until it is on disk.
+    """Write a manifest: the known records in one go; yield what appends one more, and waits until it is on disk.
 
     Args:
         root: the prepared folder.
