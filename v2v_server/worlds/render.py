@@ -190,8 +190,9 @@ def _follow(world: World, at: Doubles, points: Doubles, seconds: Doubles) -> tup
         [N], the layers; [n, N, 3], where each point is in the crop, and 1 where it is seen.
     """
     layers, tracks = np.empty(len(points), np.uint8), np.empty((len(seconds), len(points), 3))
-    places = world.places(seconds)
-    _walk(world.places(at), points, places, _inverse(places)[0], world.outlines, *world.crop, layers, tracks)
+    places = world.places(np.concatenate([at, seconds]))
+    at_first, places = places[: len(at)], places[len(at) :]
+    _walk(at_first, points, places, _inverse(places)[0], world.outlines, *world.crop, layers, tracks)
     return layers, tracks
 
 
