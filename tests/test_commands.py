@@ -171,6 +171,8 @@ def _wrong_with_launched(words: list[str]) -> str:
         return wrong_with(["pytest", *rest])
     if started == "bench":
         return _refused(parser_for(rest[0]), rest[1:]) if rest[0] in BENCHES else "no bench"
+    if started.startswith("tests.") and not rest:
+        return "" if (ROOT / f"{started.replace('.', '/')}.py").exists() else "no such module"
     module = _LAUNCHED.get(started)
     return "nothing that can be started" if module is None else _refused(parser_of(module), rest)
 

@@ -159,7 +159,7 @@ def package(name: str, what: str) -> Any:
         return import_module(name)
     except ModuleNotFoundError as error:
         raise UsageError(
-            f"{what} needs the package {error.name}: pip install '.[convert]' in a checkout of v2v-stream"
+            f"{what} needs the package {name.partition('.')[0]}: pip install '.[convert]' in a checkout of v2v-stream"
         ) from error
 
 

@@ -68,8 +68,10 @@ def test_a_local_dataset_streams_and_stops_its_server(clips: Path, servers: set[
     for batch in dataset:
         assert batch.epoch == 1
         break  # in the middle of an epoch
-    loader = DataLoader(V2VStreamDataset(dataset._address, 2, recipe=RECIPE), batch_size=None, num_workers=1)
-    assert all(torch.equal(mine, other.voxels) for mine, other in zip(whole, loader, strict=True))
+    loader = DataLoader(
+        V2VStreamDataset(dataset.describe()["address"], 2, recipe=RECIPE), batch_size=None, num_workers=1
+    )
+    assert all(torch.equal(mine, batch.voxels) for mine, batch in zip(whole, loader, strict=True))
     assert any("v2v_server" in " ".join(command(process)) for process in servers)
     del dataset, loader
     gc.collect()

@@ -72,7 +72,8 @@ def fits(kind: Any, value: Any) -> bool:
         return type(value) in (int, float) and math.isfinite(value)
     if origin is Annotated:
         allowed = (int,) if parts[0] is int else (int, float)
-        return type(value) in allowed and (parts[1].low <= value <= parts[1].high or math.isnan(value))
+        is_open = parts[1].high == math.inf  # then NaN stands for an unknown value
+        return type(value) in allowed and (parts[1].low <= value <= parts[1].high or (is_open and math.isnan(value)))
     if origin in (typing.Union, UnionType):
         return any(fits(part, value) for part in parts)
     if origin is tuple and parts[-1] is ...:

@@ -109,7 +109,7 @@ class Prediction:
     def features(self) -> Features:
         """Return what the loss depends on."""
         ways = self.along * self.across_twice, self.across * self.along_twice
-        smear = math.log(ways[0] / ways[1]) if min(ways) > 0.0 else 0.0
+        smear = math.log(ways[0]) - math.log(ways[1]) if min(ways) > 0.0 else 0.0
         moves = self.moving / max(self.divided, 1.0)  # few cells of a still clip "move", by noise
         return Features(
             max(1.0 - self.linear / self.divided, 0.0) if self.divided else 0.0,

@@ -72,7 +72,7 @@ class VideosKind:
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> VideosKind:
         """Return the kind of a command's flags; None stands for a default."""
-        return cls(given["videos_kind"] or "videos", given["rate"] or 0.0, given["photograph_seconds"] or 0.0)
+        return cls(given["videos_kind"] or "videos", given["rate"] or 0.0, given.get("photograph_seconds") or 0.0)
 
     @property
     def has_parts(self) -> bool:
