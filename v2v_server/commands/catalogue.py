@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -160,3 +161,7 @@ def _of_all(catalogue: Catalogue) -> list[str]:
         if catalogue.scene_digest is not None:
             lines.append(f"with scenes: {catalogue.scene_digest}")
         return lines
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -59,3 +60,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def _default_folder() -> Path:
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config", "v2v", "keys")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -161,3 +162,7 @@ def _listed(title: str, items: list[tuple[str, str]]) -> list[str]:
 
 def _size(made: int, expected: int) -> str:
     return f"{made / 1e9:.1f} of about {expected / 1e9:.1f} GB" if expected else ""
+
+
+if __name__ == "__main__":
+    sys.exit(main())

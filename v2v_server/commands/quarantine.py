@@ -7,6 +7,7 @@ it has read. It learns of a clearing with its next entry or at its next start.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -56,3 +57,7 @@ def _clear(file: Path, quarantine: Quarantine) -> None:
         quarantine.extend(write_entry(file, clearing(now), quarantine))
     except OSError as error:
         raise V2VError(f"quarantine file {file} cannot be written: {error.strerror}; nothing was cleared") from error
+
+
+if __name__ == "__main__":
+    sys.exit(main())

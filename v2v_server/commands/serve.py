@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -49,3 +50,7 @@ def _run(arguments: argparse.Namespace) -> None:
         from v2v_server.serve import serve  # takes as long as the imports of a worker, which run meanwhile
 
         serve(config, standbys, arguments.debug)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

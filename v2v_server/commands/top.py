@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -71,3 +72,7 @@ def _live(console: Console, client: StatusClient, state: dict[str, Any], timeout
             except ServerLost as error:  # the server may come back
                 note = f"{error} The state shown is old."
             live.update(draw(state, note), refresh=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

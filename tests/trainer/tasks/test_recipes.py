@@ -117,11 +117,13 @@ def reconstruction_loss(learner: Learner, prediction: Tensor, work: Work) -> flo
 
 
 def flow_loss(learner: Learner, prediction: Tensor, work: Work) -> float:
-    """The last update, or all of them, each 0.8 of the next."""
+    """The last update, or all of them, each 0.8 of the next; over the valid pixels, if they are told."""
     p, truth, gamma = float64(prediction), float64(work.truth["flow"]), learner.config.loss.gamma
+    counts = float64(work.truth["valid"]) if "valid" in work.truth else np.ones((*truth.shape[:2], 1, *truth.shape[3:]))
+    shares = counts / (2 * counts.sum())
     if p.ndim == 5:
-        return float(np.abs(p - truth).mean())
-    errors = [np.abs(each - truth).mean() for each in p]
+        return float((np.abs(p - truth) * shares).sum())
+    errors = [(np.abs(each - truth) * shares).sum() for each in p]
     return float(sum(gamma ** (len(p) - 1 - i) * error for i, error in enumerate(errors)) if gamma else errors[-1])
 
 
