@@ -166,7 +166,7 @@ class V2VStreamDataset(IterableDataset[Batch]):
         videos: str | os.PathLike[str],
         batch_size: int = 12,
         arrays: Sequence[str] = ("voxels", "frames"),
-        recipe: str | Mapping[str, Any] | Recipe | None = "paper",
+        recipe: str | Mapping[str, Any] | Recipe | None = None,
         *,
         workers: int = 4,
         flags: Sequence[str] = (),
@@ -184,16 +184,18 @@ class V2VStreamDataset(IterableDataset[Batch]):
 
         Args:
             videos: folder or list, as for ``v2v-serve --videos``.
-            batch_size, arrays, recipe, seed, labels, options: as for the dataset.
+            batch_size, arrays, seed, labels, options: as for the dataset.
+            recipe: as for the dataset; None: that of ``preset``, or the paper's.
             workers: number of server workers.
-            flags: more flags for ``v2v-serve``, for instance ``["--cache", "clips/"]``.
+            flags: more flags for ``v2v-serve``, for instance ``["--cache", "clips/"]``, or
+                ``["--videos-kind", "photographs"]`` with ``preset="worlds"``.
 
         Raises:
             UsageError: the videos, flags or options are not valid; the message says why.
             ServerLost: the server does not start.
         """
         require_arguments(cls.local, options)
-        resolved = StreamSpec.from_dict({"recipe": read_recipe(recipe)}).recipe
+        resolved = StreamSpec.from_dict({"preset": options.get("preset"), "recipe": read_recipe(recipe)}).recipe
         server = LocalServer(videos, workers=workers, flags=server_flags(resolved, options, *flags)).__enter__()
         try:
             # V2V_KEYS may name a key for other servers.

@@ -26,7 +26,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS
-from v2v_protocol.spec_flags import add_spec, recipe_changes, recipe_setting, spec_fields
+from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_changes, recipe_setting, spec_fields
 from v2v_protocol.write_aside import write_json
 
 _RSS_EVERY_SECONDS = 0.5
@@ -286,7 +286,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.connect:
         _dataset(arguments, "tcp://127.0.0.1:0")  # report wrong options before a server is started
         # The server checks with its own recipe which videos are long enough, so it gets the stream's.
-        recipe = recipe_setting(arguments.recipe, arguments.set) or Recipe()
+        recipe = recipe_setting(asked_recipe(arguments), arguments.set) or Recipe()
         flags = server_flags(recipe, vars(arguments), *(("--rows", arguments.rows) if arguments.rows else ()))
     for workers in (None,) if arguments.connect else arguments.workers or (1, 2):
         local = None if workers is None else LocalServer(arguments.videos, workers=workers, flags=flags)

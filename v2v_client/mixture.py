@@ -44,9 +44,13 @@ class MixtureConsumer(Consumer):
     seed: int
     weights: list[list[float]]
 
+    def shares(self, epoch: int) -> list[float]:
+        """Return the weights of an epoch."""
+        return self.weights[min(epoch, len(self.weights) - 1)]
+
     def order(self, stream: StreamIdentity, epoch: int) -> npt.NDArray[np.int64]:
         """Return the number of the member that each batch of an epoch comes from, [batches]."""
-        weights = self.weights[min(epoch, len(self.weights) - 1)]
+        weights = self.shares(epoch)
         own = [each["sequences"] // (self.world_size * self.batch_size) for each in stream.spec["members"]]
         scale = min(batches / weight for batches, weight in zip(own, weights, strict=True) if weight)
         times = []
@@ -147,7 +151,14 @@ class Mixture(V2VStreamDataset):
                 raise UsageError(f"mix: samples differ in form, {forms}: give recipes of one size, and one voxel_dtype")
             stream = self._identity([each.conversation.stream for each in connections])
             begun = self._position.pin(begun, stream, "this mixture")
-            yield connections, begun, self._consumer.plan(stream, begun.state)
+            consumer, needed = self._consumer, self.world_size * self.members[0]._consumer.batch_size
+            for each, weight in zip(connections, consumer.shares(begun.state.epoch), strict=True):
+                if weight and each.conversation.stream.sequences < needed:
+                    raise UsageError(
+                        f"mix: {each.address} gives {each.conversation.stream.sequences} sequences, and a batch of all "
+                        f"ranks needs {needed}: use a smaller batch_size, fewer ranks or more videos"
+                    )
+            yield connections, begun, consumer.plan(stream, begun.state)
 
     def _snapshots(self, state: ResumeState) -> list[int | None]:
         return [*state.quarantine] if isinstance(state.quarantine, list | tuple) else [None] * len(self.members)

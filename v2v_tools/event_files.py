@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
 from v2v_protocol.write_aside import write_aside_and_rename
+from v2v_recordings.archive import package
 
 _NOTE = "simulated from video frames: log intensity is linear in time between frames"
 
@@ -47,8 +46,8 @@ def check_event_file(path: Path) -> None:
     ending = path.suffix.lower()
     if ending not in EVENT_WRITERS:
         raise UsageError(f"{path}: unknown ending; events go into a file that ends in {', '.join(EVENT_WRITERS)}")
-    if package := _PACKAGES.get(EVENT_WRITERS[ending]):
-        _package(package, path)
+    if needed := _PACKAGES.get(EVENT_WRITERS[ending]):
+        package(needed, str(path))
 
 
 def _npz(path: Path, events: EventList) -> None:
@@ -63,7 +62,7 @@ def _hdf5(path: Path, events: EventList) -> None:
     last_ms = int(events.t[-1]) // 1000 if len(events) else 0
     first_of_ms = np.searchsorted(events.t, np.arange(last_ms + 2) * 1000)
     content = io.BytesIO()  # HDF5 crashes the process on a full disk
-    with _package("h5py", path).File(content, "w") as file:
+    with package("h5py", str(path)).File(content, "w") as file:
         file.attrs.update(width=events.width_px, height=events.height_px, note=_NOTE)
         columns = {"x": events.x, "y": events.y, "t": events.t, "p": events.p.astype(np.uint8)}
         for name, column in columns.items():
@@ -74,7 +73,7 @@ def _hdf5(path: Path, events: EventList) -> None:
 
 
 def _faery(path: Path, events: EventList) -> None:
-    faery = _package("faery", path)
+    faery = package("faery", str(path))
     table = np.empty(len(events), faery.EVENTS_DTYPE)
     table["t"], table["x"], table["y"], table["on"] = events.t, events.x, events.y, events.p
     stream = faery.events_stream_from_array(table, (events.width_px, events.height_px))
@@ -90,10 +89,3 @@ EVENT_WRITERS: dict[str, Callable[[Path, EventList], None]] = {
 }  # fmt: skip
 """Writers by the ending of the name."""
 _PACKAGES: dict[Callable[[Path, EventList], None], str] = {_hdf5: "h5py", _faery: "faery"}
-
-
-def _package(name: str, path: Path) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        raise UsageError(f"{path}: needs the package {error.name}: pip install {name}") from error

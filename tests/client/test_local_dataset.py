@@ -182,10 +182,17 @@ def test_no_process_is_left_when_the_program_ends(clips: Path, tmp_path: Path, e
 
 
 @pytest.mark.parametrize(
-    ("options", "scene"), [({}, "off"), ({"preset": "natural"}, "auto"), ({"scene": "auto"}, "auto")]
+    ("options", "scene", "moves"),
+    [
+        ({}, "off", False),
+        ({"preset": "natural"}, "auto", False),
+        ({"scene": "auto"}, "auto", False),
+        ({"preset": "worlds"}, "off", True),
+        ({"preset": "worlds", "recipe": "paper"}, "off", False),
+    ],
 )
-def test_its_server_has_the_statistics_that_the_options_need(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, options: dict[str, Any], scene: str
+def test_its_server_has_the_statistics_and_the_recipe_that_the_options_need(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, options: dict[str, Any], scene: str, moves: bool
 ) -> None:
     asked: list[list[str]] = []
 
@@ -203,3 +210,4 @@ def test_its_server_has_the_statistics_that_the_options_need(
     told = [] if scene == "off" else ["--scene", scene]
     assert flags[len(flags) - len(told) :] == told
     assert ("--scene" in flags) == bool(told)
+    assert any(flag.startswith("world_speed_px=") for flag in flags) == moves

@@ -215,7 +215,7 @@ def test_datasets_that_do_not_fit_together_are_refused(servers: tuple[FakeServer
 def test_a_lost_server_and_a_small_member_are_named(servers: tuple[FakeServer, FakeServer]) -> None:
     one, other = servers
     other.sequences = 3
-    with pytest.raises(UsageError, match="holds no global batch"):
+    with pytest.raises(UsageError, match=f"mix: {other.address} gives 3 sequences, and a batch of all ranks needs 4"):
         next(iter(mixed(servers)))
     other.sequences, other.mute = 43, True
     with pytest.raises(ServerLost, match=other.address):
