@@ -1,4 +1,4 @@
-"""Predict the share of the events that is lost between the frames of a clip, without and with sub-steps, from them.
+"""Predict the share of the events that is lost between the frames of a clip, without and with sub-steps.
 
 Events are lost where the light of a pixel rises and falls again within a step. The events of the frames alone, in bins
 of a frame, are compared with those of the frames and the levels along the motion. The true events are estimated as
@@ -46,7 +46,7 @@ _WEIGHTS = (
 )
 """Constant and weights of Features, for the low end, the estimate and the high end: ``python -m bench loss``."""
 _SHARP, _SMEARED, _STEADY = 0.2, 0.5, 0.35
-"""Values that clips without blur, and without turns, reach too; and the smear that is not told from more."""
+"""Smear that sharp clips reach too, smear above which all counts alike; unsteadiness that steady clips reach too."""
 _SLIGHT_LOSS, _UNSTEADY, _FLICKERS, _UNCOVERS = 0.05, 0.25, 0.55, 0.12
 _STILL_GREY, _TEXTURE_GREY = 3.0, 8.0
 """Mean change, at most, and range of grey levels, at least, of a cell that rests and would show a motion."""

@@ -25,9 +25,9 @@ from v2v_server.worlds.world import Doubles, World
 WHITEST = 4095
 """The highest level of a rendered picture."""
 _LEAST_PART = 2.0**-14
-"""Less of a coarser level changes no level by a half, and a picture in its own size needs none."""
+"""A smaller share of the coarser level changes no level by a half. A picture in its own size reads none of it."""
 _LEAST_DEPTH = 2.0**-6
-"""A place that is farther away, or behind the camera, counts as that far: only what is never seen can be."""
+"""Smallest depth that is divided by. What the camera sees is always deeper."""
 compiled: Any = numba.njit(nogil=True, cache=True, error_model="numpy")
 """Decorator of this folder's compiled functions."""
 
@@ -76,7 +76,9 @@ def render(pyramid: PhotoPyramid, world: World, seconds: Doubles) -> npt.NDArray
     shown[:, 0] = np.maximum(shown[:, 0], 1 << world.focus)
     boxes = np.full((*shown.shape, 4), (0, height, 0, width))
     for layer, outline in enumerate(outlines, 1):
-        reach = outline[2] * (1.0 + 1.0 / (6.0 * outline[8])) * np.array([-1.0, 1.0])  # there q exceeds what covers
+        reach = (
+            outline[2] * (1.0 + 1.0 / (6.0 * outline[8])) * np.array([-1.0, 1.0])
+        )  # a patch covers nothing beyond it
         corners = (part.ravel() for part in np.meshgrid(outline[0] + reach, outline[1] + reach))
         ends = np.stack(_taken(back[:, layer, None], *corners)) - np.array([left, top])[:, None, None]
         for axis, side in enumerate((width, height)):
