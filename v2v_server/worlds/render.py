@@ -76,9 +76,8 @@ def render(pyramid: PhotoPyramid, world: World, seconds: Doubles) -> npt.NDArray
     shown[:, 0] = np.maximum(shown[:, 0], 1 << world.focus)
     boxes = np.full((*shown.shape, 4), (0, height, 0, width))
     for layer, outline in enumerate(outlines, 1):
-        reach = (
-            outline[2] * (1.0 + 1.0 / (6.0 * outline[8])) * np.array([-1.0, 1.0])
-        )  # a patch covers nothing beyond it
+        # A patch covers nothing beyond this.
+        reach = outline[2] * (1.0 + 1.0 / (6.0 * outline[8])) * np.array([-1.0, 1.0])
         corners = (part.ravel() for part in np.meshgrid(outline[0] + reach, outline[1] + reach))
         ends = np.stack(_taken(back[:, layer, None], *corners)) - np.array([left, top])[:, None, None]
         for axis, side in enumerate((width, height)):
