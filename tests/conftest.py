@@ -4,25 +4,38 @@ from __future__ import annotations
 
 import fcntl
 import os
+import socket
 from collections.abc import Iterator
 from typing import Any
 
 import numba.core.dispatcher
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
-# Hypothesis fails an example that takes longer than 200 ms: a timing assertion, which a busy machine breaks.
-settings.register_profile("v2v", deadline=None, print_blob=True)
+# Hypothesis fails an example that takes longer than 200 ms, and a test whose inputs take longer than a time limit to
+# draw: timing assertions, which a busy machine breaks.
+settings.register_profile("v2v", deadline=None, print_blob=True, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("ci", parent=settings.get_profile("v2v"), derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "v2v")
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep catalogue indexes and quarantine files of the tests out of the user's cache."""
+def _own_environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep the files of the tests out of the user's cache, and the user's settings and terminal out of the tests."""
     with pytest.MonkeyPatch.context() as patch:
+        for name in ("V2V_KEYS", "PYTHONSAFEPATH", "NO_COLOR", "FORCE_COLOR"):
+            patch.delenv(name, raising=False)
+        patch.setenv("COLUMNS", "80")
         patch.setenv("V2V_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture
+def unused_port() -> Iterator[int]:
+    """Return a port of 127.0.0.1 where nothing listens: a socket keeps it, so no other process can take it."""
+    with socket.socket() as keeper:
+        keeper.bind(("127.0.0.1", 0))
+        yield keeper.getsockname()[1]
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -56,3 +69,11 @@ def _one_process_compiles(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     with (folder / "compiling.lock").open("ab") as lock, pytest.MonkeyPatch.context() as patch:
         patch.setattr(dispatcher, "compile", compile_in_turn)
         yield
+
+
+@pytest.fixture(scope="session")
+def compiled(_one_process_compiles: None) -> None:
+    """Compile the kernels before a server starts: on a busy host that takes longer than its consumers wait."""
+    from v2v_server.worker.warm_up import warm_up_in_turn
+
+    warm_up_in_turn()
