@@ -4,9 +4,18 @@
 #     bash examples/gpu_first.sh
 #     PYTHON=python3 WHEELS=wheels OUT=results bash examples/gpu_first.sh        # without a network
 #
-# It runs in a checkout. With 16 cores it should end within 10 minutes: each network trains for two minutes, and the rest
+# With 16 cores it should end within 10 minutes: each network trains for two minutes, and the rest
 # takes about five. Longer trainings need a longer call: SECONDS_EACH=240 takes four minutes more. A stage that fails does
-# not stop the next ones, and summary.json is written again after each stage.
+# not stop the next ones, and summary.json is written again after each stage. In it, of each training:
+#
+#   batches_per_second    without the first reading, while libraries choose kernels and the CUDA graph is recorded
+#   loop_waited_share     time in which the training loop waited for data. The loop queues steps ahead of a GPU, so this
+#                         is more than the GPU waited.
+#   gpu_busy_share        share of the time in which the GPU computed, as nvidia-smi says; in the rest it waited
+#   gpu_peak_memory_mib   memory of the GPU in use, other programs' included
+#   held_out_losses       of samples that are not trained on, each 500 steps and at the end
+#
+# What can be set; paths are relative to the checkout:
 #
 #   OUT           folder of the JSON files (default out/gpu_first)
 #   WORK          folder of checkpoints, videos and installed packages (default: a new temporary one)
@@ -27,7 +36,7 @@
 #   SETTINGS      more settings of both trainings, KEY=VALUE with spaces between
 set -uo pipefail
 cd "$(dirname "$0")/.." || exit 2
-OUT=${OUT:-out/gpu_first} WORK=${WORK:-$(mktemp -d)} WHEELS=${WHEELS:-} WEIGHTS=${WEIGHTS:-weights}
+OUT=${OUT:-out/gpu_first} WHEELS=${WHEELS:-} WEIGHTS=${WEIGHTS:-weights}
 VIDEOS=${VIDEOS:-} RECORDINGS=${RECORDINGS:-} DEVICE=${DEVICE:-cuda}
 SECONDS_EACH=${SECONDS_EACH:-120} STEPS_EACH=${STEPS_EACH:-0} FEED_SECONDS=${FEED_SECONDS:-15}
 BATCH=${BATCH:-12} GRIDS=${GRIDS:-40} CROP=${CROP:-128} FRAMES=${FRAMES:-450} SIDE=${SIDE:-64}
@@ -41,9 +50,10 @@ if [ -e "$OUT/summary.json" ]; then
     echo "gpu_first.sh: $OUT holds the summary.json of an earlier run; give another folder, OUT=DIR" >&2
     exit 2
 fi
+WORK=${WORK:-$(mktemp -d)}
 mkdir -p "$OUT" "$WORK" || exit 2
 rm -rf "$WORK/runs" "$WORK/stages"
-export PYTHONPATH="$PWD:$WORK/site" V2V_CACHE_DIR="$WORK/cache" PYTHONUNBUFFERED=1
+export PYTHONPATH="$PWD:$WORK/site${PYTHONPATH:+:$PYTHONPATH}" V2V_CACHE_DIR="$WORK/cache" PYTHONUNBUFFERED=1
 unset V2V_KEYS # of other servers; the ones here need none
 
 # shellcheck disable=SC2329 # the trap below calls it
@@ -82,20 +92,18 @@ def run(name):
     held_out = [record["held_out_total"] for record in records if "held_out_total" in record]
     if not readings:
         return None
-    # Not the first reading: libraries choose kernels and the CUDA graph is recorded meanwhile.
     steps = [after["step"] - before["step"] for before, after in pairwise(readings)]
     seconds = sum(n / each["steps_per_second"] for n, each in zip(steps, readings[1:]))
     waited = sum(n * each["data_wait_seconds"] for n, each in zip(steps, readings[1:]))
     found = {"first_reading_step": readings[0]["step"], "last_reading_step": readings[-1]["step"]}
     found |= {"loss_first": readings[0]["total"], "loss_last": readings[-1]["total"], "held_out_losses": held_out}
     if seconds:
-        # The loop queues steps ahead of a GPU: a wait for data is a wait of the GPU only once its queue is empty.
         found |= {"batches_per_second": sum(steps) / seconds, "loop_waited_share": waited / seconds}
     return found | gpu(work / f"{name}.csv")
 
 
 def gpu(samples):
-    """Return what nvidia-smi said each second, from the first second with work to the last."""
+    """Return what nvidia-smi said, from the first second with work to the last."""
     rows = [line.split(", ") for line in samples.read_text().splitlines()] if samples.exists() else []
     rows = [tuple(map(int, row)) for row in rows if all(value.isdigit() for value in row)]
     busy = [at for at, row in enumerate(rows) if row[0]]
@@ -130,7 +138,10 @@ stage() {
     shift
     echo "== $name (after $began s)"
     "$@" || status=$?
-    [ "$status" = 0 ] || { failed="$failed $name" && echo "== $name failed with status $status" >&2; }
+    if [ "$status" != 0 ]; then
+        echo "== $name failed with status $status" >&2
+        failed="$failed $name"
+    fi
     echo "$name $status $((SECONDS - began))" >>"$WORK/stages"
     summarise
     return "$status"
@@ -185,18 +196,23 @@ prepare() {
         done
     fi
     for pid in "${pids[@]}"; do wait "$pid" || return; done
+    [ -z "$VIDEOS" ] || return 0
     # More names for the same clips make an epoch long: between two epochs, no batch is ahead.
-    for copy in $([ -n "$VIDEOS" ] || seq 40); do
+    for copy in {1..40}; do
         for source in "$WORK"/videos/*/clip*_gop250.mp4; do ln -f "$source" "${source%.mp4}_$copy.mp4" || return; done
     done
 }
 
-# Train for some seconds: the run's name, configuration, seconds, steps and more flags. Beside it, read the GPU's use.
+# Print the share of time in which the GPU computes, in percent, and its used memory, each second.
+watch_gpu() {
+    while nvidia-smi --query-gpu=utilization.gpu,memory.used --format=csv,noheader,nounits --id=0; do sleep 1; done
+}
+
+# Train: the run's name, configuration, seconds, steps and more flags. Beside it, read the GPU's use.
 train() {
     local name=$1 configuration=$2 seconds=$3 steps=$4 watcher status=0
     shift 4
-    nvidia-smi --query-gpu=utilization.gpu,memory.used --format=csv,noheader,nounits --loop=1 --id=0 \
-        >"$WORK/$name.csv" 2>/dev/null &
+    watch_gpu >"$WORK/$name.csv" 2>/dev/null &
     watcher=$!
     v2v train "$configuration" --videos "$VIDEOS" --workers "$WORKERS" --out "$WORK/runs/$name" \
         --set stream.rows=full --set 'stream.spec.scene="off"' --set "stream.batch_size=$BATCH" \
@@ -206,7 +222,7 @@ train() {
         "${compute[@]}" "${settings[@]}" "$@" || status=$?
     kill "$watcher" 2>/dev/null
     wait "$watcher" 2>/dev/null
-    cp "$WORK/runs/$name/metrics.jsonl" "$OUT/$name.jsonl" || return
+    cp "$WORK/runs/$name/metrics.jsonl" "$OUT/$name.jsonl" || status=1
     return "$status"
 }
 
@@ -218,7 +234,7 @@ score() {
 status=0
 machine 2>"$WORK/missing" || status=$?
 if [ "$status" = 1 ]; then
-    echo "packages are installed into $WORK/site: $(tail -n 1 "$WORK/missing")"
+    echo "installing packages into $WORK/site: $(tail -n 1 "$WORK/missing")"
     status=0
     { install && machine; } || status=$?
 fi
@@ -264,5 +280,5 @@ stage e2vid train e2vid e2vid "$SECONDS_EACH" "$STEPS_EACH" "${e2vid[@]}"
 stage firenet_scores score firenet firenet_resumed
 stage e2vid_scores score e2vid e2vid
 
-echo "== $SECONDS s; figures: $OUT/summary.json; checkpoints: $WORK/runs"
-[ -z "$failed" ] || { echo "failed:$failed" >&2 && exit 1; }
+echo "== $SECONDS s; figures: $OUT/summary.json; checkpoints: $WORK/runs; failed:${failed:- none}"
+[ -z "$failed" ] || exit 1
