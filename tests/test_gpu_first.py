@@ -18,6 +18,7 @@ SCRIPT = Path(__file__).parents[1] / "examples" / "gpu_first.sh"
 SMALL = {
     "DEVICE": "cpu", "SECONDS_EACH": "600", "STEPS_EACH": "6", "FEED_SECONDS": "0.1", "WORKERS": "1", "BATCH": "2",
     "GRIDS": "4", "CROP": "32", "FRAMES": "45", "SIDE": "32", "PYTHON": sys.executable, "WEIGHTS": "none",
+    "OMP_NUM_THREADS": "1",
     "SETTINGS": "run.log_every=1 network.options.base_channels=4 compute.threads=1",
 }  # fmt: skip
 NVIDIA_SMI = "#!/bin/sh\nprintf '50, 2000\\n[N/A], 10\\n100, 3000\\n'\n"
