@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.client.fake_server import SPEC, expected
 from v2v_client.connection import Connection
-from v2v_client.conversation import TRANSITIONS, Conversation, Event, ListeningClock, State
+from v2v_client.conversation import Conversation, Event, ListeningClock, State
 from v2v_client.options import Patience
 from v2v_client.position import StreamIdentity
 from v2v_protocol.arena import Slot
@@ -89,12 +89,6 @@ def at(done: list[tuple[float, Any]], what: Any) -> list[float]:
 
 
 # --- states -----------------------------------------------------------------------------------------------------------
-
-
-def test_every_state_can_be_reached_and_left() -> None:
-    assert set(TRANSITIONS) == set(State)
-    assert {state for row in TRANSITIONS.values() for state in row.values()} == set(State)
-    assert all(TRANSITIONS.values())
 
 
 @given(st.lists(st.sampled_from(Event), max_size=20))

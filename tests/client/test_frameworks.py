@@ -128,40 +128,6 @@ def test_epochs_of_lightning_that_end_early_are_other_samples_or_are_not_silent(
     assert taken == [(epoch, *range(4 * n, 4 * n + 4)) for epoch in range(1 + sets_epoch) for n in range(8)]
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore", "error::v2v_client.RepeatedSamplesWarning")
-@pytest.mark.parametrize("workers", [0, 2])
-def test_validations_of_lightning_give_the_same_samples_each_time(server: FakeServer, workers: int) -> None:
-    lightning = importlib.import_module("lightning")
-    taken: list[tuple[int | None, ...]] = []
-    validation = dataset(server)
-
-    class Module(lightning.LightningModule):  # type: ignore[misc, name-defined]
-        def __init__(self) -> None:
-            super().__init__()
-            self.network = torch.nn.Linear(1, 1)
-
-        def training_step(self, batch: torch.Tensor, _number: int) -> torch.Tensor:
-            return self.network(batch).mean()
-
-        def validation_step(self, batch: Batch, _number: int) -> None:
-            taken.append((batch.epoch, *batch.indices))
-
-        def on_validation_end(self) -> None:
-            validation.set_epoch(0)
-
-        def configure_optimizers(self) -> torch.optim.Optimizer:
-            return torch.optim.SGD(self.parameters(), 1e-3)
-
-    trainer = lightning.Trainer(
-        max_epochs=3, limit_val_batches=3, num_sanity_val_steps=2, accelerator="cpu", logger=False,
-        enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
-    )  # fmt: skip
-    trainer.fit(Module(), DataLoader([torch.ones(1)]), DataLoader(validation, batch_size=None, num_workers=workers))
-    batches = [(0, *range(4 * n, 4 * n + 4)) for n in range(3)]
-    assert taken == batches[:2] + 3 * batches
-
-
 def test_a_forked_child_cannot_continue_an_iterator(server: FakeServer) -> None:
     batches = iter(dataset(server))
     next(batches)

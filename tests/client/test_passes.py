@@ -185,14 +185,6 @@ def test_tables_of_ended_ranks_do_not_fill_the_file() -> None:
     assert shared.read().start.state.epoch == 5
 
 
-def test_a_copy_is_a_table_of_its_own() -> None:
-    shared = Shared(TABLE)
-    copied = pickle.loads(pickle.dumps(shared))
-    with copied.change() as table:
-        table.set_epoch(4)
-    assert (shared.read().start.state.epoch, copied.read().start.state.epoch) == (3, 4)
-
-
 def test_changes_of_many_threads_and_processes_are_all_kept() -> None:
     shared = Shared(TABLE)
     threads = [threading.Thread(target=_count_up, args=(shared,)) for _ in range(3)]
