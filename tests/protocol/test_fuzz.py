@@ -23,13 +23,6 @@ def test_twenty_thousand_frames() -> None:
     assert min(record["messages"], record["samples"], record["refused"]) > 200
 
 
-def test_the_frames_follow_from_the_seed() -> None:
-    one, same, other = (FrameFuzzer(random.Random(seed)) for seed in (5, 5, 6))
-    frames = [one.header() for _ in range(100)]
-    assert frames == [same.header() for _ in range(100)]
-    assert frames != [other.header() for _ in range(100)]
-
-
 def test_every_type_of_message_is_reached_whole_and_damaged() -> None:
     fuzzer = FrameFuzzer(random.Random(3))
     assert {type(decode(fuzzer.true())) for _ in range(500)} == set(MESSAGE_TYPES)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe, preset
-from v2v_protocol.sample import Provenance, Refusal, Sample, SampleId, SampleParams, array_layout, layout_bytes
+from v2v_protocol.sample import Provenance, Refusal, SampleId, SampleParams, array_layout, layout_bytes
 
 PARAMS = SampleParams(
     threshold_pos=0.25,
@@ -60,10 +60,6 @@ def test_limits_of_an_identity(name: str, limit: int) -> None:
 
 def with_pauses(pauses: tuple[tuple[int, int], ...]) -> SampleParams:
     return SampleParams(1.0, 1.0, 0.0, 0, 0.0, pauses, 1.0, 0, 0, False, 0.0, (0, 0, 0, 0))
-
-
-def test_a_camera_that_never_pauses_shows_every_frame() -> None:
-    assert with_pauses(()).source_index(5).tolist() == [0, 1, 2, 3, 4, 5]
 
 
 def test_a_pause_repeats_the_frame_before_it() -> None:
@@ -154,8 +150,3 @@ def test_the_largest_layout_does_not_overflow() -> None:
 def test_unknown_arrays_are_refused(arrays: tuple[str, ...]) -> None:
     with pytest.raises(UsageError, match="arrays"):
         array_layout(Recipe(), "int8", arrays)
-
-
-def test_a_sample_prints_shapes_not_data() -> None:
-    sample = Sample({"voxels": np.zeros((2, 5, 4, 3), np.int8)}, PROVENANCE)
-    assert repr(sample) == "Sample(voxels: int8[2, 5, 4, 3], tree/clip.mp4@200)"
