@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import multiprocessing
-import os
 from collections.abc import Iterator
 from contextlib import nullcontext
 from typing import Any
@@ -15,9 +13,8 @@ from torch.utils.data import DataLoader
 from torchdata.stateful_dataloader import StatefulDataLoader
 
 from tests.client.fake_server import FakeServer
+from tests.waiting import result_in_process
 from v2v_client import Batch, RepeatedSamplesWarning, UsageError, V2VStreamDataset
-
-FORK = multiprocessing.get_context("fork")
 
 
 @pytest.fixture
@@ -131,23 +128,14 @@ def test_epochs_of_lightning_that_end_early_are_other_samples_or_are_not_silent(
 def test_a_forked_child_cannot_continue_an_iterator(server: FakeServer) -> None:
     batches = iter(dataset(server))
     next(batches)
-    here, there = FORK.Pipe()
-    child = FORK.Process(target=_read_on, args=(batches, there))
-    child.start()
-    there.close()
-    assert here.poll(60.0)
-    said = here.recv()
-    child.join()
-    child.close()
-    here.close()
+    said = result_in_process(_read_on, batches)
     assert "process" in said
     assert "call iter() in the process that takes the batches" in said
     assert next(batches).indices == (4, 5, 6, 7)
 
 
-def _read_on(batches: Iterator[Batch], there: Any) -> None:
+def _read_on(batches: Iterator[Batch]) -> str:
     try:
-        there.send(str(next(batches)))
+        return str(next(batches))
     except UsageError as error:
-        there.send(str(error))
-    os._exit(0)
+        return str(error)

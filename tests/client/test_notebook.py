@@ -110,5 +110,3 @@ def test_grids_within_a_step_are_shown_and_found_at_their_frames(tmp_path: Path)
     assert divided.show(0).width > 500
     assert divided.spec.recipe.frame_grids == (-1, 2, 5, 8, 11)
     assert batch.frame_grids.tolist() == [-1, 2, 5, 8, 11]
-
-

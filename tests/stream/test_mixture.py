@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 from torch.utils.data import DataLoader
 
 from tests.clips import panned_luma, write_clip
@@ -42,4 +41,4 @@ def test_two_servers_two_ranks_two_loader_workers_and_a_resume(server: LocalServ
             assert [digest(batch) for batch in again] == got[5:]
             assert again.epoch == 1
             assert whole[0].frame_grids.tolist() == [0, 1, 2, 3]
-            assert pytest.approx(whole[0].voxels.float().abs().mean().item()) != 0
+            assert whole[0].voxels.any()

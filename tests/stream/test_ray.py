@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import re
@@ -71,25 +72,17 @@ def workers() -> list[psutil.Process]:
     return sorted(found, key=lambda process: process.create_time())
 
 
-def test_a_cluster_gives_the_bytes_of_local_workers_whatever_dies(
-    clips: Path, cluster: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cluster_gives_the_bytes_of_local_workers_whatever_dies(clips: Path, cluster: Any) -> None:
     with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as local:
         reference = [digest(batch) for epoch in range(_EPOCHS) for batch in epoch_of(local.address, epoch=epoch)]
-    started = time.monotonic()
     with LocalServer(clips, workers=2, flags=flags_for(cluster)) as server:
         until(lambda: len(workers()) == 2)
-        first = time.monotonic() - started
         nodes = [raylet_of(process) for process in workers()]
         assert len(set(nodes)) == 2, "they are not spread"
         got: list[str] = []
-        took: dict[str, float] = {}
 
-        def back(what: str, gone: list[psutil.Process]) -> None:
-            """Waits until two others than those are at work."""
-            begun = time.monotonic()
-            until(lambda: len(set(workers()) - set(gone)) == 2)
-            took[what] = time.monotonic() - begun
+        def two_others(gone: set[psutil.Process]) -> bool:
+            return len(set(workers()) - gone) == 2
 
         for epoch in range(_EPOCHS):
             for number, batch in enumerate(
@@ -99,27 +92,23 @@ def test_a_cluster_gives_the_bytes_of_local_workers_whatever_dies(
                 if number != 1:
                     continue
                 victim = workers()[0]
+                gone, node = {victim}, raylet_of(victim)
                 if epoch == 0:
                     victim.kill()
-                    back("a worker killed", [victim])
                 elif epoch == 1:
                     os.kill(victim.ppid(), signal.SIGKILL)  # its actor: the kernel ends the worker along with it
-                    back("an actor killed", [victim])
                 else:
-                    node = raylet_of(victim)
-                    lost = [process for process in workers() if raylet_of(process) == node]
+                    gone = {process for process in workers() if raylet_of(process) == node}
                     cluster.remove_node(
                         next(each for each in cluster.worker_nodes if pid_of_raylet(each) == node), allow_graceful=False
                     )
-                    back("a node killed", lost)
-                    assert {raylet_of(process) for process in workers()} != {node}
+                until(functools.partial(two_others, gone))
+                assert epoch < 2 or {raylet_of(process) for process in workers()} != {node}
         said = log_of(server)
     assert got == reference
     assert "workers have a place on 2 nodes" in said
     assert "was lost with its actor on" in said
     until(lambda: not workers())
-    with capsys.disabled():
-        print(f"\nray: two workers up after {first:.1f} s; " + ", ".join(f"{k}: {v:.1f} s" for k, v in took.items()))
 
 
 def log_of(server: LocalServer) -> str:
@@ -176,11 +165,8 @@ def session_of(cluster: Any) -> Path:
 
 def holding(folder: Path, secret: bytes) -> list[str]:
     """Files below a folder with that text."""
-    found = []
-    for path in folder.rglob("*"):
-        if path.is_file() and not path.is_symlink() and secret in path.read_bytes():
-            found.append(path.name)
-    return found
+    files = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+    return [path.name for path in files if secret in path.read_bytes()]
 
 
 def test_workers_on_a_cluster_get_a_key_that_is_written_down_nowhere(

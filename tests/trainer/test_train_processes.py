@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
 import sys
-from itertools import islice
 from pathlib import Path
 
-import av
-import cv2
-import numpy as np
 import psutil
 import pytest
 import torch
@@ -198,40 +193,3 @@ def test_ctrl_c_reaches_its_server_as_well(clips: Path, tmp_path: Path) -> None:
         process.communicate()
     assert process.returncode == 128 + signal.SIGINT
     assert load_checkpoint(tmp_path / "run" / LAST).step == len(losses(tmp_path / "run")) >= 2
-
-
-REAL = Path(os.environ.get("V2V_DEMO_VIDEOS", ROOT / ".demo" / "videos"))
-SIDE_PX = 48
-
-
-def small_copy(source: Path, target: Path, frames: int) -> None:
-    """The middle of a film's first frames, shrunk to one crop, so that every sample shows the same."""
-    luma = []
-    with av.open(str(source)) as container:
-        for frame in islice(container.decode(video=0), frames):
-            grey = frame.to_ndarray(format="gray")
-            side, left = grey.shape[0], (grey.shape[1] - grey.shape[0]) // 2
-            luma.append(cv2.resize(grey[:, left : left + side], (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA))
-    write_clip(target, np.stack(luma))
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not (REAL / "bikes.mp4").is_file(), reason=f"no bikes.mp4 in {REAL}: `make demo` fetches it")
-def test_the_tiny_configuration_overfits_two_real_clips(tmp_path: Path) -> None:
-    """The same two samples again and again: their error falls to less than half of what it was at the start."""
-    for name in ("bikes.mp4", "carphone_pristine.mp4"):
-        (tmp_path / "videos").mkdir(exist_ok=True)
-        small_copy(REAL / name, tmp_path / "videos" / name, 51)
-    camera = {
-        "preset": "noise-free", "voxels_per_clip": 10, "crop_height_px": SIDE_PX, "crop_width_px": SIDE_PX,
-        "threshold": 0.15, "threshold_ratio": 1.0, "flip_probability": 0.0,
-    }  # fmt: skip
-    settings = {
-        "run.seconds": 0, "run.steps": 80, "run.log_every": 5, "run.preview_every": 0, "stream.recipe": camera,
-    }  # fmt: skip
-    changes = [text for key, value in settings.items() for text in ("--set", f"{key}={json.dumps(value)}")]
-    given = ["tiny-cpu", "--videos", str(tmp_path / "videos"), "--out", str(tmp_path / "run"), *changes]
-    assert main(given) == 0
-    readings = losses(tmp_path / "run")
-    assert (readings[-1]["step"], readings[-1]["epoch"]) == (80, 79)
-    assert readings[-1]["total"] < 0.5 * readings[0]["total"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +37,6 @@ SHIPPED = [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow])
 SIDES_PX = {"alex": 33}
 OTHER_SIDE_PX = 17
 """The least that each network of LPIPS takes, and divides by nothing."""
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[FakeServer]:
-    with FakeServer(sequences=23) as running:
-        yield running
 
 
 @pytest.fixture(scope="module")
