@@ -15,7 +15,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, get_worker_info
 
-from tests.clips import panned_luma, write_clip
+from tests.clips import write_panned
 from tests.leftovers import abandoned_memory, shared_memory
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
@@ -38,10 +38,7 @@ if __name__ == "__main__":
 
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("local-clips")
-    for number in range(4):
-        write_clip(folder / f"{number}.mp4", panned_luma(40, 48, 64, step=(1, 1 + number)))
-    return folder
+    return write_panned(tmp_path_factory.mktemp("local-clips"), 4, 40)
 
 
 @pytest.fixture

@@ -6,15 +6,14 @@ from pathlib import Path
 
 from torch.utils.data import DataLoader
 
-from tests.clips import panned_luma, write_clip
+from tests.clips import write_panned
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 
 
 def test_two_servers_two_ranks_two_loader_workers_and_a_resume(server: LocalServer, tmp_path: Path) -> None:
-    for number in range(4):
-        write_clip(tmp_path / f"{number}.mp4", panned_luma(64, 48, 64, step=(1, 1 + number)), gop=16)
+    write_panned(tmp_path, 4, 64, gop=16)
 
     def members(rank: int) -> list[V2VStreamDataset]:
         recipes = (SMALL, SMALL.replace(threshold=(0.1, 0.3), noise_sigma=(0.0, 0.0)))

@@ -16,17 +16,15 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tests.trainer.evaluation.h5_file import random_recording
 from tests.trainer.evaluation.test_flow import constant
 from tests.trainer.evaluation.test_flow import recording as flow_recording
-from tests.trainer.training import configured
+from tests.trainer.training import ALONE, configured
 from trainer.config import RunConfig
 from trainer.config_file import load_config
 from trainer.learner import build
 from trainer.models import NETWORKS
 from trainer.models.firenet import FireNet
 from trainer.precision import bfloat16_products
-from trainer.run.distributed import Ranks
 from trainer.run.validation import Validation
 
-ALONE = Ranks(0, 1, torch.device("cpu"))
 CPU = torch.device("cpu")
 USES = 600  # adding 1 to 256 gives 256 in bfloat16
 

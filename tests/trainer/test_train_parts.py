@@ -15,19 +15,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.client.fake_server import SPEC, FakeServer
+from tests.trainer.training import ALONE
 from trainer.config import OptimizerConfig, RunConfig, StreamConfig, TrainConfig
 from trainer.feed import flags_of, streams
 from trainer.learner import AveragedNetwork, learning_rate
 from trainer.models import FireNet
-from trainer.run.distributed import Ranks, ranks
+from trainer.run.distributed import ranks
 from trainer.run.interruption import StopRequest
 from trainer.run.reporting import _planned_steps
 from trainer.tasks import Asked
 from trainer.train import serving
 from v2v_protocol.errors import ServerLost, StateMismatch, UsageError, V2VError, WorkerCrashLoop
 from v2v_protocol.recipe import Recipe
-
-ALONE = Ranks(0, 1, torch.device("cpu"))
 
 
 def test_a_local_server_gets_the_options_it_needs_at_its_start() -> None:

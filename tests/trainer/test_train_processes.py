@@ -14,19 +14,17 @@ import torch
 import yaml
 
 from tests.client.fake_server import FakeServer
-from tests.clips import panned_luma, write_clip
+from tests.clips import write_panned
 from tests.trainer.evaluation.h5_file import random_recording
-from tests.trainer.training import OF_THE_CLOCK, arguments, losses, trained
+from tests.trainer.training import ALONE, OF_THE_CLOCK, arguments, losses, trained
 from trainer.config_file import load_config
 from trainer.feed import held_out_batch
 from trainer.learner import build
 from trainer.run.checkpoint import BEST, LAST, load_checkpoint
-from trainer.run.distributed import Ranks
 from trainer.run.reporting import METRICS_FILE, read_metrics
 from trainer.train import main
 
 ROOT = Path(__file__).parents[2]
-ALONE = Ranks(0, 1, torch.device("cpu"))
 TRAIN = (sys.executable, "-m", "trainer.train")
 TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
 
@@ -134,10 +132,7 @@ def test_two_ranks_with_validation_go_on_after_a_kill_as_if_there_had_been_none(
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four small films: 16 sequences of 16 frames."""
-    folder = tmp_path_factory.mktemp("clips")
-    for number in range(4):
-        write_clip(folder / f"{number}.mp4", panned_luma(61, 48, 64, step=(1, 1 + number)), gop=15)
-    return folder
+    return write_panned(tmp_path_factory.mktemp("clips"), 4, 61, gop=15)
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from bench.__main__ import main
 from bench.chaos import chaos
 from bench.chaos.faults import Fault
 from bench.chaos.fleet import Fleet
-from tests.clips import panned_luma, write_clip
+from tests.clips import write_panned
 from tests.leftovers import abandoned_memory, shared_memory
 
 
@@ -56,10 +56,7 @@ def test_shared_memory_is_left_over_once_nobody_maps_it() -> None:
 
 @pytest.mark.slow
 def test_a_short_run_keeps_the_promise(tmp_path: Path) -> None:
-    clips = tmp_path / "clips"
-    clips.mkdir()
-    for number in range(6):
-        write_clip(clips / f"{number}.mp4", panned_luma(201, 128, 160, step=(1, 1 + number)), gop=12)
+    clips = write_panned(tmp_path / "clips", 6, 201, 128, 160)
     out = tmp_path / "chaos.json"
     flags = ["--minutes", "0.5", "--every", "1.5", "--remakes", "60", "--seed", "3"]
     status = main(["chaos", "--videos", str(clips), *flags, "--keep", str(tmp_path / "run"), "--json", str(out)])

@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 import torch
 
+from tests.trainer.training import ALONE
 from trainer.config import TrainConfig
-from trainer.run.distributed import Ranks
 from trainer.run.reporting import METRICS_FILE, Meter, Reporter, read_metrics
 from v2v_protocol.errors import UsageError
-
-ALONE = Ranks(0, 1, torch.device("cpu"))
 
 
 def test_the_meter_returns_means_and_resets(monkeypatch: pytest.MonkeyPatch) -> None:
