@@ -61,6 +61,13 @@ def test_a_missing_package_is_named(
     assert "pip install '.[convert]'" in line
 
 
+def test_no_text_installs_from_an_index_that_lacks_this_package() -> None:
+    folders = ("v2v_protocol", "v2v_server", "v2v_tools", "v2v_client", "trainer", "bench", "docs")
+    texts = [path for folder in folders for path in (HOME / folder).rglob("*") if path.suffix in (".py", ".md")]
+    assert len(texts) > 100
+    assert not [path for path in (HOME / "README.md", *texts) if "install 'v2v-stream" in path.read_text("utf-8")]
+
+
 def test_no_decoder_is_installed_that_does_not_tell_damage() -> None:
     (bound,) = [text for text in PROJECT["optional-dependencies"]["server"] if text.startswith("av")]
     # PyAV 18 carries FFmpeg 8.1.2, with the fixes of 2026; what a later one delivers has not been looked at.
