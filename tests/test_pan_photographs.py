@@ -19,10 +19,12 @@ def test_motion_begins_at_rest_position_and_never_jumps():
     jumps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     assert jumps.mean() > 0.1
     assert jumps.max() < 15
+    still = pan_photographs.motion(np.random.default_rng(0), 0.0, 30)
+    np.testing.assert_allclose(still, np.broadcast_to(np.eye(3), still.shape), atol=1e-12)
 
 
-def clip(photographs, objects, seed, count):
-    return pan_photographs.clip(photographs, objects, np.random.default_rng(seed), count, 0.0, 0.0)
+def clip(photographs, objects, seed, count, plain=0.0, walls=0.0):
+    return pan_photographs.clip(photographs, objects, np.random.default_rng(seed), count, plain, walls)
 
 
 def test_the_same_seed_gives_the_same_frames():
@@ -52,6 +54,27 @@ def test_an_object_cut_out_moves_over_a_photograph():
     shares = [np.mean(frames > frames.min()) for frames in clips]
     assert min(shares) == 0  # black alone, or under ellipses of black
     assert 0.001 < max(shares) < 0.6
+
+
+def test_a_plain_clip_has_plain_patches_before_a_smooth_gradient():
+    stripes = np.repeat(np.resize(np.uint8([[20], [220]]), (600, 1)), 800, axis=1)
+    pictures = [np.dstack([picture] * 3) for picture in (stripes, np.zeros_like(stripes))]
+    steps = [np.abs(np.diff(clip(pictures, [], 6, 1, plain).astype(int), axis=1)) for plain in (0, 1)]
+    shares = [np.mean(step > 8) for step in steps]
+    assert shares[0] > 0.2
+    assert 0 < shares[1] < shares[0]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_wall_is_bright_with_the_texture_of_its_photograph(seed):
+    rng = np.random.default_rng(seed)
+    stripes = np.resize(np.uint8([[[20]], [[120]]]), (600, 800, 3))
+    wall = pan_photographs.wall(stripes, rng)
+    assert 160 < wall.mean() <= 250
+    assert wall.std() <= 0.8 * stripes.std()
+    assert np.corrcoef(wall.ravel(), stripes.ravel())[0, 1] > 0.9
+    dark = clip([stripes // 8], [], seed, 1, walls=1.0)
+    assert np.quantile(dark, 0.95) > 150 > dark.min()
 
 
 def test_a_partly_transparent_picture_is_not_a_background(tmp_path, monkeypatch):
