@@ -129,9 +129,6 @@ def test_a_stateful_loader_left_early_repeats_the_epoch(
         assert digests(loader) == plain[0]
 
 
-# --- other sizes, other streams ---------------------------------------------------------------------------------------
-
-
 def singles(batch: Batch) -> Iterator[tuple[int, str]]:
     """Index and digest of each sample, as of a batch of its own."""
     for row, index in enumerate(batch.indices):
