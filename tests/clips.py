@@ -114,6 +114,14 @@ def write_clip(
     return path
 
 
+def write_panned(folder: Path, count: int, frames: int, height: int = 48, width: int = 64, *, gop: int = 12) -> Path:
+    """Write the clips 0.mp4, 1.mp4 ... to a folder, each panned faster than the one before; return the folder."""
+    folder.mkdir(exist_ok=True)
+    for number in range(count):
+        write_clip(folder / f"{number}.mp4", panned_luma(frames, height, width, step=(1, 1 + number)), gop=gop)
+    return folder
+
+
 def _frame(luma: npt.NDArray[np.integer], pixel_format: str, full_range: bool | None) -> VideoFrame:
     height, width = luma.shape
     if "yuv" not in pixel_format and "gray" not in pixel_format:

@@ -107,9 +107,7 @@ def test_command_lines_are_found_in_texts() -> None:
 def test_every_program_is_checked() -> None:
     named = {value.strip('"') for value in re.findall(r"^(v2v-\w+) = ", (ROOT / "pyproject.toml").read_text(), re.M)}
     assert named == set(MODULES)
-    assert "--videos" in flags_of("v2v-serve")
-    assert "--no-shuffle" in flags_of("v2v-serve")
-    assert "--resume" in flags_of("v2v-train")
+    assert {"--videos", "--no-shuffle"} <= flags_of("v2v-serve")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -229,7 +227,3 @@ def test_programs_and_flags_named_in_prose_exist(page: Path) -> None:
     named = set(BARE.findall(text)) - set(OF_OTHERS)
     parsers = [*map(parser_of, MODULES.values()), *map(parser_for, BENCHES)]
     assert named <= {flag for parser in parsers for flag in parser._option_string_actions}
-
-
-def test_pages_with_command_lines_are_many() -> None:
-    assert sum(bool(command_lines(page.read_text(encoding="utf-8"))) for page in PAGES) > 10

@@ -17,6 +17,7 @@ from v2v_server.config import ServeConfig
 
 DEPLOY = Path(__file__).parents[1] / "deploy"
 UNIT = DEPLOY / "systemd" / "v2v-serve.service"
+SERVICES = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
 
 
 @pytest.fixture(scope="module")
@@ -63,28 +64,25 @@ def test_the_unit_waits_for_its_bind_address(unit: RawConfigParser) -> None:
 
 
 def test_a_container_stops_before_the_server_has_signal_handlers() -> None:
-    services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
-    assert [service["init"] for service in services.values()] == [True, True, True]
+    assert [service["init"] for service in SERVICES.values()] == [True, True, True]
     for file in ("Dockerfile", "trainer.Dockerfile"):
         assert "#   docker run --rm --init " in (DEPLOY / file).read_text()
 
 
 def test_a_mistyped_folder_of_videos_is_not_created() -> None:
-    service = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]["v2v-server"]
-    (videos,) = [volume for volume in service["volumes"] if "VIDEOS" in str(volume)]
+    (videos,) = [volume for volume in SERVICES["v2v-server"]["volumes"] if "VIDEOS" in str(volume)]
     assert (videos["type"], videos["target"], videos["read_only"]) == ("bind", "/videos", True)
     assert videos["bind"] == {"create_host_path": False}
 
 
 def test_a_container_has_minimal_rights() -> None:
     """It does not run as root either: both images set a user."""
-    services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
-    for service in services.values():
+    for service in SERVICES.values():
         assert service["cap_drop"] == ["ALL"]
         assert service["security_opt"] == ["no-new-privileges:true"]
         assert "privileged" not in service
-    assert services["v2v-server"]["read_only"] is True
-    assert services["v2v-server"]["tmpfs"] == ["/tmp"]
+    assert SERVICES["v2v-server"]["read_only"] is True
+    assert SERVICES["v2v-server"]["tmpfs"] == ["/tmp"]
     for file in ("Dockerfile", "trainer.Dockerfile"):
         *_, last = [line for line in (DEPLOY / file).read_text().splitlines() if line.startswith("USER ")]
         assert last == "USER v2v"

@@ -45,16 +45,6 @@ def test_the_dashboard_works_with_any_prometheus() -> None:
     assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
 
 
-def test_panels_do_not_overlap() -> None:
-    taken: set[tuple[int, int]] = set()
-    for panel in DASHBOARD["panels"]:
-        at = panel["gridPos"]
-        cells = {(at["x"] + x, at["y"] + y) for x in range(at["w"]) for y in range(at["h"])}
-        assert not cells & taken, panel["title"]
-        assert at["x"] + at["w"] <= 24
-        taken |= cells
-
-
 def test_prometheus_uses_a_host_name_that_the_page_accepts(monkeypatch: Any) -> None:
     asked: list[ServeConfig] = []
     monkeypatch.setattr("v2v_server.serve.serve", lambda config, *_: asked.append(config))

@@ -113,11 +113,6 @@ from . import o
     assert imported_modules(source) == {"a.b", "c", "e.f", "i", "j", "l.m", "n", "."}
 
 
-@pytest.mark.parametrize("package", ["v2v_protocol", *FORBIDDEN])
-def test_the_packages_have_modules_to_check(package: str) -> None:
-    assert modules(package)
-
-
 @pytest.mark.parametrize("path", modules("v2v_protocol"), ids=lambda path: path.name)
 def test_the_protocol_needs_only_light_packages(path: Path) -> None:
     may = PROTOCOL_MAY | {"safe_yaml.py": {"yaml"}, "progress.py": {"rich"}, "command.py": {"shtab"}}.get(

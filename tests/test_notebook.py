@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from tests.clips import panned_luma, write_clip
+from tests.clips import write_panned
 
 NOTEBOOK = Path(__file__).parents[1] / "examples" / "first_steps.ipynb"
 CELLS = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
@@ -41,8 +41,7 @@ def test_linked_pages_exist() -> None:
 def test_from_a_video_to_a_trained_network(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for number in range(2):
-        write_clip(tmp_path / f"{number}.mp4", panned_luma(60, 144, 176, step=(1, 1 + number)))
+    write_panned(tmp_path, 2, 60, 144, 176)
     monkeypatch.setenv("V2V_VIDEOS", str(tmp_path))
     monkeypatch.setenv("V2V_SECONDS", "5")
     monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path / "cache"))

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from tests.clips import panned_luma, write_clip
+from tests.clips import panned_luma, write_panned
 from tests.test_commands import MODULES, ROOT
 
 VIDEOS = ("my.mp4", "VIDEO", "bigbuckbunny.mp4")
@@ -84,10 +84,7 @@ def test_there_are_commands_of_each_kind() -> None:
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two clips, long and large enough for the paper's recipe, in WebVid's upper rows too."""
-    folder = tmp_path_factory.mktemp("clips")
-    for number in range(2):
-        write_clip(folder / f"{number}.mp4", panned_luma(203, 256, 256, step=(1, 1 + number)))
-    return folder
+    return write_panned(tmp_path_factory.mktemp("clips"), 2, 203, 256, 256)
 
 
 @pytest.mark.slow

@@ -192,13 +192,6 @@ def test_every_array_that_can_be_requested_is_made() -> None:
     assert arrays.ARRAY_BUILDERS.keys() == sample.ARRAYS.keys()
 
 
-def test_the_toys_only_add_the_stated_lines() -> None:
-    """Their own file besides, nothing but added lines: two for each, one for a representation."""
-    for lines in (EFFECT_LINES, ARRAY_LINES, REPRESENTATION_LINES):
-        assert len(lines) == 2 - (lines is REPRESENTATION_LINES)
-        assert all(line.count("\n") == 1 for *_, line in lines)
-
-
 def test_every_seam_of_the_page_has_a_toy() -> None:
     """Each section names the test that adds its toy."""
     _, *sections = re.split(r"^##+ ", (ROOT / "docs/extending.md").read_text(encoding="utf-8"), flags=re.MULTILINE)

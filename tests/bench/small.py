@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tests.clips import panned_luma, write_clip
+from tests.clips import write_panned
 from v2v_protocol.recipe import Recipe
 
 RECIPE = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=40)
@@ -16,10 +16,7 @@ FLAGS = ["--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "c
 
 def clips(folder: Path) -> Path:
     """Write three clips, twelve sequences, to a new folder; return it."""
-    folder.mkdir()
-    for number in range(3):
-        write_clip(folder / f"{number}.mp4", panned_luma(90, step=(1, 1 + number)), gop=15)
-    return folder
+    return write_panned(folder, 3, 90, gop=15)
 
 
 def records(file: Path) -> list[dict[str, Any]]:

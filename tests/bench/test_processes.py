@@ -23,26 +23,14 @@ def test_an_exact_line_is_found(slope: float) -> None:
     assert found.standard_error == pytest.approx(0.0, abs=1e-9)
 
 
-def test_white_noise_gives_the_textbook_standard_error() -> None:
-    rng = np.random.default_rng(1)
-    at = np.arange(600.0)
-    slopes, stated = [], []
-    for _ in range(200):
-        found = fit(list(zip(at, 5.0 + rng.normal(size=600), strict=True)))
-        slopes.append(found.slope)
-        stated.append(found.standard_error)
-    textbook = 60.0 / np.sqrt(((at - at.mean()) ** 2).sum())
-    assert np.std(slopes) == pytest.approx(textbook, rel=0.2)
-    assert np.mean(stated) == pytest.approx(textbook, rel=0.1)
-
-
-def test_points_that_say_nearly_the_same_widen_the_error() -> None:
+@pytest.mark.parametrize("persistence", [0.0, 0.8], ids=["white noise", "points that say nearly the same"])
+def test_the_stated_error_is_that_of_many_series(persistence: float) -> None:
     rng = np.random.default_rng(2)
     slopes, stated = [], []
     for _ in range(200):
-        noise = np.zeros(600)
+        noise = rng.normal(size=600)
         for place in range(1, 600):
-            noise[place] = 0.8 * noise[place - 1] + rng.normal()
+            noise[place] += persistence * noise[place - 1]
         found = fit([(float(at), 5.0 + error) for at, error in enumerate(noise)])
         slopes.append(found.slope)
         stated.append(found.standard_error)

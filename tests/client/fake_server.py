@@ -71,7 +71,6 @@ class FakeServer:
         drop: samples (epoch, index) that are lost once, after they count as answered.
         twice: samples that are sent twice.
         unavailable: indices that cannot be made.
-        refuse_repeat: refuses, once and for credit, a request that repeats an index.
         overstated: Welcome grants this much more than is accepted.
         alter: changes the frames of a sample before they are sent.
         snapshot: quarantine snapshot that samples are made under.
@@ -97,7 +96,6 @@ class FakeServer:
         self.drop: set[tuple[int, int]] = set()
         self.twice: set[tuple[int, int]] = set()
         self.unavailable: set[int] = set()
-        self.refuse_repeat = False
         self.overstated = 0
         self.alter: Callable[[list[Any]], list[Any]] = lambda frames: frames
         self.snapshot = 0
@@ -243,7 +241,6 @@ class FakeServer:
 
     def _want(self, identity: bytes, session: _Session, want: Want) -> None:
         asked = [(want.epoch, index) for index in want.indices]
-        repeats = any(key in self.wants for key in asked)
         self.wants += asked
         self.slots += want.slots or (NO_SLOT,) * len(asked)
         for key, arena, number in zip(asked, want.arenas, want.slots, strict=False):
@@ -255,8 +252,7 @@ class FakeServer:
             self._send(identity, encode(Denied(ErrorCode.RANGE, f"an epoch has {self.sequences} sequences")))
             return
         unanswered = session.unanswered | dict.fromkeys(asked)
-        if len(unanswered) > self.credit or (repeats and self.refuse_repeat):
-            self.refuse_repeat = False
+        if len(unanswered) > self.credit:
             self.refused_for_credit += 1
             self._send(identity, encode(Denied(ErrorCode.CREDIT, f"{len(unanswered)} of {self.credit}")))
             return

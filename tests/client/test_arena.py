@@ -3,11 +3,10 @@ reports that it could not write it."""
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import mmap
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -67,14 +66,6 @@ def test_workers_write_the_rows_of_the_batch(arena: Arena) -> None:
     }
     assert all(holds(arrays, row, row) for row in range(ROWS))
     assert all(array.flags.c_contiguous and array.flags.writeable for array in arrays.values())
-
-
-def test_writes_to_a_batch_are_private(arena: Arena) -> None:
-    assert write(arena.slot(2), 2)
-    for array in arena.arrays(ignore).values():
-        array[...] = 111
-    again = arena.arrays(ignore)
-    assert holds(again, 2, 2)
 
 
 def test_an_unwritten_mapping_is_reused(arena: Arena) -> None:
@@ -138,17 +129,6 @@ def test_the_callback_runs_once_a_batch_is_unreferenced(arena: Arena) -> None:
     assert seen == ["unused"]
 
 
-def test_another_process_of_this_user_can_write(arena: Arena) -> None:
-    code = (
-        "import sys; from tests.client.test_arena import Slot, write; "
-        "sys.exit(not write(Slot(sys.argv[1], int(sys.argv[2])), 4))"
-    )
-    slot = arena.slot(3)
-    command = [sys.executable, "-c", code, slot.arena, str(slot.number)]
-    assert subprocess.run(command, check=False).returncode == 0
-    assert holds(arena.arrays(ignore), 3, 4)
-
-
 def test_a_file_that_is_not_the_named_arena_is_not_written(arena: Arena, tmp_path: Path) -> None:
     name = ArenaName.parse(arena.slot(0).arena)
     other = os.memfd_create("v2v-other")
@@ -169,8 +149,6 @@ def test_a_file_that_is_not_the_named_arena_is_not_written(arena: Arena, tmp_pat
 @pytest.mark.parametrize("flaw", ["not sealed", "too small", "of more slots"])
 def test_unsealed_memory_is_not_written(flaw: str) -> None:
     """Writing to a page that is missing, or removed meanwhile, kills the process by a signal."""
-    import fcntl
-
     good = ArenaName.parse(Arena(LAYOUT, ROWS).slot(0).arena)
     *_, size = array_offsets([np.dtype(dtype).itemsize * int(np.prod(shape)) for dtype, shape in LAYOUT.values()], ROWS)
     descriptor = os.memfd_create(good.memory_name, os.MFD_ALLOW_SEALING)

@@ -28,6 +28,7 @@ from v2v_protocol.link import dealer
 from v2v_protocol.messages import Frames, Hello
 from v2v_protocol.sample import DEFAULT_ARRAYS
 
+HELLO = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
 NEVER_BY_THE_CLOCK = Patience(timeout_seconds=60.0, ping_seconds=1000.0, rewant_seconds=1000.0)
 
 
@@ -39,8 +40,7 @@ def server() -> Iterator[FakeServer]:
 
 def test_requests_denied_for_credit_are_repeated_when_a_sample_comes_twice(server: FakeServer) -> None:
     """Sample 0 is requested again while it is on its way, so it is made twice, and the server still counts it."""
-    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
-    with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK)) as connection:
+    with closing(Connection(server.address, HELLO, 0, patience=NEVER_BY_THE_CLOCK)) as connection:
         connection.open()
         server.held = True
         connection.want(range(4))
@@ -62,8 +62,7 @@ def test_requests_denied_for_credit_are_repeated_when_a_sample_comes_twice(serve
 
 def test_a_reopened_session_keeps_the_newest_quarantine_snapshot_received(server: FakeServer) -> None:
     """This includes samples whose provenance was not decoded yet."""
-    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
-    with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK)) as connection:
+    with closing(Connection(server.address, HELLO, 0, patience=NEVER_BY_THE_CLOCK)) as connection:
         connection.open()
         for index, snapshot in enumerate((7, 3)):
             server.call(lambda snapshot=snapshot: setattr(server, "snapshot", snapshot))
@@ -81,8 +80,7 @@ def test_time_in_which_the_trainer_was_stopped_is_not_silence(
 ) -> None:
     """A trainer may be stopped for hours together with its server; that time is not the server's silence."""
     stopped = [0.0]
-    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
-    with closing(Connection(server.address, hello, 0, clock=lambda: time.monotonic() + sum(stopped))) as connection:
+    with closing(Connection(server.address, HELLO, 0, clock=lambda: time.monotonic() + sum(stopped))) as connection:
         connection.open()
         listen = dealer.Dealer.receive
 
@@ -100,12 +98,11 @@ def test_time_in_which_the_trainer_was_stopped_is_not_silence(
 def test_time_spent_opening_counts_as_listening(server: FakeServer, monkeypatch: pytest.MonkeyPatch) -> None:
     """If a server needs most of the deadline to start, and is then killed, it counts as lost after one deadline."""
     waited: list[float] = []
-    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
 
     def clock() -> float:
         return time.monotonic() + sum(waited)
 
-    with closing(Connection(server.address, hello, 0, patience=NEVER_BY_THE_CLOCK, clock=clock)) as connection:
+    with closing(Connection(server.address, HELLO, 0, patience=NEVER_BY_THE_CLOCK, clock=clock)) as connection:
         listen = dealer.Dealer.receive
 
         def receive(self: dealer.Dealer, seconds: float) -> Frames | None:
@@ -133,32 +130,13 @@ def test_a_host_name_is_tried_as_ipv4_then_ipv6_in_turn(host: str, kinds: list[i
 
 
 def test_a_reconnection_keeps_the_ip_version_that_worked(server: FakeServer) -> None:
-    with closing(Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)) as connection:
+    with closing(Connection(server.address, HELLO, 0)) as connection:
         connection.open()
         made_anew = connection._open_link()
         assert isinstance(made_anew, dealer.Dealer)
         made_anew.connect(1 << 20, again=True)
         assert made_anew._socket is not None
         assert made_anew._socket.getsockopt(zmq.IPV6) == 0
-
-
-@pytest.mark.parametrize("which", [1, 2])
-def test_a_signal_while_closing_raises_instead_of_hanging(
-    server: FakeServer, monkeypatch: pytest.MonkeyPatch, which: int
-) -> None:
-    """ZeroMQ's context waits indefinitely for a socket that was not closed."""
-    connection = Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)
-    connection.open()
-    closing_socket, calls = zmq.Socket.close, iter(range(1, 100))
-
-    def interrupted(self: zmq.Socket[bytes], linger: int | None = None) -> None:
-        if next(calls) == which:
-            raise KeyboardInterrupt
-        closing_socket(self, linger)
-
-    monkeypatch.setattr(zmq.Socket, "close", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        connection.close()
 
 
 @pytest.mark.filterwarnings("ignore:Unclosed (socket|context):ResourceWarning")  # the collector closes some of them
@@ -183,7 +161,7 @@ def test_a_signal_at_any_line_of_opening_and_closing_raises_instead_of_hanging(s
                 raise KeyboardInterrupt
             return trace
 
-        connection = Connection(server.address, Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5), 0)
+        connection = Connection(server.address, HELLO, 0)
         before = sys.gettrace()
         sys.settrace(trace)
         try:
@@ -328,12 +306,9 @@ def test_the_server_is_lost_once_each_broker_had_its_turn(unused_port: int) -> N
 def test_a_broker_without_workers_is_replaced_by_the_next(servers: tuple[FakeServer, FakeServer]) -> None:
     one, other = servers
     one.held, one.trouble = True, "no worker is connected"
-    hello = Hello(SPEC.to_dict(), DEFAULT_ARRAYS, 4, 5)
-    with closing(Connection([one.address, other.address], hello, 0, patience=PATIENT)) as connection:
+    with closing(Connection([one.address, other.address], HELLO, 0, patience=PATIENT)) as connection:
         connection.open()
         connection.conversation._shortage = WorkerShortage(connection._now(), 0.0)  # no patience with one
         connection.want([0])
-        arrival = connection.receive()
-        assert arrival is not None
-        assert arrival.header.index == 0
+        assert _next(connection) == 0
         assert connection.address == other.address

@@ -143,20 +143,6 @@ def test_arrival_order_and_duplicates_do_not_change_batches(server):
     assert server.refused_for_credit == 0
 
 
-def test_a_credit_smaller_than_a_batch_is_enough(server):
-    server.credit = 1
-    server.shuffled = True
-    assert places(dataset(server)) == epoch_places(0)
-    assert server.most_unanswered == 1
-
-
-def test_ranks_share_an_epoch(server):
-    of_rank = [places(dataset(server, batch_size=3, rank=rank, world_size=2)) for rank in (0, 1)]
-    assert [len(part) for part in of_rank] == [9, 9]
-    assert of_rank[0] == [(0, index) for index in range(0, 18, 2)]
-    assert sorted(of_rank[0] + of_rank[1]) == epoch_places(0, 0, 18)
-
-
 def test_ranks_are_those_of_torch_distributed(server, tmp_path):
     torch.distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/store", rank=0, world_size=1)
     try:
@@ -164,35 +150,6 @@ def test_ranks_are_those_of_torch_distributed(server, tmp_path):
         assert (stream.rank, stream.world_size) == (0, 1)
     finally:
         torch.distributed.destroy_process_group()
-
-
-@pytest.mark.slow
-def test_two_processes_of_torch_distributed_get_disjoint_samples(server, tmp_path):
-    context = torch.multiprocessing.get_context("spawn")
-    results = context.SimpleQueue()
-    ranks = [
-        context.Process(target=_rank_process, args=(rank, f"file://{tmp_path}/store", server.address, results))
-        for rank in (0, 1)
-    ]
-    for process in ranks:
-        process.start()
-    found = dict(results.get() for _ in ranks)
-    for process in ranks:
-        process.join()
-        process.close()
-    results.close()
-    assert len(found[0]) == len(found[1]) == 8
-    assert sorted(found[0] + found[1]) == epoch_places(0, 0, 16)
-    assert found[1][0] == (0, 1)
-
-
-def _rank_process(rank, store, address, results):
-    torch.distributed.init_process_group("gloo", init_method=store, rank=rank, world_size=2)
-    stream = V2VStreamDataset(address, batch_size=4, seed=SEED)
-    loader = DataLoader(stream, batch_size=None, num_workers=1, multiprocessing_context="spawn")
-    results.put((rank, places(loader)))
-    torch.distributed.barrier()
-    torch.distributed.destroy_process_group()
 
 
 def test_options_reach_the_server(server):
@@ -324,14 +281,6 @@ def test_the_state_at_the_end_of_an_epoch_begins_the_next(server):
     assert places(again) == epoch_places(1)
 
 
-def test_a_remainder_smaller_than_a_batch_starts_the_next_epoch(server):
-    batches = iter(dataset(server))
-    state = [next(batches).resume_state for _ in range(4)][-1]
-    again = dataset(server, batch_size=8)
-    again.load_state_dict(state)
-    assert places(again) == epoch_places(1, 0, 16)
-
-
 @pytest.mark.parametrize("workers", [0, 1])
 def test_set_epoch_to_a_loaded_epoch_with_no_batch_left_repeats_no_samples(server, workers):
     """Training loops over epochs call load_state_dict(state), then set_epoch(state["epoch"])."""
@@ -365,18 +314,6 @@ def test_an_epoch_whose_remainder_was_dropped_is_whole_when_set_again(server):
     again.set_epoch(5)
     again.set_epoch(0)
     assert places(again) == epoch_places(0, 0, 16)
-
-
-def test_set_epoch_to_the_loaded_epoch_keeps_the_position(server):
-    batches = iter(dataset(server))
-    state = next(batches).resume_state
-    again = dataset(server)
-    again.load_state_dict(state)
-    again.set_epoch(0)
-    assert places(again) == epoch_places(0, 4)
-    again.load_state_dict(state)
-    again.set_epoch(3)
-    assert places(again) == epoch_places(3)
 
 
 def test_resume_with_another_world_size(server):
@@ -450,28 +387,6 @@ def test_after_a_server_restart_no_sample_is_lost_or_repeated(server):
     assert server.hellos[-1].spec == SPEC.to_dict()
 
 
-def test_a_forgotten_session_is_reopened(server):
-    batches = iter(dataset(server, batch_size=2))
-    taken = [next(batches)]
-    server.forget()
-    assert places([*taken, *batches]) == epoch_places(0, 0, 22)
-
-
-def test_a_restart_with_other_videos_is_refused(server):
-    batches = iter(dataset(server, batch_size=2))
-    next(batches)
-    server.restart(catalogue="catalogue-2")
-    with pytest.raises(StateMismatch, match=r"catalogue-1.*catalogue-2"):
-        list(batches)
-
-
-def test_lost_samples_are_requested_again(server):
-    server.drop = {(0, 2), (0, 3), (0, 17)}
-    batches = list(dataset(server))
-    assert places(batches) == epoch_places(0)
-    assert server.drop == set()
-
-
 @pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="this system has no memfd_create")
 def test_repeated_requests_name_no_shared_memory(server):
     """The first worker may still be writing there."""
@@ -484,43 +399,11 @@ def test_repeated_requests_name_no_shared_memory(server):
     assert set(again) == {NO_SLOT}
 
 
-def test_a_denial_for_credit_after_repeated_requests_is_recovered(server):
-    """A sample that was on its way when it was requested again is made twice, and uses up credit at the server."""
-    server.drop = {(0, 2)}
-    server.refuse_repeat = True
-    assert places(dataset(server)) == epoch_places(0)
-    assert server.refused_for_credit == 1
-
-
 def test_any_other_denial_for_credit_is_an_error(server):
     server.overstated = 3
     server.held = True
     with pytest.raises(RemoteError, match=r"\[credit\]"):
         next(iter(dataset(server)))
-
-
-def test_repeating_requests_for_slow_samples_is_harmless(server):
-    server.held = True
-    asked_again = threading.Event()
-
-    def release():
-        if server.wants.count((0, 0)) > 1:
-            asked_again.set()
-        return asked_again.is_set()
-
-    def watch():
-        while not server.call(release):
-            pass
-        server.call(lambda: setattr(server, "held", False))
-        server.call(lambda: setattr(server, "shuffled", True))
-
-    watcher = threading.Thread(target=watch)
-    server.shuffled = True
-    watcher.start()
-    try:
-        assert places(dataset(server)) == epoch_places(0)
-    finally:
-        watcher.join()
 
 
 def test_a_dead_server_raises_with_address_and_last_sample(server):
@@ -653,17 +536,6 @@ def test_the_parents_state_is_refused_after_loader_workers_and_names_the_remedy(
     assert stream.state_dict() == kept
 
 
-@pytest.mark.slow  # PyTorch waits five seconds for a worker that failed
-def test_an_error_in_a_loader_worker_is_raised_in_the_parent(server):
-    server.catalogue = "catalogue-2"
-    state = next(iter(dataset(server))).resume_state
-    server.catalogue = "catalogue-1"
-    stream = dataset(server)
-    stream.load_state_dict(state)
-    with pytest.raises(StateMismatch, match=r"catalogue-2.*catalogue-1"):
-        list(loader(stream, 1))
-
-
 @pytest.mark.parametrize("kind", [RemoteError, SampleUnavailable])
 def test_a_refusal_in_a_loader_worker_keeps_its_code(kind):
     """PyTorch passes on its type, and its traceback as text."""
@@ -696,22 +568,6 @@ def test_a_dataset_leaves_no_file_when_its_process_ends_in_any_way(server, tmp_p
 
 
 # --- buffers ----------------------------------------------------------------------------------------------------------
-
-
-def test_no_batch_changes_while_a_view_of_it_lives(server):
-    kept = []
-    for batch in dataset(server, batch_size=2):
-        kept.append((batch.epoch, batch.indices[1], batch.voxels[1, :, 0]))
-        del batch
-    for epoch, index, view in kept:
-        np.testing.assert_array_equal(view.numpy(), expected("voxels", SEED, epoch, index)[:, 0])
-
-
-def test_unreferenced_buffers_are_reused():
-    with FakeServer(sequences=200, credit=4) as server:
-        addresses = [batch.voxels.data_ptr() for batch in dataset(server, batch_size=2)]
-    assert len(addresses) == 100
-    assert len(set(addresses)) <= 4 // 2 + 3
 
 
 def test_buffers_are_reused_in_the_next_epoch(server):
@@ -814,14 +670,10 @@ def test_resuming_and_setting_epochs_do_not_warn(server):
     for epoch in (0, 0, 1):
         stream.set_epoch(epoch)
         steps(stream, 2)
-    *_, last = itertools.islice(stream_of(stream), 2)
+    stream.set_epoch(2)
+    *_, last = itertools.islice(stream, 2)
     stream.load_state_dict(last.resume_state)
     assert steps(stream, 1)[0] not in last.indices
-
-
-def stream_of(stream):
-    stream.set_epoch(2)
-    return iter(stream)
 
 
 @pytest.mark.parametrize("make", [V2VStreamDataset, V2VStreamDataset.local])

@@ -87,15 +87,6 @@ TestArrivals = Arrivals.TestCase
 TestArrivals.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
 
 
-def test_second_copies_and_what_was_not_requested_are_dropped():
-    window = ReorderWindow([0], lambda _: (5, 6), 2, 4)
-    assert window.ask() == (5, 6)
-    assert window.receive(5) is not None
-    assert window.receive(5) is None
-    assert window.receive(9) is None
-    assert [*window.outstanding] == [6]
-
-
 def test_a_credit_of_zero_is_refused():
     with pytest.raises(LimitExceeded, match="credit = 0 samples"):
         ReorderWindow([0], lambda _: (0,), 1, 0)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import multiprocessing
-import os
 from collections.abc import Iterator
 from contextlib import nullcontext
 from typing import Any
@@ -15,9 +13,8 @@ from torch.utils.data import DataLoader
 from torchdata.stateful_dataloader import StatefulDataLoader
 
 from tests.client.fake_server import FakeServer
+from tests.waiting import result_in_process
 from v2v_client import Batch, RepeatedSamplesWarning, UsageError, V2VStreamDataset
-
-FORK = multiprocessing.get_context("fork")
 
 
 @pytest.fixture
@@ -128,60 +125,17 @@ def test_epochs_of_lightning_that_end_early_are_other_samples_or_are_not_silent(
     assert taken == [(epoch, *range(4 * n, 4 * n + 4)) for epoch in range(1 + sets_epoch) for n in range(8)]
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore", "error::v2v_client.RepeatedSamplesWarning")
-@pytest.mark.parametrize("workers", [0, 2])
-def test_validations_of_lightning_give_the_same_samples_each_time(server: FakeServer, workers: int) -> None:
-    lightning = importlib.import_module("lightning")
-    taken: list[tuple[int | None, ...]] = []
-    validation = dataset(server)
-
-    class Module(lightning.LightningModule):  # type: ignore[misc, name-defined]
-        def __init__(self) -> None:
-            super().__init__()
-            self.network = torch.nn.Linear(1, 1)
-
-        def training_step(self, batch: torch.Tensor, _number: int) -> torch.Tensor:
-            return self.network(batch).mean()
-
-        def validation_step(self, batch: Batch, _number: int) -> None:
-            taken.append((batch.epoch, *batch.indices))
-
-        def on_validation_end(self) -> None:
-            validation.set_epoch(0)
-
-        def configure_optimizers(self) -> torch.optim.Optimizer:
-            return torch.optim.SGD(self.parameters(), 1e-3)
-
-    trainer = lightning.Trainer(
-        max_epochs=3, limit_val_batches=3, num_sanity_val_steps=2, accelerator="cpu", logger=False,
-        enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
-    )  # fmt: skip
-    trainer.fit(Module(), DataLoader([torch.ones(1)]), DataLoader(validation, batch_size=None, num_workers=workers))
-    batches = [(0, *range(4 * n, 4 * n + 4)) for n in range(3)]
-    assert taken == batches[:2] + 3 * batches
-
-
 def test_a_forked_child_cannot_continue_an_iterator(server: FakeServer) -> None:
     batches = iter(dataset(server))
     next(batches)
-    here, there = FORK.Pipe()
-    child = FORK.Process(target=_read_on, args=(batches, there))
-    child.start()
-    there.close()
-    assert here.poll(60.0)
-    said = here.recv()
-    child.join()
-    child.close()
-    here.close()
+    said = result_in_process(_read_on, batches)
     assert "process" in said
     assert "call iter() in the process that takes the batches" in said
     assert next(batches).indices == (4, 5, 6, 7)
 
 
-def _read_on(batches: Iterator[Batch], there: Any) -> None:
+def _read_on(batches: Iterator[Batch]) -> str:
     try:
-        there.send(str(next(batches)))
+        return str(next(batches))
     except UsageError as error:
-        there.send(str(error))
-    os._exit(0)
+        return str(error)

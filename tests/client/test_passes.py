@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import torch.utils.data._utils.worker as torch_worker
 
+from tests.waiting import result_in_process
 from v2v_client.passes import Iteration, Position, Shared, Start, Table
 from v2v_client.position import Consumer, ResumeState, StreamIdentity
 from v2v_protocol.errors import UsageError
@@ -106,7 +107,6 @@ def test_a_pass_that_is_no_longer_remembered_changes_nothing() -> None:
 
 
 FORK = multiprocessing.get_context("fork")
-SPAWN = multiprocessing.get_context("spawn")
 TABLE = Table(Start(ResumeState(None, 7, 3, 0, 0, 1)))
 
 
@@ -117,12 +117,12 @@ def test_ranks_that_get_a_dataset_from_one_process_each_have_their_own_epochs() 
     with shared.change() as table:
         table.begin("before", 0, 1)
     for _ in range(2):
-        assert _forked(_rank, shared) == (3, 4)
+        assert result_in_process(_rank, shared) == (3, 4)
     assert shared.read().start.state.epoch == 3
 
 
 def _rank(shared: Shared) -> tuple[int, int]:
-    first: int = _forked(_loader_worker, shared)
+    first: int = result_in_process(_loader_worker, shared)
     return first, shared.read().start.state.epoch
 
 
@@ -135,39 +135,11 @@ def _loader_worker(shared: Shared) -> int:
     return epoch
 
 
-def _forked(function: Callable[[Shared], Any], shared: Shared) -> Any:
-    here, there = FORK.Pipe()
-
-    def run() -> None:
-        there.send(function(shared))
-        os._exit(0)
-
-    process = FORK.Process(target=run)
-    process.start()
-    there.close()
-    found = here.recv()
-    process.join()
-    process.close()
-    here.close()
-    return found
-
-
 def test_a_rank_that_is_spawned_has_its_own_epochs() -> None:
     """Its loader workers, which are forked or spawned in turn, have those of the rank."""
     shared = Shared(TABLE)
-    here, there = SPAWN.Pipe()
-    process = SPAWN.Process(target=_spawned_rank, args=(shared, there))
-    process.start()
-    there.close()
-    assert here.recv() == (3, 4)
-    process.join()
-    process.close()
-    here.close()
+    assert result_in_process(_rank, shared, method="spawn") == (3, 4)
     assert shared.read().start.state.epoch == 3
-
-
-def _spawned_rank(shared: Shared, there: Any) -> None:
-    there.send(_rank(shared))
 
 
 def test_tables_of_ended_ranks_do_not_fill_the_file() -> None:
@@ -185,21 +157,13 @@ def test_tables_of_ended_ranks_do_not_fill_the_file() -> None:
     assert shared.read().start.state.epoch == 5
 
 
-def test_a_copy_is_a_table_of_its_own() -> None:
-    shared = Shared(TABLE)
-    copied = pickle.loads(pickle.dumps(shared))
-    with copied.change() as table:
-        table.set_epoch(4)
-    assert (shared.read().start.state.epoch, copied.read().start.state.epoch) == (3, 4)
-
-
 def test_changes_of_many_threads_and_processes_are_all_kept() -> None:
     shared = Shared(TABLE)
     threads = [threading.Thread(target=_count_up, args=(shared,)) for _ in range(3)]
     for thread in threads:
         thread.start()
     for _ in range(3):
-        _forked(_count_up_as_a_loader_worker, shared)
+        result_in_process(_count_up_as_a_loader_worker, shared)
     for thread in threads:
         thread.join()
     assert shared.read().start.state.epoch == 3 + 6 * 50

@@ -43,18 +43,6 @@ def test_ranks_and_loader_workers_take_the_prefix_once(sequences, world, batch, 
         assert sorted(number for share in shares for number in share) == list(range(plan.batches))
 
 
-@given(SEQUENCES, RANKS, BATCH, BATCH, st.integers(0, 40))
-def test_another_batch_size_goes_on_where_the_first_stopped(sequences, world, batch, other, taken):
-    plans = ranks(sequences, world, batch)
-    taken = min(taken, plans[0].batches)
-    position = taken * batch
-    before = [index for plan in plans for number in range(taken) for index in plan.indices(number)]
-    after = consumed(ranks(sequences, world, other, position=position))
-    both = sorted(before + after)
-    assert both == list(range(len(both)))
-    assert sequences - len(both) < world * other
-
-
 @given(SEQUENCES, RANKS, RANKS, BATCH, BATCH, st.integers(0, 40))
 def test_another_world_size_goes_on_at_a_global_batch_boundary(sequences, world, other_world, batch, other, taken):
     plans = ranks(sequences, world, batch)
@@ -127,12 +115,6 @@ def test_a_hostile_state_is_taken_or_refused_in_words(changed: dict[str, Any], m
     state = {name: value for name, value in (STATE | changed).items() if name not in missing}
     with suppress(UsageError):
         assert ResumeState.from_dict(state).to_dict().keys() == STATE.keys()
-
-
-@given(st.dictionaries(st.sampled_from(list(STATE["loader_worker"])) | st.text(), VALUES) | VALUES)
-def test_a_hostile_share_is_taken_or_refused_in_words(share: object) -> None:
-    with suppress(UsageError):
-        ResumeState.from_dict(STATE | {"loader_worker": share})
 
 
 @given(VALUES)

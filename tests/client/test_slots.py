@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from v2v_client.memory import Slots
 from v2v_protocol.arena import NO_SLOT, Slot
 from v2v_protocol.messages import Want
@@ -30,17 +32,12 @@ def test_a_repeated_request_names_no_slot() -> None:
     assert slots.want(0, [1, 7]) == Want(0, (1, 7))
 
 
-def test_a_sample_is_accepted_from_its_slot_once() -> None:
+@pytest.mark.parametrize("in_message", [False, True])
+def test_a_sample_of_its_slot_frees_the_slot_and_is_read_from_it_once(in_message: bool) -> None:
     slots = offered(5)
     slots.want(0, [5])
-    assert slots.record_arrival(5, 6, in_message=False) is True
+    assert slots.record_arrival(5, 6, in_message=in_message) is True
     assert slots.record_arrival(5, 6, in_message=False) is None
-
-
-def test_a_sample_in_a_message_with_its_slot_frees_the_slot() -> None:
-    slots = offered(5)
-    slots.want(0, [5])
-    assert slots.record_arrival(5, 6, in_message=True) is True
 
 
 def test_a_sample_from_another_worker_abandons_the_slot() -> None:

@@ -108,19 +108,6 @@ def test_each_loader_worker_resumes_at_its_own_position(server):
     assert [row[:2] for row in rest[1].batches] == [whole(0)[3]]
 
 
-def test_the_initial_state_of_a_loader_worker_starts_the_epoch(server):
-    stream = dataset(server)
-    begun = run(stream, 100, most=(0, 0))
-    assert in_order(run(stream, 200)) == whole(0)
-    assert begun[0].batches == []
-
-
-def test_states_after_the_end_start_a_whole_next_epoch(server):
-    first = run(dataset(server), 100)
-    assert in_order(first) == whole(0)
-    assert in_order(run(dataset(server), 200, [outcome.ended for outcome in first])) == whole(1)
-
-
 def test_a_restored_finished_loader_starts_a_whole_next_epoch(server):
     first = run(dataset(server), 100)
     states = [outcome.batches[-1][2] for outcome in first]
@@ -138,14 +125,6 @@ def test_a_restored_epoch_with_no_batches_left_yields_no_batches(server):
     assert in_order(run(restored, 300)) == whole(1)
 
 
-def test_a_late_loader_worker_starts_the_epoch_of_the_others(server):
-    """All workers of an iteration deliver the same epoch, even if one finishes it before another starts."""
-    stream = dataset(server, batch_size=20)  # one batch: worker 1 has none, and is done at once
-    for epoch in (0, 1):
-        outcomes = run(stream, 100 + epoch)
-        assert in_order(outcomes) == [(epoch, tuple(range(20)))]
-
-
 def test_the_state_of_a_loader_worker_is_refused_elsewhere(server):
     state = run(dataset(server), 100, most=(1, 1))[1].batches[-1][2]
     with pytest.raises(UsageError, match=r"loader worker 1 of 2 .* Batch\.resume_state"):
@@ -156,12 +135,6 @@ def test_the_state_of_a_loader_worker_is_refused_elsewhere(server):
     assert "batch_size 4" in other_batch[1].error
 
 
-def test_loader_workers_resume_from_the_state_of_a_rank(server):
-    batches = iter(dataset(server))
-    state = [next(batches).resume_state for _ in range(2)][-1]
-    assert in_order(run(dataset(server), 100, [state, state])) == whole(0, first=2)
-
-
 def test_a_state_loaded_twice_starts_the_iteration_at_its_position(server):
     """A trainer does this after two non-finite losses. The seeds are in the loader's state, so they are equal."""
     stream = dataset(server)
@@ -169,11 +142,3 @@ def test_a_state_loaded_twice_starts_the_iteration_at_its_position(server):
     for _ in range(2):
         assert in_order(run(stream, 100, states)) == [whole(0)[4], whole(0)[3]]
         assert in_order(run(stream, 200)) == whole(1)
-
-
-def test_short_passes_that_are_left_early_warn_at_the_third(server):
-    """Each worker makes no more batches than it prefetches, so two passes could be a look at the data."""
-    stream = dataset(server)
-    errors = [[outcome.error for outcome in run(stream, 100 * turn, most=(1, 1))] for turn in range(3)]
-    assert errors[:2] == [["", ""], ["", ""]]
-    assert sorted("set_epoch" in error for error in errors[2]) == [False, True]  # the worker that is first says so

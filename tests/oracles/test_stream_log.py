@@ -67,54 +67,6 @@ def test_an_honest_log_has_no_fault_whatever_died(lives: list[tuple[int, int]]) 
     assert verdict.lives == len(lives)
 
 
-def _without(lines: list[Line], number: int) -> list[Line]:
-    """As if one batch had been passed over: the numbers, which the consumer counts itself, have no gap."""
-    found: list[Line] = []
-    shift = 0
-    for line in lines:
-        if isinstance(line, BatchLine) and line.number == number and not shift:
-            shift = 1
-            continue
-        found.append(dataclasses.replace(line, number=line.number - shift) if isinstance(line, BatchLine) else line)
-    return found
-
-
-@given(honest_lives(), st.data())
-def test_a_lost_batch_is_found(lives: list[tuple[int, int]], data: st.DataObject) -> None:
-    committed, end = lives[-1]
-    lives = [*lives[:-1], (committed, end + 2)]
-    lost = data.draw(st.integers(committed, end))
-    verdict = check_order(_last_life(lives, lambda lines: _without(lines, lost)), sequences=11, batch_size=3)
-    assert verdict.lost == BATCH_SIZE
-    assert not verdict.faultless
-
-
-@given(honest_lives(), st.data())
-def test_a_batch_that_comes_twice_in_a_life_is_found(lives: list[tuple[int, int]], data: st.DataObject) -> None:
-    committed, end = lives[-1]
-    lives = [*lives[:-1], (committed, end + 2)]
-    twice = data.draw(st.integers(committed, end + 1))
-
-    def plant(lines: list[Line]) -> list[Line]:
-        place = next(at for at, line in enumerate(lines) if isinstance(line, BatchLine) and line.number == twice)
-        rest = [dataclasses.replace(line, number=line.number + 1) for line in lines[place:] if _is_batch(line)]
-        return [*lines[: place + 1], *rest]
-
-    verdict = check_order(_last_life(lives, plant), sequences=SEQUENCES, batch_size=BATCH_SIZE)
-    assert verdict.duplicated == BATCH_SIZE
-    assert not verdict.faultless
-
-
-def _is_batch(line: Line) -> bool:
-    return isinstance(line, BatchLine)
-
-
-def _last_life(lives: list[tuple[int, int]], plant: object) -> list[Line]:
-    lines = log(*lives)
-    begin = max(at for at, line in enumerate(lines) if isinstance(line, LifeLine))
-    return [*lines[: begin + 1], *plant(lines[begin + 1 :])]  # type: ignore[operator]
-
-
 @pytest.mark.parametrize("ahead", [-1, 1, 5])
 def test_a_state_that_is_not_where_it_says_is_found(ahead: int) -> None:
     """The state was after 4 batches; the stream goes on a batch too early (twice) or too late (lost)."""
@@ -131,19 +83,6 @@ def test_a_life_that_skips_its_own_numbers_is_found() -> None:
     lines = log((0, 5))
     lines.append(LifeLine(7, 0.0))
     assert check_order(lines, sequences=SEQUENCES, batch_size=BATCH_SIZE).broken_lives == 1
-
-
-def test_two_samples_that_change_places_are_out_of_order() -> None:
-    first = batch(0)
-    swapped = dataclasses.replace(first, samples=first.samples[::-1])
-    verdict = check_order([LifeLine(0, 0.0), swapped], sequences=SEQUENCES, batch_size=BATCH_SIZE)
-    assert (verdict.lost, verdict.duplicated, verdict.out_of_order) == (0, 0, 3)
-    assert not verdict.faultless
-
-
-def test_a_sample_of_the_dropped_remainder_is_foreign() -> None:
-    stray = dataclasses.replace(batch(0), samples=(dataclasses.replace(batch(0).samples[0], index=10),))
-    assert check_order([LifeLine(0, 0.0), stray], sequences=SEQUENCES, batch_size=BATCH_SIZE).foreign == 1
 
 
 def test_other_bytes_of_the_same_sample_contradict() -> None:

@@ -20,7 +20,7 @@ from tests.protocol.test_sample import PARAMS, PROVENANCE
 from v2v_pictures.camera import Camera
 from v2v_pictures.canvas import INK, MARK, PAGE_MARGIN_PX, PAUSED_INK, Canvas, beginning, shortened, text_width
 from v2v_pictures.colours import BRIGHTER, DARKER, draw_events, draw_grey, full_colour
-from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, png_bytes, write_png
+from v2v_pictures.files import gif_bytes, html_page, mp4_bytes, write_png
 from v2v_pictures.film import draw_film
 from v2v_pictures.sheet import (
     draw_overview,
@@ -99,7 +99,6 @@ def test_a_sheet_has_a_panel_for_each_bin_and_one_scale() -> None:
 
 
 def test_pauses_are_hatched_and_named() -> None:
-
     voxels = np.ones((10, 5, 16, 16), np.int8)
     assert has(draw_sheet([camera(voxels, pauses=((1, 20),))], "t"), PAUSED_INK) > has(
         draw_sheet([camera(voxels)], "t"), PAUSED_INK
@@ -267,7 +266,7 @@ def test_nothing_at_all_is_drawn_without_a_warning() -> None:
 
 
 def test_files_read_back(tmp_path: Path) -> None:
-    image = np.random.default_rng(0).integers(0, 255, (31, 40, 3)).astype(np.uint8)
+    image = np.random.default_rng(0).integers(0, 255, (31, 80, 3)).astype(np.uint8)[:, ::2]  # not contiguous
     write_png(tmp_path / "picture.png", image)
     assert np.array_equal(np.asarray(Pictures.open(tmp_path / "picture.png")), image)
     film = [np.full((31, 40, 3), value, np.uint8) for value in (0, 120, 250)]
@@ -308,11 +307,6 @@ def test_a_long_description_keeps_its_beginning() -> None:
     assert short.endswith("...")
     assert text_width(short) <= 300
     assert beginning("mirrored", 300) == "mirrored"
-
-
-def test_png_of_a_view_that_is_not_contiguous() -> None:
-    image = np.zeros((8, 8, 3), np.uint8)
-    assert png_bytes(image[:, ::2]) == png_bytes(image[:, ::2].copy())
 
 
 def test_the_strip_states_the_time_of_the_clip() -> None:

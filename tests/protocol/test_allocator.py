@@ -39,11 +39,6 @@ def test_kept_memory_is_used_again_without_page_faults():
     assert after < before / 4
 
 
-def test_another_c_library_is_told_apart(monkeypatch):
-    monkeypatch.setattr(ctypes, "CDLL", lambda _: object())
-    assert not keep_freed_memory()
-
-
 def test_loader_workers_can_be_given_it_however_they_are_started(monkeypatch):
     monkeypatch.setattr(ctypes, "CDLL", lambda _: object())
     worker_init_fn = pickle.loads(pickle.dumps(keep_freed_memory))

@@ -6,7 +6,6 @@ import pickle
 
 import pytest
 
-from v2v_protocol import errors
 from v2v_protocol.errors import RemoteError, SampleUnavailable, V2VError, VideoChanged, VideoError
 
 
@@ -39,8 +38,3 @@ def test_errors_survive_pickling(error: V2VError) -> None:
 def test_a_refusal_is_read_from_its_message(message: str, text: str, code: str) -> None:
     error = RemoteError(message)
     assert (error.text, error.code, str(error)) == (text, code, f"{text} [{code}]")
-
-
-def test_the_docstring_draws_every_error() -> None:
-    drawn = (errors.__doc__ or "").split()
-    assert [name for name, item in vars(errors).items() if isinstance(item, type) and name not in drawn] == []

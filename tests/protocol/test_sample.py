@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe, preset
-from v2v_protocol.sample import Provenance, Refusal, Sample, SampleId, SampleParams, array_layout, layout_bytes
+from v2v_protocol.sample import Provenance, Refusal, SampleId, SampleParams, array_layout, layout_bytes
 
 PARAMS = SampleParams(
     threshold_pos=0.25,
@@ -58,19 +58,6 @@ def test_limits_of_an_identity(name: str, limit: int) -> None:
 # --- pauses -----------------------------------------------------------------------------------------------------------
 
 
-def with_pauses(pauses: tuple[tuple[int, int], ...]) -> SampleParams:
-    return SampleParams(1.0, 1.0, 0.0, 0, 0.0, pauses, 1.0, 0, 0, False, 0.0, (0, 0, 0, 0))
-
-
-def test_a_camera_that_never_pauses_shows_every_frame() -> None:
-    assert with_pauses(()).source_index(5).tolist() == [0, 1, 2, 3, 4, 5]
-
-
-def test_a_pause_repeats_the_frame_before_it() -> None:
-    assert with_pauses(((2, 3),)).source_index(7).tolist() == [0, 1, 1, 1, 1, 2, 3, 4]
-    assert with_pauses(((1, 7),)).source_index(7).tolist() == [0] * 8
-
-
 @given(st.lists(st.booleans(), max_size=300))
 def test_source_index_against_a_walk_over_the_positions(paused: list[bool]) -> None:
     """``paused[i]``: position i + 1 repeats the frame before."""
@@ -82,7 +69,8 @@ def test_source_index_against_a_walk_over_the_positions(paused: list[bool]) -> N
             runs.append([position, 0])
         if still:
             runs[-1][1] += 1
-    index = with_pauses(tuple((first, length) for first, length in runs)).source_index(len(paused))
+    params = dataclasses.replace(PARAMS, pauses=tuple((first, length) for first, length in runs))
+    index = params.source_index(len(paused))
     assert index.dtype == np.int64
     assert index.tolist() == walk
     assert index[0] == 0
@@ -95,10 +83,6 @@ def test_source_index_against_a_walk_over_the_positions(paused: list[bool]) -> N
 def packed(provenance: Provenance) -> dict[str, Any]:
     values: dict[str, Any] = msgpack.unpackb(msgpack.packb(provenance.to_dict()))
     return values
-
-
-def test_provenance_travels_unchanged() -> None:
-    assert Provenance.from_dict(packed(PROVENANCE)) == PROVENANCE
 
 
 @given(
@@ -154,8 +138,3 @@ def test_the_largest_layout_does_not_overflow() -> None:
 def test_unknown_arrays_are_refused(arrays: tuple[str, ...]) -> None:
     with pytest.raises(UsageError, match="arrays"):
         array_layout(Recipe(), "int8", arrays)
-
-
-def test_a_sample_prints_shapes_not_data() -> None:
-    sample = Sample({"voxels": np.zeros((2, 5, 4, 3), np.int8)}, PROVENANCE)
-    assert repr(sample) == "Sample(voxels: int8[2, 5, 4, 3], tree/clip.mp4@200)"

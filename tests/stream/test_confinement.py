@@ -90,14 +90,13 @@ def test_a_killed_workers_successor_gets_slots_and_a_consumer_that_leaves_no_mem
         gc.collect()
         until(lambda: open_files(server.pid)["/memfd"] == before["/memfd"])
         (successor,) = server_workers(server.pid)
-        memory = "v2v-"
         until(
             lambda: (
                 not [
                     each
                     for process in (psutil.Process(server.pid), successor)
                     for each in Path(f"/proc/{process.pid}/fd").iterdir()
-                    if memory in os.readlink(each) and "logbook" not in os.readlink(each)
+                    if "v2v-" in os.readlink(each) and "logbook" not in os.readlink(each)
                 ]
             )
         )

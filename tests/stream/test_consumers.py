@@ -13,7 +13,7 @@ from typing import Any
 import psutil
 import pytest
 
-from tests.clips import panned_luma, write_clip
+from tests.clips import write_panned
 from tests.stream.conftest import SMALL, SMALL_FLAGS
 from tests.stream.test_loaders import singles
 from v2v_client import Batch, V2VStreamDataset
@@ -95,8 +95,7 @@ def _take_one(address: str, control: Connection) -> None:
 @pytest.mark.slow
 def test_stalled_consumers_hold_bounded_memory_and_do_not_delay_others(tmp_path: Path) -> None:
     """One reads no more, the other is stopped (SIGSTOP), so that even its ZeroMQ takes nothing off the network."""
-    for number in range(4):
-        write_clip(tmp_path / f"{number}.mp4", panned_luma(401, 160, 208, step=(1, 1 + number)), gop=50)
+    write_panned(tmp_path, 4, 401, 160, 208, gop=50)
     spawn = multiprocessing.get_context("spawn")
     with LocalServer(tmp_path, workers=1, flags=[*SMALL_FLAGS, "--max-sequences-per-video", "20"]) as server:
         broker = psutil.Process(server.pid)

@@ -17,8 +17,6 @@ from tests.stream.conftest import SMALL, digest, epoch_of
 from v2v_client import Batch, UsageError, V2VDataset, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import CorpusError
-from v2v_server.flow import flow_for
-from v2v_server.worker import produce
 
 
 @pytest.fixture(scope="module")
@@ -60,16 +58,6 @@ def test_events_add_up_to_the_voxels(dataset: V2VDataset) -> None:
     assert (np.diff(events.t) >= 0).all()
     with pytest.raises(IndexError, match="the epoch has"):
         dataset.events(len(dataset))
-
-
-def test_events_estimate_no_flow_beyond_that_of_the_sample(
-    clips: Path, index_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    dataset = V2VDataset(clips, recipe=SMALL, arrays=("voxels", "flow"), cache_dir=str(index_folder))
-    estimated = []
-    monkeypatch.setattr(produce, "flow_for", lambda *given, **named: estimated.append(1) or flow_for(*given, **named))
-    dataset.events(0)
-    assert len(estimated) == 1
 
 
 _RANGES = {

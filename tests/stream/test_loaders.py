@@ -8,16 +8,14 @@ import pickle
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
-from pathlib import Path
 from typing import Any
 
 import pytest
 from torch.utils.data import DataLoader
 from torchdata.stateful_dataloader import StatefulDataLoader
 
-from tests.clips import panned_luma, write_clip
-from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
-from v2v_client import Batch, RepeatedSamplesWarning, StateMismatch, UsageError, V2VStreamDataset
+from tests.stream.conftest import SMALL, digest, epoch_of
+from v2v_client import Batch, RepeatedSamplesWarning, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 
 # StatefulDataLoader of torchdata 0.11 calls a function that newer releases of torch deprecate.
@@ -64,33 +62,11 @@ def stateful_loader(stream: V2VStreamDataset, workers: int, method: str | None) 
 # --- torch's DataLoader -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("workers", "method"), LOADER_WORKERS)
-def test_the_epochs_of_a_loader_are_those_of_the_dataset(
-    server: LocalServer, plain: list[list[str]], workers: int, method: str | None
-) -> None:
-    loader = plain_loader(dataset(server), workers, method)
-    assert [digests(loader) for _ in range(2)] == plain[:2]
-
-
 def repetition_is_said(workers: int) -> AbstractContextManager[object]:
     """Expect the warning in this process. A loader worker gives it in its own, if it had prefetched enough batches."""
     if workers:
         return warnings.catch_warnings(action="ignore", category=RepeatedSamplesWarning)
     return pytest.warns(RepeatedSamplesWarning)
-
-
-@pytest.mark.parametrize(("workers", "method"), LOADER_WORKERS)
-def test_leaving_early_repeats_the_epoch(
-    server: LocalServer, plain: list[list[str]], workers: int, method: str | None
-) -> None:
-    loader = plain_loader(dataset(server), workers, method)
-    for number, batch in enumerate(loader):
-        assert digest(batch) == plain[0][number]
-        if number == 1:
-            break
-    with repetition_is_said(workers):
-        assert digests(loader) == plain[0]
-    assert digests(loader) == plain[1]
 
 
 @pytest.mark.parametrize(("before", "after"), [(0, 2), (2, 0), (2, 1)])
@@ -104,21 +80,6 @@ def test_a_batch_resumes_under_any_number_of_loader_workers(
     loader = plain_loader(resumed, after, "fork" if after else None)
     assert digests(used) + digests(loader) == plain[0]
     assert digests(loader) == plain[1]
-
-
-@pytest.mark.parametrize("after", [0, 2])
-def test_the_last_batch_resumes_at_a_full_next_epoch(server: LocalServer, plain: list[list[str]], after: int) -> None:
-    *_, last = plain_loader(dataset(server), 2, "fork")
-    resumed = dataset(server)
-    resumed.load_state_dict(saved_and_loaded(last.resume_state))
-    assert digests(plain_loader(resumed, after, "fork" if after else None)) == plain[1]
-
-
-def test_the_parent_of_loader_workers_has_no_state_and_says_where_it_is(server: LocalServer) -> None:
-    stream = dataset(server)
-    next(iter(plain_loader(stream, 1, "fork")))
-    with pytest.raises(UsageError, match=r"DataLoader workers.*Batch\.resume_state"):
-        stream.state_dict()
 
 
 # --- torchdata's StatefulDataLoader -----------------------------------------------------------------------------------
@@ -168,34 +129,6 @@ def test_a_stateful_loader_left_early_repeats_the_epoch(
         assert digests(loader) == plain[0]
 
 
-def test_a_batch_of_a_stateful_loader_resumes_under_other_loader_workers(
-    server: LocalServer, plain: list[list[str]]
-) -> None:
-    used = take(iter(stateful_loader(dataset(server), 2, "fork")), 3)
-    resumed = dataset(server)
-    resumed.load_state_dict(saved_and_loaded(used[-1].resume_state))
-    assert digests(used) + digests(stateful_loader(resumed, 1, "fork")) == plain[0]
-
-
-# --- other sizes, other streams ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("before", "after", "workers"), [(3, 5, 0), (5, 2, 2), (4, 1, 0)])
-def test_another_batch_size_is_exact(
-    server: LocalServer, plain: list[list[str]], before: int, after: int, workers: int
-) -> None:
-    """Sample by sample, so that where batches begin does not matter."""
-    whole = {batch.indices[0]: digest(batch) for batch in dataset(server, batch_size=1)}
-    used = take(iter(dataset(server, batch_size=before)), 2)
-    resumed = dataset(server, batch_size=after)
-    resumed.load_state_dict(saved_and_loaded(used[-1].resume_state))
-    rest = list(plain_loader(resumed, workers, "fork" if workers else None))
-    found = [item for batch in (*used, *rest) for item in singles(batch)]
-    assert [index for index, _ in found] == list(range(2 * before + len(rest) * after))
-    assert all(whole[index] == item for index, item in found)
-    assert len(whole) - len(found) < after
-
-
 def singles(batch: Batch) -> Iterator[tuple[int, str]]:
     """Index and digest of each sample, as of a batch of its own."""
     for row, index in enumerate(batch.indices):
@@ -206,35 +139,3 @@ def singles(batch: Batch) -> Iterator[tuple[int, str]]:
             provenance=batch.provenance[row : row + 1],
         )
         yield index, digest(alone)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"seed": 4}, r"seed: the state has 3, this dataset 4"),
-        (
-            {"recipe": {**SMALL.to_dict(), "gamma": 1.5}},
-            r"the options given to this dataset / the state: recipe\.gamma 1\.5 / 2\.2; ask for the recipe",
-        ),
-        ({"voxel_dtype": "int16"}, r"voxel_dtype int16 / int8"),
-    ],
-)
-def test_a_state_of_another_stream_is_refused(server: LocalServer, options: dict[str, Any], message: str) -> None:
-    state = next(iter(dataset(server))).resume_state
-    with pytest.raises(StateMismatch, match=message):
-        dataset(server, **options).load_state_dict(state)
-
-
-def test_a_state_of_another_catalogue_is_refused_naming_both(server: LocalServer, tmp_path: Path) -> None:
-    state = next(iter(dataset(server))).resume_state
-    write_clip(tmp_path / "other.mp4", panned_luma(90, 48, 64))
-    with LocalServer(tmp_path, workers=1, flags=SMALL_FLAGS) as other:
-        theirs = next(iter(dataset(other))).resume_state
-        resumed = dataset(other)
-        resumed.load_state_dict(state)
-        expected = (
-            rf"catalogue_digest: the saved state has {state['catalogue_digest']}, "
-            rf"{other.address} has {theirs['catalogue_digest']}"
-        )
-        with pytest.raises(StateMismatch, match=expected):
-            next(iter(resumed))

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 from torch.utils.data import DataLoader
 
-from tests.clips import panned_luma, write_clip
+from tests.clips import write_panned
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 
 
 def test_two_servers_two_ranks_two_loader_workers_and_a_resume(server: LocalServer, tmp_path: Path) -> None:
-    for number in range(4):
-        write_clip(tmp_path / f"{number}.mp4", panned_luma(64, 48, 64, step=(1, 1 + number)), gop=16)
+    write_panned(tmp_path, 4, 64, gop=16)
 
     def members(rank: int) -> list[V2VStreamDataset]:
         recipes = (SMALL, SMALL.replace(threshold=(0.1, 0.3), noise_sigma=(0.0, 0.0)))
@@ -42,4 +40,4 @@ def test_two_servers_two_ranks_two_loader_workers_and_a_resume(server: LocalServ
             assert [digest(batch) for batch in again] == got[5:]
             assert again.epoch == 1
             assert whole[0].frame_grids.tolist() == [0, 1, 2, 3]
-            assert pytest.approx(whole[0].voxels.float().abs().mean().item()) != 0
+            assert whole[0].voxels.any()

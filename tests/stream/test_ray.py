@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import re
@@ -80,9 +81,8 @@ def test_a_cluster_gives_the_bytes_of_local_workers_whatever_dies(clips: Path, c
         assert len(set(nodes)) == 2, "they are not spread"
         got: list[str] = []
 
-        def back(gone: list[psutil.Process]) -> None:
-            """Wait until two others than those are at work."""
-            until(lambda: len(set(workers()) - set(gone)) == 2)
+        def two_others(gone: set[psutil.Process]) -> bool:
+            return len(set(workers()) - gone) == 2
 
         for epoch in range(_EPOCHS):
             for number, batch in enumerate(
@@ -92,20 +92,18 @@ def test_a_cluster_gives_the_bytes_of_local_workers_whatever_dies(clips: Path, c
                 if number != 1:
                     continue
                 victim = workers()[0]
+                gone, node = {victim}, raylet_of(victim)
                 if epoch == 0:
                     victim.kill()
-                    back([victim])
                 elif epoch == 1:
                     os.kill(victim.ppid(), signal.SIGKILL)  # its actor: the kernel ends the worker along with it
-                    back([victim])
                 else:
-                    node = raylet_of(victim)
-                    lost = [process for process in workers() if raylet_of(process) == node]
+                    gone = {process for process in workers() if raylet_of(process) == node}
                     cluster.remove_node(
                         next(each for each in cluster.worker_nodes if pid_of_raylet(each) == node), allow_graceful=False
                     )
-                    back(lost)
-                    assert {raylet_of(process) for process in workers()} != {node}
+                until(functools.partial(two_others, gone))
+                assert epoch < 2 or {raylet_of(process) for process in workers()} != {node}
         said = log_of(server)
     assert got == reference
     assert "workers have a place on 2 nodes" in said
@@ -167,11 +165,8 @@ def session_of(cluster: Any) -> Path:
 
 def holding(folder: Path, secret: bytes) -> list[str]:
     """Files below a folder with that text."""
-    found = []
-    for path in folder.rglob("*"):
-        if path.is_file() and not path.is_symlink() and secret in path.read_bytes():
-            found.append(path.name)
-    return found
+    files = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+    return [path.name for path in files if secret in path.read_bytes()]
 
 
 def test_workers_on_a_cluster_get_a_key_that_is_written_down_nowhere(

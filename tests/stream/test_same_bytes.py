@@ -95,11 +95,6 @@ def test_grids_of_a_duration_are_the_same_however_they_travel(server: LocalServe
     assert len({sum(provenance.params.grid_steps) for batch in batches for provenance in batch.provenance}) > 2
 
 
-def test_many_workers_change_nothing(clips: Path, reference: list[str]) -> None:
-    with LocalServer(clips, workers=4, flags=SMALL_FLAGS) as many:
-        assert [digest(batch) for epoch in (0, 1) for batch in epoch_of(many.address, epoch=epoch)] == reference
-
-
 def test_batch_size_changes_no_sample(server: LocalServer) -> None:
     threes = np.concatenate([batch.voxels.numpy() for batch in epoch_of(server.address, batch_size=3)])
     fours = np.concatenate([batch.voxels.numpy() for batch in epoch_of(server.address, batch_size=4)])
@@ -133,19 +128,6 @@ def test_a_stopped_worker_is_replaced(clips: Path, reference: list[str]) -> None
         got = [digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
         stopped.wait(timeout=60)
     assert got == reference
-
-
-def test_one_process_makes_the_same_samples(clips: Path, server: LocalServer) -> None:
-    batch = epoch_of(server.address, seed=5, epoch=2)[1]
-    catalogue = open_catalogue(clips)
-    try:
-        for row, index in enumerate(batch.indices):
-            sample = remake(catalogue, StreamSpec(recipe=SMALL), seed=5, epoch=2, index=index)
-            np.testing.assert_array_equal(batch.voxels[row].numpy(), sample.arrays["voxels"])
-            np.testing.assert_array_equal(batch.frames[row].numpy(), sample.arrays["frames"])
-            assert batch.provenance[row] == sample.provenance
-    finally:
-        catalogue.close()
 
 
 def test_v2v_simulate_makes_the_same_sample(clips: Path, server: LocalServer, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from tests.trainer.training import configured
+from tests.trainer.training import ALONE, configured
 from trainer.captured import WARM_UP_STEPS, CapturedGradients
 from trainer.config_file import load_config
 from trainer.learner import Learner, build
@@ -23,7 +23,6 @@ from trainer.run.distributed import Ranks
 from trainer.tasks import Work
 from v2v_protocol.errors import UsageError
 
-ALONE = Ranks(0, 1, torch.device("cpu"))
 STEPS = WARM_UP_STEPS + 3
 
 

@@ -9,18 +9,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.trainer.training import configured
+from tests.trainer.training import ALONE, configured
 from trainer.config_file import load_config
 from trainer.learner import Learner, build, obeying_weights
 from trainer.models import FireNet
 from trainer.models.blocks import Loop
 from trainer.run.checkpoint import load_checkpoint, save_checkpoint
-from trainer.run.distributed import Ranks
 from trainer.tasks import Work
 from trainer.weights import SHIPPED, load_network
 from v2v_protocol.errors import UsageError
-
-ALONE = Ranks(0, 1, torch.device("cpu"))
 
 
 def learner(folder: Path, *, channels_last: bool, fused: bool) -> Learner:

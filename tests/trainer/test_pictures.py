@@ -15,7 +15,6 @@ from trainer.pictures import (
     contact_sheet,
     draw_events,
     draw_flow,
-    draw_grey,
     flow_scale,
     side_by_side,
     write_png,
@@ -42,11 +41,6 @@ def test_rounding_errors_of_cancelling_events_are_white() -> None:
     voxels = np.array([0.3, 0.4, -0.7], np.float32).reshape(3, 1, 1)
     assert voxels.sum(axis=-3) != 0
     assert (draw_events(voxels) == 255).all()
-
-
-def test_grey_is_rounded_and_clipped() -> None:
-    drawn = draw_grey(np.array([[-1.0, 0.0, 0.499, 1.0, 7.0]]))
-    assert drawn[0, :, 0].tolist() == [0, 0, 127, 255, 255]
 
 
 def test_flow_is_white_at_rest_and_red_to_the_right() -> None:

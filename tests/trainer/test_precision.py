@@ -16,17 +16,15 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tests.trainer.evaluation.h5_file import random_recording
 from tests.trainer.evaluation.test_flow import constant
 from tests.trainer.evaluation.test_flow import recording as flow_recording
-from tests.trainer.training import configured
+from tests.trainer.training import ALONE, configured
 from trainer.config import RunConfig
 from trainer.config_file import load_config
 from trainer.learner import build
 from trainer.models import NETWORKS
 from trainer.models.firenet import FireNet
 from trainer.precision import bfloat16_products
-from trainer.run.distributed import Ranks
 from trainer.run.validation import Validation
 
-ALONE = Ranks(0, 1, torch.device("cpu"))
 CPU = torch.device("cpu")
 USES = 600  # adding 1 to 256 gives 256 in bfloat16
 
@@ -63,15 +61,6 @@ def test_gradients_are_summed_in_float32(share: bool, most: int, view: bool) -> 
     assert gradient.dtype == torch.float32
     assert gradient[0, -1] == USES
     assert casts == most
-
-
-def test_autocast_alone_sums_in_bfloat16() -> None:
-    weight = nn.Parameter(torch.ones(1, 2))
-    with torch.autocast("cpu", torch.bfloat16):
-        total = torch.stack([F.linear(torch.ones(1, 2), weight).float() for _ in range(USES)]).sum()
-    total.backward()  # type: ignore[no-untyped-call]
-    assert weight.grad is not None
-    assert weight.grad[0, 0] < USES
 
 
 def test_disabled_casting_leaves_layers_unchanged() -> None:

@@ -15,19 +15,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.client.fake_server import SPEC, FakeServer
+from tests.trainer.training import ALONE
 from trainer.config import OptimizerConfig, RunConfig, StreamConfig, TrainConfig
 from trainer.feed import flags_of, streams
 from trainer.learner import AveragedNetwork, learning_rate
 from trainer.models import FireNet
-from trainer.run.distributed import Ranks, ranks
+from trainer.run.distributed import ranks
 from trainer.run.interruption import StopRequest
 from trainer.run.reporting import _planned_steps
 from trainer.tasks import Asked
 from trainer.train import serving
 from v2v_protocol.errors import ServerLost, StateMismatch, UsageError, V2VError, WorkerCrashLoop
 from v2v_protocol.recipe import Recipe
-
-ALONE = Ranks(0, 1, torch.device("cpu"))
 
 
 def test_a_local_server_gets_the_options_it_needs_at_its_start() -> None:
@@ -70,27 +69,13 @@ def test_the_average_is_the_recurrence_of_its_docstring(values: list[float], dec
     assert bias is not None
     expected = float(bias.detach())
     average = AveragedNetwork(network, decay)
+    assert not any(parameter.requires_grad for parameter in average.network.parameters())
     for update, value in enumerate(values, start=1):
         with torch.no_grad():
             bias.fill_(value)
         average.update(network, update)
         expected += (1 - min(decay, (1 + update) / (10 + update))) * (value - expected)
     assert float(average.network.state_dict()["net.pred.conv2d.bias"]) == pytest.approx(expected, rel=1e-4, abs=1e-4)
-
-
-def test_the_average_of_a_constant_is_the_constant_and_shares_no_memory() -> None:
-    network = FireNet(bins=1, base_channels=2)
-    average = AveragedNetwork(network, 0.9)
-    before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-    average.update(network, 1)
-    for name, tensor in average.network.state_dict().items():
-        assert torch.equal(tensor, before[name])
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.add_(1)
-    for name, tensor in average.network.state_dict().items():
-        assert torch.equal(tensor, before[name])
-    assert not any(parameter.requires_grad for parameter in average.network.parameters())
 
 
 def test_the_rate_warms_up_decays_by_epoch_and_may_end_as_a_cosine() -> None:

@@ -2,36 +2,29 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
 import sys
-from itertools import islice
 from pathlib import Path
 
-import av
-import cv2
-import numpy as np
 import psutil
 import pytest
 import torch
 import yaml
 
 from tests.client.fake_server import FakeServer
-from tests.clips import panned_luma, write_clip
+from tests.clips import write_panned
 from tests.trainer.evaluation.h5_file import random_recording
-from tests.trainer.training import OF_THE_CLOCK, arguments, losses, trained
+from tests.trainer.training import ALONE, OF_THE_CLOCK, arguments, losses, trained
 from trainer.config_file import load_config
 from trainer.feed import held_out_batch
 from trainer.learner import build
 from trainer.run.checkpoint import BEST, LAST, load_checkpoint
-from trainer.run.distributed import Ranks
 from trainer.run.reporting import METRICS_FILE, read_metrics
 from trainer.train import main
 
 ROOT = Path(__file__).parents[2]
-ALONE = Ranks(0, 1, torch.device("cpu"))
 TRAIN = (sys.executable, "-m", "trainer.train")
 TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
 
@@ -139,10 +132,7 @@ def test_two_ranks_with_validation_go_on_after_a_kill_as_if_there_had_been_none(
 @pytest.fixture(scope="module")
 def clips(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four small films: 16 sequences of 16 frames."""
-    folder = tmp_path_factory.mktemp("clips")
-    for number in range(4):
-        write_clip(folder / f"{number}.mp4", panned_luma(61, 48, 64, step=(1, 1 + number)), gop=15)
-    return folder
+    return write_panned(tmp_path_factory.mktemp("clips"), 4, 61, gop=15)
 
 
 @pytest.mark.slow
@@ -198,40 +188,3 @@ def test_ctrl_c_reaches_its_server_as_well(clips: Path, tmp_path: Path) -> None:
         process.communicate()
     assert process.returncode == 128 + signal.SIGINT
     assert load_checkpoint(tmp_path / "run" / LAST).step == len(losses(tmp_path / "run")) >= 2
-
-
-REAL = Path(os.environ.get("V2V_DEMO_VIDEOS", ROOT / ".demo" / "videos"))
-SIDE_PX = 48
-
-
-def small_copy(source: Path, target: Path, frames: int) -> None:
-    """The middle of a film's first frames, shrunk to one crop, so that every sample shows the same."""
-    luma = []
-    with av.open(str(source)) as container:
-        for frame in islice(container.decode(video=0), frames):
-            grey = frame.to_ndarray(format="gray")
-            side, left = grey.shape[0], (grey.shape[1] - grey.shape[0]) // 2
-            luma.append(cv2.resize(grey[:, left : left + side], (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA))
-    write_clip(target, np.stack(luma))
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not (REAL / "bikes.mp4").is_file(), reason=f"no bikes.mp4 in {REAL}: `make demo` fetches it")
-def test_the_tiny_configuration_overfits_two_real_clips(tmp_path: Path) -> None:
-    """The same two samples again and again: their error falls to less than half of what it was at the start."""
-    for name in ("bikes.mp4", "carphone_pristine.mp4"):
-        (tmp_path / "videos").mkdir(exist_ok=True)
-        small_copy(REAL / name, tmp_path / "videos" / name, 51)
-    camera = {
-        "preset": "noise-free", "voxels_per_clip": 10, "crop_height_px": SIDE_PX, "crop_width_px": SIDE_PX,
-        "threshold": 0.15, "threshold_ratio": 1.0, "flip_probability": 0.0,
-    }  # fmt: skip
-    settings = {
-        "run.seconds": 0, "run.steps": 80, "run.log_every": 5, "run.preview_every": 0, "stream.recipe": camera,
-    }  # fmt: skip
-    changes = [text for key, value in settings.items() for text in ("--set", f"{key}={json.dumps(value)}")]
-    given = ["tiny-cpu", "--videos", str(tmp_path / "videos"), "--out", str(tmp_path / "run"), *changes]
-    assert main(given) == 0
-    readings = losses(tmp_path / "run")
-    assert (readings[-1]["step"], readings[-1]["epoch"]) == (80, 79)
-    assert readings[-1]["total"] < 0.5 * readings[0]["total"]

@@ -11,8 +11,11 @@ import torch
 import yaml
 from torch import Tensor
 
+from trainer.run.distributed import Ranks
 from trainer.run.reporting import METRICS_FILE, read_metrics
 from trainer.train import main
+
+ALONE = Ranks(0, 1, torch.device("cpu"))
 
 SMALL: dict[str, Any] = {
     "network": {"name": "firenet", "options": {"base_channels": 2}},

@@ -86,11 +86,8 @@ def test_a_corpus_that_is_not_there_is_in_the_way(tmp_path: Path, capsys: pytest
     assert "there is no such folder" in said
 
 
-def test_what_is_missing_or_too_old_is_named(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def pretend(monkeypatch: pytest.MonkeyPatch, found: dict[str, str | None]) -> None:
     version = metadata.version
-    found = {"av": None, "pyzmq": "25.9"}
 
     def pretended(name: str) -> str:
         if name in found and found[name] is None:
@@ -98,6 +95,12 @@ def test_what_is_missing_or_too_old_is_named(
         return str(found.get(name) or version(name))
 
     monkeypatch.setattr(command.metadata, "version", pretended)
+
+
+def test_what_is_missing_or_too_old_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pretend(monkeypatch, {"av": None, "pyzmq": "25.9"})
     assert {"av<19,>=18", "pyzmq>=26"} == set(command._missing("server"))
     assert {"av<19,>=18", "pyzmq>=26"} == set(command._missing("trainer"))  # one of its own, one of the client's
     status, said = told(capsys, "--videos", ".")
@@ -106,14 +109,7 @@ def test_what_is_missing_or_too_old_is_named(
 
 
 def test_a_server_without_torch_is_whole(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    version = metadata.version
-
-    def without_torch(name: str) -> str:
-        if name == "torch":
-            raise metadata.PackageNotFoundError(name)
-        return version(name)
-
-    monkeypatch.setattr(command.metadata, "version", without_torch)
+    pretend(monkeypatch, {"torch": None})
     monkeypatch.setattr(command, "_torch", lambda: Finding(BAD, "torch", "was loaded"))
     status, said = told(capsys)
     assert status == 0
@@ -297,4 +293,3 @@ def test_preview_and_doctor_agree_on_what_changes(
     assert text.startswith("changes that motion does not explain: ")
     assert change in text
     assert change in said
-    assert "flicker" not in said

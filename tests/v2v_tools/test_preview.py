@@ -157,11 +157,6 @@ def test_recipes_of_other_sizes_are_not_compared(clip: Path, tmp_path: Path) -> 
     assert (tmp_path / "p.png").exists()
 
 
-def test_the_error_of_the_library_is_typed(clip: Path, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="ends in"):
-        preview(str(clip), tmp_path / "p.tiff", [PreviewCamera("", "paper", 0)], {}, title="t")
-
-
 def test_many_cameras_and_a_film_show_their_progress(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -77,15 +77,6 @@ def test_ramps_jumps_and_sinusoids_have_the_counts_of_their_formulas() -> None:
     assert events == PIXELS * (top + 199 * (top - bottom) - bottom)
 
 
-def test_moved_photographs_move_at_the_stated_speed() -> None:
-    still = moved_photograph("camera", 3, 40, 50, 0.0)
-    np.testing.assert_array_equal(still[0], still[2])
-    assert 0.0 <= still.min() < still.max() <= 1.0
-    slow, fast = (moved_photograph("camera", 9, 40, 50, speed) for speed in (0.1, 0.2))
-    change = [float(np.abs(np.diff(frames, axis=0)).mean()) for frames in (slow, fast)]
-    assert change[1] == pytest.approx(2 * change[0], rel=0.1)
-
-
 def test_errors_by_hand() -> None:
     fine = np.array([[2, 0], [-1, 0], [0, 3], [0, 0]])
     found = physics.errors(fine, np.array([[1, 1], [0, 3]]), 8, 2)

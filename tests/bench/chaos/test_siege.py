@@ -13,7 +13,7 @@ from bench.chaos.fleet import Fleet
 from bench.chaos.hostile import KINDS, REFUSED
 from bench.chaos.siege import CREDIT_FLAGS, CREDIT_MIB, PEERS, besiege, missed, stretch
 from bench.chaos.trimming_server import MODULE
-from tests.clips import panned_luma, write_clip
+from tests.clips import write_panned
 from tests.waiting import until
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a connection guard")
@@ -21,10 +21,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has 
 
 @pytest.fixture(scope="module")
 def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("siege-clips")
-    for number in range(3):
-        write_clip(folder / f"{number}.mp4", panned_luma(240, 160, 210))
-    return folder
+    return write_panned(tmp_path_factory.mktemp("siege-clips"), 3, 240, 160, 210)
 
 
 @pytest.mark.slow

@@ -86,6 +86,12 @@ def is_ended(peer: socket.socket) -> bool:
     return True
 
 
+def send_ping(peer: zmq.Socket[bytes], sockets: Sockets, kind: type = FromConsumer) -> ServerInput:
+    """Send a Ping; return the next message that the server receives."""
+    peer.send_multipart(encode(Ping()))
+    return next_from(sockets, kind)
+
+
 def next_from(sockets: Sockets, kind: type) -> ServerInput:
     came: list[ServerInput] = []
 
@@ -104,17 +110,6 @@ def guarded(sockets: Sockets, kind: type = FromConsumer) -> guard.ConnectionGuar
 
 
 # --- which have ended -------------------------------------------------------------------------------------------------
-
-
-def test_the_end_of_a_connection_is_reported(
-    serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
-) -> None:
-    sockets = serve()
-    peer = consumer(sockets, b"c")
-    peer.send_multipart(encode(Ping()))
-    next_from(sockets, FromConsumer)
-    peer.close()
-    assert next_from(sockets, ConsumerGone) == ConsumerGone(b"c")
 
 
 def test_the_place_of_a_killed_trainer_is_free(serve: Callable[..., Sockets]) -> None:
@@ -169,8 +164,7 @@ def test_a_last_message_is_handled_after_its_connection_has_ended(
     """A consumer says Goodbye and disconnects."""
     sockets = serve()
     peer = consumer(sockets, b"c")
-    peer.send_multipart(encode(Ping()))
-    next_from(sockets, FromConsumer)
+    send_ping(peer, sockets)
     watched = guarded(sockets)
     peer.send_multipart(encode(Ping()))
     peer.close(linger=-1)
@@ -192,8 +186,7 @@ def test_a_late_message_is_not_taken_for_one_of_the_next_connection_with_its_des
     connections = guarded(sockets)._connections
     early = consumer(sockets, b"early")
     if is_known:
-        early.send_multipart(encode(Ping()))
-        assert next_from(sockets, FromConsumer).identity == b"early"
+        assert send_ping(early, sockets).identity == b"early"
     until(lambda: connections)
     descriptors = list(connections)
     for _ in range(2):
@@ -250,8 +243,7 @@ def test_a_refused_connection_is_ended_at_once_and_none_of_its_messages_handled(
             stranger.sendall(GREETING + READY + b"\0\x01!" * (number % 2))
             assert is_ended(stranger)
         refused.clear()
-    honest.send_multipart(encode(Ping()))
-    assert next_from(sockets, FromConsumer).identity == b"honest"
+    assert send_ping(honest, sockets).identity == b"honest"
     assert [one for one in sockets.receive(0.2) if isinstance(one, FromConsumer)] == []
 
 
@@ -292,13 +284,11 @@ def test_the_oldest_connection_without_a_session_makes_room(
     sockets = serve(most_connections=4, has_session=lambda identity: identity == b"honest")
     address = sockets.address if kind is FromConsumer else sockets.worker_address
     honest = consumer(sockets, b"honest", address)
-    honest.send_multipart(encode(Ping()))
-    next_from(sockets, kind)
+    send_ping(honest, sockets, kind)
     idle = [raw(address) for _ in range(20)]
     until(lambda: len(guarded(sockets, kind)._connections) <= 4)
     newcomer = consumer(sockets, b"newcomer", address)
-    newcomer.send_multipart(encode(Ping()))
-    assert next_from(sockets, kind).identity == b"newcomer"
+    assert send_ping(newcomer, sockets, kind).identity == b"newcomer"
     assert sockets.send(b"honest", encode(Pong()), to_worker=kind is FromWorker)
     for each in idle:
         each.close()
@@ -310,15 +300,12 @@ def test_pings_do_not_keep_a_place(serve: Callable[..., Sockets], consumer: Call
     names = [b"%d" % number for number in range(4)]
     peers = [consumer(sockets, name) for name in names]
     for peer in peers:
-        peer.send_multipart(encode(Ping()))
-        next_from(sockets, FromConsumer)
+        send_ping(peer, sockets)
     for peer in peers:
-        peer.send_multipart(encode(Ping()))
-        next_from(sockets, FromConsumer)
+        send_ping(peer, sockets)
     newcomer = consumer(sockets, b"newcomer")
     assert next_from(sockets, ConsumerGone) == ConsumerGone(b"0")
-    newcomer.send_multipart(encode(Ping()))
-    assert next_from(sockets, FromConsumer).identity == b"newcomer"
+    assert send_ping(newcomer, sockets).identity == b"newcomer"
 
 
 def test_connections_with_a_session_make_no_room(
@@ -326,8 +313,7 @@ def test_connections_with_a_session_make_no_room(
 ) -> None:
     sockets = serve(most_connections=2, has_session=bool)
     for name in (b"a", b"b"):
-        consumer(sockets, name).send_multipart(encode(Ping()))
-        next_from(sockets, FromConsumer)
+        send_ping(consumer(sockets, name), sockets)
     with raw(sockets.address) as newcomer:
         assert is_ended(newcomer)
     assert all(sockets.send(name, encode(Pong())) for name in (b"a", b"b"))
@@ -356,8 +342,7 @@ def test_five_thousand_connections_with_few_descriptors_do_not_stop_a_newcomer(
         most = most_connections(8)
         sockets = serve(most_connections=most, has_session=lambda identity: identity == b"honest")
         honest = consumer(sockets, b"honest")
-        honest.send_multipart(encode(Ping()))
-        next_from(sockets, FromConsumer)
+        send_ping(honest, sockets)
         port = sockets.address.rpartition(":")[2]
         with subprocess.Popen(
             [sys.executable, "-c", CONNECT_MANY, port], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -371,8 +356,7 @@ def test_five_thousand_connections_with_few_descriptors_do_not_stop_a_newcomer(
             assert many.stdout.readline() == b"connected\n"
             assert most_open < 1100
             newcomer = consumer(sockets, b"newcomer")
-            newcomer.send_multipart(encode(Ping()))
-            assert next_from(sockets, FromConsumer).identity == b"newcomer"
+            assert send_ping(newcomer, sockets).identity == b"newcomer"
             assert sockets.send(b"honest", encode(Pong()))
             many.stdin.close()
     finally:
@@ -387,8 +371,7 @@ def test_disconnect_ends_the_connection(
 ) -> None:
     sockets = serve()
     peer = consumer(sockets, b"c")
-    peer.send_multipart(encode(Ping()))
-    next_from(sockets, FromConsumer)
+    send_ping(peer, sockets)
     sockets.cut(b"stranger")
     sockets.cut(b"c")
     assert next_from(sockets, ConsumerGone) == ConsumerGone(b"c")
@@ -413,8 +396,7 @@ def test_a_message_of_too_many_frames_is_dropped_and_ends_its_connection(
     """A thousand frames take a thousand times as long to receive as one."""
     sockets = serve()
     peer = consumer(sockets, b"c")
-    peer.send_multipart(encode(Ping()))
-    next_from(sockets, FromConsumer)
+    send_ping(peer, sockets)
     peer.send_multipart([b""] * (MOST_MESSAGE_FRAMES + 1))
     assert next_from(sockets, ConsumerGone) == ConsumerGone(b"c")
     other = consumer(sockets, b"d")

@@ -11,7 +11,7 @@ from tests.trainer.conftest import WEIGHTS
 from trainer.convert import Converted, convert
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
-from trainer.evaluation.windows import picture_windows, regular_windows
+from trainer.evaluation.windows import picture_windows
 from v2v_protocol.errors import UsageError
 from v2v_recordings.items import ConvertOptions, SensorSize
 
@@ -57,11 +57,3 @@ def test_bag_of_evt3_packets(tmp_path: Path) -> None:
     assert done.written.events > 300_000
     # 517 packets of about 4 ms.
     assert done.written.seconds == pytest.approx(2.07, abs=0.02)
-
-
-def test_text_of_a_davis240(tmp_path: Path) -> None:
-    done = converted("ijrr_boxes_translation_slice.txt", tmp_path, ConvertOptions(size=SensorSize(240, 180)))
-    assert (done.form, done.written.events) == ("ijrr", 162_100)
-    with Recording(done.destination) as recording:
-        windows = regular_windows(recording, 25)
-        assert sum(len(recording.events(window)) for window in windows) > 150_000

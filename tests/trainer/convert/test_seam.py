@@ -11,7 +11,6 @@ import pytest
 from trainer.convert.conversion import convert
 from trainer.evaluation.readers import EventWindow, Recording
 from trainer.evaluation.windows import picture_windows
-from v2v_protocol.errors import UsageError
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, ReadProgress, SensorSize
 from v2v_recordings.reading import FORMS, RawForm, recognise
 
@@ -43,9 +42,3 @@ def test_a_toy_form_is_recognised_and_converted(tmp_path: Path, monkeypatch: pyt
         assert events.x.tolist() == [0, 5, 2]
         assert events.y.tolist() == [0, 3, 1]
         assert (np.asarray(events.p) > 0).tolist() == [True, False, True]
-
-
-def test_an_unknown_form_is_refused_with_a_list_of_forms(tmp_path: Path) -> None:
-    (tmp_path / "raw.toy").write_text("")
-    with pytest.raises(UsageError, match="is not a known recording"):
-        recognise(tmp_path / "raw.toy")

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 
-from tests.trainer.conftest import WEIGHTS
 from tests.trainer.convert import raw_forms
 from tests.trainer.convert.scene import expected_voxels, scene
 from tests.trainer.evaluation.h5_file import random_recording
@@ -27,7 +26,6 @@ from trainer.models import FireNet
 from v2v_recordings.items import ConvertOptions, Light, Picture
 from v2v_recordings.reading import read_items
 
-DAVIS = WEIGHTS.parent / "events" / "davis346_aestream.aedat4"
 TOP_PX, LEFT_PX = 82, 44
 """Headings and the arrow of time, beside the panels of a picture."""
 
@@ -140,17 +138,6 @@ def test_the_light_of_the_pictures_is_said_and_scored_as_asked(
     assert "taken as linear, and scored as videos code them" in capsys.readouterr().out
     assert (ours[0]["light"], other[0]["light"]) == ("as stored", "linear")
     assert ours[0]["mse"] != other[0]["mse"]
-
-
-def test_published_event_indices_change_the_scores(tmp_path: Path, weights: Path) -> None:
-    raw_forms.write_bag(tmp_path / "desk.bag", scene())
-    convert_cli.main([str(tmp_path / "desk.bag"), "--out", str(tmp_path / "h5")])
-    ours = evaluate("--weights", weights, "--data", tmp_path / "h5")
-    published = evaluate("--weights", weights, "--data", tmp_path / "h5", "--as-published")
-    # Every picture, the first apart, is paired with the event before: the last window does not gain what it loses.
-    assert (ours[0]["events"], published[0]["events"]) == (28, 27)
-    assert ours[0]["mse"] != published[0]["mse"]
-    assert published[0]["as_published"] is True
 
 
 @pytest.mark.parametrize(("folder", "name", "end"), [("evaid", "outdoor", 1.4), ("ijrr", "slider_depth", 2.5)])
@@ -309,22 +296,3 @@ def test_bad_recordings_are_refused_before_any_evaluation(
     assert cli.main([*fixed, *(argument.replace("{data}", str(tmp_path)) for argument in arguments)]) == 2
     assert message in capsys.readouterr().err
     assert not evaluated
-
-
-def test_published_firenet_shows_the_scene_of_a_real_recording(tmp_path: Path, published: Path) -> None:
-    """A dark panel on a bright peg board, and two lamps: their order of brightness in the reconstruction."""
-    if not DAVIS.is_file():
-        pytest.skip(f"no file {DAVIS}: set V2V_TEST_WEIGHTS to the folder beside `events`")
-    convert_cli.main([str(DAVIS), "--out", str(tmp_path)])
-    (tmp_path / "weights.pth").write_bytes((published / "firenet_evreal.pth").read_bytes())
-    evaluate(
-        "--weights", tmp_path / "weights.pth", "--normalize-voxels", "--voxels", "interpolated",
-        "--data", tmp_path / "davis346_aestream.h5", "--out", tmp_path / "out", "--rows", 1,
-    )  # fmt: skip
-    drawn = cv2.imread(str(tmp_path / "out/davis346_aestream/davis346_aestream.png"), cv2.IMREAD_GRAYSCALE)
-    drawn = drawn[TOP_PX:, LEFT_PX:].astype(float)
-    reconstruction, camera = drawn[:260, 350:696], drawn[:260, 700:1046]
-    panel, board = (slice(40, 125), slice(85, 170)), (slice(40, 125), slice(200, 290))
-    lamps = camera > 250
-    for picture in (reconstruction, camera):
-        assert picture[panel].mean() + 20 < picture[board].mean() < picture[lamps].mean()

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from tests.trainer.evaluation.h5_file import write_h5
-from trainer.convert.cli import main as convert
 from trainer.evaluation import paper
 from trainer.evaluation.cli import main
 from trainer.evaluation.flow import HOOD_ROW, FlowRun, FlowScore, evaluate_flow, flow_table
@@ -56,36 +55,6 @@ def constant(x: float, y: float) -> EVFlowNet:
 
 def run(network: EVFlowNet | ERAFT, *, as_published: bool) -> FlowRun:
     return FlowRun(network, VoxelSettings(bins=network.bins), as_published=as_published)
-
-
-def test_the_field_at_the_start_of_a_window_is_its_flow(tmp_path: Path) -> None:
-    """Indoors all rows count: a twentieth of them has ten times the flow."""
-    found = evaluate_flow(run(constant(0.6, 0.8), as_published=False), recording(tmp_path / "indoor.h5"), None)
-    share = 1 - HOOD_ROW / HEIGHT
-    expected = {
-        "network": (LENGTHS[:3], lambda length: (length - 1) * (1 - share) + (10 * length - 1) * share),
-        "zeros": (LENGTHS[:3], lambda length: length * (1 - share) + 10 * length * share),
-    }
-    for predictor, (lengths, of) in expected.items():
-        for kind in ("dense", "sparse"):
-            assert found[predictor].means[f"aee_{kind}"] == pytest.approx(
-                np.mean([of(length) for length in lengths]), rel=1e-5
-            )
-    # Errors of the network: 0, 3 and 1 px above, 9, 39 and 19 px below; 3 is not more than 3.
-    assert found["network"].means["3pe_dense"] == pytest.approx(100 * share, rel=1e-4)
-    assert found["zeros"].means["3pe_dense"] == pytest.approx(100 * (2 * share + 1) / 3, rel=1e-5)
-
-
-def test_outdoors_the_hood_does_not_count_unless_as_published(tmp_path: Path) -> None:
-    path = recording(tmp_path / "outdoor_day1.h5")
-    right = evaluate_flow(run(constant(0, 0), as_published=False), path, None)
-    assert right["network"].means == pytest.approx(right["zeros"].means)
-    assert right["zeros"].means["aee_dense"] == pytest.approx(np.mean(LENGTHS[:3]), rel=1e-5)
-    assert right["zeros"].means["3pe_sparse"] == pytest.approx(100 / 3)
-    published = evaluate_flow(run(constant(0, 0), as_published=True), path, None)
-    share = 1 - HOOD_ROW / HEIGHT
-    later = np.mean([length * (1 + 9 * share) for length in LENGTHS[1:]])
-    assert published["zeros"].means["aee_dense"] == pytest.approx(later, rel=1e-5)
 
 
 def test_a_window_without_counted_pixels_is_left_out_or_scores_0(tmp_path: Path) -> None:
@@ -145,26 +114,3 @@ def test_rows_of_the_paper_that_have_no_flow_are_left_out() -> None:
     score.add(np.zeros((2, 1, 1), np.float32), np.ones((2, 1, 1), np.float32), np.ones((1, 1), bool), 1)
     table = flow_table("a", {"indoor_flying1": {"network": score}}, ["Zeros", next(iter(paper.RESULTS))])
     assert table.row_count == 2
-
-
-def test_flow_of_mvsec_is_converted_with_its_recording(tmp_path: Path) -> None:
-    """With a prediction of no motion, the scores are the lengths of the raw file's flow."""
-    rng = np.random.default_rng(0)
-    times, lengths = 100.0 + 0.05 * np.arange(3), (2.0, 5.0, 1.0)
-    with h5py.File(tmp_path / "indoor_flying1_data.hdf5", "w") as file:
-        t = np.sort(rng.uniform(99.9, 100.2, 300))
-        rows = [rng.integers(0, 24, 300), rng.integers(0, 18, 300), t, rng.choice([-1, 1], 300)]
-        file["davis/left/events"] = np.stack(rows, axis=1)
-    with h5py.File(tmp_path / "indoor_flying1_gt.hdf5", "w") as file:
-        flow, depth = np.zeros((3, 2, 18, 24)), np.ones((3, 18, 24), np.float32)
-        flow[:, 0] = np.array(lengths)[:, None, None]
-        flow[:, :, :9] *= 100
-        depth[:, :9] = np.nan
-        group = file.create_group("davis/left")
-        group["flow_dist"], group["depth_image_raw"], group["depth_image_raw_ts"] = flow, depth, times
-    assert not convert([str(tmp_path / "indoor_flying1_data.hdf5"), "--out", str(tmp_path / "h5"), "--size", "24x18"])
-    (path,) = (tmp_path / "h5").iterdir()
-    found = evaluate_flow(run(constant(0, 0), as_published=False), path, None)["zeros"]
-    assert (found.windows, found.means["aee_dense"]) == (2, pytest.approx(3.5))
-    published = evaluate_flow(run(constant(0, 0), as_published=True), path, None)["zeros"]
-    assert published.means["aee_dense"] == pytest.approx(3.0)

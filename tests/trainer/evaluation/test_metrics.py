@@ -53,24 +53,10 @@ def test_ssim(height: int, width: int, seed: int, data_range: float) -> None:
     )
 
 
-def test_a_wider_data_range_raises_ssim() -> None:
-    """Range 2 doubles both constants' roots, which pulls every window towards 1."""
-    prediction, target = pair(20, 20, 0)
-    assert ssim(prediction, target, data_range=1.0) < ssim(prediction, target, data_range=2.0) < 1
-
-
 def test_mse() -> None:
     prediction, target = pair(9, 11, 1)
     assert mse(prediction, target) == pytest.approx(sum((prediction - target).ravel() ** 2) / 99, rel=1e-12)
     assert mse(np.zeros((2, 2)), np.full((2, 2), 0.5)) == 0.25
-
-
-def test_equal_pictures() -> None:
-    _, target = pair(16, 16, 2)
-    metrics = make_metrics(["mse", "ssim", "ssim_range2"], {})
-    assert {name: metric(target, target) for name, metric in metrics.items()} == pytest.approx(
-        {"mse": 0, "ssim": 1, "ssim_range2": 1}, abs=1e-12
-    )
 
 
 @pytest.mark.parametrize("net", ["alex", "squeeze"])

@@ -6,6 +6,7 @@ import itertools
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -126,6 +127,20 @@ def test_without_time_stamps_the_index_decides(tmp_path: Path) -> None:
         assert [image.time for image in opened.images] == [1.1, 1.4]
 
 
+def test_pictures_are_listed_without_all_being_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    open_datasets = []
+    repair = Recording._repair_times
+
+    def count_and_repair(self: Recording, times: list[float]) -> list[float]:
+        open_datasets.append(h5py.h5f.get_obj_count(self._file.id, h5py.h5f.OBJ_DATASET))
+        return repair(self, times)
+
+    monkeypatch.setattr(Recording, "_repair_times", count_and_repair)
+    with Recording(random_recording(tmp_path / "a.h5", images=50, events=50)) as opened:
+        assert len(opened.images) == 50
+    assert open_datasets[0] <= 6, "four columns, and at most the picture read last"
+
+
 def test_time_ranges_count_from_the_first_picture(tmp_path: Path) -> None:
     path = random_recording(tmp_path / "a.h5", images=51, period=0.1, events=500)
     with Recording(path) as opened:
@@ -229,22 +244,6 @@ def test_a_size_may_be_given_if_the_file_states_none(tmp_path: Path) -> None:
         assert opened.size == (3, 4)
 
 
-def test_pictures_are_listed_without_all_being_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import h5py
-
-    open_datasets = []
-    repair = Recording._repair_times
-
-    def count_and_repair(self: Recording, times: list[float]) -> list[float]:
-        open_datasets.append(h5py.h5f.get_obj_count(self._file.id, h5py.h5f.OBJ_DATASET))
-        return repair(self, times)
-
-    monkeypatch.setattr(Recording, "_repair_times", count_and_repair)
-    with Recording(random_recording(tmp_path / "a.h5", images=50, events=50)) as opened:
-        assert len(opened.images) == 50
-    assert open_datasets[0] <= 6, "four columns, and at most the picture read last"
-
-
 @settings(max_examples=30)
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=40), st.integers(1, 9))
 def test_search_in_blocks_equals_search_in_memory(
@@ -282,8 +281,6 @@ def broken(path: Path, kind: str) -> Path:
     elif kind == "columns":
         write_h5(file, T, T[:2], T, T, [])
     elif kind in ("rows", "scalar", "fractions"):
-        import h5py
-
         write_h5(file, T, T, T, T, [(PIXELS, {"timestamp": 1.0, "event_idx": 0})])
         with h5py.File(file, "r+") as opened:
             del opened["events/xs"]
@@ -299,8 +296,6 @@ def broken(path: Path, kind: str) -> Path:
     elif kind == "twice back":
         recording(path, stamped(1.3, 1.2, 1.1))
     elif kind == "raw":
-        import h5py
-
         with h5py.File(file, "w") as raw:
             raw["davis/left/events"] = np.zeros((2, 4))
     return file
@@ -363,8 +358,6 @@ def test_nan_times_are_refused(tmp_path: Path) -> None:
 
 def damaged(path: Path, name: str) -> Path:
     """Write a recording in which one dataset's compressed bytes are invalid."""
-    import h5py
-
     file = recording(path, stamped(1.05, 1.25, 1.45))
     with h5py.File(file, "r+") as opened:
         values, attributes = opened[name][:], dict(opened[name].attrs)
@@ -386,22 +379,6 @@ def test_damage_is_reported(tmp_path: Path, name: str) -> None:
 
     with pytest.raises(UsageError, match=r"a.h5 cannot be read as HDF5: .*HDF5_PLUGIN_PATH"):
         read()
-
-
-def test_a_missing_compression_plugin_is_reported(tmp_path: Path) -> None:
-    import h5py
-
-    file = recording(tmp_path, stamped(1.05, 1.25))
-    with h5py.File(file, "r+") as opened:
-        del opened["events/ts"]
-        properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        properties.set_chunk((len(T),))
-        properties.set_filter(32001, h5py.h5z.FLAG_OPTIONAL)  # Blosc
-        space = h5py.h5s.create_simple((len(T),))
-        made = h5py.h5d.create(opened["events"].id, b"ts", h5py.h5t.NATIVE_DOUBLE, space, properties)
-        made.write_direct_chunk((0,), b"whatever")
-    with pytest.raises(UsageError, match="plugin"):
-        Recording(file)
 
 
 def test_pictures_of_another_size_are_refused(tmp_path: Path) -> None:

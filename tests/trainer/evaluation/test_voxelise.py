@@ -8,7 +8,7 @@ from math import floor
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from trainer.evaluation.voxelise import Events, VoxelSettings, voxel_grid
@@ -63,30 +63,6 @@ def test_every_event_counts_once(rows: list[tuple[int, int, int, int]], kind: st
     np.testing.assert_allclose(result.sum(axis=0), expected, rtol=0, atol=tolerance)
     if kind == "discrete":
         assert (result == np.rint(result)).all()
-
-
-@given(recorded)
-def test_reversed_time_reverses_interpolated_bins(rows: list[tuple[int, int, int, int]]) -> None:
-    last = rows[-1][0]
-    # Events at one time are all in the first bin, whichever way time runs.
-    assume(rows[0][0] < last)
-    backwards = [(last - t, x, y, p) for t, x, y, p in reversed(rows)]
-    # Up to the 1e-4 us that published code adds to the span: 4e-4 of a bin for spans of a microsecond.
-    np.testing.assert_allclose(grid(backwards, "interpolated"), grid(rows, "interpolated")[::-1], rtol=0, atol=0.03)
-    long = [(t * 1000, x, y, p) for t, x, y, p in rows]
-    backwards = [(last * 1000 - t, x, y, p) for t, x, y, p in reversed(long)]
-    np.testing.assert_allclose(grid(backwards, "interpolated"), grid(long, "interpolated")[::-1], rtol=0, atol=3e-5)
-
-
-@given(st.lists(st.integers(0, 999), min_size=1, max_size=40), st.integers(1, 7))
-def test_reversed_time_reverses_discrete_bins(steps: list[int], bins: int) -> None:
-    """Events lie inside the bins, because at an edge an event belongs to the later bin in both directions."""
-    # Odd multiples of 1 us in a span of bins * 2000 us are never on an edge; 0 and the end fix the span.
-    times = [0, *sorted(2 * bins * step + 1 for step in steps), 2000 * bins]
-    inside = [t for t in times if t % 2000 or t in (0, 2000 * bins)]
-    rows = [(t, index % 4, index % 3, 1 if index % 2 else -1) for index, t in enumerate(inside)]
-    backwards = [(2000 * bins - t, x, y, p) for t, x, y, p in reversed(rows)]
-    np.testing.assert_array_equal(grid(backwards, "discrete", bins), grid(rows, "discrete", bins)[::-1])
 
 
 def test_span_of_the_window_or_of_the_events() -> None:

@@ -9,10 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from trainer.models import E2VID, ERAFT, ETNet, EVFlowNet, FireNet, HyperE2VID, VoxelNetwork
+from trainer.models import E2VID, ERAFT, ETNet, FireNet, HyperE2VID, VoxelNetwork
 from trainer.models.blocks import Loop
 from trainer.models.sequence import Guide
-from v2v_protocol.errors import UsageError
 
 pytestmark = [  # of what torch.compile itself does
     pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor"),
@@ -73,8 +72,3 @@ def test_one_iteration_is_traced_without_changes(name: str, monkeypatch: pytest.
 def test_compiled_code_computes_the_same() -> None:
     torch.manual_seed(3)
     compared(FireNet(bins=2, base_channels=2))
-
-
-def test_a_network_without_loops_is_refused() -> None:
-    with pytest.raises(UsageError, match="EVFlowNet has no loop"):
-        EVFlowNet(base_channels=2).compile_turns()

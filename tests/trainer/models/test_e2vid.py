@@ -87,17 +87,6 @@ def test_unknown_settings_are_refused(options: dict[str, str]) -> None:
         E2VID(**options)  # type: ignore[arg-type]
 
 
-def test_padding_is_cropped_from_the_output() -> None:
-    model = E2VID(base_channels=4, encoders=2)
-    voxels = torch.from_numpy(counts((1, 2, 5, 16, 32)))
-    voxels[..., 13:, :] = 0
-    voxels[..., 27:] = 0
-    with torch.no_grad():
-        padded = model.forward_sequence(voxels[..., :13, :27])
-        whole = model.forward_sequence(voxels)
-    torch.testing.assert_close(padded, whole[..., :13, :27], rtol=0, atol=1e-6)
-
-
 def test_normalisation_of_voxels() -> None:
     voxels = torch.from_numpy(counts((4, 5, 9, 7))).double()
     voxels[1] = 0

@@ -175,14 +175,6 @@ def test_splatting() -> None:
     np.testing.assert_allclose(forward_splat(tensor(flow)).numpy(), expected, rtol=0, atol=1e-9)
 
 
-def test_uniform_flow_is_carried_along_and_leaves_a_hole() -> None:
-    flow = torch.zeros(1, 2, 6, 8)
-    flow[:, 0] = 2.0
-    carried = forward_splat(flow)
-    assert (carried[0, 0, :, 2:] == 2).all()
-    assert (carried[0, 0, :, :2] == 0).all()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("by_window", [False, True])
 def test_batch_norm_of_the_context_is_that_of_one_window_only_if_asked(by_window: bool) -> None:

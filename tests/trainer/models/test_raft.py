@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tests.trainer.models.raft_pairs import HEIGHT, SAMPLED, WIDTH, formula_weights, pictures
 from trainer.losses.warp import warp
-from trainer.models.raft import RAFT, RAFT_SIZES, look_up, torchvision_name
+from trainer.models.raft import RAFT, RAFT_SIZES, torchvision_name
 from trainer.models.raft_flow import RaftFlow
 from v2v_protocol.errors import UsageError
 
@@ -52,14 +52,6 @@ def in_the_authors_layout(state: dict[str, Tensor], size: str) -> dict[str, Tens
             renamed["module." + name.replace("downsample.1", "norm3")] = value
         renamed["module." + name] = value
     return renamed
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def saved(folder: Path, size: str, authors: bool = False) -> Path:
@@ -122,19 +114,6 @@ def test_bfloat16_stays_near() -> None:
     near = RaftFlow("small", PUBLISHED, bfloat16=True)(*pictures())
     assert near.dtype == torch.float32
     assert 0 < (near[0] - exact[0]).norm(dim=0).median() < 0.1
-
-
-def test_correlations_are_sampled_at_the_right_positions() -> None:
-    """Against plain indexing: offsets in x vary slowest, those in y fastest."""
-    plane = torch.arange(35.0).reshape(1, 1, 5, 7).repeat(35, 1, 1, 1)
-    y, x = torch.meshgrid(torch.arange(5.0), torch.arange(7.0), indexing="ij")
-    found = look_up([plane], torch.stack([x, y])[None], radius=1)
-    expected = torch.zeros(9, 5, 7)
-    padded = torch.nn.functional.pad(plane[0, 0], (1, 1, 1, 1))
-    for column in range(3):
-        for row in range(3):
-            expected[3 * column + row] = padded[row : row + 5, column : column + 7]
-    np.testing.assert_allclose(found[0], expected, atol=1e-4)
 
 
 def test_unsuitable_weights_are_refused_with_a_source(tmp_path: Path) -> None:

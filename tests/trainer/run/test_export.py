@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -19,14 +20,19 @@ def network(seed: int) -> FireNet:
     return FireNet(base_channels=4)
 
 
+def saved(path: Path, steps: int, model: Any, average: Any = None, **options: object) -> str:
+    config = {"network": {"name": "firenet", "options": {"base_channels": 4, **options}, "weights": ""}}
+    save_checkpoint(path, Checkpoint(steps, 0, model, {}, average, None, config))
+    return str(path)
+
+
 @pytest.mark.parametrize("is_averaged", [True, False])
 def test_the_averaged_weights_are_exported_where_there_are_any(
     tmp_path: Path, is_averaged: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model, average = network(0).state_dict(), network(1).state_dict()
-    config = {"network": {"name": "firenet", "options": {"base_channels": 4}, "weights": ""}}
-    save_checkpoint(tmp_path / "last.pt", Checkpoint(7, 0, model, {}, average if is_averaged else None, None, config))
-    assert main([str(tmp_path / "last.pt"), str(tmp_path / "firenet.pt")]) == 0
+    last = saved(tmp_path / "last.pt", 7, model, average if is_averaged else None)
+    assert main([last, str(tmp_path / "firenet.pt")]) == 0
     assert "trained for 7 steps" in capsys.readouterr().out
     found, name = load_network(tmp_path / "firenet.pt")
     assert name == "firenet"
@@ -35,19 +41,14 @@ def test_the_averaged_weights_are_exported_where_there_are_any(
 
 
 def test_the_weights_of_several_runs_are_averaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    states, files = (
-        [network(seed).state_dict() for seed in range(3)],
-        [str(tmp_path / f"{seed}.pt") for seed in range(4)],
-    )
-    for number, file in enumerate(files):
-        options = {"base_channels": 4, "normalize_voxels": number == 3}
-        config = {"network": {"name": "firenet", "options": options, "weights": ""}}
-        save_checkpoint(file, Checkpoint(7 + number, 0, states[number % 3], {}, None, None, config))
-    assert main([*files[:3], str(tmp_path / "mean.pt")]) == 0
+    states = [network(seed).state_dict() for seed in range(3)]
+    files = [saved(tmp_path / f"{number}.pt", 7 + number, state) for number, state in enumerate(states)]
+    assert main([*files, str(tmp_path / "mean.pt")]) == 0
     assert "trained for 24 steps" in capsys.readouterr().out
     for key, tensor in load_network(tmp_path / "mean.pt")[0].state_dict().items():
         torch.testing.assert_close(tensor, sum(state[key] for state in states) / 3)
-    assert main([files[0], files[3], str(tmp_path / "mixed.pt")]) == 2
+    other = saved(tmp_path / "other.pt", 10, states[0], normalize_voxels=True)
+    assert main([files[0], other, str(tmp_path / "mixed.pt")]) == 2
     assert "give one network" in capsys.readouterr().err
 
 
@@ -71,12 +72,11 @@ def test_a_file_that_cannot_be_written_is_said(
     def full(_descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
-    config = {"network": {"name": "firenet", "options": {"base_channels": 4}, "weights": ""}}
-    save_checkpoint(tmp_path / "last.pt", Checkpoint(7, 0, network(0).state_dict(), {}, None, None, config))
+    last = saved(tmp_path / "last.pt", 7, network(0).state_dict())
     target = tmp_path / "firenet.pt"
     if refusal == "File exists":
         target = tmp_path / "last.pt" / "firenet.pt"
     else:
         monkeypatch.setattr(os, "fsync", full)
-    assert main([str(tmp_path / "last.pt"), str(target)]) == 2
+    assert main([last, str(target)]) == 2
     assert f"{target}: {refusal}; give another FILE, or free space there" in capsys.readouterr().err

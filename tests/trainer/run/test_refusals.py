@@ -83,14 +83,6 @@ def test_another_run_is_not_resumed(server: FakeServer, tmp_path: Path, capsys: 
     assert "stream.seed: 0 -> 9" in message
 
 
-def test_other_videos_are_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with FakeServer(sequences=23) as server:
-        trained(tmp_path, server.address, "run", run__steps=1)
-        server.restart(catalogue="catalogue-2")
-        message = refused(tmp_path, server.address, capsys, resume=f"run/{LAST}")
-    assert "catalogue_digest" in message
-
-
 def test_a_refused_resume_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Neither the configuration nor readings of the other corpus, and no reading is dropped."""
     with FakeServer(sequences=23) as server:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import resource
 from collections.abc import Callable
@@ -12,12 +11,10 @@ import numpy as np
 import pytest
 import torch
 
+from tests.trainer.training import ALONE
 from trainer.config import TrainConfig
-from trainer.run.distributed import Ranks
 from trainer.run.reporting import METRICS_FILE, Meter, Reporter, read_metrics
 from v2v_protocol.errors import UsageError
-
-ALONE = Ranks(0, 1, torch.device("cpu"))
 
 
 def test_the_meter_returns_means_and_resets(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,12 +38,6 @@ def test_the_meter_returns_means_and_resets(monkeypatch: pytest.MonkeyPatch) -> 
     }  # fmt: skip
 
 
-def test_metrics_are_lines_of_json(tmp_path: Path) -> None:
-    path = tmp_path / "m.jsonl"
-    path.write_text(json.dumps({"step": 1}) + "\n" + json.dumps({"step": 2}) + "\n")
-    assert read_metrics(path) == [{"step": 1}, {"step": 2}]
-
-
 @pytest.mark.parametrize("torn", ['{"step": 3, "to', "{", "\0\0\0", "\ufffd"])
 def test_a_truncated_last_line_is_ignored(tmp_path: Path, torn: str) -> None:
     path = tmp_path / "m.jsonl"
@@ -65,13 +56,6 @@ def test_a_malformed_line_is_reported(tmp_path: Path, damaged: str) -> None:
         path.write_text(f'{{"step": 1}}\n{damaged}\n{after}')
         with pytest.raises(UsageError, match=r"m\.jsonl, line 2, is no record"):
             read_metrics(path)
-
-
-def test_a_reading_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
-    reporter = Reporter(tmp_path, speaks=True)
-    (tmp_path / METRICS_FILE).symlink_to("/dev/full")
-    with reporter, pytest.raises(UsageError, match=r"metrics\.jsonl: No space left"):
-        reporter.metrics(1, 0, 0.1, {"total": 1.0})
 
 
 READING = {"total": 1.0, "steps_per_second": 1.0, "data_wait_seconds": 0.0}

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from tests.trainer.evaluation.h5_file import random_recording
 from tests.trainer.evaluation.test_flow import constant, recording, run
+from tests.trainer.training import ALONE
 from trainer.config import RunConfig
 from trainer.evaluation.config import parse_config
 from trainer.evaluation.evaluate import Run, evaluate_data_set
@@ -30,7 +31,6 @@ from trainer.tasks.reconstruction import Reconstruction, ReconstructionSettings
 from v2v_protocol.errors import UsageError
 
 CPU = torch.device("cpu")
-ALONE = Ranks(0, 1, CPU)
 DATA_SETS = [
     {"name": "first", "folder": "a", "sequences": {"0": [0, 0.1], "1": None}},
     {"name": "second", "folder": "b", "sequences": ["0", "absent"]},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.client.fake_server import FakeServer
 from tests.trainer.models import numpy_networks as oracle
+from tests.trainer.training import ALONE
 from trainer.config import TrainConfig
 from trainer.config_file import load_config, shipped
 from trainer.feed import Feed, stream
@@ -26,7 +27,6 @@ from trainer.run.distributed import Ranks
 from trainer.run.reporting import Meter
 from trainer.tasks import Work
 
-ALONE = Ranks(0, 1, torch.device("cpu"))
 NETWORKS: dict[str, dict[str, Any]] = {
     "e2vid": {"base_channels": 2, "encoders": 2}, "firenet": {"base_channels": 2}, "hypere2vid": {"base_channels": 2},
     "etnet": {"base_channels": 2}, "evflownet": {"base_channels": 2}, "eraft": {},
@@ -37,12 +37,6 @@ SHIPPED = [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow])
 SIDES_PX = {"alex": 33}
 OTHER_SIDE_PX = 17
 """The least that each network of LPIPS takes, and divides by nothing."""
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[FakeServer]:
-    with FakeServer(sequences=23) as running:
-        yield running
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from tests.oracles.cameras import Film, TrueCamera, record, rendered_film
 from tests.oracles.simulators import frame_offset, part_of
-from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.errors import UsageError
 from v2v_recordings.items import ConvertOptions, Light, SensorSize
 from v2v_server.config import recipe_setting
 from v2v_tools.fit import estimators
@@ -27,7 +27,7 @@ from v2v_tools.fit.increments import increments_of, is_still, still_time
 from v2v_tools.fit.interval import Estimate, bootstrap
 from v2v_tools.fit.recording import Recorded, chosen_pixels, read_recording, recorded
 from v2v_tools.fit.regression import Regression
-from v2v_tools.fit.report import draw_fit, report_lines, write_recipe
+from v2v_tools.fit.report import report_lines, write_recipe
 from v2v_tools.fit.statistics import simulate_recording
 
 LIGHT = Light.parse("2.2")
@@ -41,11 +41,14 @@ def film() -> Film:
     return rendered_film("coffee", 48, 64, 70.0, moving=1.0)
 
 
-def recording_of(camera: TrueCamera, film_seen: Film | None = None) -> Recorded:
+def recording_of(
+    camera: TrueCamera, film_seen: Film | None = None, frames: npt.NDArray[np.uint8] | None = None
+) -> Recorded:
     made = record(film_seen or film(), camera, 1)
-    height, width = made["frames"].shape[1:]
+    shown = made["frames"] if frames is None else frames
+    height, width = shown.shape[1:]
     place = made["y"].astype(np.int64) * width + made["x"]
-    return recorded(height, width, made["t"], place, made["p"], made["frames"], made["frame_us"], light=LIGHT)
+    return recorded(height, width, made["t"], place, made["p"], shown, made["frame_us"], light=LIGHT)
 
 
 @lru_cache(maxsize=3)
@@ -105,25 +108,6 @@ def test_the_recipe_is_one_that_a_server_accepts(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_picture_shows_measured_and_simulated() -> None:
-    page = draw_fit(fitted(SLOW), "recording.h5")
-    assert page.dtype == np.uint8
-    assert page.shape[1] == 1400
-    assert fitted(SLOW).simulated is not None
-
-
-def test_a_recording_without_frames_is_not_fitted() -> None:
-    rng = np.random.default_rng(0)
-    alone = recorded(
-        8, 8, np.sort(rng.integers(0, 10**6, 999)), rng.integers(0, 64, 999), rng.random(999) < 0.5,
-        np.empty((0, 8, 8), np.uint8), np.empty(0, np.int64),
-    )  # fmt: skip
-    with pytest.raises(V2VError, match=r"has 0 frames, and a fit needs 3: .* or give --static") as caught:
-        fit(alone)
-    assert not isinstance(caught.value, UsageError)
-
-
-@pytest.mark.slow
 def test_noise_that_ignores_the_refractory_period_does_not_hide_it() -> None:
     made = fitted(IGNORING)
     check(made.estimates, IGNORING, ("threshold_pos", "threshold_neg", "refractory_seconds", "shot_noise_hz"))
@@ -154,13 +138,9 @@ def test_noise_is_that_of_pixels_whose_neighbours_are_quiet_too() -> None:
 def test_late_frames_are_no_low_pass(camera: TrueCamera, late: int) -> None:
     """The low-pass is slower in the dark, frames are as late everywhere."""
     seen = rendered_film("camera", 48, 64, 70.0, moving=0.8, still=0.0)
-    made = record(seen, camera, 1)
     shown = np.minimum(np.arange(0, len(seen.grey), 8) + late, len(seen.grey) - 1)
-    place = made["y"].astype(np.int64) * 64 + made["x"]
-    frames = np.rint(255 * seen.grey[shown]).astype(np.uint8)
-    given_recording = recorded(48, 64, made["t"], place, made["p"], frames, made["frame_us"], light=LIGHT)
-    increments = increments_of(given_recording, camera.refractory_seconds, 33_333.0)
-    corner = Regression(increments, given_recording.blocks()).corner
+    made = recording_of(camera, seen, np.rint(255 * seen.grey[shown]).astype(np.uint8))
+    corner = Regression(increments_of(made, camera.refractory_seconds, 33_333.0), made.blocks()).corner
     inverse = 1 / camera.photoreceptor_hz if camera.photoreceptor_hz else 0.0
     assert corner.is_absent != bool(inverse)
     assert corner.is_absent or corner.low <= inverse
