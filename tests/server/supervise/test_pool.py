@@ -1,4 +1,4 @@
-"""The pool with harmless programs in the place of workers."""
+"""The pool with harmless programs in the place of workers, some of them started before there is work."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ import psutil
 import pytest
 
 from tests.waiting import until
-from v2v_protocol.errors import WorkerCrashLoop
+from v2v_protocol.errors import CorpusError, WorkerCrashLoop
 from v2v_server.broker.leases import Cause, Loss
-from v2v_server.supervise import local_host as child_module
-from v2v_server.supervise import local_host as host_module
-from v2v_server.supervise.local_host import LocalHost
+from v2v_server.config import ServeConfig
+from v2v_server.supervise import local_host
+from v2v_server.supervise.local_host import LocalHost, WorkerProcess, start_ahead
 from v2v_server.supervise.pool import Death, Pool, crash_budget
 from v2v_server.worker.logbook import note
 
@@ -45,7 +45,7 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, str], Pool
     pools: list[Pool] = []
 
     def make(workers: int, program: str) -> Pool:
-        monkeypatch.setattr(child_module, "PROGRAM", (sys.executable, "-S", "-E", "-c", program))
+        monkeypatch.setattr(local_host, "PROGRAM", (sys.executable, "-S", "-E", "-c", program))
         pools.append(Pool(LocalHost("/corpus"), "label"))
         pools[-1].start("tcp://127.0.0.1:1")
         pools[-1].scale(workers)
@@ -200,7 +200,7 @@ def test_a_system_that_starts_no_process_at_all_ends_in_the_crash_budget(
 def test_a_crash_is_told_from_a_kill(
     start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch, number: int, cause: Cause, text: str
 ) -> None:
-    monkeypatch.setattr(host_module, "out_of_memory_kills", lambda: 5)
+    monkeypatch.setattr(local_host, "out_of_memory_kills", lambda: 5)
     pool = started(start(1, SLEEPS))
     until(lambda: is_loaded(pids_of(pool)[0]))
     os.kill(pids_of(pool)[0], number)
@@ -212,7 +212,7 @@ def test_all_that_are_killed_at_once_for_want_of_memory_are_told_so_and_none_lon
     start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kills = [7]
-    monkeypatch.setattr(host_module, "out_of_memory_kills", lambda: kills[0])
+    monkeypatch.setattr(local_host, "out_of_memory_kills", lambda: kills[0])
     pool = start(2, SLEEPS)
 
     def causes_of_deaths_at(now: float) -> list[Cause]:
@@ -236,7 +236,7 @@ def test_all_that_are_killed_at_once_for_want_of_memory_are_told_so_and_none_lon
 
 def test_the_kernels_count_of_such_kills_is_read() -> None:
     said = Path("/proc/vmstat").read_text(encoding="ascii")
-    assert f"\noom_kill {child_module.out_of_memory_kills()}\n" in said
+    assert f"\noom_kill {local_host.out_of_memory_kills()}\n" in said
 
 
 @pytest.mark.parametrize("status", [0, 1, 3])
@@ -398,10 +398,70 @@ def test_stop_after_a_crash_leaves_no_zombie_and_may_come_twice(start: Callable[
 
 @pytest.mark.parametrize("decodes", [True, False])
 def test_only_a_death_while_decoding_speaks_against_the_video(decodes: bool) -> None:
-    child = child_module.WorkerProcess()
+    child = WorkerProcess()
     with open(f"/proc/self/fd/{child.logbook.descriptor}", "r+b") as worker:
         note(worker.fileno(), 7, decodes=decodes)
     child.process.send_signal(signal.SIGSEGV)
     child.process.wait()
     assert child.post_mortem(short_of_memory=False) == Loss(Cause.CRASHED, "was ended by SIGSEGV", 7, for_all=decodes)
     child.end()
+
+
+# --- workers that are started before there is work --------------------------------------------------------------------
+
+
+WRITES = "import os, sys; open(sys.argv[1], 'wb').write(sys.stdin.buffer.read())"
+
+
+@pytest.fixture
+def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file in which a standby writes what it is told; it ends then."""
+    path = tmp_path / "told"
+    monkeypatch.setattr(local_host, "PROGRAM", (sys.executable, "-S", "-E", "-c", WRITES, str(path)))
+    return path
+
+
+def test_the_pool_takes_standbys_first_and_tells_them_the_arguments_of_a_worker(told: Path) -> None:
+    config = ServeConfig(videos="/corpus", workers=(1, 1))
+    with start_ahead(config) as standbys:
+        (standby,) = standbys
+        expected = local_host.arguments("tcp://127.0.0.1:1", "/corpus", "label-0.1", ["--debug"], standby.logbook)
+        pool = Pool(LocalHost("/corpus", ["--debug"], standbys), "label")
+        pool.start("tcp://127.0.0.1:1")
+        pool.scale(1)
+        pool.watch(0.0, 0)
+        assert standbys == []
+        standby.process.wait()
+        pool.stop(0.0, 0.0)
+    assert told.read_bytes().decode().split("\0") == expected
+
+
+def test_standbys_that_are_not_used_end_with_the_start(told: Path) -> None:
+    def fail(config: ServeConfig, started: list[WorkerProcess]) -> None:
+        with start_ahead(config) as standbys:
+            started += standbys
+            raise CorpusError("no videos")
+
+    started: list[WorkerProcess] = []
+    with pytest.raises(CorpusError):
+        fail(ServeConfig(videos="videos", workers=(2, 2)), started)
+    assert len(started) == 2
+    assert all(each.process.returncode is not None for each in started)
+
+
+def test_a_standby_that_has_ended_is_a_failed_start_and_leaves_no_zombie(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local_host, "PROGRAM", (sys.executable, "-S", "-E", "-c", "raise SystemExit(3)"))
+    standby = WorkerProcess()
+    standby.process.wait()
+    pool = Pool(LocalHost("/corpus", (), [standby]), "label")
+    pool.start("tcp://127.0.0.1:1")
+    pool.scale(1)
+    (death,) = pool.watch(0.0, 0)
+    assert "could not be started" in death.loss.text
+    pool.stop(0.0, 0.0)
+
+
+def test_a_server_with_workers_elsewhere_starts_none() -> None:
+    config = ServeConfig(videos="videos", engine="ray", worker_bind="tcp://127.0.0.1:5556")
+    with start_ahead(config) as standbys:
+        assert standbys == []
