@@ -537,6 +537,7 @@ def test_a_peer_that_sends_only_faults_is_disconnected(frames: list[bytes]) -> N
 
 def test_a_consumer_whose_connection_ended_has_a_moment_to_come_back() -> None:
     at = peers()
+    at.now = 100.0
     for name in (b"comes back", b"does not"):
         at.hello(name)
         at.dispatcher.consumer_gone(name, at.now)

@@ -161,13 +161,6 @@ def test_a_task_queued_behind_one_that_hangs_is_slow() -> None:
     assert book.slow(6.6) == [(numbered(2), A)]
 
 
-def test_what_was_usual_goes_with_the_consumer() -> None:
-    book = practised(1.0)
-    book.forget_session(b"consumer")
-    book.grant(REQUEST, A, 0.0)
-    assert book.slow(50.0) == []
-
-
 # --- any order --------------------------------------------------------------------------------------------------------
 
 

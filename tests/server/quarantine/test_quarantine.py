@@ -113,8 +113,6 @@ def write(file: Path, *verdicts: QuarantineEntry) -> Quarantine:
 def test_the_file_lies_beside_the_index(tmp_path: Path) -> None:
     file = quarantine_path(Path("/corpus"), tmp_path)
     assert file.parent == tmp_path
-    assert file.name.startswith("quarantine-")
-    assert file.suffix == ".jsonl"
     assert file != quarantine_path(Path("/corpus2"), tmp_path)
 
 
