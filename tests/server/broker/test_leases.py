@@ -92,6 +92,24 @@ def test_what_a_consumer_gave_up_is_counted_until_the_workers_are_through_with_i
     assert book.abandoned(b"consumer") == 0
 
 
+# --- twins ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fast", [A, B])
+def test_the_first_answer_retires_the_twin(fast: bytes) -> None:
+    """Whether it is a sample or a failure: the book cannot tell, and both answer for the two of them."""
+    book = LeaseBook(DEADLINE)
+    numbers = {A: book.grant(REQUEST, A, 0.0), B: book.grant(REQUEST, B, 5.0)}
+    slow = B if fast == A else A
+    assert book.finished(numbers[fast], fast, 6.0) is REQUEST
+    assert book.request(numbers[slow], slow) is None
+    # The slower one does not know: it is still at it, fills its worker, and may be overdue.
+    assert (len(book), book.held_by(slow), list(book.requests_of(slow))) == (1, 1, [])
+    assert overdue_workers(book, DEADLINE + 5.5) == [slow]
+    assert book.finished(numbers[slow], slow, 7.0) is None
+    assert (len(book), book.held_by(A), book.held_by(B)) == (0, 0, 0)
+
+
 # --- the slow ---------------------------------------------------------------------------------------------------------
 
 
@@ -179,6 +197,7 @@ class LeaseModel(RuleBasedStateMachine):
 
     numbers = Bundle("numbers")
     workers = st.sampled_from((A, B, b"worker c"))
+    speakers = st.sampled_from((None, None, None, A, B, b"worker c"))  # None: the worker that has the lease
     sessions = st.sampled_from((b"s1", b"s2"))
 
     def __init__(self) -> None:
@@ -188,6 +207,9 @@ class LeaseModel(RuleBasedStateMachine):
         self.now = 0.0
         self.requests = 0
         self.ever: set[int] = set()
+
+    def _speaker(self, number: int, worker: bytes | None) -> bytes:
+        return worker or (self.out[number].worker if number in self.out else A)
 
     def _granted(self, request: Request, worker: bytes) -> int:
         number = self.book.grant(request, worker, self.now)
@@ -200,10 +222,10 @@ class LeaseModel(RuleBasedStateMachine):
         for place in self.out.values():
             place.retired |= place.request == request
 
-    @rule(target=numbers, worker=workers, session=sessions)
-    def grant(self, worker: bytes, session: bytes) -> int:
+    @rule(target=numbers, workers=st.lists(workers, min_size=1, max_size=2, unique=True), session=sessions)
+    def grant(self, workers: list[bytes], session: bytes) -> object:
         self.requests += 1
-        return self._granted(Request(session, 0, self.requests), worker)
+        return multiple(*(self._granted(Request(session, 0, self.requests), worker) for worker in workers))
 
     @rule(target=numbers, number=numbers, worker=workers)
     def twin(self, number: int, worker: bytes) -> object:
@@ -214,8 +236,9 @@ class LeaseModel(RuleBasedStateMachine):
             return multiple()  # no worker is given a request that it has
         return self._granted(place.request, worker)
 
-    @rule(number=numbers, worker=workers)
-    def begun(self, number: int, worker: bytes) -> None:
+    @rule(number=numbers, speaker=speakers)
+    def begun(self, number: int, speaker: bytes | None) -> None:
+        worker = self._speaker(number, speaker)
         self.book.mark_begun(number, worker, self.now)
         place = self.out.get(number)
         if place is not None and place.worker == worker and not place.begun:
@@ -224,9 +247,9 @@ class LeaseModel(RuleBasedStateMachine):
                 if other.worker == worker:
                     other.deadline = self.now + DEADLINE
 
-    @rule(number=numbers, worker=workers)
-    def finished(self, number: int, worker: bytes) -> None:
-        place = self.out.get(number)
+    @rule(number=numbers, speaker=speakers)
+    def finished(self, number: int, speaker: bytes | None) -> None:
+        worker, place = self._speaker(number, speaker), self.out.get(number)
         asked = self.book.request(number, worker)
         request = self.book.finished(number, worker, self.now)
         assert request == asked
