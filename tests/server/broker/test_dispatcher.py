@@ -307,6 +307,13 @@ def test_a_video_that_the_server_lacks_as_well_is_refused() -> None:
     assert at.dispatcher.counters.missing_videos == 0
 
 
+def test_a_consumer_may_leave_while_its_video_is_looked_for() -> None:
+    at = serving(3)
+    at.consumer_says(b"c", Goodbye())
+    at.fail(here=True)
+    assert (at.dispatcher.counters.missing_videos, at.dispatcher.waiting) == (0, 0)
+
+
 def test_a_failed_video_is_passed_over_and_the_next_lease_says_so() -> None:
     at = serving(3)
     first = at.fail(reason="no frame", frame=17)
