@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -43,44 +43,35 @@ def dataset(
     )
 
 
+def disturbed(stream: V2VStreamDataset, strike: Callable[[], object]) -> list[str]:
+    """Return the digests of an epoch whose network is struck after the first batch."""
+    batches = iter(stream)
+    first = digest(next(batches))
+    strike()
+    return [first, *map(digest, batches)]
+
+
 def test_without_a_fault_the_proxy_changes_nothing(proxy: Proxy, undisturbed: list[str]) -> None:
     assert [digest(batch) for batch in dataset(proxy, NEVER_BY_THE_CLOCK)] == undisturbed
     assert proxy.connections == 2  # the first asks how large a sample is
     assert (proxy.refused, proxy.truncated, proxy.swallowed) == (0, 0, 0)
 
 
-def test_cut_after_every_batch(proxy: Proxy, undisturbed: list[str]) -> None:
+@pytest.mark.parametrize("shared_memory", [False, True])
+def test_cut_after_every_batch(proxy: Proxy, undisturbed: list[str], shared_memory: bool) -> None:
+    """With shared memory, what was answered and not heard of is in slots that are never used again."""
     got = []
-    for batch in dataset(proxy, NEVER_BY_THE_CLOCK):
+    for batch in dataset(proxy, NEVER_BY_THE_CLOCK, shared_memory=shared_memory):
         got.append(digest(batch))
         proxy.cut()
     assert got == undisturbed
-    assert proxy.connections > 3
-
-
-def test_cut_after_every_batch_with_shared_memory(proxy: Proxy, undisturbed: list[str]) -> None:
-    """What was answered and not heard of is in slots that are never used again."""
-    got = []
-    for batch in dataset(proxy, NEVER_BY_THE_CLOCK, shared_memory=True):
-        got.append(digest(batch))
-        proxy.cut()
-    assert got == undisturbed
-
-
-@pytest.mark.parametrize("after_bytes", [1500, 4000, 9000])
-def test_truncated_with_shared_memory(proxy: Proxy, undisturbed: list[str], after_bytes: int) -> None:
-    proxy.truncate(after_bytes, connections=3)
-    assert [digest(batch) for batch in dataset(proxy, shared_memory=True)] == undisturbed
-    assert proxy.truncated == 3
+    assert shared_memory or proxy.connections > 3
 
 
 def test_cut_and_refused_for_a_while(proxy: Proxy, undisturbed: list[str]) -> None:
-    batches = iter(dataset(proxy, NEVER_BY_THE_CLOCK))
-    got = [digest(next(batches))]
-    proxy.refuse(connections=4)
-    proxy.cut()
-    got += [digest(batch) for batch in batches]
-    assert got == undisturbed
+    assert (
+        disturbed(dataset(proxy, NEVER_BY_THE_CLOCK), lambda: (proxy.refuse(connections=4), proxy.cut())) == undisturbed
+    )
     assert proxy.refused == 4
 
 
@@ -97,49 +88,44 @@ def test_delay(proxy: Proxy, undisturbed: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("way", "after_bytes"),
+    ("way", "after_bytes", "shared_memory"),
     [
-        (Way.TO_CLIENT, 10),  # in the greeting
-        (Way.TO_CLIENT, 700),  # in Welcome
-        (Way.TO_CLIENT, 20_000),  # in a sample's first array
-        (Way.TO_CLIENT, 75_001),
-        (Way.TO_SERVER, 70),  # in the greeting
-        (Way.TO_SERVER, 300),  # in Hello
+        (Way.TO_CLIENT, 10, False),  # in the greeting
+        (Way.TO_CLIENT, 700, False),  # in Welcome
+        (Way.TO_CLIENT, 20_000, False),  # in a sample's first array
+        (Way.TO_CLIENT, 75_001, False),
+        (Way.TO_SERVER, 70, False),  # in the greeting
+        (Way.TO_SERVER, 300, False),  # in Hello
+        (Way.TO_CLIENT, 1500, True),
+        (Way.TO_CLIENT, 4000, True),
+        (Way.TO_CLIENT, 9000, True),
     ],
 )
-def test_truncated_at_the_start(proxy: Proxy, undisturbed: list[str], way: Way, after_bytes: int) -> None:
+def test_truncated_at_the_start(
+    proxy: Proxy, undisturbed: list[str], way: Way, after_bytes: int, shared_memory: bool
+) -> None:
     proxy.truncate(after_bytes, way=way, connections=3)
-    assert [digest(batch) for batch in dataset(proxy)] == undisturbed
+    assert [digest(batch) for batch in dataset(proxy, shared_memory=shared_memory)] == undisturbed
     assert proxy.truncated == 3
 
 
 def test_truncated_in_mid_message_again_and_again(proxy: Proxy, undisturbed: list[str]) -> None:
     """No connection lives for two samples (of 31 kB)."""
-    batches = iter(dataset(proxy, NEVER_BY_THE_CLOCK))
-    got = [digest(next(batches))]
-    proxy.truncate(50_000, connections=8)
-    got += [digest(batch) for batch in batches]
-    assert got == undisturbed
+    stream = dataset(proxy, NEVER_BY_THE_CLOCK)
+    assert disturbed(stream, lambda: proxy.truncate(50_000, connections=8)) == undisturbed
     assert proxy.truncated == 8
 
 
 def test_a_truncated_request(proxy: Proxy, undisturbed: list[str]) -> None:
-    batches = iter(dataset(proxy, NEVER_BY_THE_CLOCK))
-    got = [digest(next(batches))]
-    proxy.truncate(9, way=Way.TO_SERVER, connections=1)
-    got += [digest(batch) for batch in batches]
-    assert got == undisturbed
+    stream = dataset(proxy, NEVER_BY_THE_CLOCK)
+    assert disturbed(stream, lambda: proxy.truncate(9, way=Way.TO_SERVER, connections=1)) == undisturbed
     assert proxy.truncated == 1
 
 
 @pytest.mark.parametrize("after_bytes", [0, 45_000])
 def test_a_dead_connection_is_left_for_another(proxy: Proxy, undisturbed: list[str], after_bytes: int) -> None:
     """It stays open and swallows everything, and so do the next two."""
-    batches = iter(dataset(proxy))
-    got = [digest(next(batches))]
-    proxy.blackhole(after_bytes, connections=3)
-    got += [digest(batch) for batch in batches]
-    assert got == undisturbed
+    assert disturbed(dataset(proxy), lambda: proxy.blackhole(after_bytes, connections=3)) == undisturbed
     assert proxy.swallowed > 0
     assert proxy.connections >= 2 + 3
 
@@ -159,9 +145,8 @@ def test_nothing_heard_within_the_deadline_names_address_and_last_sample(proxy: 
 
 def test_a_dataset_that_gave_up_begins_again_after_healing(proxy: Proxy, undisturbed: list[str]) -> None:
     stream = dataset(proxy, timeout_seconds=3.0)
-    got = []
     batches = iter(stream)
-    got.append(digest(next(batches)))
+    got = [digest(next(batches))]
     state = stream.state_dict()
     proxy.blackhole()
     with pytest.raises(ServerLost):

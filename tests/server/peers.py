@@ -304,3 +304,12 @@ def peers(
         share_bytes=share_bytes,
     )
     return Peers(dispatcher, videos, held)
+
+
+def serving(*indices: int, worker: bytes = b"w", credit: int = CREDIT, **hello: Any) -> Peers:
+    """Return a dispatcher with a worker, and a consumer that has asked for these indices."""
+    at = peers()
+    at.join(worker, credit)
+    at.hello(**hello)
+    at.want(*indices)
+    return at

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,13 @@ from v2v_server.commands.serve import main as serve
 from v2v_server.config import DEFAULT_BIND, ServeConfig, read_yaml_mapping, recipe_setting
 
 
-def load(tmp_path: Path, text: str | None = None, **flags: Any) -> ServeConfig:
-    """The configuration from a YAML text, if any, and flags."""
+def load(tmp_path: Path, text: str | None = None, settings: Sequence[str] = (), **flags: Any) -> ServeConfig:
+    """The configuration from a YAML text, if any, settings of the recipe, and flags."""
     if text is None:
-        return ServeConfig.load(None, flags)
+        return ServeConfig.load(None, flags, settings)
     file = tmp_path / "serve.yaml"
     file.write_text(text, encoding="utf-8")
-    return ServeConfig.load(str(file), flags)
+    return ServeConfig.load(str(file), flags, settings)
 
 
 # --- file and flags ---------------------------------------------------------------------------------------------------
@@ -32,7 +33,7 @@ def load(tmp_path: Path, text: str | None = None, **flags: Any) -> ServeConfig:
 
 def test_defaults(tmp_path: Path) -> None:
     config = load(tmp_path, videos="clips", workers=None)
-    assert config == ServeConfig(videos="clips")
+    assert config == load(tmp_path, "", videos="clips") == ServeConfig(videos="clips")
     assert (config.workers, config.bind, config.insecure) == ((2, 2), DEFAULT_BIND, False)
     assert config.spec == StreamSpec()
 
@@ -109,24 +110,16 @@ def test_single_fields_are_changed_in_the_recipe_of_the_file(
 
 
 def test_settings_change_the_recipe_of_a_stream_preset_in_the_file(tmp_path: Path) -> None:
-    file = tmp_path / "serve.yaml"
-    file.write_text("videos: a\npreset: natural-davis346\n")
-    config = ServeConfig.load(str(file), {}, ["bins=3"])
+    config = load(tmp_path, "videos: a\npreset: natural-davis346\n", ["bins=3"])
     assert config.spec.recipe == preset("davis346-running").replace(bins=3)
     assert config.spec.scene == "auto"
 
 
 def test_a_named_recipe_of_the_file_is_changed_too_and_without_one_the_papers(tmp_path: Path) -> None:
-    file = tmp_path / "serve.yaml"
-    file.write_text("videos: a\nrecipe: clean\n")
-    assert ServeConfig.load(str(file), {}, ["bins=3"]).spec.recipe == preset("clean").replace(bins=3)
-    assert ServeConfig.load(None, {"videos": "a"}, ["bins=3"]).spec.recipe == Recipe(bins=3)
-    file.write_text("videos: a\nrecipe: 5\n")
+    assert load(tmp_path, "videos: a\nrecipe: clean\n", ["bins=3"]).spec.recipe == preset("clean").replace(bins=3)
+    assert load(tmp_path, None, ["bins=3"], videos="a").spec.recipe == Recipe(bins=3)
     with pytest.raises(RecipeError, match="unknown recipe 5"):
-        ServeConfig.load(str(file), {}, ["bins=3"])
-
-
-SMALL = "--videos a --bind tcp://127.0.0.1:* --set voxels_per_clip=1 --set crop_height_px=8 --set crop_width_px=8"
+        load(tmp_path, "videos: a\nrecipe: 5\n", ["bins=3"])
 
 
 @pytest.mark.parametrize(
@@ -143,12 +136,9 @@ def test_the_workers_that_a_credit_is_settled_for(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(f"v2v_server.serve.{what_changes_this_process}", lambda: None)
     monkeypatch.setattr("v2v_server.serve.load_catalogue", lambda config: corpus(video("a.mp4")))
     monkeypatch.setattr("v2v_server.serve.Dispatcher", dispatcher)
+    small = "--set voxels_per_clip=1 --set crop_height_px=8 --set crop_width_px=8"
     with pytest.raises(Stopped, match=f"^{expected}$"):
-        serve(f"{SMALL} {flags}".split())
-
-
-def test_an_empty_file_says_nothing(tmp_path: Path) -> None:
-    assert load(tmp_path, "", videos="a") == ServeConfig(videos="a")
+        serve(f"--videos a --bind tcp://127.0.0.1:* {small} {flags}".split())
 
 
 @pytest.mark.parametrize(
@@ -201,11 +191,6 @@ def test_refusals_name_the_flag(tmp_path: Path, text: str, message: str) -> None
     flags = {} if text.startswith("videos") else {"videos": "a"}
     with pytest.raises(UsageError, match=message):
         load(tmp_path, text, **flags)
-
-
-def test_no_videos() -> None:
-    with pytest.raises(UsageError, match="--videos is missing"):
-        ServeConfig.load(None, {})
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
@@ -390,5 +375,4 @@ def test_the_least_comes_first() -> None:
 
 
 def test_in_a_file_two_numbers_are_no_number_of_base_sixty(tmp_path: Path) -> None:
-    (tmp_path / "serve.yaml").write_text("videos: a\nworkers: 8:32\n")
-    assert ServeConfig.load(str(tmp_path / "serve.yaml"), {}).workers == (8, 32)
+    assert load(tmp_path, "videos: a\nworkers: 8:32\n").workers == (8, 32)

@@ -89,6 +89,14 @@ class Scripted:
         return [ToWorker(b"w", encode(Stop()))]
 
 
+def toys(workers: int) -> ToyPool:
+    """A pool of workers toy1, toy2 and so on."""
+    pool = ToyPool(lambda name, address: None)
+    pool.scale(workers)
+    pool.watch(0.0, 0)
+    return pool
+
+
 def served(
     dispatcher: Scripted,
     folder: Path,
@@ -108,7 +116,7 @@ def served(
         cast(Catalogue, catalogue),
         cast(Dispatcher, dispatcher),
         transport or Queues(),
-        supervisor or ToyPool(lambda name, address: None),
+        supervisor or toys(0),
         folder / "quarantine.jsonl",
         clock,
     )
@@ -171,9 +179,7 @@ def test_what_is_looked_for_is_reported(found: bool, tmp_path: Path, capsys: pyt
 
 def test_the_loop_reads_no_sidecar_for_a_worker_of_this_host(tmp_path: Path) -> None:
     """What that worker has read lies here too: a folder of masks would stop the loop for seconds."""
-    supervisor = ToyPool(lambda name, address: None)
-    supervisor.scale(1)
-    supervisor.watch(0.0, 0)
+    supervisor = toys(1)
     asked: list[str] = []
     missing = CheckVideo("a.mp4", "f", b"toy1", None, "changed", Request(b"c", 0, 0), ".masks/")
     elsewhere = replace(missing, identity=b"elsewhere")
@@ -195,9 +201,7 @@ def test_what_holds_everybody_up_is_said_once(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_a_worker_given_up_is_reported_with_what_its_loss_means(tmp_path: Path) -> None:
-    supervisor = ToyPool(lambda name, address: None)
-    supervisor.scale(1)
-    supervisor.watch(0.0, 0)
+    supervisor = toys(1)
     dispatcher = Scripted([GiveUp(b"toy1", "slept"), GiveUp(b"elsewhere", "slept")], workers=[b"toy1", b"elsewhere"])
     served(dispatcher, tmp_path, supervisor)
     assert dispatcher.told == [
@@ -207,9 +211,7 @@ def test_a_worker_given_up_is_reported_with_what_its_loss_means(tmp_path: Path) 
 
 
 def test_a_death_is_reported_with_its_cause(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    supervisor = ToyPool(lambda name, address: None)
-    supervisor.scale(2)
-    supervisor.watch(0.0, 0)
+    supervisor = toys(2)
     supervisor.kill(b"toy1", Cause.CRASHED)
     dispatcher = Scripted(workers=[b"toy1"])
     served(dispatcher, tmp_path, supervisor)
@@ -221,9 +223,7 @@ def test_a_death_is_reported_with_its_cause(tmp_path: Path, capsys: pytest.Captu
 @pytest.mark.parametrize("watched", [True, False])
 def test_who_cannot_be_reached_is_reported_unless_its_end_will_be(watched: bool, tmp_path: Path) -> None:
     """How a process of ours ended says whether the sample is to blame; that it is not there any more does not."""
-    supervisor = ToyPool(lambda name, address: None)
-    supervisor.scale(int(watched))
-    supervisor.watch(0.0, 0)
+    supervisor = toys(int(watched))
     dispatcher = Scripted([ToWorker(b"toy1", encode(Stop()))], workers=[b"toy1"])
     served(dispatcher, tmp_path, supervisor)
     assert dispatcher.told == ([] if watched else [("unreachable", b"toy1")])
@@ -232,11 +232,6 @@ def test_who_cannot_be_reached_is_reported_unless_its_end_will_be(watched: bool,
 def test_what_is_passed_over_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     served(Scripted([ReportRefusal(Refusal("a.mp4", 7, "cut short"))]), tmp_path)
     assert "passed over a.mp4 at frame 7: cut short\n" in capsys.readouterr().err
-
-
-def test_a_server_stops_even_if_a_worker_is_not_connected(tmp_path: Path) -> None:
-    server = served(Scripted(), tmp_path)
-    server.close()  # to a worker that is not there
 
 
 def test_a_time_in_which_the_server_was_stopped_is_no_silence_of_others(
@@ -259,7 +254,7 @@ def test_more_workers_than_can_be_of_use_are_questioned() -> None:
 def test_more_workers_come_while_consumers_wait_and_leave_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    dispatcher, supervisor = Scripted(), ToyPool(lambda name, address: None)
+    dispatcher, supervisor = Scripted(), toys(0)
     now = [0.0]
     monkeypatch.setattr(serve_module, "Clock", lambda: lambda: now[0])
     dispatcher.workers, dispatcher.waiting_share, dispatcher.idle_share = 2, 1.0, 0.0  # type: ignore[attr-defined]
@@ -282,11 +277,6 @@ def test_more_workers_come_while_consumers_wait_and_leave_again(
     assert "workers: 2 from now on, because at the busiest 0% of consumers waited and 90%" in said
 
 
-def logged(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
-    """What a server said, each line one object."""
-    return [json.loads(line) for line in capsys.readouterr().err.splitlines()]
-
-
 def test_with_json_every_line_is_an_object_and_one_on_a_sample_has_its_identity(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -297,7 +287,7 @@ def test_with_json_every_line_is_an_object_and_one_on_a_sample_has_its_identity(
     dispatcher._there = at.dispatcher
     server = served(dispatcher, tmp_path, log_format="json")
     server.close()
-    lines = logged(capsys)
+    lines: list[dict[str, Any]] = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     assert all({"time", "level", "text"} <= line.keys() for line in lines)
     passed_over, condemned = (next(line for line in lines if word in line["text"]) for word in ("passed", "quarantine"))
     session = at.dispatcher.sessions.get(b"c")
@@ -313,16 +303,13 @@ def test_with_json_every_line_is_an_object_and_one_on_a_sample_has_its_identity(
     assert lines[-1]["totals"]["samples"] == 0
 
 
-def test_the_end_is_summed_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    served(Scripted(), tmp_path).close()
+@pytest.mark.parametrize(("workers", "is_ready"), [(0, True), (1, False)])
+def test_the_end_is_summed_up_unless_the_server_was_never_ready(
+    workers: int, is_ready: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    served(Scripted(), tmp_path, workers=workers).close()  # it tells a worker that is not there
     said = capsys.readouterr().err
-    assert "in total 0 samples" in said
-    assert "\nfaults 0\n" in said
-
-
-def test_a_server_that_was_never_ready_sums_up_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    served(Scripted(), tmp_path, workers=1).close()
-    assert "in all" not in capsys.readouterr().err
+    assert ("in total 0 samples" in said, "\nfaults 0\n" in said) == (is_ready, is_ready)
 
 
 class Recording(Scripted):

@@ -7,17 +7,14 @@ from dataclasses import replace
 import pytest
 
 from tests.server.named_corpus import SMALL_SPEC
-from tests.server.peers import DEADLINE, Peers, peers
-from v2v_protocol.messages import Lease, LeaseFailed, Result
+from tests.server.peers import DEADLINE, Peers, peers, serving
+from v2v_protocol.messages import Lease
 from v2v_server.broker.leases import ALONE_AFTER, Cause
 
 
 def practised() -> tuple[Peers, Lease]:
     """A consumer whose samples take half a second, and a worker with room for no more that has begun its index 20."""
-    at = peers()
-    at.join(b"before")
-    at.hello(batch_size=20)
-    at.want(*range(8))
+    at = serving(*range(8), worker=b"before", batch_size=20)
     for _ in range(8):
         at.begin(b"before")
         at.now += 0.5
@@ -66,22 +63,6 @@ def test_the_first_answer_is_delivered_and_the_second_dropped(order: tuple[bytes
     assert (len(at.leases[b"slow"]), len(at.leases[b"fast"])) == (1, 2)
 
 
-def test_a_failure_answers_for_both() -> None:
-    at, first, _ = slowed()
-    at.fail(b"fast")
-    # A free worker tries the next candidate, and the slow worker's sample of the one before comes too late.
-    assert [lease.candidate for lease in at.leases[b"fast"]] == [1]
-    before = at.samples()
-    at.finish(b"slow")
-    assert at.samples() == before
-    at.finish(b"fast")
-    assert at.samples() == [*before, (0, 20)]
-    at.worker_says(b"slow", LeaseFailed(first.lease, None, "late"))
-    at.worker_says(b"slow", Result(first.lease), b"late")
-    assert at.samples() == [*before, (0, 20)]
-    assert len(at.dispatcher.leases) == 0
-
-
 @pytest.mark.parametrize("cause", list(Cause))
 @pytest.mark.parametrize("lost", [b"slow", b"fast"])
 def test_losing_one_of_the_two_changes_nothing(lost: bytes, cause: Cause) -> None:
@@ -91,18 +72,6 @@ def test_losing_one_of_the_two_changes_nothing(lost: bytes, cause: Cause) -> Non
     assert (at.recorded, at.dispatcher.waiting) == ([], 0)
     left = b"fast" if lost == b"slow" else b"slow"
     assert at.finish(left).candidate == 0
-    assert at.samples()[8:] == [(0, 20)]
-
-
-def test_losing_both_judges_the_last() -> None:
-    at, *_ = slowed()
-    at.begin(b"fast")
-    at.die(b"fast", Cause.CRASHED)
-    at.die(b"slow", Cause.CRASHED)
-    assert len(at.recorded) == 1
-    at.join(b"w")
-    assert at.leases[b"w"][0].candidate == 1
-    at.work_off(b"w")
     assert at.samples()[8:] == [(0, 20)]
 
 
@@ -119,32 +88,8 @@ def test_a_hang_under_two_leases_ends_in_one_verdict_and_an_answer() -> None:
     assert at.now < 2 * DEADLINE + 20
 
 
-def test_what_waits_behind_a_hanging_sample_of_another_consumer_is_rescued() -> None:
-    at = peers()
-    at.join(b"w1")
-    at.hello(b"c", batch_size=20)
-    at.want(*range(8))
-    for _ in range(8):
-        at.begin(b"w1")
-        at.now += 0.5
-        at.finish(b"w1")
-    at.hello(b"hangs")
-    at.want(0, identity=b"hangs")
-    at.begin(b"w1")
-    at.want(8)
-    assert [at.asked_by(lease) for lease in at.leases[b"w1"]] == [b"hangs", b"c"]
-    at.join(b"w2")
-    at.tick(2.0)
-    assert [at.asked_by(lease) for lease in at.leases[b"w2"]] == [b"c"]
-    at.work_off(b"w2")
-    assert at.samples()[8:] == [(0, 8)]
-
-
 def test_a_lone_task_has_no_twin() -> None:
-    at = peers()
-    at.join(b"w")
-    at.hello(batch_size=20)
-    at.want(*range(8))
+    at = serving(*range(8), batch_size=20)
     at.work_off(b"w")
     at.die(b"w")
     at.want(20)

@@ -1,15 +1,15 @@
-"""The lease book against a model that keeps, for every request, the one place where it is."""
+"""The lease book against a model that keeps, for every request, the one place where it is; and who is to blame."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import hypothesis.strategies as st
 import pytest
 from hypothesis import settings
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, multiple, rule
 
-from v2v_server.broker.leases import LeaseBook, Request, Stall
+from v2v_server.broker.leases import Cause, LeaseBook, Loss, Request, Stall, judge, runs_alone
 
 DEADLINE = 60.0
 A, B = b"worker a", b"worker b"
@@ -25,31 +25,6 @@ def overdue_workers(book: LeaseBook, now: float) -> list[bytes]:
 
 
 # --- single steps -----------------------------------------------------------------------------------------------------
-
-
-def test_an_answer_returns_the_task_once() -> None:
-    book = LeaseBook(DEADLINE)
-    number = book.grant(REQUEST, A, 0.0)
-    assert (len(book), book.held_by(A), book.held_by(B)) == (1, 1, 0)
-    assert book.finished(number, B, 0.0) is None
-    assert book.finished(number + 1, A, 0.0) is None
-    assert book.finished(number, A, 0.0) is REQUEST
-    assert book.finished(number, A, 0.0) is None
-    assert (len(book), book.held_by(A)) == (0, 0)
-
-
-def test_a_lost_worker_returns_its_tasks_oldest_first_and_only_the_begun_is_suspect() -> None:
-    book = LeaseBook(DEADLINE)
-    numbers = [book.grant(numbered(index), A, 0.0) for index in range(3)]
-    other = book.grant(numbered(9), B, 0.0)
-    assert book.finished(numbers[0], A, 0.0) == numbered(0)
-    book.mark_begun(numbers[1], A, 1.0)
-    book.mark_begun(numbers[2], B, 1.0)
-    assert (book.request(numbers[1], A), book.request(numbers[1], B), book.request(0, A)) == (numbered(1), None, None)
-    assert book.lost(A) == [(numbered(1), True), (numbered(2), False)]
-    assert book.lost(A) == []
-    assert book.finished(numbers[1], A, 0.0) is None
-    assert book.finished(other, B, 0.0) == numbered(9)
 
 
 def test_a_deadline_scales_with_the_work_also_of_what_is_in_front() -> None:
@@ -74,11 +49,7 @@ def test_time_stopped_is_not_time_worked() -> None:
 
 def where_others_are_quick() -> LeaseBook:
     """A has begun a sample; those before took a tenth of a second each."""
-    book = LeaseBook(DEADLINE)
-    for index in range(20):
-        number = book.grant(numbered(index), B, 0.0)
-        book.mark_begun(number, B, 0.0)
-        book.finished(number, B, 0.1)
+    book = practised(0.1)
     book.mark_begun(book.grant(REQUEST, A, 0.0), A, 0.0)
     return book
 
@@ -121,66 +92,6 @@ def test_what_a_consumer_gave_up_is_counted_until_the_workers_are_through_with_i
     assert book.abandoned(b"consumer") == 0
 
 
-def test_a_late_answer_finds_nothing_even_when_the_task_went_back_to_the_same_worker() -> None:
-    book = LeaseBook(DEADLINE)
-    first = book.grant(REQUEST, A, 0.0)
-    book.lost(A)
-    second = book.grant(REQUEST, A, 1.0)
-    assert second != first
-    book.mark_begun(first, A, 2.0)
-    assert book.finished(first, A, 0.0) is None
-    assert book.lost(A) == [(REQUEST, False)]
-
-
-def test_the_deadline_counts_from_the_grant_and_from_each_beginning() -> None:
-    book = LeaseBook(DEADLINE)
-    first, second = book.grant(numbered(0), A, 0.0), book.grant(numbered(1), A, 0.0)
-    assert overdue_workers(book, DEADLINE) == []
-    assert overdue_workers(book, DEADLINE + 0.5) == [A]
-    book.mark_begun(first, A, 50.0)
-    assert overdue_workers(book, 50.0 + DEADLINE) == []
-    book.finished(first, A, 0.0)
-    book.mark_begun(second, A, 100.0)
-    assert overdue_workers(book, 100.0 + DEADLINE) == []
-    assert overdue_workers(book, 100.5 + DEADLINE) == [A]
-    assert book.held_by(A) == 1
-
-
-def test_a_forgotten_consumer_gets_no_answer_but_its_leases_still_fill_the_worker() -> None:
-    """The worker does not know: it has to get through them, so it has no room for others, and may still hang."""
-    book = LeaseBook(DEADLINE)
-    gone, stays = book.grant(numbered(0, b"gone"), A, 0.0), book.grant(numbered(1, b"stays"), A, 0.0)
-    book.forget_session(b"gone")
-    assert book.held_by(A) == 2
-    assert overdue_workers(book, DEADLINE + 1) == [A]
-    book.mark_begun(gone, A, 50.0)
-    assert overdue_workers(book, 50.0 + DEADLINE) == []
-    assert book.finished(gone, A, 0.0) is None
-    assert book.held_by(A) == 1
-    assert book.finished(stays, A, 0.0) == numbered(1, b"stays")
-    assert len(book) == 0
-
-
-def test_a_worker_lost_over_forgotten_leases_returns_nothing() -> None:
-    book = LeaseBook(DEADLINE)
-    number = book.grant(numbered(0, b"gone"), A, 0.0)
-    book.mark_begun(number, A, 0.0)
-    book.forget_session(b"gone")
-    assert book.lost(A) == []
-    assert len(book) == 0
-    assert overdue_workers(book, 1000.0) == []
-
-
-def test_a_lease_begins_once() -> None:
-    """A worker that says so again and again must not put off its deadline for ever."""
-    book = LeaseBook(DEADLINE)
-    number = book.grant(REQUEST, A, 0.0)
-    for second in range(2 * int(DEADLINE)):
-        book.mark_begun(number, A, float(second))
-    assert overdue_workers(book, DEADLINE) == []
-    assert overdue_workers(book, DEADLINE + 0.5) == [A]
-
-
 # --- twins ------------------------------------------------------------------------------------------------------------
 
 
@@ -199,43 +110,14 @@ def test_the_first_answer_retires_the_twin(fast: bytes) -> None:
     assert (len(book), book.held_by(A), book.held_by(B)) == (0, 0, 0)
 
 
-@pytest.mark.parametrize("first", [A, B])
-def test_losing_one_of_two_returns_nothing_and_losing_both_returns_it_once(first: bytes) -> None:
-    book = LeaseBook(DEADLINE)
-    for worker in (A, B):
-        book.mark_begun(book.grant(REQUEST, worker, 0.0), worker, 0.0)
-    assert book.lost(first) == []
-    assert book.lost(B if first == A else A) == [(REQUEST, True)]
-    assert len(book) == 0
-
-
-def test_a_retired_twin_returns_nothing_when_its_worker_is_lost() -> None:
-    book = LeaseBook(DEADLINE)
-    number = book.grant(REQUEST, A, 0.0)
-    book.mark_begun(book.grant(REQUEST, B, 0.0), B, 0.0)
-    assert book.finished(number, A, 1.0) is REQUEST
-    assert book.lost(B) == []
-    assert len(book) == 0
-
-
-def test_a_forgotten_consumer_forgets_both() -> None:
-    book = LeaseBook(DEADLINE)
-    numbers = [book.grant(REQUEST, worker, 0.0) for worker in (A, B)]
-    book.forget_session(REQUEST.session)
-    assert [book.finished(number, worker, 1.0) for number, worker in zip(numbers, (A, B), strict=True)] == [None, None]
-    # What is asked again afterwards has nothing to do with them.
-    again = book.grant(REQUEST, A, 2.0)
-    assert book.finished(again, A, 3.0) is REQUEST
-
-
 # --- the slow ---------------------------------------------------------------------------------------------------------
 
 
-def practised(seconds: float, samples: int = 8, session: bytes = b"consumer") -> LeaseBook:
+def practised(seconds: float, samples: int = 8, book: LeaseBook | None = None) -> LeaseBook:
     """A book that has seen that many samples of a consumer take that long."""
-    book = LeaseBook(DEADLINE)
+    book = book or LeaseBook(DEADLINE)
     for index in range(samples):
-        number = book.grant(numbered(1000 + index, session), B, 0.0)
+        number = book.grant(numbered(1000 + index), B, 0.0)
         book.mark_begun(number, B, 0.0)
         assert book.finished(number, B, seconds) is not None
     return book
@@ -262,11 +144,7 @@ def test_slow_is_three_times_the_median_and_a_second(seconds: float, samples: in
 
 
 def test_the_median_is_of_the_last_samples_and_of_the_consumer_itself() -> None:
-    book = practised(1.0, 8)
-    for _ in range(64):
-        number = book.grant(numbered(1), B, 0.0)
-        book.mark_begun(number, B, 0.0)
-        book.finished(number, B, 10.0)
+    book = practised(10.0, 64, practised(1.0, 8))
     book.mark_begun(book.grant(REQUEST, A, 100.0), A, 100.0)
     assert book.slow(130.0) == []
     assert book.slow(130.5) == [(REQUEST, A)]
@@ -301,13 +179,6 @@ def test_a_task_queued_behind_one_that_hangs_is_slow() -> None:
     assert book.slow(6.6) == [(numbered(2), A)]
 
 
-def test_what_was_usual_goes_with_the_consumer() -> None:
-    book = practised(1.0)
-    book.forget_session(b"consumer")
-    book.grant(REQUEST, A, 0.0)
-    assert book.slow(50.0) == []
-
-
 # --- any order --------------------------------------------------------------------------------------------------------
 
 
@@ -326,6 +197,7 @@ class LeaseModel(RuleBasedStateMachine):
 
     numbers = Bundle("numbers")
     workers = st.sampled_from((A, B, b"worker c"))
+    speakers = st.sampled_from((None, None, None, A, B, b"worker c"))  # None: the worker that has the lease
     sessions = st.sampled_from((b"s1", b"s2"))
 
     def __init__(self) -> None:
@@ -335,6 +207,9 @@ class LeaseModel(RuleBasedStateMachine):
         self.now = 0.0
         self.requests = 0
         self.ever: set[int] = set()
+
+    def _speaker(self, number: int, worker: bytes | None) -> bytes:
+        return worker or (self.out[number].worker if number in self.out else A)
 
     def _granted(self, request: Request, worker: bytes) -> int:
         number = self.book.grant(request, worker, self.now)
@@ -347,10 +222,10 @@ class LeaseModel(RuleBasedStateMachine):
         for place in self.out.values():
             place.retired |= place.request == request
 
-    @rule(target=numbers, worker=workers, session=sessions)
-    def grant(self, worker: bytes, session: bytes) -> int:
+    @rule(target=numbers, workers=st.lists(workers, min_size=1, max_size=2, unique=True), session=sessions)
+    def grant(self, workers: list[bytes], session: bytes) -> object:
         self.requests += 1
-        return self._granted(Request(session, 0, self.requests), worker)
+        return multiple(*(self._granted(Request(session, 0, self.requests), worker) for worker in workers))
 
     @rule(target=numbers, number=numbers, worker=workers)
     def twin(self, number: int, worker: bytes) -> object:
@@ -361,8 +236,9 @@ class LeaseModel(RuleBasedStateMachine):
             return multiple()  # no worker is given a request that it has
         return self._granted(place.request, worker)
 
-    @rule(number=numbers, worker=workers)
-    def begun(self, number: int, worker: bytes) -> None:
+    @rule(number=numbers, speaker=speakers)
+    def begun(self, number: int, speaker: bytes | None) -> None:
+        worker = self._speaker(number, speaker)
         self.book.mark_begun(number, worker, self.now)
         place = self.out.get(number)
         if place is not None and place.worker == worker and not place.begun:
@@ -371,9 +247,9 @@ class LeaseModel(RuleBasedStateMachine):
                 if other.worker == worker:
                     other.deadline = self.now + DEADLINE
 
-    @rule(number=numbers, worker=workers)
-    def finished(self, number: int, worker: bytes) -> None:
-        place = self.out.get(number)
+    @rule(number=numbers, speaker=speakers)
+    def finished(self, number: int, speaker: bytes | None) -> None:
+        worker, place = self._speaker(number, speaker), self.out.get(number)
         asked = self.book.request(number, worker)
         request = self.book.finished(number, worker, self.now)
         assert request == asked
@@ -426,3 +302,41 @@ class LeaseModel(RuleBasedStateMachine):
 
 TestLeaseModel = LeaseModel.TestCase
 TestLeaseModel.settings = settings(max_examples=60, stateful_step_count=30, deadline=None)
+
+
+# --- blame: every cause, with every number of deaths before it --------------------------------------------------------
+
+
+JUDGED = Request(b"consumer", 3, 7, candidate=2)
+
+
+def after(deaths: int) -> Request:
+    return replace(JUDGED, deaths=deaths)
+
+
+REFUSED = "a worker did something over it"
+
+
+@pytest.mark.parametrize(
+    ("cause", "deaths", "verdict"),
+    [
+        (Cause.CRASHED, 0, REFUSED),
+        (Cause.CRASHED, 1, REFUSED),
+        (Cause.CRASHED, 2, REFUSED),
+        (Cause.HUNG, 0, REFUSED),
+        (Cause.HUNG, 1, REFUSED),
+        (Cause.HUNG, 2, REFUSED),
+        (Cause.UNEXPLAINED, 0, after(1)),
+        (Cause.UNEXPLAINED, 1, after(2)),
+        (Cause.UNEXPLAINED, 2, REFUSED),
+        (Cause.KILLED, 0, after(0)),
+        (Cause.KILLED, 1, after(1)),
+        (Cause.KILLED, 2, after(2)),
+    ],
+)
+def test_verdicts(cause: Cause, deaths: int, verdict: Request | str) -> None:
+    assert judge(after(deaths), Loss(cause, "did something")) == verdict
+
+
+def test_a_task_runs_alone_after_two_unexplained_deaths_until_its_candidate_changes() -> None:
+    assert [runs_alone(after(deaths)) for deaths in range(4)] == [False, False, True, True]

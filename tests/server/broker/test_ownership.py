@@ -63,13 +63,6 @@ def test_the_secret_moves_a_session_to_a_new_connection_with_its_debt() -> None:
     assert (session.identity, at.dispatcher.sessions.queue.balance_ns(b"after")) == (b"after", -3_000_000_000)
 
 
-def test_consumers_without_a_secret_stay_apart() -> None:
-    at = peers()
-    at.consumer_says(b"a", hello(b""))
-    at.consumer_says(b"b", hello(b""))
-    assert [session.identity for session in at.dispatcher.sessions] == [b"a", b"b"]
-
-
 def test_another_key_cannot_act_for_a_session_even_with_its_secret() -> None:
     at = peers()
     say(at, b"c", hello(OURS), "gpu-1")

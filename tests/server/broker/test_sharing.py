@@ -30,11 +30,16 @@ def sharing(*consumers: bytes, seed: int = 0) -> Peers:
     return at
 
 
-def test_a_request_for_a_sample_in_work_follows_it() -> None:
+@pytest.mark.parametrize("waited", [True, False])
+def test_a_request_for_a_sample_in_work_follows_it(waited: bool) -> None:
     at = sharing(b"c", b"d")
-    at.join()
+    if not waited:
+        at.join()
     at.want(0, identity=b"c")
     at.want(0, identity=b"d")
+    if waited:
+        at.join()
+    assert len(at.leases[b"w"]) == 1
     at.work_off()
     assert at.samples(b"c") == at.samples(b"d") == [(0, 0)]
     assert (at.dispatcher.counters.samples, at.dispatcher.counters.shared) == (2, 1)
@@ -66,27 +71,6 @@ def test_a_finished_sample_is_sent_even_if_no_worker_is_left() -> None:
     at.want(0, 1, identity=b"d")
     assert at.samples(b"d") == [(0, 0)]
     assert at.dispatcher.waiting == 1
-
-
-def test_a_request_that_waited_while_its_sample_was_made_takes_no_worker() -> None:
-    at = sharing(b"c", b"d")
-    at.want(0, identity=b"c")
-    at.want(0, identity=b"d")
-    at.join()
-    assert len(at.leases[b"w"]) == 1
-    at.work_off()
-    assert at.samples(b"c") == at.samples(b"d") == [(0, 0)]
-
-
-def test_followers_of_a_consumer_that_leaves_are_served() -> None:
-    at = sharing(b"c", b"d")
-    at.join()
-    at.want(0, identity=b"c")
-    at.want(0, identity=b"d")
-    at.dispatcher.consumer_lost(b"c")
-    at.tick(0.1)
-    at.work_off()
-    assert at.samples(b"d") == [(0, 0)]
 
 
 def test_other_streams_share_nothing() -> None:
@@ -123,8 +107,9 @@ def test_a_worker_gets_memory_of_the_server_and_consumers_their_own_slot_back() 
 def test_without_memory_of_the_server_shared_samples_are_messages(
     packed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They are never only in the arena of the consumer that came first."""
-    monkeypatch.setattr(SampleRing, "lend", lambda *_: None)
+    """They are never only in the arena of the consumer that came first. No memory is lent to packed samples."""
+    if not packed:
+        monkeypatch.setattr(SampleRing, "lend", lambda *_: None)
     at = peers(share_bytes=1 << 20)
     for identity in (b"c", b"d", b"e"):
         at.consumer_says(identity, Hello({}, ("voxels",), 4, 0, packed=packed))
@@ -132,22 +117,13 @@ def test_without_memory_of_the_server_shared_samples_are_messages(
     at.want(0, identity=b"c", arena=ARENA, slots=[5])
     at.want(0, identity=b"d", arena=ARENA, slots=[7])
     lease = at.begin()
-    assert (lease.arena, lease.slot) == ("", NO_SLOT)
+    assert (lease.packed, lease.arena, lease.slot) == (packed, "", NO_SLOT)
     at.finish()
     at.want(0, identity=b"e")
     for identity, number in ((b"c", 5), (b"d", 7), (b"e", NO_SLOT)):
         answer = at.heard[identity][-1]
         assert isinstance(answer, SampleHeader)
         assert (answer.arena, answer.slot, len(at.frames[identity][-1])) == ("", number, 2)
-
-
-def test_the_server_lends_no_memory_to_a_sample_that_is_packed() -> None:
-    at = peers(share_bytes=1 << 20)
-    at.consumer_says(b"c", Hello({}, ("voxels",), 4, 0, packed=True))
-    at.join()
-    at.want(0, identity=b"c", arena=ARENA, slots=[5])
-    lease = at.begin()
-    assert (lease.packed, lease.arena, lease.slot) == (True, "", NO_SLOT)
 
 
 class Sharing(WithSlots):

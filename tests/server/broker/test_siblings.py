@@ -69,16 +69,6 @@ def test_every_sequence_that_is_not_dropped_comes_once_for_each_view(
     assert len(found) == (everything if views == 1 else everything // spacing * spacing)
 
 
-def test_substitutes_are_shared_too() -> None:
-    of = schedule(30, VIEWS, 4)
-    for index in (0, 5, 13):
-        same = [other for other in range(of.count) if of.place(other) == of.place(index)]
-        assert len(same) == VIEWS
-        for candidate in range(3):
-            assert len({of.candidate(7, 2, other, candidate).start_frame for other in same}) == 1
-            assert len({of.candidate(7, 2, other, candidate).video.id for other in same}) == 1
-
-
 def test_a_schedule_needs_the_spacing() -> None:
     videos = corpus(video("a.mp4", frames=30)).videos
     with pytest.raises(UsageError, match="sibling_spacing = 0: set sibling_spacing to the number"):
@@ -118,12 +108,6 @@ def test_room_is_counted_in_clips() -> None:
     at.begin()
     at.finish()
     assert [lease.indices[0] for lease in at.leases[b"w"]] == [1, 5, 9]
-
-
-def test_everything_is_made_once() -> None:
-    at = opened()
-    at.work_off()
-    assert sorted(at.samples()) == [(0, index) for index in range(2 * BATCH * VIEWS)]
 
 
 def test_siblings_that_were_not_asked_for_yet_come_later() -> None:

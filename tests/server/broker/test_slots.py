@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from tests.server.peers import DEADLINE, Peers, answer_to, peers
+from tests.server.peers import DEADLINE, Peers, answer_to, peers, serving
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.messages import Buffer, ErrorCode, Result, SampleHeader, Want, decode, encode
 
@@ -15,9 +15,7 @@ ARENA = f"17:9:12:{'0123456789abcdef' * 2}"
 
 def at_work(*, workers: int = 1) -> Peers:
     """A consumer that asked for index 0 in slot 5, and so many workers; the first has the lease."""
-    at = peers()
-    at.join(b"w")
-    at.hello()
+    at = serving()
     at.want(0, arena=ARENA, slots=[5])
     for number in range(1, workers):
         at.join(f"w{number}".encode())
@@ -55,18 +53,8 @@ def test_a_worker_that_cannot_reach_it_sends_the_arrays_and_says_that_the_slot_i
     assert at.dispatcher.counters.in_slots == 0
 
 
-def test_a_lease_after_a_lost_one_names_none() -> None:
-    at = at_work()
-    at.begin()
-    at.die(b"w")
-    at.join(b"w2")
-    assert (at.leases[b"w2"][0].arena, at.leases[b"w2"][0].slot) == ("", NO_SLOT)
-
-
 def test_the_second_worker_of_a_slow_sample_is_told_of_none() -> None:
-    at = peers()
-    at.join(b"w")
-    at.hello()
+    at = serving()
     for index in range(8):  # what is usual
         at.want(index)
         at.begin()
@@ -111,9 +99,7 @@ def test_an_index_that_is_asked_again_keeps_its_first_slot() -> None:
     ],
 )
 def test_malformed_slots_are_refused_and_no_request_is_taken(arena: str, slots: list[int]) -> None:
-    at = peers()
-    at.join()
-    at.hello()
+    at = serving()
     at.want(0, arena=arena, slots=slots)
     assert [refused.code for refused in at.refusals()] == [ErrorCode.MALFORMED]
     assert not at.leases[b"w"]
@@ -129,16 +115,6 @@ def test_a_result_in_another_slot_than_was_lent_is_none(slot: int) -> None:
     at.worker_says(b"w", Result(lease.lease), header, *frames[1:])
     assert at.samples() == []
     assert [held.indices for held in at.leases[b"w1"]] == [(0,)]
-
-
-def test_a_header_alone_is_no_result_where_no_slot_was_lent() -> None:
-    at = peers()
-    at.join()
-    at.hello()
-    at.want(0)
-    lease = at.begin()
-    at.worker_says(b"w", Result(lease.lease), *answer_to(lease)[:1])
-    assert at.samples() == []
 
 
 def at_header(raw: Buffer, slot: int) -> bytes:

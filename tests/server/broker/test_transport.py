@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -22,9 +22,8 @@ from v2v_protocol.messages import Ping, Pong, Stop, encode
 
 @pytest.fixture
 def sockets() -> Iterator[Sockets]:
-    both = Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
-    yield both
-    both.close()
+    with closing(Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")) as both:
+        yield both
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="Linux only")
@@ -46,7 +45,6 @@ def _keepalive_is_due(peer: socket.socket) -> bool:
 @pytest.mark.skipif(sys.platform != "linux" or os.getuid() != 0, reason="takes another user's place: Linux, as root")
 def test_another_user_of_the_host_is_no_worker() -> None:
     """40 leases went to one, and its forged samples to consumers."""
-    sockets = Sockets("tcp://127.0.0.1:*", f"ipc://@v2v-test-{os.getpid()}")
     says = (
         "import os, sys, zmq\n"
         "os.setuid(int(sys.argv[2]))\n"
@@ -56,7 +54,7 @@ def test_another_user_of_the_host_is_no_worker() -> None:
         "peer.poll(int(sys.argv[3]))\n"
     )
 
-    def answered(user: int, waits_ms: int) -> bool:
+    def answered(sockets: Sockets, user: int, waits_ms: int) -> bool:
         command = [sys.executable, "-c", says, sockets.worker_address, str(user), str(waits_ms)]
         with subprocess.Popen(command) as process:
             came = False
@@ -65,11 +63,9 @@ def test_another_user_of_the_host_is_no_worker() -> None:
             process.kill()
         return came
 
-    try:
-        assert answered(0, 60_000)
-        assert not answered(65534, 3000)
-    finally:
-        sockets.close()
+    with closing(Sockets("tcp://127.0.0.1:*", f"ipc://@v2v-test-{os.getpid()}")) as sockets:
+        assert answered(sockets, 0, 60_000)
+        assert not answered(sockets, 65534, 3000)
 
 
 def test_sending_to_an_unknown_peer_returns_false(sockets: Sockets) -> None:
@@ -157,26 +153,25 @@ def test_a_consumer_that_never_reads_is_disconnected_at_the_limit_of_messages(so
 def test_those_that_take_nothing_are_disconnected_if_there_is_too_much_in_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(router, "_STUCK_SECONDS", 0.5)
     monkeypatch.setattr(router, "MOST_IN_FLIGHT_BYTES", 100 * MIB)
-    sockets = Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
     sample, gone = bytes(4 * MIB), set[bytes]()
-    try:
-        with consumers(sockets, b"reads", *(b"deaf %d" % number for number in range(8))) as (reads, *_):
-            for number in range(8):
-                for _ in range(10):
-                    assert sockets.send(b"deaf %d" % number, [b"", bytearray(sample)])
+    with (
+        closing(Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")) as sockets,
+        consumers(sockets, b"reads", *(b"deaf %d" % number for number in range(8))) as (reads, *_),
+    ):
+        for number in range(8):
+            for _ in range(10):
+                assert sockets.send(b"deaf %d" % number, [b"", bytearray(sample)])
 
-            def is_bounded() -> bool:
-                assert sockets.send(b"reads", [b"", bytearray(sample)])
-                reads.recv_multipart()
-                gone.update(each.identity for each in sockets.receive(0.01) if isinstance(each, ConsumerGone))
-                queues = sockets._consumers._in_flight.values()
-                return bool(gone) and sum(size for queue in queues for _, size in queue) <= 100 * MIB
+        def is_bounded() -> bool:
+            assert sockets.send(b"reads", [b"", bytearray(sample)])
+            reads.recv_multipart()
+            gone.update(each.identity for each in sockets.receive(0.01) if isinstance(each, ConsumerGone))
+            queues = sockets._consumers._in_flight.values()
+            return bool(gone) and sum(size for queue in queues for _, size in queue) <= 100 * MIB
 
-            until(is_bounded)
-            assert b"reads" not in gone
-            assert 2 <= len(gone) < 8
-    finally:
-        sockets.close()
+        until(is_bounded)
+        assert b"reads" not in gone
+        assert 2 <= len(gone) < 8
 
 
 def test_a_failed_call_costs_only_the_answer(sockets: Sockets, monkeypatch: pytest.MonkeyPatch) -> None:

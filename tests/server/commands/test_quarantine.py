@@ -73,15 +73,6 @@ def test_clearing_begins_a_snapshot_only_when_there_is_something_to_clear(
     assert [len(quarantine.entries(number)) for number in range(4)] == [0, 1, 2, 0]
 
 
-def test_a_server_that_runs_meanwhile_goes_on_with_the_numbers(corpus: Path) -> None:
-    file = fill(corpus, 40)
-    server = read_quarantine(file)
-    run(corpus, "--clear")
-    server.extend(write_entry(file, QuarantineEntry(0, "b.mp4", "f", 0, "crash", "t"), server))
-    assert server.lines == read_quarantine(file).lines
-    assert [(line.snapshot, line.path) for line in server.lines] == [(1, "a/v.mp4"), (2, ""), (3, "b.mp4")]
-
-
 def test_json_has_a_record_a_line(corpus: Path, tmp_path: Path) -> None:
     file = fill(corpus, 40)
     run(corpus, "--clear", "--json", str(tmp_path / "out.json"))

@@ -10,6 +10,7 @@ import struct
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ from tests.waiting import until
 from v2v_protocol.errors import KeyRefused, UsageError, V2VError
 from v2v_protocol.keys import is_key, key_for, read_key
 from v2v_protocol.link.dealer import Dealer, Handshakes, mechanism_of, secure
-from v2v_protocol.link.router import FromConsumer, FromWorker, ServerInput, Sockets
+from v2v_protocol.link.router import FromConsumer, FromWorker, Gate, ServerInput, Sockets
 from v2v_protocol.messages import Ping, Pong, encode, largest_frame_bytes
 from v2v_server.commands.keys import main
 from v2v_server.keys import KeyFolder
@@ -43,6 +44,12 @@ def sockets(folder: KeyFolder) -> Iterator[Sockets]:
     opened = Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*", keys=folder, local_bind=f"ipc://@v2v-keys-{os.getpid()}")
     yield opened
     opened.close()
+
+
+@pytest.fixture
+def gate(sockets: Sockets) -> Gate:
+    assert sockets._gate is not None
+    return sockets._gate
 
 
 @pytest.fixture
@@ -80,27 +87,16 @@ def arrivals(sockets: Sockets, seconds: float) -> list[ServerInput]:
     return found
 
 
-def test_who_has_a_key_is_served(sockets: Sockets, consumer: Callable[..., Dealer], tmp_path: Path) -> None:
-    link = consumer(tmp_path / "gpu1.key")
-    arrival = next_from(sockets, FromConsumer)
-    assert isinstance(arrival, FromConsumer)
-    assert sockets.send(arrival.identity, encode(Pong()))
-    until(lambda: link.receive(0.1))
-
-
 @pytest.mark.parametrize("frame", [bytes(1 << 21), pack(os.urandom(1 << 21))], ids=["raw", "compressed noise"])
 def test_the_largest_array_passes_encrypted(sockets: Sockets, tmp_path: Path, frame: bytes) -> None:
     """ZeroMQ's limit counts what CURVE adds to a frame; samples of the paper's size never came without compression."""
-    link = Dealer(sockets.address, str(tmp_path / "gpu1.key"))
-    try:
+    with closing(Dealer(sockets.address, str(tmp_path / "gpu1.key"))) as link:
         link.connect(largest_frame_bytes([1 << 21]))
         link.send(encode(Ping()))
         arrival = next_from(sockets, FromConsumer)
         assert isinstance(arrival, FromConsumer)
         assert sockets.send(arrival.identity, [*encode(Pong()), frame])
         until(lambda: link.receive(0.1))
-    finally:
-        link.close()
 
 
 def test_who_has_no_key_is_told_what_to_do(sockets: Sockets, consumer: Callable[..., Dealer]) -> None:
@@ -132,14 +128,12 @@ def test_a_key_of_another_server_opens_nothing(
 
 
 def test_a_revoked_key_loses_its_open_connection(
-    folder: KeyFolder, sockets: Sockets, consumer: Callable[..., Dealer], tmp_path: Path
+    folder: KeyFolder, sockets: Sockets, gate: Gate, consumer: Callable[..., Dealer], tmp_path: Path
 ) -> None:
     folder.new("gpu2", "consumer", tmp_path / "gpu2.key")  # while the server runs
     link, other = consumer(tmp_path / "gpu1.key"), consumer(tmp_path / "gpu2.key")
     assert len({next_from(sockets, FromConsumer).identity for _ in range(2)}) == 2  # type: ignore[union-attr]
     folder.revoke("gpu1")
-    gate = sockets._gate
-    assert gate is not None
     until(lambda: list(gate._allowed["consumer"].values()) == ["gpu2"])  # the server looks twice a second
     link.send(encode(Ping()))
     other.send(encode(Ping()))
@@ -232,7 +226,7 @@ def test_every_key_of_zeromq_is_one() -> None:
 
 
 def test_who_says_nothing_until_its_key_is_revoked_is_not_heard(
-    folder: KeyFolder, sockets: Sockets, tmp_path: Path
+    folder: KeyFolder, sockets: Sockets, gate: Gate, tmp_path: Path
 ) -> None:
     with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
         peer.setsockopt(zmq.RECONNECT_IVL, -1)
@@ -243,8 +237,6 @@ def test_who_says_nothing_until_its_key_is_revoked_is_not_heard(
         assert monitor.poll(60_000)
         monitor.recv_multipart()
         folder.revoke("gpu1")
-        gate = sockets._gate
-        assert gate is not None
         public = read_key(tmp_path / "gpu1.key").public
         until(lambda: not gate.admits("consumer", public))
         peer.send_multipart(encode(Ping()))
@@ -260,10 +252,8 @@ def test_who_says_nothing_until_its_key_is_revoked_is_not_heard(
         monitor.close()
 
 
-def test_without_an_authentication_thread_no_peer_connects(folder: KeyFolder, sockets: Sockets, tmp_path: Path) -> None:
+def test_without_an_authentication_thread_no_peer_connects(sockets: Sockets, gate: Gate, tmp_path: Path) -> None:
     """ZAP_ENFORCE_DOMAIN is set; without it every peer would connect."""
-    gate = sockets._gate
-    assert gate is not None
     gate.close()
     with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
         peer.setsockopt(zmq.LINGER, 0)
@@ -301,12 +291,9 @@ def test_what_is_no_key_file(content: str, tmp_path: Path) -> None:
 
 def test_no_secret_is_in_an_error(folder: KeyFolder, sockets: Sockets, tmp_path: Path) -> None:
     secret = read_key(tmp_path / "gpu1.key").secret
-    link = Dealer(sockets.worker_address, str(tmp_path / "gpu1.key"))
-    try:
+    with closing(Dealer(sockets.worker_address, str(tmp_path / "gpu1.key"))) as link:
         link.connect(1 << 16)
         assert secret not in refusal(link)
-    finally:
-        link.close()
     file = tmp_path / "gpu1.key"
     file.write_text(file.read_text().replace('"side"', '"sides"'))
     with pytest.raises(V2VError) as raised:
@@ -318,12 +305,15 @@ def test_no_secret_is_in_an_error(folder: KeyFolder, sockets: Sockets, tmp_path:
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    assert main(["init"]) == 0
-    assert main(["init"]) == 2  # the keys that were given out would end
-    assert main(["new", "gpu1", "--for", "consumer"]) == 0
-    assert main(["new", "gpu1", "--for", "consumer"]) == 2
-    assert main(["new", "../gpu1", "--for", "consumer"]) == 2
-    assert main(["new", "gpu2"]) == 2
+    for arguments, status in (
+        ("init", 0),
+        ("init", 2),  # the keys that were given out would end
+        ("new gpu1 --for consumer", 0),
+        ("new gpu1 --for consumer", 2),
+        ("new ../gpu1 --for consumer", 2),
+        ("new gpu2", 2),
+    ):
+        assert main(arguments.split()) == status, arguments
     key = read_key(tmp_path / "gpu1.key")
     capsys.readouterr()
     assert main(["list"]) == 0
@@ -337,9 +327,10 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
 
 @pytest.mark.parametrize("is_late", [False, True])
 def test_a_server_without_keys_is_not_talked_to_with_one(tmp_path: Path, folder: KeyFolder, is_late: bool) -> None:
-    plain = Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
-    link = Dealer(plain.address, str(tmp_path / "gpu1.key"))
-    try:
+    with (
+        closing(Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")) as plain,
+        closing(Dealer(plain.address, str(tmp_path / "gpu1.key"))) as link,
+    ):
         link.connect(1 << 16)
         if is_late:  # a busy host: the handshake has failed when it is this one's turn
             socket = link._socket
@@ -348,9 +339,6 @@ def test_a_server_without_keys_is_not_talked_to_with_one(tmp_path: Path, folder:
         link.send(encode(Ping()))
         assert "asks for no key" in refusal(link)
         assert arrivals(plain, 0.3) == []
-    finally:
-        link.close()
-        plain.close()
 
 
 SILENT = struct.pack("=Hi", 0x0800, 32)
@@ -359,8 +347,7 @@ SILENT = struct.pack("=Hi", 0x0800, 32)
 @pytest.mark.parametrize("has_key", [True, False])
 def test_a_server_whose_words_were_lost_is_asked_again(tmp_path: Path, sockets: Sockets, has_key: bool) -> None:
     """It ends the connection as soon as it knows that the two disagree; on a busy host nothing else was ever heard."""
-    plain = Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")
-    try:
+    with closing(Sockets("tcp://127.0.0.1:*", "tcp://127.0.0.1:*")) as plain:
         assert mechanism_of(sockets.address) == b"CURVE"
         assert mechanism_of(plain.address) == b"NULL"
         address, other = (plain.address, sockets.address) if has_key else (sockets.address, plain.address)
@@ -370,8 +357,6 @@ def test_a_server_whose_words_were_lost_is_asked_again(tmp_path: Path, sockets: 
             Handshakes(address, key, "consumer").take(lambda: len(events), lambda: [events.pop()])
         events = [SILENT]
         Handshakes(other, key, "consumer").take(lambda: len(events), lambda: [events.pop()])
-    finally:
-        plain.close()
     assert mechanism_of(plain.address) == b""
 
 

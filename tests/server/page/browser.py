@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import itertools
 import json
 import os
@@ -10,7 +9,6 @@ import shutil
 import subprocess
 import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -93,11 +91,6 @@ class Browser:
         )
         theme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self._tell("Emulation.setEmulatedMedia", features=[theme])
-
-    def picture(self, file: Path, *, whole: bool = False) -> None:
-        """A PNG of what is seen, or of the whole page."""
-        taken = self._tell("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
-        file.write_bytes(base64.b64decode(taken["data"]))
 
     def _tell(self, method: str, **parameters: Any) -> dict[str, Any]:
         return self._ask(method, session=self._session, **parameters)

@@ -12,6 +12,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import psutil
@@ -85,20 +86,9 @@ def test_a_page_that_others_can_reach_is_typed_out() -> None:
 
 
 def test_a_process_that_ends_is_said_and_started_again_ever_more_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Ended:
-        pid = 1
-
-        def poll(self) -> int:
-            return -signal.SIGKILL
-
-        def terminate(self) -> None:
-            pass
-
-        def wait(self, seconds: float) -> int:
-            return 0
-
+    ended = SimpleNamespace(pid=1, poll=lambda: -signal.SIGKILL, terminate=lambda: None, wait=lambda seconds: 0)
     started: list[float] = []
-    monkeypatch.setattr(PageProcess, "_started", lambda self: started.append(now) or Ended())
+    monkeypatch.setattr(PageProcess, "_started", lambda self: started.append(now) or ended)
     page, said, now = PageProcess("127.0.0.1", 0), [], 0.0
     assert page.watch(now) == []  # not started yet
     page.start("ipc://somewhere")

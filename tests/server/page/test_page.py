@@ -124,7 +124,7 @@ def test_a_stream_is_seen_and_a_killed_worker_soon(served: LocalServer, port: in
         assert browser.complaints == []
 
 
-def test_it_fits_every_screen_and_both_themes(served: LocalServer, port: int, browser: Browser, tmp_path: Path) -> None:
+def test_it_fits_every_screen_and_both_themes(served: LocalServer, port: int, browser: Browser) -> None:
     browser.open(f"http://127.0.0.1:{port}/")
     browser.until("document.querySelectorAll('#workers tbody tr').length === 2")
     papers = set()
@@ -135,8 +135,6 @@ def test_it_fits_every_screen_and_both_themes(served: LocalServer, port: int, br
             assert browser.value("document.documentElement.scrollWidth - document.documentElement.clientWidth") == 0
             papers.add(browser.value("getComputedStyle(document.body).backgroundColor"))
     assert len(papers) == 2
-    browser.picture(tmp_path / "page.png", whole=True)
-    assert (tmp_path / "page.png").stat().st_size > 10_000
     assert browser.complaints == []
 
 

@@ -25,15 +25,10 @@ def chi_square(counts: np.ndarray) -> float:
     return float((((counts - expected) ** 2 / expected).sum() - freedom) / np.sqrt(2 * freedom))
 
 
-@given(st.integers(1, 2000), seeds, epochs)
+@given(st.integers(1, 2000) | st.sampled_from((255, 256, 257, 1023, 1024, 1025, 4096, 4097)), seeds, epochs)
 @settings(max_examples=60)
 def test_bijection(n: int, seed: int, epoch: int) -> None:
     assert sorted(order(n, seed, epoch)) == list(range(n))
-
-
-@pytest.mark.parametrize("n", [1, 2, 3, 15, 16, 17, 255, 256, 257, 1023, 1024, 1025, 4096, 4097])
-def test_bijection_around_powers_of_two(n: int) -> None:
-    assert sorted(order(n, 2**64 - 1, 2**32 - 1)) == list(range(n))
 
 
 @given(st.integers(2001, 2**48), seeds, epochs, st.data())
@@ -92,26 +87,6 @@ def test_pairs_are_equally_likely() -> None:
         pairs[permutation(2), permutation(3)] += 1
     assert not pairs.diagonal().any()
     assert abs(chi_square(pairs[~np.eye(6, dtype=bool)])) < 5
-
-
-def test_consecutive_indices_have_no_fixed_pattern() -> None:
-    """Steps between the images of neighbours: as spread as those of a true shuffle, and no favourite among them."""
-    n = 4000
-    images = np.array(order(n, 123, 4))
-    steps = np.diff(images) % n
-    assert len(np.unique(steps)) > 0.6 * n  # 1 - 1/e of all steps occur in a random order
-    assert np.bincount(steps).max() < 12
-    assert abs(np.corrcoef(np.arange(n), images)[0, 1]) < 5 / np.sqrt(n)
-    assert abs(np.corrcoef(images[:-1], images[1:])[0, 1]) < 5 / np.sqrt(n)
-    # Fixed points of a random permutation: Poisson with mean 1.
-    assert (images == np.arange(n)).sum() < 8
-
-
-def test_epochs_are_unrelated() -> None:
-    n = 4000
-    one, other = np.array(order(n, 5, 0)), np.array(order(n, 5, 1))
-    assert abs(np.corrcoef(one, other)[0, 1]) < 5 / np.sqrt(n)
-    assert (one == other).sum() < 8
 
 
 # --- substitutes ------------------------------------------------------------------------------------------------------

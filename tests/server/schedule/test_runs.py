@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -139,27 +138,6 @@ def test_shares_are_nested(parts: Pieces, one: float, other: float) -> None:
         )
     )
     assert few <= many <= every
-
-
-@given(st.integers(21, 300), st.integers(1, 12))
-def test_without_defects_there_are_the_same_sequences(frames: int, most: int) -> None:
-    spec = StreamSpec(recipe=RECIPE, scene="auto", max_sequences_per_video=most)
-    plain = StreamSpec(recipe=RECIPE, max_sequences_per_video=most)
-    videos = (video("a", frames), video("b", 40))
-    table = SequenceTable(videos, Rows(), spec)
-    assert starts(table) == starts(SequenceTable(videos, Rows(), plain))
-    assert table.spoilt == 0
-
-
-@given(st.lists(st.integers(1, 299), unique=True, max_size=12), st.integers(1, 12))
-def test_no_sequence_holds_a_cut(cuts: list[int], most: int) -> None:
-    spec = StreamSpec(recipe=RECIPE, scene="auto", max_sequences_per_video=most)
-    table = SequenceTable((video("a", 300, shots(300, *sorted(cuts))), video("z", 21)), Rows(), spec)
-    found = [start for name, start in starts(table) if name == "a"]
-    assert len(found) <= most
-    for start in found:
-        assert not any(start < cut < start + 21 for cut in cuts)
-    assert all(later - earlier >= 20 for earlier, later in pairwise(found))
 
 
 def test_the_rest_of_a_long_video_is_served_if_the_analysed_part_has_no_defects() -> None:

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from tests.pieces import pieces
 from tests.server.named_corpus import SMALL, SMALL_SPEC, video
-from v2v_protocol.recipe import MOST_STEPS_PER_GRID, Recipe, preset
+from v2v_protocol.recipe import MOST_STEPS_PER_GRID, Recipe
 from v2v_protocol.spec import StreamSpec
 from v2v_server import schedule as sequences
 from v2v_server.corpus.scenes.scene import Flag
@@ -68,22 +68,6 @@ def brute_force(videos: list[VideoEntry], spec: StreamSpec) -> list[tuple[str, i
 def test_the_papers_rule(frames: int, starts: list[int]) -> None:
     found = table(video("a", frames, 336, 596), spec=StreamSpec())
     assert [start for _, start in listed(found)] == starts
-
-
-def test_the_papers_rule_on_a_list_of_lengths() -> None:
-    """On lengths like WebVid's the rule gives the released code's count, below the sum of floor(frames / 200)."""
-    lengths = [150 + 37 * number % 1900 for number in range(1000)] + [400, 600, 800]
-    found = table(
-        *(video(f"{number:04}", frames, 336, 596) for number, frames in enumerate(lengths)), spec=StreamSpec()
-    )
-    assert found.count == sum(min(10, (frames - 1) // 200) for frames in lengths)
-    assert found.count <= sum(frames // 200 for frames in lengths) - 3
-
-
-def test_eraft_sequences_are_one_voxel_longer() -> None:
-    spec = StreamSpec(recipe=preset("paper-eraft"))
-    assert listed(table(video("a", 205, 336, 596), spec=spec)) == []
-    assert listed(table(video("a", 411, 336, 596), spec=spec)) == [("a", 0), ("a", 205)]
 
 
 _lengths = st.lists(st.integers(1, 120), max_size=12)

@@ -7,8 +7,10 @@ import mmap
 import os
 import resource
 from collections.abc import Sequence
+from typing import Any
 
 import hypothesis.strategies as st
+import numpy.typing as npt
 import pytest
 from hypothesis import given
 
@@ -16,7 +18,7 @@ from tests.server.peers import frames_of
 from v2v_client.memory import open_sample
 from v2v_protocol.arena import ArenaName, Slot, open_memory
 from v2v_protocol.messages import Frames, SampleHeader, decode
-from v2v_server.sharing import SampleRing, mappings
+from v2v_server.sharing import SampleRing, SharedSample, mappings
 from v2v_server.worker.process import slot_arrays
 
 LAYOUT = {"voxels": ("int8", (3, 5)), "frames": ("uint8", (7,))}
@@ -31,7 +33,7 @@ def header(index: int = 0) -> SampleHeader:
     return message
 
 
-def fill(ring: SampleRing, lease: int, value: int) -> None:
+def fill(ring: SampleRing, lease: int, value: int) -> dict[str, npt.NDArray[Any]]:
     """As a worker does with the slot of its lease."""
     slot = ring.lend(lease, SIZES)
     assert slot is not None
@@ -39,6 +41,14 @@ def fill(ring: SampleRing, lease: int, value: int) -> None:
     assert arrays is not None
     for array in arrays.values():
         array[:] = value
+    return arrays
+
+
+def filled() -> tuple[SampleRing, SharedSample]:
+    """A ring with one sample that a worker wrote to its memory."""
+    ring = SampleRing(1 << 20)
+    fill(ring, 1, 9)
+    return ring, ring.add("key", 1, header(), [])
 
 
 def read(message: Frames) -> list[bytes]:
@@ -55,9 +65,7 @@ def content(value: int) -> list[bytes]:
 
 @pytest.mark.parametrize("slot", [None, SLOT])
 def test_every_consumer_reads_what_the_worker_wrote(slot: Slot | None) -> None:
-    ring = SampleRing(1 << 20)
-    fill(ring, 1, 9)
-    sample = ring.add("key", 1, header(), [])
+    ring, sample = filled()
     for is_first in (True, False):
         message = sample.message(slot, is_first=is_first)
         answer = decode(message[0])
@@ -75,9 +83,7 @@ def open_files() -> int:
 
 
 def test_all_messages_of_a_sample_share_one_mapping() -> None:
-    ring = SampleRing(1 << 20)
-    fill(ring, 1, 9)
-    sample, before = ring.add("key", 1, header(), []), open_files()
+    (_, sample), before = filled(), open_files()
     messages = [sample.message(None, is_first=False) for _ in range(100)]
     assert open_files() == before + 1
     assert all(read(message) == content(9) for message in messages)
@@ -87,9 +93,7 @@ def test_without_a_descriptor_for_a_mapping_a_sample_is_copied(monkeypatch: pyte
     def refuse(*arguments: object) -> None:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
-    ring = SampleRing(1 << 20)
-    fill(ring, 1, 9)
-    sample = ring.add("key", 1, header(), [])
+    _, sample = filled()
     monkeypatch.setattr("v2v_protocol.arena.mmap.mmap", refuse)
     assert read(sample.message(None, is_first=True)) == content(9)
 
@@ -109,9 +113,8 @@ def test_samples_on_their_way_count_against_the_open_files(monkeypatch: pytest.M
 
 
 def test_finished_memory_cannot_be_written_to() -> None:
-    ring = SampleRing(1 << 20)
-    fill(ring, 1, 9)
-    answer = decode(ring.add("key", 1, header(), []).message(SLOT, is_first=True)[0])
+    _, sample = filled()
+    answer = decode(sample.message(SLOT, is_first=True)[0])
     assert isinstance(answer, SampleHeader)
     descriptor = open_memory(ArenaName.parse(answer.arena), PAGES, writable=True)
     try:
@@ -125,12 +128,7 @@ def test_finished_memory_cannot_be_written_to() -> None:
 
 def test_memory_that_a_worker_can_still_write_to_is_copied() -> None:
     ring = SampleRing(1 << 20)
-    slot = ring.lend(1, SIZES)
-    assert slot is not None
-    arrays = slot_arrays(slot, LAYOUT)
-    assert arrays is not None
-    for array in arrays.values():
-        array[:] = 9
+    arrays = fill(ring, 1, 9)
     message = ring.add("key", 1, header(), []).message(SLOT, is_first=True)
     arrays["voxels"][:] = 3
     assert len(message) == 3

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from tests.server.peers import answer_to, peers
-from tests.server.status.services import published
+from tests.server.peers import Peers, answer_to
+from tests.server.status.services import Published
 from v2v_protocol.messages import Goodbye, Result, Want
 from v2v_server.broker.leases import Stall
 from v2v_server.status.snapshot import Shares, find_bottleneck
@@ -50,9 +50,7 @@ def test_a_cache_that_is_there_is_no_remedy() -> None:
     assert "--cache" not in find_bottleneck(shares, is_attended=True, workers=1, has_cache=True).remedy
 
 
-def test_the_shares_are_of_the_time_that_was_noted() -> None:
-    at = peers()
-    service = published(at)
+def test_the_shares_are_of_the_time_that_was_noted(at: Peers, service: Published) -> None:
     at.join(b"busy")
     at.join(b"idle")
     at.hello(b"waits")
@@ -76,9 +74,7 @@ def test_the_shares_are_of_the_time_that_was_noted() -> None:
     assert (shares.queued, shares.cores) == pytest.approx((0.2, 0.04))
 
 
-def test_what_was_long_ago_counts_no_more() -> None:
-    at = peers()
-    service = published(at)
+def test_what_was_long_ago_counts_no_more(at: Peers, service: Published) -> None:
     at.join()
     at.hello()
     at.consumer_says(b"c", Want(0, (), waited_seconds=50.0))
@@ -89,9 +85,7 @@ def test_what_was_long_ago_counts_no_more() -> None:
     assert shares.seconds == pytest.approx(10.0, abs=1.1)
 
 
-def test_the_time_before_the_first_consumer_does_not_count() -> None:
-    at = peers()
-    service = published(at)
+def test_the_time_before_the_first_consumer_does_not_count(at: Peers, service: Published) -> None:
     at.join()
     service.pass_seconds(9.0)
     at.hello()
@@ -104,9 +98,7 @@ def test_the_time_before_the_first_consumer_does_not_count() -> None:
     assert (shares.idle, shares.broker) == pytest.approx((0.0, 0.5), abs=0.05)
 
 
-def test_a_consumer_that_comes_again_for_the_next_epoch_was_not_away() -> None:
-    at = peers()
-    service = published(at)
+def test_a_consumer_that_comes_again_for_the_next_epoch_was_not_away(at: Peers, service: Published) -> None:
     at.join()
     at.hello(b"c1")
     service.pass_seconds(5.0)

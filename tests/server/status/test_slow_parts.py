@@ -26,30 +26,20 @@ MUCH = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def small(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Clips that take next to nothing to decode."""
-    folder = tmp_path_factory.mktemp("small")
-    for number in range(4):
-        write_clip(folder / f"{number}.mp4", panned_luma(200, 48, 64, step=(1, 1 + number)), gop=5)
-    return folder
+# How many, frames, height, width; and how they are coded.
+CLIPS: dict[str, tuple[int, tuple[int, int, int], dict[str, Any]]] = {
+    "next to nothing to decode": (4, (200, 48, 64), {"gop": 5}),
+    "decoded from far before": (2, (240, 360, 480), {"gop": 240, "b_frames": 2}),
+    "as large, decoded from just before": (2, (240, 360, 480), {"gop": 5}),
+}
 
 
 @pytest.fixture(scope="module")
-def large(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Clips that have to be decoded from far before."""
-    folder = tmp_path_factory.mktemp("large")
-    for number in range(2):
-        write_clip(folder / f"{number}.mp4", panned_luma(240, 360, 480, step=(1, 1 + number)), gop=240, b_frames=2)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def near(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Clips as large that are decoded from just before."""
-    folder = tmp_path_factory.mktemp("near")
-    for number in range(2):
-        write_clip(folder / f"{number}.mp4", panned_luma(240, 360, 480, step=(1, 1 + number)), gop=5)
+def clips(compiled: None, request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("clips")
+    number, shape, coding = CLIPS[request.param]
+    for each in range(number):
+        write_clip(folder / f"{each}.mp4", panned_luma(*shape, step=(1, 1 + each)), **coding)
     return folder
 
 
@@ -89,29 +79,29 @@ def verdicts(
 @pytest.mark.parametrize(
     ("part", "clips", "arrays", "recipe", "workers", "pause_seconds", "slow"),
     [
-        ("consumers", "small", ("voxels",), LITTLE, 2, 0.5, ""),
-        ("decode", "large", ("voxels",), LITTLE, 1, 0.0, ""),
-        ("simulate", "near", ("voxels", "flow"), MUCH, 1, 0.0, ""),
-        ("handover", "small", ("voxels",), LITTLE, 1, 0.0, "handover"),
-        ("broker", "small", ("voxels",), LITTLE, 2, 0.0, "broker"),
+        ("consumers", "next to nothing to decode", ("voxels",), LITTLE, 2, 0.5, ""),
+        ("decode", "decoded from far before", ("voxels",), LITTLE, 1, 0.0, ""),
+        ("simulate", "as large, decoded from just before", ("voxels", "flow"), MUCH, 1, 0.0, ""),
+        ("handover", "next to nothing to decode", ("voxels",), LITTLE, 1, 0.0, "handover"),
+        ("broker", "next to nothing to decode", ("voxels",), LITTLE, 2, 0.0, "broker"),
     ],
+    indirect=["clips"],
 )
 def test_the_sentence_names_the_slow_part(
     part: str,
-    clips: str,
+    clips: Path,
     arrays: tuple[str, ...],
     recipe: dict[str, Any],
     workers: int,
     pause_seconds: float,
     slow: str,
-    request: pytest.FixtureRequest,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     if slow:
         monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(SLOW), *filter(None, [os.environ.get("PYTHONPATH")])]))
         monkeypatch.setenv("V2V_SLOW", slow)
     flags = [flag for name, value in recipe.items() for flag in ("--set", f"{name}={value}")]
-    with LocalServer(request.getfixturevalue(clips), workers=workers, flags=flags) as server:
+    with LocalServer(clips, workers=workers, flags=flags) as server:
         said = verdicts(server.address, arrays, recipe, pause_seconds)
     assert said
     assert {each["part"] for each in said} == {part}, said[-1]

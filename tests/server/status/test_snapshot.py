@@ -14,7 +14,6 @@ from tests.server.status.services import WALL, Published, View, json_of, publish
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
 from v2v_protocol.messages import GetStatus, Goodbye, Hello, Result, Want, WorkerHello, encode
 from v2v_protocol.sample import Refusal
-from v2v_server.broker.leases import Cause
 from v2v_server.broker.session import RETURN_SECONDS
 from v2v_server.broker.state import RefusalPart, SendStatus, ToConsumer, ToWorker
 from v2v_server.quarantine import QuarantineEntry
@@ -43,11 +42,10 @@ def test_a_service_without_peers_says_what_it_serves() -> None:
     assert state.waiting.part == "no_consumers"
     assert not state.is_ready
     assert state.spec["recipe"]["bins"] == 5
+    assert set(state.spec) == set(SMALL_SPEC.to_dict())
 
 
-def test_a_row_says_what_a_worker_makes_and_what_it_took() -> None:
-    at = peers()
-    service = published(at)
+def test_a_row_says_what_a_worker_makes_and_what_it_took(at: Peers, service: Published) -> None:
     at.worker_says(b"w", WorkerHello("w", NUMERICS_VERSION, 2, "node-7"))
     hello(at)
     at.want(0, 1, 2, 3)
@@ -71,9 +69,7 @@ def test_a_row_says_what_a_worker_makes_and_what_it_took() -> None:
     assert (state.totals.cpu_seconds, state.totals.samples, state.totals.batches) == (1.5, 1, 0.5)
 
 
-def test_a_worker_rests_is_idle_or_lost() -> None:
-    at = peers()
-    service = published(at)
+def test_a_worker_rests_is_idle_or_lost(at: Peers, service: Published) -> None:
     for name in (b"idle", b"resting", b"lost"):
         at.join(name)
     at.dispatcher.registry.rest(b"resting", at.now, "v0.mp4: no such file")
@@ -89,9 +85,7 @@ def test_a_worker_rests_is_idle_or_lost() -> None:
     assert states["lost"].silent_seconds == 31.0
 
 
-def test_the_servers_own_workers_have_a_number_of_restarts() -> None:
-    at = peers()
-    service = published(at)
+def test_the_servers_own_workers_have_a_number_of_restarts(at: Peers, service: Published) -> None:
     service.pool.scale(2)
     service.pool.watch(0.0, 0)
     at.join(b"toy1")
@@ -101,9 +95,7 @@ def test_the_servers_own_workers_have_a_number_of_restarts() -> None:
     assert (state.worker_processes, state.worker_count) == (2, 2)
 
 
-def test_a_consumer_is_stalled_that_waits_most_of_its_time() -> None:
-    at = peers()
-    service = published(at)
+def test_a_consumer_is_stalled_that_waits_most_of_its_time(at: Peers, service: Published) -> None:
     hello(at)
     at.consumer_says(b"c", Want(3, (10,), waited_seconds=0.0))
     service.pass_seconds(10.0)
@@ -114,9 +106,7 @@ def test_a_consumer_is_stalled_that_waits_most_of_its_time() -> None:
     assert consumer.state == "stalled"
 
 
-def test_a_row_says_where_a_consumer_is_in_its_epoch() -> None:
-    at = peers()
-    service = published(at)
+def test_a_row_says_where_a_consumer_is_in_its_epoch(at: Peers, service: Published) -> None:
     hello(at)
     at.consumer_says(b"c", Want(3, (10, 11, 12, 13), waited_seconds=0.0))
     at.join()
@@ -136,9 +126,7 @@ def test_a_row_says_where_a_consumer_is_in_its_epoch() -> None:
     assert service.view().specs[consumer.spec] == at.dispatcher.sessions.get(b"c").spec.to_dict()  # type: ignore[union-attr]
 
 
-def test_a_new_epoch_begins_at_its_beginning() -> None:
-    at = peers()
-    service = published(at)
+def test_a_new_epoch_begins_at_its_beginning(at: Peers, service: Published) -> None:
     hello(at)
     at.join()
     at.want(40, 41)
@@ -166,9 +154,7 @@ def run_epochs(at: Peers, service: Published, epochs: int) -> list[View]:
     return rows
 
 
-def test_a_row_counts_over_short_epochs() -> None:
-    at = peers()
-    service = published(at)
+def test_a_row_counts_over_short_epochs(at: Peers, service: Published) -> None:
     at.join()
     *_, before, last = run_epochs(at, service, 20)
     assert (last.id, last.epoch, last.served) == (before.id, 19, 200)
@@ -179,9 +165,7 @@ def test_a_row_counts_over_short_epochs() -> None:
     assert last.eta_seconds == pytest.approx((50 - 10) / (10 / 1.2), rel=0.1)
 
 
-def test_a_reconnect_continues_the_row_and_a_later_run_begins_one() -> None:
-    at = peers()
-    service = published(at)
+def test_a_reconnect_continues_the_row_and_a_later_run_begins_one(at: Peers, service: Published) -> None:
     at.join()
     (first,) = run_epochs(at, service, 1)
     service.pass_seconds(RETURN_SECONDS - 1.0)
@@ -237,9 +221,7 @@ def test_rows_add_up_to_the_totals(epochs: list[tuple[bytes, int, float, bool]])
             assert 0.0 <= row.samples_per_second <= 4.0 + 1e-6  # two in half a second
 
 
-def test_consumers_of_one_name_keep_rows_of_their_own() -> None:
-    at = peers()
-    service = published(at)
+def test_consumers_of_one_name_keep_rows_of_their_own(at: Peers, service: Published) -> None:
     at.join()
     for identity in (b"a", b"b"):
         hello(at, identity)
@@ -255,9 +237,7 @@ def test_consumers_of_one_name_keep_rows_of_their_own() -> None:
     assert sorted(rows.values()) == [0, 0, 2]
 
 
-def test_a_consumer_whose_connection_has_ended_is_not_counted() -> None:
-    at = peers()
-    service = published(at)
+def test_a_consumer_whose_connection_has_ended_is_not_counted(at: Peers, service: Published) -> None:
     hello(at, b"stays")
     hello(at, b"goes")
     at.want(0, identity=b"goes")
@@ -271,9 +251,7 @@ def test_a_consumer_whose_connection_has_ended_is_not_counted() -> None:
     assert [consumer.id for consumer in service.view().consumers] == [state.consumers[0].id]
 
 
-def test_refusals_and_verdicts_are_listed_newest_first() -> None:
-    at = peers()
-    service = published(at)
+def test_refusals_and_verdicts_are_listed_newest_first(at: Peers, service: Published) -> None:
     hello(at)
     at.join()
     at.want(0)
@@ -291,8 +269,7 @@ def test_refusals_and_verdicts_are_listed_newest_first() -> None:
     assert state.totals.refused_candidates == 2
 
 
-def test_of_many_refusals_the_last_few_are_listed() -> None:
-    at = peers()
+def test_of_many_refusals_the_last_few_are_listed(at: Peers) -> None:
     for number in range(100):
         at.dispatcher.refusals.append(RefusalPart.of(Refusal("v.mp4", None, "x" * 500), str(number)))
     state = published(at).view()
@@ -301,17 +278,7 @@ def test_of_many_refusals_the_last_few_are_listed() -> None:
     assert len(state.refusals[0].reason) == 200
 
 
-def test_a_lost_worker_is_a_fault_and_gone() -> None:
-    at = peers()
-    service = published(at)
-    at.join()
-    at.die(cause=Cause.KILLED)
-    state = service.view()
-    assert (state.totals.workers_lost, state.totals.faults, state.workers) == (1, 1, [])
-
-
-def test_what_peers_call_themselves_is_short_and_printable() -> None:
-    at = peers()
+def test_what_peers_call_themselves_is_short_and_printable(at: Peers) -> None:
     hello(at, name="\x1b[2J" + "n" * 1000, host="\n<script>")
     (consumer,) = published(at).view().consumers
     assert len(consumer.name) <= 100
@@ -322,8 +289,7 @@ def test_what_peers_call_themselves_is_short_and_printable() -> None:
 # --- its form ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_state_is_plain_json() -> None:
-    at = peers()
+def test_the_state_is_plain_json(at: Peers) -> None:
     service = published(at, cache="/nowhere")
     hello(at)
     at.join()
@@ -333,9 +299,9 @@ def test_the_state_is_plain_json() -> None:
     assert service.plain()["workers"][0]["name"] == "w"
 
 
-def test_thousands_of_peers_fit_into_one_message_after_a_few_encodings(monkeypatch: pytest.MonkeyPatch) -> None:
-    at = peers()
-    service = published(at)
+def test_thousands_of_peers_fit_into_one_message_after_a_few_encodings(
+    at: Peers, service: Published, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for number in range(MOST_SHOWN + 50):
         at.join(b"w%04d" % number)
     for number in range(MOST_SHOWN + 50):
@@ -355,8 +321,7 @@ def test_thousands_of_peers_fit_into_one_message_after_a_few_encodings(monkeypat
     assert 1 < len(encodings) <= 3  # lists that do not fit are halved, not shortened one by one
 
 
-def test_names_that_are_no_text_and_very_long_ones_do_no_harm() -> None:
-    at = peers()
+def test_names_that_are_no_text_and_very_long_ones_do_no_harm(at: Peers) -> None:
     for _ in range(20):
         at.dispatcher.refusals.append(RefusalPart.of(Refusal("\x01" * 4000, None, "\x02" * 4000), WALL))
     at.quarantine.extend(
@@ -372,29 +337,17 @@ def test_names_that_are_no_text_and_very_long_ones_do_no_harm() -> None:
 # --- requests ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_client_gets_the_next_status_without_a_session() -> None:
-    at = peers()
-    service = published(at)
-    service.ask(at.dispatcher.from_consumer(b"page", encode(GetStatus()), at.now))
-    (answer,) = service.answers()
-    assert isinstance(answer, ToConsumer)
-    assert answer.identity == b"page"
-    assert json.loads(json_of(answer))["version"] == STATUS_VERSION
-    assert service.view().consumer_count == 0
+def test_a_client_on_either_side_gets_the_next_status_without_a_session(at: Peers, service: Published) -> None:
+    for speak, side in ((at.dispatcher.from_consumer, ToConsumer), (at.dispatcher.from_worker, ToWorker)):
+        service.ask(speak(b"page", encode(GetStatus()), at.now))
+        (answer,) = service.answers()
+        assert (type(answer), answer.identity) == (side, b"page")
+        state = json.loads(json_of(answer))
+        assert (state["version"], state["consumer_count"], state["worker_count"]) == (STATUS_VERSION, 0, 0)
+        at.now += ANSWER_SECONDS
 
 
-def test_a_client_on_the_workers_side_is_no_worker() -> None:
-    at = peers()
-    service = published(at)
-    service.ask(at.dispatcher.from_worker(b"page", encode(GetStatus()), at.now))
-    (answer,) = service.answers()
-    assert isinstance(answer, ToWorker)
-    assert json.loads(json_of(answer))["worker_count"] == 0
-
-
-def test_a_status_is_built_a_few_times_a_second_at_any_number_of_requests() -> None:
-    at = peers()
-    service = published(at)
+def test_a_status_is_built_a_few_times_a_second_at_any_number_of_requests(at: Peers, service: Published) -> None:
     made = 0
     for _ in range(20):
         for _ in range(50):
@@ -406,9 +359,7 @@ def test_a_status_is_built_a_few_times_a_second_at_any_number_of_requests() -> N
     assert made == 2.0 / ANSWER_SECONDS
 
 
-def test_a_status_that_takes_long_is_built_less_often() -> None:
-    at = peers()
-    service = published(at)
+def test_a_status_that_takes_long_is_built_less_often(at: Peers, service: Published) -> None:
     worked = iter(range(1000))
     service.publisher._processor_clock = lambda: float(next(worked)) / 10.0
     made = []
@@ -420,10 +371,8 @@ def test_a_status_that_takes_long_is_built_less_often() -> None:
     assert made == pytest.approx([0.0, 5.0, 10.0, 15.0], abs=0.5)
 
 
-def test_every_client_gets_the_same_status_and_the_page_too() -> None:
+def test_every_client_gets_the_same_status_and_the_page_too(at: Peers, service: Published) -> None:
     """90 clients that asked at the port left no place for the page, which then called the server down."""
-    at = peers()
-    service = published(at)
     for number in range(500):
         service.publisher.ask(SendStatus(b"%d" % number))
         service.publisher.ask(SendStatus(b"%d" % number))
@@ -434,14 +383,7 @@ def test_every_client_gets_the_same_status_and_the_page_too() -> None:
     assert len({id(each.frames) for each in answers}) == 1
 
 
-def test_the_spec_of_the_server_is_complete() -> None:
-    state = published(peers()).view()
-    assert set(state.spec) == set(SMALL_SPEC.to_dict())
-
-
-def test_a_consumer_cannot_have_waited_longer_than_it_was_there() -> None:
-    at = peers()
-    service = published(at)
+def test_a_consumer_cannot_have_waited_longer_than_it_was_there(at: Peers, service: Published) -> None:
     at.now = 10.0
     hello(at)
     at.now = 14.0

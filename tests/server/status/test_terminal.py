@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from tests.server.peers import peers
-from tests.server.status.services import published
+from tests.server.peers import Peers, peers
+from tests.server.status.services import Published, published
 from v2v_server.broker.state import Counters
 from v2v_server.status.snapshot import StatusFields
-from v2v_server.status.terminal import StatusView
+from v2v_server.status.terminal import StatusView, format_shutdown_summary
 from v2v_server.system.log import Log
 
 
@@ -30,9 +30,7 @@ def said(status: StatusFields) -> str:
     return stream.getvalue().removesuffix("\n")
 
 
-def test_the_line_counts_what_happened() -> None:
-    at = peers()
-    service = published(at)
+def test_the_line_counts_what_happened(at: Peers, service: Published) -> None:
     before = service.status()
     at.join()
     at.hello(batch_size=2)
@@ -77,9 +75,7 @@ def test_a_line_of_any_thread_stays_above_what_a_terminal_shows(monkeypatch: pyt
     assert again == shown
 
 
-def test_an_idle_server_says_so_once_in_a_log() -> None:
-    at = peers()
-    service = published(at)
+def test_an_idle_server_says_so_once_in_a_log(at: Peers, service: Published) -> None:
     stream = io.StringIO()
     view = StatusView(Log(), stream)
     for now in (0.0, 10.0, 20.0):
@@ -102,8 +98,7 @@ def test_programs_get_the_same_as_json(capsys: pytest.CaptureFixture[str]) -> No
     assert line["totals"] == status["totals"]
 
 
-def test_workers_that_start_and_those_of_other_hosts_are_counted() -> None:
-    at = peers()
+def test_workers_that_start_and_those_of_other_hosts_are_counted(at: Peers) -> None:
     for number in range(3):
         at.join(b"remote%d" % number)
     status = published(at).plain()
@@ -111,8 +106,7 @@ def test_workers_that_start_and_those_of_other_hosts_are_counted() -> None:
     assert "workers 3/7" in said(status | {"worker_processes": 7})
 
 
-def test_shared_decodes_shared_memory_and_the_cache_are_named_where_there_are_any() -> None:
-    at = peers()
+def test_shared_decodes_shared_memory_and_the_cache_are_named_where_there_are_any(at: Peers) -> None:
     at.dispatcher.counters.samples, at.dispatcher.counters.decodes = 30, 12
     at.dispatcher.counters.in_slots, at.dispatcher.counters.cache_hits, at.dispatcher.counters.cache_misses = 15, 9, 3
     status = published(at).plain()
@@ -121,14 +115,12 @@ def test_shared_decodes_shared_memory_and_the_cache_are_named_where_there_are_an
     assert "cache 75% hits, 1.50 of 4 GiB (no room)  workers" in said(status | {"cache": cache})
 
 
-def test_unusual_events_are_named_once_there_are_any() -> None:
-    at = peers()
+def test_unusual_events_are_named_once_there_are_any(at: Peers) -> None:
     at.dispatcher.counters.malformed, at.dispatcher.counters.returned_leases = 2, 3
     assert said(published(at).status()).endswith("faults 2  total 0 samples  3 returned leases  2 malformed")
 
 
-def test_a_terminal_shows_a_few_lines_in_the_place_of_the_previous_ones() -> None:
-    at = peers()
+def test_a_terminal_shows_a_few_lines_in_the_place_of_the_previous_ones(at: Peers) -> None:
     out = Terminal()
     view = StatusView(Log(), out)
     service = published(at)
@@ -165,3 +157,23 @@ def test_faults_are_the_counters_that_say_so() -> None:
     counters = Counters(samples=9, refused_candidates=1, unavailable=2, workers_lost=4, malformed=8, late_results=16)
     assert counters.faults == 15
     assert replace(counters, returned_leases=5).faults == 15
+
+
+def test_a_server_that_did_nothing_says_so() -> None:
+    assert format_shutdown_summary(published(peers()).status()) == [
+        "in total 0 samples (0.0 batches, 0.00 GiB) in 0.0 s: 0.00 samples/s", "faults 0",
+    ]  # fmt: skip
+
+
+def test_samples_faults_and_rates_are_summed_up(at: Peers) -> None:
+    counters = at.dispatcher.counters
+    counters.samples, counters.batches, counters.decodes, counters.bytes = 600, 50.0, 200, 3 << 30
+    counters.refused_candidates, counters.workers_lost, counters.returned_leases = 2, 1, 4
+    counters.waited_seconds = 90.0
+    counters.decode_seconds, counters.simulate_seconds, counters.handover_seconds = 200.0, 150.0, 50.0
+    status = published(at).plain() | {"uptime_seconds": 3 * 3600.0}
+    assert format_shutdown_summary(status) == [
+        "in total 600 samples (50.0 batches, 3.00 GiB, from 200 decoded clips) in 3 h 0 min: 0.06 samples/s",
+        "faults 3; 2 refused candidates, 4 returned leases, 1 workers lost",
+        "workers spent 7 min on them: decoding 50%, simulating 38%, delivering 12%; consumers waited 90.0 s",
+    ]

@@ -55,21 +55,15 @@ def test_workers_consumers_and_the_sentence_are_shown() -> None:
     assert state["waiting"]["sentence"] in line(state)
 
 
-def test_names_are_text_and_nothing_else() -> None:
-    text = drawn(busy())
+def test_names_are_text_many_are_counted_and_an_old_state_is_said_to_be_one() -> None:
+    state = busy()
+    state["workers"] *= 100
+    text = drawn(state, "no answer for 10 s")
+    assert "and 70 more" in text
+    assert "no answer for 10 s" in text
     assert "[red]x[/red]" in text
     assert "[bold]cut" in text
     assert "\x1b" not in text
-
-
-def test_that_a_state_is_old_is_said() -> None:
-    assert "no answer for 10 s" in drawn(busy(), "no answer for 10 s")
-
-
-def test_many_are_counted() -> None:
-    state = busy()
-    state["workers"] *= 100
-    assert "and 70 more" in drawn(state)
 
 
 def test_an_absent_server_is_an_error(capsys: pytest.CaptureFixture[str], unused_port: int) -> None:

@@ -1,4 +1,4 @@
-"""The pool with harmless programs in the place of workers."""
+"""The pool with harmless programs in the place of workers, some of them started before there is work."""
 
 from __future__ import annotations
 
@@ -17,18 +17,17 @@ import psutil
 import pytest
 
 from tests.waiting import until
-from v2v_protocol.errors import WorkerCrashLoop
+from v2v_protocol.errors import CorpusError, WorkerCrashLoop
 from v2v_server.broker.leases import Cause, Loss
-from v2v_server.supervise import local_host as child_module
-from v2v_server.supervise import local_host as host_module
-from v2v_server.supervise.local_host import LocalHost
+from v2v_server.config import ServeConfig
+from v2v_server.supervise import local_host
+from v2v_server.supervise.local_host import LocalHost, WorkerProcess, start_ahead
 from v2v_server.supervise.pool import Death, Pool, crash_budget
-from v2v_server.worker.logbook import Logbook, note
+from v2v_server.worker.logbook import note
 
 SLEEPS = "import time\ntime.sleep(600)"
 NAPS = "import time\nwhile True:\n    time.sleep(0.01)"
 """For programs with a handler in Python: a signal just before a long sleep would be handled after it."""
-LEAVES = "import sys\nsys.exit(3)"
 
 
 @pytest.fixture(autouse=True)
@@ -46,7 +45,7 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, str], Pool
     pools: list[Pool] = []
 
     def make(workers: int, program: str) -> Pool:
-        monkeypatch.setattr(child_module, "PROGRAM", (sys.executable, "-S", "-E", "-c", program))
+        monkeypatch.setattr(local_host, "PROGRAM", (sys.executable, "-S", "-E", "-c", program))
         pools.append(Pool(LocalHost("/corpus"), "label"))
         pools[-1].start("tcp://127.0.0.1:1")
         pools[-1].scale(workers)
@@ -60,6 +59,11 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, str], Pool
 def pids_of(pool: Pool) -> list[int]:
     """Process ids of the workers that are alive."""
     return [slot.place.child.process.pid for slot in pool._slots if slot.place.is_running]
+
+
+def started(pool: Pool) -> Pool:
+    pool.watch(0.0, 0)
+    return pool
 
 
 def all_dead(pool: Pool) -> None:
@@ -96,6 +100,7 @@ def test_it_starts_as_many_as_asked_each_with_a_name_of_its_own(start: Callable[
     assert pool.watch(0.0, 0) == []
     assert pool.running == 2
     pids = pids_of(pool)
+    assert all(os.getpgid(pid) == pid != os.getpgid(0) for pid in pids)
 
     def names() -> list[bytes]:
         # Four arguments follow; a process has none to show until its program has been loaded.
@@ -105,12 +110,6 @@ def test_it_starts_as_many_as_asked_each_with_a_name_of_its_own(start: Callable[
     assert names() == [b"label-0.1", b"label-1.1"]
     assert pool.watch(100.0, 0) == []
     assert pids_of(pool) == pids
-
-
-def test_an_empty_pool_is_content(start: Callable[[int, str], Pool]) -> None:
-    pool = start(0, SLEEPS)
-    assert pool.watch(0.0, 0) == []
-    pool.stop()
 
 
 def test_those_that_are_too_many_are_told_to_leave_and_not_missed(start: Callable[[int, str], Pool]) -> None:
@@ -144,13 +143,6 @@ def _catches_terminate(pid: int) -> bool:
         if line.startswith("SigCgt")
     )
     return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
-
-
-def test_workers_are_in_a_process_group_of_their_own(start: Callable[[int, str], Pool]) -> None:
-    pool = start(1, SLEEPS)
-    pool.watch(0.0, 0)
-    (pid,) = pids_of(pool)
-    assert os.getpgid(pid) == pid != os.getpgid(0)
 
 
 def test_a_process_that_the_system_does_not_start_is_tried_again(
@@ -215,37 +207,19 @@ def test_a_system_that_starts_no_process_at_all_ends_in_the_crash_budget(
 def test_a_crash_is_told_from_a_kill(
     start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch, number: int, cause: Cause, text: str
 ) -> None:
-    monkeypatch.setattr(host_module, "out_of_memory_kills", lambda: 5)
-    pool = start(1, SLEEPS)
-    pool.watch(0.0, 0)
+    monkeypatch.setattr(local_host, "out_of_memory_kills", lambda: 5)
+    pool = started(start(1, SLEEPS))
     until(lambda: is_loaded(pids_of(pool)[0]))
     os.kill(pids_of(pool)[0], number)
     all_dead(pool)
     assert pool.watch(1.0, 0) == [Death(b"label-0.1", Loss(cause, text))]
 
 
-def test_a_kill_while_the_host_runs_out_of_memory_may_be_the_samples_doing(
-    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    kills = [7]
-    monkeypatch.setattr(host_module, "out_of_memory_kills", lambda: kills[0])
-    pool = start(1, SLEEPS)
-    pool.watch(0.0, 0)
-    causes = []
-    for now, more in ((10.0, 1), (20.0, 0)):
-        kill_one(pool)
-        kills[0] += more
-        (death,) = pool.watch(now, 1)
-        causes.append(death.loss.cause)
-        pool.watch(now + 5.0, 2)
-    assert causes == [Cause.UNEXPLAINED, Cause.KILLED]
-
-
 def test_all_that_are_killed_at_once_for_want_of_memory_are_told_so_and_none_long_after(
     start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kills = [7]
-    monkeypatch.setattr(host_module, "out_of_memory_kills", lambda: kills[0])
+    monkeypatch.setattr(local_host, "out_of_memory_kills", lambda: kills[0])
     pool = start(2, SLEEPS)
 
     def causes_of_deaths_at(now: float) -> list[Cause]:
@@ -268,7 +242,7 @@ def test_all_that_are_killed_at_once_for_want_of_memory_are_told_so_and_none_lon
 
 
 def test_the_kernels_count_of_such_kills_is_read() -> None:
-    counted = child_module.out_of_memory_kills
+    counted = local_host.out_of_memory_kills
     until(lambda: f"\noom_kill {counted()}\n" in Path("/proc/vmstat").read_text(encoding="ascii"))
 
 
@@ -279,8 +253,7 @@ def test_an_exit_is_not_blamed_on_the_sample(start: Callable[[int, str], Pool], 
 
 
 def test_a_worker_that_was_given_up_is_killed_and_not_reported_again(start: Callable[[int, str], Pool]) -> None:
-    pool = start(2, SLEEPS)
-    pool.watch(0.0, 0)
+    pool = started(start(2, SLEEPS))
     hung, other = pids_of(pool)
     assert pool.watches(b"label-0.1")
     assert pool.give_up(b"label-9.9", "slept") is None
@@ -306,8 +279,7 @@ def test_a_worker_that_was_given_up_is_killed_and_not_reported_again(start: Call
 
 
 def test_a_worker_that_somebody_stopped_is_not_called_hung(start: Callable[[int, str], Pool]) -> None:
-    pool = start(1, SLEEPS)
-    pool.watch(0.0, 0)
+    pool = started(start(1, SLEEPS))
     (pid,) = pids_of(pool)
     os.kill(pid, signal.SIGSTOP)
     until(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED)
@@ -319,8 +291,7 @@ def test_a_worker_that_somebody_stopped_is_not_called_hung(start: Callable[[int,
 
 def test_it_says_how_long_a_worker_was_stopped_from_outside(start: Callable[[int, str], Pool]) -> None:
     """It may go on just before its deadline, and look like any other then."""
-    pool = start(2, SLEEPS)
-    pool.watch(0.0, 0)
+    pool = started(start(2, SLEEPS))
     pid, _ = pids_of(pool)
 
     def stopped(now: float) -> dict[bytes, float]:
@@ -340,8 +311,7 @@ def test_it_says_how_long_a_worker_was_stopped_from_outside(start: Callable[[int
 
 def test_it_says_how_long_a_worker_waited_for_a_core(start: Callable[[int, str], Pool]) -> None:
     """Many that want the one core that they may use."""
-    pool = start(4, "while True: pass")
-    pool.watch(0.0, 0)
+    pool = started(start(4, "while True: pass"))
     core = min(os.sched_getaffinity(0))
     for pid in pids_of(pool):
         os.sched_setaffinity(pid, {core})
@@ -355,8 +325,7 @@ def test_it_says_how_long_a_worker_waited_for_a_core(start: Callable[[int, str],
 
 
 def test_one_that_hangs_in_a_decoder_speaks_against_the_video(start: Callable[[int, str], Pool]) -> None:
-    pool = start(1, SLEEPS)
-    pool.watch(0.0, 0)
+    pool = started(start(1, SLEEPS))
     book = pool._slots[0].place.child.logbook
     with open(f"/proc/self/fd/{book.descriptor}", "r+b") as worker:
         note(worker.fileno(), 7, decodes=True)
@@ -368,8 +337,7 @@ def test_a_worker_whose_storage_does_not_answer_is_not_called_hung(
     start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All workers of a host wait then, each at a sound clip."""
-    pool = start(1, SLEEPS)
-    pool.watch(0.0, 0)
+    pool = started(start(1, SLEEPS))
     monkeypatch.setattr(psutil.Process, "status", lambda self: psutil.STATUS_DISK_SLEEP)
     expected = Loss(Cause.UNEXPLAINED, "waited for its storage and gave no answer for 60 s", for_all=False)
     assert pool.give_up(b"label-0.1", "gave no answer for 60 s") == expected
@@ -379,25 +347,6 @@ def test_a_worker_whose_storage_does_not_answer_is_not_called_hung(
 # --- restarting -------------------------------------------------------------------------------------------------------
 
 
-def kill_one(pool: Pool) -> None:
-    os.kill(pids_of(pool)[0], signal.SIGKILL)
-    all_dead(pool)
-
-
-def test_each_death_in_a_row_doubles_the_wait(start: Callable[[int, str], Pool]) -> None:
-    pool = start(1, SLEEPS)
-    now = 0.0
-    pool.watch(now, 0)
-    for wait in (0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10.0):
-        kill_one(pool)
-        pool.watch(now, 0)
-        pool.watch(now + 0.99 * wait, 0)
-        assert pool.running == 0
-        now += 1.01 * wait
-        pool.watch(now, 0)
-        assert pool.running == 1
-
-
 def test_the_wait_is_bounded_however_large_the_pool() -> None:
     """A thousand deaths in a row are within the budget of a large pool; two to the thousandth seconds are not."""
     pool = Pool(LocalHost("/corpus"), "label")
@@ -405,7 +354,7 @@ def test_the_wait_is_bounded_however_large_the_pool() -> None:
     for slot in pool._slots[1:]:
         slot.start_at = float("inf")
     pool._restarts._deaths_in_a_row = crash_budget(1000) - 1
-    dead = subprocess.Popen([sys.executable, "-S", "-E", "-c", LEAVES])
+    dead = subprocess.Popen([sys.executable, "-S", "-E", "-c", ""])
     dead.wait()
     pool._slots[0].place.child = SimpleNamespace(
         process=dead, post_mortem=lambda **_: Loss(Cause.UNEXPLAINED, "exited"), end=lambda: None
@@ -416,34 +365,11 @@ def test_the_wait_is_bounded_however_large_the_pool() -> None:
     assert pool._slots[0].start_at == 110.0
 
 
-def test_workers_that_only_die_use_up_the_budget(start: Callable[[int, str], Pool]) -> None:
-    pool = start(1, LEAVES)
-    assert crash_budget(1) == 7
-    now = 0.0
-    for _ in range(crash_budget(1)):
-        assert len(deaths_at(pool, now)) == 1
-        now += 60.0
-    with pytest.raises(WorkerCrashLoop, match=r"8 server workers died in a row .* \(limit 7\).*exited with status 3"):
-        deaths_at(pool, now)
-
-
-def test_any_finished_sample_forgives(start: Callable[[int, str], Pool]) -> None:
-    pool = start(1, SLEEPS)
-    now = 0.0
-    for samples in range(2 * crash_budget(1)):
-        pool.watch(now, samples)
-        kill_one(pool)
-        # The first death after progress waits the shortest time again.
-        assert len(pool.watch(now, samples + 1)) == 1
-        now += 0.21
-
-
 # --- stopping ---------------------------------------------------------------------------------------------------------
 
 
 def test_stop_waits_for_those_that_leave_by_themselves(start: Callable[[int, str], Pool]) -> None:
-    pool = start(2, "import time\ntime.sleep(0.05)")
-    pool.watch(0.0, 0)
+    pool = started(start(2, "import time\ntime.sleep(0.05)"))
     pids = pids_of(pool)
     pool.stop(join_seconds=60.0)
     assert all(is_gone(pid) for pid in pids)
@@ -457,8 +383,7 @@ def test_stop_reaps_what_ignores_every_request(start: Callable[[int, str], Pool]
         f"open({str(tmp_path)!r} + '/' + sys.argv[8], 'w').close()\n"
         "time.sleep(600)\n"
     )
-    pool = start(2, stubborn)
-    pool.watch(0.0, 0)
+    pool = started(start(2, stubborn))
     pids = pids_of(pool)
     until(lambda: len(list(tmp_path.iterdir())) == 2)
     pool.stop(join_seconds=0.0, terminate_seconds=0.1)
@@ -467,8 +392,7 @@ def test_stop_reaps_what_ignores_every_request(start: Callable[[int, str], Pool]
 
 
 def test_stop_after_a_crash_leaves_no_zombie_and_may_come_twice(start: Callable[[int, str], Pool]) -> None:
-    pool = start(2, SLEEPS)
-    pool.watch(0.0, 0)
+    pool = started(start(2, SLEEPS))
     pids = pids_of(pool)
     os.kill(pids[0], signal.SIGKILL)
     pool.stop(join_seconds=0.0)
@@ -478,7 +402,7 @@ def test_stop_after_a_crash_leaves_no_zombie_and_may_come_twice(start: Callable[
 
 @pytest.mark.parametrize("decodes", [True, False])
 def test_only_a_death_while_decoding_speaks_against_the_video(decodes: bool) -> None:
-    child = child_module.WorkerProcess()
+    child = WorkerProcess()
     with open(f"/proc/self/fd/{child.logbook.descriptor}", "r+b") as worker:
         note(worker.fileno(), 7, decodes=decodes)
     child.process.send_signal(signal.SIGSEGV)
@@ -487,13 +411,61 @@ def test_only_a_death_while_decoding_speaks_against_the_video(decodes: bool) -> 
     child.end()
 
 
-def test_the_programs_of_real_workers() -> None:
-    logbook = Logbook()
-    arguments = child_module.arguments("tcp://127.0.0.1:5556", "/a folder", "w-0.1", ["--debug"], logbook)
-    assert (sys.executable, "-m", "v2v_server.commands.worker") == child_module.PROGRAM
-    assert arguments == [
-        *("--arenas-fd", str(logbook.arenas.fileno())),
-        *("--connect", "tcp://127.0.0.1:5556", "--videos", "/a folder", "--name", "w-0.1"),
-        *("--parent-pid", str(os.getpid()), "--debug", "--logbook-fd", str(logbook.descriptor)),
-    ]
-    logbook.close()
+# --- workers that are started before there is work --------------------------------------------------------------------
+
+
+WRITES = "import os, sys; open(sys.argv[1], 'wb').write(sys.stdin.buffer.read())"
+
+
+@pytest.fixture
+def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file in which a standby writes what it is told; it ends then."""
+    path = tmp_path / "told"
+    monkeypatch.setattr(local_host, "PROGRAM", (sys.executable, "-S", "-E", "-c", WRITES, str(path)))
+    return path
+
+
+def test_the_pool_takes_standbys_first_and_tells_them_the_arguments_of_a_worker(told: Path) -> None:
+    config = ServeConfig(videos="/corpus", workers=(1, 1))
+    with start_ahead(config) as standbys:
+        (standby,) = standbys
+        expected = local_host.arguments("tcp://127.0.0.1:1", "/corpus", "label-0.1", ["--debug"], standby.logbook)
+        pool = Pool(LocalHost("/corpus", ["--debug"], standbys), "label")
+        pool.start("tcp://127.0.0.1:1")
+        pool.scale(1)
+        pool.watch(0.0, 0)
+        assert standbys == []
+        standby.process.wait()
+        pool.stop(0.0, 0.0)
+    assert told.read_bytes().decode().split("\0") == expected
+
+
+def test_standbys_that_are_not_used_end_with_the_start(told: Path) -> None:
+    def fail(config: ServeConfig, started: list[WorkerProcess]) -> None:
+        with start_ahead(config) as standbys:
+            started += standbys
+            raise CorpusError("no videos")
+
+    started: list[WorkerProcess] = []
+    with pytest.raises(CorpusError):
+        fail(ServeConfig(videos="videos", workers=(2, 2)), started)
+    assert len(started) == 2
+    assert all(each.process.returncode is not None for each in started)
+
+
+def test_a_standby_that_has_ended_is_a_failed_start_and_leaves_no_zombie(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local_host, "PROGRAM", (sys.executable, "-S", "-E", "-c", "raise SystemExit(3)"))
+    standby = WorkerProcess()
+    standby.process.wait()
+    pool = Pool(LocalHost("/corpus", (), [standby]), "label")
+    pool.start("tcp://127.0.0.1:1")
+    pool.scale(1)
+    (death,) = pool.watch(0.0, 0)
+    assert "could not be started" in death.loss.text
+    pool.stop(0.0, 0.0)
+
+
+def test_a_server_with_workers_elsewhere_starts_none() -> None:
+    config = ServeConfig(videos="videos", engine="ray", worker_bind="tcp://127.0.0.1:5556")
+    with start_ahead(config) as standbys:
+        assert standbys == []

@@ -1,13 +1,16 @@
-"""More workers where consumers wait, fewer where workers do; and no swinging between the two."""
+"""More workers where consumers wait, fewer where workers do; no swinging between the two; and what follows deaths."""
 
 from __future__ import annotations
 
 import random
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from v2v_server.supervise.pool import Decision, Scaling
+from v2v_protocol.errors import WorkerCrashLoop
+from v2v_server.broker.leases import Cause, Loss
+from v2v_server.supervise.pool import Decision, Restarts, Scaling, crash_budget
 
 SECONDS = 60.0
 
@@ -94,3 +97,27 @@ def test_from_none_the_first_comes_when_somebody_asks() -> None:
     assert (workers, len(up)) == (1, 1)
     assert run(scaling, 1, 0.01, 300.0, start=400.0)[0] == 1
     assert run(scaling, 1, 0.0, 300.0, start=700.0)[0] == 0
+
+
+# --- how long a dead worker's successor waits, and when there is none -------------------------------------------------
+
+
+LOSS = Loss(Cause.CRASHED, "was ended by SIGSEGV")
+
+
+def test_the_wait_doubles_and_any_sample_forgives() -> None:
+    restarts = Restarts()
+    assert [restarts.delay(2, LOSS) for _ in range(8)] == [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10.0, 10.0]
+    restarts.progress(0)
+    assert restarts.delay(2, LOSS) == 10.0
+    restarts.progress(1)
+    assert restarts.delay(2, LOSS) == 0.2
+
+
+def test_the_budget_grows_with_the_workers() -> None:
+    restarts = Restarts()
+    for _ in range(crash_budget(1)):
+        restarts.delay(1, LOSS)
+    restarts.delay(2, LOSS)
+    with pytest.raises(WorkerCrashLoop, match=r"9 server workers died in a row .* \(limit 7\).* was ended by SIGSEGV"):
+        restarts.delay(1, LOSS)

@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept, and that a kernel never outlives what it was made of."""
+"""Where compiled kernels are kept, and that none outlives what it was made of; and that OpenCV loads with its use."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import sys
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
+import cv2 as real
 import pytest
 
+from v2v_server import flow as methods
 from v2v_server.system import compile_cache
-from v2v_server.system.compile_cache import choose_compile_cache, sources_digest
+from v2v_server.system.compile_cache import choose_compile_cache, cv2, sources_digest
 
 ROOT = Path(__file__).parents[3]
 NAME = f"numba-{sources_digest()}"
@@ -26,6 +28,13 @@ def run(code: str, folder: Path = ROOT) -> str:
     return done.stdout.strip()
 
 
+def chosen(environment: dict[str, str]) -> dict[str, str]:
+    """Return the environment after the choice."""
+    changed = environment.copy()
+    choose_compile_cache(changed)
+    return changed
+
+
 @pytest.fixture
 def read_only_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The folder of the sources cannot be written. Permissions would not keep the superuser out; a file does."""
@@ -36,8 +45,7 @@ def read_only_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 def test_what_the_user_says_counts() -> None:
     environment = {"NUMBA_CACHE_DIR": "/somewhere", "V2V_CACHE_DIR": "/else"}
-    choose_compile_cache(environment)
-    assert environment == {"NUMBA_CACHE_DIR": "/somewhere", "V2V_CACHE_DIR": "/else"}
+    assert chosen(environment) == environment
 
 
 @pytest.mark.parametrize("parents_choice", [{}, {"NUMBA_CACHE_DIR": "/of/older/sources/numba-0123456789ab"}])
@@ -46,8 +54,7 @@ def test_beside_the_code_where_that_can_be_written(
 ) -> None:
     monkeypatch.setattr(compile_cache, "SOURCES", tmp_path / "simulation")
     (tmp_path / "simulation").mkdir()
-    environment = parents_choice | {"V2V_CACHE_DIR": str(tmp_path / "cache")}
-    choose_compile_cache(environment)
+    environment = chosen(parents_choice | {"V2V_CACHE_DIR": str(tmp_path / "cache")})
     assert environment["NUMBA_CACHE_DIR"] == str(tmp_path / "simulation" / "__pycache__" / NAME)
     assert not (tmp_path / "cache").exists()
 
@@ -57,17 +64,15 @@ def test_where_the_code_cannot_be_written_the_cache_folder_is_taken(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(compile_cache, "sources_digest", lambda: "0123456789ab")
-    environment = {"XDG_CACHE_HOME": "/else", "V2V_CACHE_DIR": str(tmp_path / "ours")}
-    choose_compile_cache(environment)
-    assert environment["NUMBA_CACHE_DIR"] == str(tmp_path / "ours" / "numba-0123456789ab")
-    environment = {"XDG_CACHE_HOME": str(tmp_path / "user")}
-    choose_compile_cache(environment)
-    assert environment["NUMBA_CACHE_DIR"] == str(tmp_path / "user" / "v2v" / "numba-0123456789ab")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    environment = {}
-    choose_compile_cache(environment)
-    assert environment["NUMBA_CACHE_DIR"] == str(tmp_path / "home" / ".cache" / "v2v" / "numba-0123456789ab")
-    assert Path(environment["NUMBA_CACHE_DIR"]).is_dir()
+    for environment, folder in (
+        ({"XDG_CACHE_HOME": "/else", "V2V_CACHE_DIR": str(tmp_path / "ours")}, "ours"),
+        ({"XDG_CACHE_HOME": str(tmp_path / "user")}, "user/v2v"),
+        ({}, "home/.cache/v2v"),
+    ):
+        expected = tmp_path / folder / "numba-0123456789ab"
+        assert chosen(environment)["NUMBA_CACHE_DIR"] == str(expected)
+        assert expected.is_dir()
 
 
 @pytest.mark.usefixtures("read_only_code")
@@ -79,22 +84,16 @@ def test_the_temporary_folder_is_used_only_if_other_users_cannot_write_to_it(
     nothing_else = {"XDG_CACHE_HOME": str(tmp_path / "file")}
     ours = tmp_path / f"v2v-{os.getuid()}"
 
-    environment = nothing_else.copy()
-    choose_compile_cache(environment)
-    assert Path(environment["NUMBA_CACHE_DIR"]).parent == ours
+    assert Path(chosen(nothing_else)["NUMBA_CACHE_DIR"]).parent == ours
     assert ours.stat().st_mode & 0o777 == 0o700
 
     ours.chmod(0o777)
-    environment = nothing_else.copy()
-    choose_compile_cache(environment)
-    assert environment == nothing_else
+    assert chosen(nothing_else) == nothing_else
 
     ours.rename(tmp_path / "elsewhere")
     (tmp_path / "elsewhere").chmod(0o700)
     ours.symlink_to(tmp_path / "elsewhere")
-    environment = nothing_else | {"NUMBA_CACHE_DIR": "/of/older/sources/numba-0123456789ab"}
-    choose_compile_cache(environment)
-    assert environment == nothing_else
+    assert chosen(nothing_else | {"NUMBA_CACHE_DIR": "/of/older/sources/numba-0123456789ab"}) == nothing_else
 
 
 def test_the_server_can_be_imported_without_numba(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,9 +101,7 @@ def test_the_server_can_be_imported_without_numba(monkeypatch: pytest.MonkeyPatc
         raise PackageNotFoundError(package)
 
     monkeypatch.setattr(compile_cache, "version", version)
-    environment: dict[str, str] = {}
-    choose_compile_cache(environment)
-    assert not environment
+    assert chosen({}) == {}
 
 
 def test_every_source_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -172,3 +169,43 @@ def test_a_change_of_one_module_reaches_the_kernels_of_another(tmp_path: Path) -
     file.write_text(text.replace("0x9E3779B9", "0x9E3779BB"), encoding="utf-8")
     after = run(code, tmp_path).split()
     assert after[2:] != before[2:]
+
+
+# --- OpenCV -----------------------------------------------------------------------------------------------------------
+
+
+def test_it_is_opencv() -> None:
+    assert cv2.resize is real.resize
+    assert cv2.ximgproc is real.ximgproc
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        cv2.nonsense  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_presets_have_opencvs_numbers() -> None:
+    assert methods.DIS_ULTRAFAST == real.DISOPTICAL_FLOW_PRESET_ULTRAFAST
+    assert methods.DIS_FAST == real.DISOPTICAL_FLOW_PRESET_FAST
+
+
+@pytest.mark.parametrize(
+    ("code", "is_loaded"),
+    [
+        ("import v2v_server.worker.process", False),
+        (
+            "import numpy as np; from v2v_server.flow import choose; choose(*np.zeros((2, 32, 32), np.uint8))",
+            True,
+        ),
+    ],
+)
+def test_a_worker_loads_it_with_its_first_use(code: str, is_loaded: bool) -> None:
+    seen = subprocess.run(
+        [sys.executable, "-c", f"import sys; {code}; print('cv2' in sys.modules)"],
+        capture_output=True, check=True, text=True,
+    )  # fmt: skip
+    assert seen.stdout.strip() == str(is_loaded)
+
+
+def test_it_begins_with_the_number_of_threads_that_a_worker_states() -> None:
+    code = "from v2v_server.system.compile_cache import cv2; print(cv2.getNumThreads())"
+    environment = os.environ | {"OPENCV_FOR_THREADS_NUM": "1"}
+    seen = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True, env=environment)
+    assert seen.stdout.strip() == "1"

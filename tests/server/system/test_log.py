@@ -23,9 +23,6 @@ def test_json_is_one_object_a_line_whatever_the_text_holds(capsys: pytest.Captur
     assert json.loads(line) == {
         "time": "now", "level": "error", "text": 'two\nlines "and" \x1b[31m', "sample": {"index": 3},
     }  # fmt: skip
-
-
-def test_the_time_is_of_the_world(capsys: pytest.CaptureFixture[str]) -> None:
     Log(is_json=True).say("x")
     said: dict[str, Any] = json.loads(capsys.readouterr().err)
     assert datetime.fromisoformat(said["time"]).utcoffset() is not None

@@ -1,4 +1,4 @@
-"""What processes ask of the operating system. Each in a process of its own: these settings last."""
+"""What processes ask of the operating system. Settings that last are made in a process of their own."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import platform
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.serve import load_catalogue, serve
 from v2v_server.system import process
+from v2v_server.system.process import lock
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux only")
 
@@ -67,21 +69,18 @@ def test_a_container_is_given_processor_time_instead_of_cores(monkeypatch: pytes
     own, groups = tmp_path / "own", tmp_path / "groups"
     (groups / "pods" / "mine").mkdir(parents=True)
     assert process._granted_cores(groups, own) == math.inf
-    own.write_text("1:name=systemd:/\n")  # version 1
-    assert process._granted_cores(groups, own) == math.inf
-    own.write_text("0::/pods/mine\n")
-    assert process._granted_cores(groups, own) == math.inf
-    (groups / "pods" / "mine" / "cpu.max").write_text("max 100000\n")
-    assert process._granted_cores(groups, own) == math.inf
-    (groups / "pods" / "cpu.max").write_text("250000 100000\n")
-    assert process._granted_cores(groups, own) == 2.5
-    (groups / "pods" / "mine" / "cpu.max").write_text("50000 100000\n")
-    assert process._granted_cores(groups, own) == 0.5
-    own.write_text("0::/\n")  # as in a container's own namespace
-    (groups / "cpu.max").write_text("150000 100000\n")
-    assert process._granted_cores(groups, own) == 1.5
-    own.write_text("0::/../elsewhere\n")  # moved there from outside
-    assert process._granted_cores(groups, own) == 1.5
+    for file, text, granted in (
+        (own, "1:name=systemd:/", math.inf),  # version 1
+        (own, "0::/pods/mine", math.inf),
+        (groups / "pods" / "mine" / "cpu.max", "max 100000", math.inf),
+        (groups / "pods" / "cpu.max", "250000 100000", 2.5),
+        (groups / "pods" / "mine" / "cpu.max", "50000 100000", 0.5),
+        (groups / "cpu.max", "150000 100000", 0.5),
+        (own, "0::/", 1.5),  # as in a container's own namespace
+        (own, "0::/../elsewhere", 1.5),  # moved there from outside
+    ):
+        file.write_text(f"{text}\n")
+        assert process._granted_cores(groups, own) == granted, (file, text)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(64)))
     for granted, cores in ((0.5, 1), (1.5, 2), (4.0, 4), (100.0, 64), (math.inf, 64)):
         monkeypatch.setattr(process, "_granted_cores", lambda granted=granted: granted)
@@ -190,3 +189,28 @@ def test_what_cataloguing_frees_is_handed_back(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("v2v_server.serve.give_back_freed_memory", lambda: told.append("handed back"))
     load_catalogue(ServeConfig(videos="videos"))
     assert told == ["catalogued", "handed back"]
+
+
+# --- locks on files that processes share ------------------------------------------------------------------------------
+
+
+def test_one_holder_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    with path.open("wb") as first, path.open("wb") as second:
+        lock(first.fileno(), 0.0, path)
+        with pytest.raises(BlockingIOError, match="another process keeps it locked; end that process") as raised:
+            lock(second.fileno(), 0.0, path)
+        assert raised.value.filename == path
+        first.close()
+        lock(second.fileno(), 0.0, path)
+
+
+def test_a_lock_that_is_released_in_time_is_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    with path.open("wb") as first, path.open("wb") as second:
+        lock(first.fileno(), 0.0, path)
+        waiter = threading.Thread(target=lock, args=(second.fileno(), 60.0, path))
+        waiter.start()
+        first.close()
+        waiter.join(60.0)
+        assert not waiter.is_alive()
