@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +53,6 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def samples(root: Path, rows: str, spec: StreamSpec, arrays: tuple[str, ...], count: int) -> Iterator[Sample]:
-    from dataclasses import replace
-    from itertools import islice
-
     with open_leases(root, rows, spec) as (folder, leases):
         for lease in islice(leases, count):
             yield whole_sample(replace(lease, arrays=arrays), folder)
@@ -96,15 +95,6 @@ def test_same_digests(pair: tuple[Path, Path], tmp_path: Path) -> None:
         for video in source.videos:
             assert store.frame_index(video.id).to_bytes() == source.frame_index(video.id).to_bytes()
             assert store.scene(video.id).to_bytes() == source.scene(video.id).to_bytes()
-
-
-def test_the_scenes_in_the_manifest_are_those_of_the_source(pair: tuple[Path, Path], tmp_path: Path) -> None:
-    run(pair[0], tmp_path / "store", rows=ROWS, scene=True)
-    with (
-        closing(open_catalogue(pair[0], rows=Rows.parse(ROWS), cache_dir=tmp_path, processes=0, scene=True)) as source,
-        closing(open_catalogue(tmp_path / "store", cache_dir=tmp_path, processes=0, scene=True)) as store,
-    ):
-        assert store.scene_digest == source.scene_digest
 
 
 def test_a_store_of_whole_pictures_takes_any_rows(pair: tuple[Path, Path], tmp_path: Path) -> None:

@@ -60,15 +60,6 @@ def inodes(folder: Path) -> dict[str, int]:
     return {str(path.relative_to(folder)): path.stat().st_ino for path in folder.rglob("*.mp4")}
 
 
-def test_a_second_run_keeps_everything(source: Path, tmp_path: Path) -> None:
-    first = run(source, tmp_path / "out")
-    before = inodes(tmp_path / "out")
-    second = run(source, tmp_path / "out")
-    assert (first.kept, second.kept) == (0, 5)
-    assert second.videos == first.videos
-    assert inodes(tmp_path / "out") == before
-
-
 def test_a_run_on_a_part_forgets_nothing(source: Path, tmp_path: Path) -> None:
     """Whether a list leaves the others out, or their folder is away that day."""
     out = tmp_path / "out"
