@@ -40,22 +40,6 @@ def poisoned(at: Peers, cause: Cause, index: int = 0, worker: bytes = b"w") -> L
 # --- which deaths count -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("begun", [True, False])
-def test_kills_from_outside_never_refuse_a_candidate_however_many(begun: bool) -> None:
-    at = peers()
-    at.hello()
-    at.want(0, 1)
-    for _ in range(50):
-        at.join()
-        first, second = at.leases[b"w"]
-        assert (first.indices, first.candidate, second.indices, second.candidate) == ((0,), 0, (1,), 0)
-        if begun:
-            at.begin()
-        at.die(cause=Cause.KILLED)
-    assert (at.recorded, at.passed_over, at.quarantine.latest) == ([], [], 0)
-    assert at.dispatcher.counters.refused_candidates == 0
-
-
 @pytest.mark.parametrize("cause", list(Cause))
 def test_a_sample_that_was_not_begun_is_never_refused(cause: Cause) -> None:
     at = peers()
@@ -179,15 +163,6 @@ def test_unexplained_deaths_make_it_run_alone_and_one_more_refuses_it() -> None:
     assert sorted(at.samples()) == [(0, 0), (0, 1), (0, 2), (0, 3)]
 
 
-def test_deaths_count_separately_for_each_candidate() -> None:
-    at = peers()
-    at.hello()
-    at.want(0)
-    candidates = [poisoned(at, Cause.UNEXPLAINED).candidate for _ in range(3 * (ALONE_AFTER + 1))]
-    assert candidates == [number // (ALONE_AFTER + 1) for number in range(len(candidates))]
-    assert len(at.recorded) == 3
-
-
 def test_a_lone_task_whose_video_fails_runs_in_company_again() -> None:
     at = peers()
     at.hello()
@@ -284,25 +259,6 @@ def test_a_spec_that_substitutes_nothing_hears_of_it_after_the_record() -> None:
     assert not at.leases[b"w"]
 
 
-def test_a_second_verdict_on_a_video_refuses_all_of_it() -> None:
-    at = peers(corpus(video("good.mp4", frames=50), video("bad.mp4", frames=50)))
-    at.hello(shuffle=False, batch_size=20)
-    indices = range(10, 20)  # catalogue order: those of bad.mp4
-    at.want(*indices)
-    for _ in range(2):
-        at.join()
-        bad = next(lease for lease in at.leases[b"w"] if lease.video == "bad.mp4")
-        at.worker_says(b"w", Begun(bad.lease))
-        at.die(cause=Cause.CRASHED)
-    at.join(credit=10)
-    leases = list(at.leases[b"w"])
-    assert sorted(lease.indices[0] for lease in leases) == list(indices)
-    assert {lease.video for lease in leases} == {"good.mp4"}
-    for lease in leases:
-        assert "video in quarantine snapshot 2 (2 verdicts)" in lease.refusals["refusals"][0]["reason"]
-    assert at.quarantine.latest == 2
-
-
 def test_one_sequence_that_crashes_for_several_consumers_gets_one_verdict() -> None:
     """Two verdicts on one sequence would condemn the whole video without having looked at any other of it."""
     at = peers()
@@ -370,32 +326,6 @@ def in_quarantine(index: int = 0, candidate: int = 0) -> QuarantineEntry:
     return against(at.begin())
 
 
-def test_what_is_in_quarantine_is_passed_over_without_a_lease() -> None:
-    verdict = in_quarantine()
-    at = peers(quarantine=Quarantine([verdict]))
-    assert at.hello().quarantine == 1
-    at.want(0)
-    at.join()
-    (lease,) = at.leases[b"w"]
-    assert (lease.candidate, lease.quarantine) == (1, 1)
-    (refusal,) = lease.refusals["refusals"]
-    assert refusal == {
-        "kind": "quarantined",
-        "video": verdict.path,
-        "frame": None,
-        "reason": "sequence in quarantine snapshot 1: a worker died over it",
-    }
-    assert at.passed_over == []
-
-
-def test_a_changed_file_is_not_the_one_in_quarantine() -> None:
-    at = peers(quarantine=Quarantine([replace(in_quarantine(), fingerprint="of before")]))
-    at.hello()
-    at.want(0)
-    at.join()
-    assert at.leases[b"w"][0].candidate == 0
-
-
 def test_a_consumer_that_resumes_an_older_snapshot_keeps_it() -> None:
     verdict = in_quarantine()
     at = peers(quarantine=Quarantine([verdict]))
@@ -451,16 +381,6 @@ def test_a_snapshot_of_the_future_is_refused() -> None:
     assert reply.code == ErrorCode.SPEC
     assert "snapshot 2 was asked for, this server has 0 .. 1" in reply.text
     assert len(at.dispatcher.sessions) == 0
-
-
-def test_after_a_clearing_the_newest_admits_it_and_the_old_one_does_not() -> None:
-    at = peers(quarantine=Quarantine([in_quarantine(), replace(clearing(TIME), snapshot=2)]))
-    at.hello(b"new")
-    at.hello(b"old", quarantine=1)
-    for identity in (b"new", b"old"):
-        at.want(0, identity=identity)
-    at.join()
-    assert {at.asked_by(lease): lease.candidate for lease in at.leases[b"w"]} == {b"new": 0, b"old": 1}
 
 
 def test_lines_that_others_wrote_meanwhile_are_taken_up_with_the_own_verdict() -> None:
