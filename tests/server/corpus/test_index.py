@@ -72,24 +72,6 @@ def corpus(tmp_path: Path) -> Corpus:
     return Corpus(tmp_path)
 
 
-def facts(catalogue: Catalogue) -> tuple[str, list[tuple[str, int]]]:
-    with closing(catalogue):
-        return catalogue.digest, [(video.id, video.frames) for video in catalogue.videos]
-
-
-def test_known_videos_come_from_the_index_and_changes_are_probed(corpus: Corpus) -> None:
-    first = facts(corpus.open())
-    assert first[1] == [(name, 300) for name in corpus.names]
-    corpus.know("007.mp4", frames=301)
-    assert dict(facts(corpus.open())[1])["007.mp4"] == 301
-    (corpus.folder / "003.mp4").unlink()
-    (corpus.folder / "004.mp4").write_bytes(b"no video")
-    (corpus.folder / "0035.mp4").write_bytes(b"none either")
-    changed = facts(corpus.open())
-    assert [name for name, _ in changed[1]] == [name for name in corpus.names if name not in ("004.mp4", "0035.mp4")]
-    assert facts(corpus.open()) == changed
-
-
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=50))
 def test_damage_is_an_error_of_sqlite_or_costs_a_probe(tmp_path: Path, damage: list[tuple[float, int]]) -> None:

@@ -72,7 +72,6 @@ def opened(folder: Path, rows: str | None = None, list_file: Path | None = None)
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five clips of 64 px width: plain, odd size in AVI, rotated with varying rate, full range, and a damaged one."""
     folder = tmp_path_factory.mktemp("corpus") / "source"
-    (folder / "dir").mkdir(parents=True)
     write_clip(folder / "b.mp4", panned_luma(40, 50, 64), b_frames=2)
     write_clip(
         folder / "dir" / "odd.avi", panned_luma(33, 49, 63), codec="mjpeg", pixel_format="yuvj420p", full_range=True
@@ -222,7 +221,6 @@ def test_one_video_may_be_prepared_in_its_own_folder(
 
 
 def test_labels_that_are_left_behind_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "films").mkdir()
     write_clip(tmp_path / "films" / "a.mp4", panned_luma(12))
     (tmp_path / "films" / "a.boxes.txt").write_text("1,1,2,3,4,5\n")
     place = tmp_path / "store"

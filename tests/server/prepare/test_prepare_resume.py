@@ -38,7 +38,6 @@ _KILLED_SECONDS = 60.0
 
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
-    (tmp_path / "source" / "sub").mkdir(parents=True)
     for number in range(4):
         write_clip(tmp_path / "source" / f"{number}.mp4", panned_luma(24, step=(1, number)))
     write_clip(tmp_path / "source" / "sub" / "4.mp4", panned_luma(30))
@@ -89,7 +88,6 @@ def test_another_corpus_is_not_taken_for_a_changed_source(source: Path, tmp_path
     run(source, out)
     before = inodes(out)
     other = tmp_path / "other"
-    other.mkdir()
     write_clip(other / "0.mp4", panned_luma(24, step=(2, 3)))
     with pytest.raises(CorpusError, match="folder called source, and none of its 5 videos is one of the 1 of other"):
         run(other, out)
@@ -125,16 +123,9 @@ def test_finished_files_are_looked_at_together_and_told_of(
     assert steps == [(0, 126), (24, 126), (48, 126), (72, 126), (96, 126), (126, 126)]
 
 
-def test_a_folder_is_resolved_once(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_source_with_links_into_the_destination_is_refused(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     run(source, out)
-    resolved: list[Path] = []
-    resolve = Path.resolve
-    monkeypatch.setattr(Path, "resolve", lambda path: (resolved.append(path), resolve(path))[1])
-    catalogue = opened(source)
-    resolved.clear()
-    refuse_links(catalogue, out)
-    assert resolved == [source, source / "sub"]
     shutil.copy(source / "0.mp4", out / "plain.mp4")  # a store file is no video
     (source / "sub" / "5.mp4").symlink_to(out / "plain.mp4")
     with pytest.raises(CorpusError, match=r"sub/5\.mp4 of the source is a link into it"):

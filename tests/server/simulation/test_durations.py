@@ -112,30 +112,6 @@ def test_bins_are_equal_parts_of_the_time_of_their_grid(spans: list[int], bins: 
     assert edges.step[::bins].tolist() == ends.tolist()
 
 
-def test_the_same_light_gives_the_same_events_at_every_rate() -> None:
-    """A ramp of log intensity: its events by bin do not depend on the frame rate, nor on a rate that varies."""
-    recipe = RECIPE.replace(
-        bins=4, threshold=0.1, threshold_ratio=1.0, noise_sigma=0.0, hot_pixel_share=0.0, pause_probability=0.0,
-        voxel_seconds=0.25,
-    )  # fmt: skip
-    random = np.random.default_rng(3)
-    times = [np.arange(0, 1.51, 1 / rate) for rate in (24, 30, 60, 240)]
-    times.append(np.concatenate(([0.0], np.cumsum(random.choice((1 / 24, 1 / 60, 1 / 240), 80)))))
-    found = []
-    for seconds in times:
-        grey = np.clip(255 * np.exp(2.0 * (seconds / seconds[-1] * seconds[-1] - 1.5) / 2.2), 0, 255)
-        frames = np.broadcast_to(np.round(grey).astype(np.uint8)[:, None, None], (len(grey), 8, 8)).copy()
-        rate = (len(seconds) - 1) / seconds[-1]
-        params = drawn(recipe, seconds, rate)
-        steps, _ = step_seconds(seconds, params.source_index(int(params.ends(recipe)[-1])), rate)
-        voxels = simulate_clip(frames, params, recipe, "int8", steps).voxels
-        assert voxels.shape == (4, 4, 8, 8)
-        # Events since the start by the time that has passed: the grids themselves differ by half a frame.
-        at = np.cumsum(lasting(params, recipe, seconds, rate))
-        found.append(voxels.sum(axis=1, dtype=int).cumsum(axis=0)[:, 0, 0] / at)
-    np.testing.assert_allclose(found, 20.0, atol=4.5)
-
-
 def test_bins_of_equal_steps_are_those_of_a_whole_number_of_frames() -> None:
     """Without noise, grids of 10 frames with 5 bins are what ``frames_per_bin=2`` makes, event for event."""
     recipe = RECIPE.replace(noise_sigma=0.0, hot_pixel_share=0.0, pause_probability=0.0, voxel_seconds=0.2)

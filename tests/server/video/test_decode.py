@@ -295,13 +295,6 @@ def test_damage_is_refused_and_does_not_spread(tmp_path: Path, codec: str, optio
     np.testing.assert_array_equal(decode_luma(bad, index, 24, 36).frames, reference[24:])
 
 
-def test_a_picture_of_another_size(tmp_path: Path) -> None:
-    small = write_clip(tmp_path / "small.mp4", panned_luma(20, 32, 48))
-    large = write_clip(tmp_path / "large.mp4", panned_luma(20, 48, 64))
-    with pytest.raises(VideoError, match="48x32 px here and 64x48 px at first"):
-        decode_luma(small, probe(large).index, 0, 5)
-
-
 def test_the_size_changes_in_mid_file(tmp_path: Path) -> None:
     parts = [
         write_clip(tmp_path / f"{number}.h264", panned_luma(20, *size))

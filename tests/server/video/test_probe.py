@@ -180,12 +180,6 @@ def test_a_tag_that_is_not_utf_8_costs_no_video(tmp_path: Path, suffix: str) -> 
     assert probe(tagged).frames == probe(plain).frames == 30
 
 
-def test_raw_motion_jpeg_is_a_video(tmp_path: Path) -> None:
-    path = write_clip(tmp_path / "raw.mjpeg", panned_luma(30), codec="mjpeg", pixel_format="yuvj420p", full_range=True)
-    assert probe(path).frames == 30
-    assert decode_luma(path, probe(path).index, 10, 20).frames.shape == (20, 48, 64)
-
-
 # --- which track is the video, and its rate ---------------------------------------------------------------------------
 
 

@@ -60,6 +60,7 @@ def coloured(frames: int = 30, height: int = 56, width: int = 72) -> npt.NDArray
 
 
 def write_coloured(path: Path, pictures: npt.NDArray[np.uint8]) -> Path:
+    path.parent.mkdir(exist_ok=True)
     with av.open(str(path), "w") as output:
         stream = cast(VideoStream, output.add_stream("libx264", rate=25, options={"crf": "1"}))
         stream.height, stream.width = pictures.shape[1:3]
@@ -128,7 +129,6 @@ def test_a_grey_video_has_equal_channels(tmp_path: Path) -> None:
 
 def test_a_prepared_folder_without_chroma_has_no_colour(tmp_path: Path) -> None:
     source, grey = tmp_path / "source", tmp_path / "grey"
-    source.mkdir()
     write_coloured(source / "a.mp4", coloured(12))
     with closing(open_catalogue(source, processes=0)) as catalogue:
         prepare(catalogue, grey, "fast", processes=0)
@@ -144,7 +144,6 @@ def test_a_prepared_folder_without_chroma_has_no_colour(tmp_path: Path) -> None:
 
 def test_colour_stays_with_another_plane_and_without_some_files(tmp_path: Path) -> None:
     source, prepared = tmp_path / "source", tmp_path / "prepared"
-    source.mkdir()
     for name in "ab":
         write_coloured(source / f"{name}.mp4", coloured(12))
     for planes in (("chroma",), ("motion",)):
@@ -160,7 +159,6 @@ def test_colour_stays_with_another_plane_and_without_some_files(tmp_path: Path) 
 
 def test_the_cache_keeps_colour_once_a_stream_needs_it(tmp_path: Path) -> None:
     folder = tmp_path / "videos"
-    folder.mkdir()
     write_coloured(folder / "a.mp4", coloured(40))
     make_cache(tmp_path / "cache")
     cache = Cache(tmp_path / "cache", 1 << 30, 0)
@@ -214,7 +212,6 @@ def sample_of(source: Path, recipe: Recipe, **fields: float) -> Sample:
 
 def ten_bits(folder: Path, transfer: ColorTrc | None) -> npt.NDArray[np.uint16]:
     """Write ``folder``/a.mkv, and return its levels, 0 .. 1023: its lowest bits vary."""
-    folder.mkdir()
     luma = LUMA.astype(np.uint16) * 4
     luma += np.arange(luma.shape[2], dtype=np.uint16) % 4
     write_clip(folder / "a.mkv", luma, codec="ffv1", pixel_format="yuv420p10le", transfer=transfer)
@@ -247,7 +244,6 @@ def test_a_deep_clip_is_simulated_from_the_light_that_it_states(
 def test_what_a_video_states_changes_no_name_that_does_not_ask_for_it(tmp_path: Path) -> None:
     """Recipes without it ignore a stated transfer, and clips of 8-bit SDR give the same arrays with it."""
     for name, transfer in (("plain", None), ("hlg", ColorTrc.ARIB_STD_B67)):
-        (tmp_path / name).mkdir()
         write_clip(tmp_path / name / "a.mp4", LUMA, transfer=transfer)
     made = {
         (name, recipe.light): sample_of(tmp_path / name, recipe)
@@ -269,7 +265,6 @@ def test_the_cache_keeps_transfer_and_bits(tmp_path: Path, is_deep: bool) -> Non
     if is_deep:
         ten_bits(tmp_path / "clips", ColorTrc.SMPTE2084)
     else:
-        (tmp_path / "clips").mkdir()
         write_clip(tmp_path / "clips" / "a.mp4", LUMA, transfer=ColorTrc.ARIB_STD_B67)
     exact = sample_of(tmp_path / "clips", DECLARED)
     make_cache(tmp_path / "cache")

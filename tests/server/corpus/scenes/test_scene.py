@@ -221,7 +221,6 @@ def test_a_scene_that_contradicts_itself_is_refused() -> None:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     made = tmp_path / "videos"
-    made.mkdir()
     write_clip(made / "cut.mkv", np.concatenate([pan(30, 2), other(40)]), codec="ffv1", pixel_format="gray")
     write_clip(made / "whole.mp4", pan(50, 1), gop=50)
     damaged(made / "whole.mp4", made / "broken.mp4", 30)
