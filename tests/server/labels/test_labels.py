@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -30,10 +29,8 @@ from v2v_server.labels import (
     numbered_files,
     read_mask,
     view_boxes,
-    view_mask,
 )
-from v2v_server.simulation.draw import draw
-from v2v_server.simulation.view import Window, apply_view, source_window
+from v2v_server.simulation.view import Window
 
 PICTURE_PX = (60, 80)
 Boxes = list[tuple[int, int, int, int, int, int, int]]
@@ -311,85 +308,6 @@ def test_boxes_of_a_frame_keep_their_order() -> None:
 
 
 # --- labels of a view -------------------------------------------------------------------------------------------------
-
-HEIGHT_PX, WIDTH_PX = 60, 83
-
-
-@st.composite
-def views(draws: st.DrawFn) -> tuple[Recipe, SampleParams, Window]:
-    """Any view that a recipe can draw of a picture, of which some rows are left out."""
-    top, bottom = draws(st.integers(0, 9)), draws(st.integers(0, 9))
-    low = draws(st.floats(0.4, 2.0))
-    recipe = Recipe(
-        crop_height_px=draws(st.integers(8, 24)),
-        crop_width_px=draws(st.integers(8, 32)),
-        resize_scale=draws(st.sampled_from([(1.0, 1.0), (low, low + 0.5)])),
-        contrast_probability=0.0,
-    )
-    usable = Window(top, 0, HEIGHT_PX - top - bottom, WIDTH_PX)
-    params = draw(
-        recipe, seed=draws(st.integers(0, 2**32)), epoch=0, index=0, picture_height_px=usable.height_px,
-        picture_width_px=usable.width_px, video_id="a",
-    )  # fmt: skip
-    return recipe, params, usable
-
-
-@st.composite
-def rectangles(draws: st.DrawFn) -> tuple[int, int, int, int]:
-    """Corners of whole pixels, at least 8 px apart: no resize makes the rectangle smaller than 3 px."""
-    x0, y0 = draws(st.integers(0, WIDTH_PX - 8)), draws(st.integers(0, HEIGHT_PX - 8))
-    return x0, y0, draws(st.integers(x0 + 8, WIDTH_PX)), draws(st.integers(y0 + 8, HEIGHT_PX))
-
-
-def drawn(box: tuple[int, int, int, int], value: int) -> npt.NDArray[np.uint8]:
-    picture = np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8)
-    picture[box[1] : box[3], box[0] : box[2]] = value
-    return picture
-
-
-def viewed(picture: npt.NDArray[np.uint8], recipe: Recipe, params: SampleParams, usable: Window) -> Any:
-    window = source_window(params, recipe, usable)
-    rows = slice(window.top_px, window.top_px + window.height_px)
-    return apply_view(picture[None, rows, window.left_px : window.left_px + window.width_px], params, recipe)[0]
-
-
-def bounds(there: npt.NDArray[np.bool_]) -> tuple[int, int, int, int]:
-    rows, columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
-    return columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
-
-
-@settings(max_examples=300)
-@given(view=views(), box=rectangles())
-def test_boxes_agree_to_half_a_pixel_and_masks_to_the_pixel(
-    view: tuple[Recipe, SampleParams, Window], box: tuple[int, int, int, int]
-) -> None:
-    recipe, params, usable = view
-    picture = viewed(drawn(box, 255), recipe, params, usable)
-    mask = view_mask(drawn(box, 3), usable, params, recipe)
-    # More than 3/4 covered: the centre is inside; less than 1/4: it is outside, also at a corner.
-    assert np.all(mask[picture > 0.76 * 255] == 3)
-    assert np.all(mask[picture < 0.24 * 255] == 0)
-    (corners,), (share,) = view_boxes(np.array([box], float), usable, params, recipe)
-    sides = corners[2:] - corners[:2]
-    if min(sides) >= 1.5:
-        np.testing.assert_allclose(bounds(mask == 3), corners, atol=0.5)
-        # Half of the darkest inner row and column: a narrow strip at the border is darker than the middle.
-        lit = (picture >= 0.5 * picture.max(axis=1, keepdims=True)) & (picture >= 0.5 * picture.max(axis=0))
-        np.testing.assert_allclose(bounds(lit & (picture > 64)), corners, atol=0.51)
-    if share == 0:
-        assert min(sides) <= 0
-    else:
-        assert 0 < share <= 1
-
-
-@given(view=views(), seed=st.integers(0, 99))
-def test_a_mask_without_a_resize_is_the_pictures_own_view(view: tuple[Recipe, SampleParams, Window], seed: int) -> None:
-    recipe, params, usable = view
-    mask = np.random.default_rng(seed).integers(0, 256, (HEIGHT_PX, WIDTH_PX), np.uint8)
-    got = view_mask(mask, usable, params, recipe)
-    assert got.shape == recipe.crop_px
-    if params.scale == 1.0:
-        np.testing.assert_array_equal(got, viewed(mask, recipe, params, usable))
 
 
 def test_the_share_counts_what_lies_in_the_crop() -> None:

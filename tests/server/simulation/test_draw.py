@@ -320,14 +320,3 @@ def test_rates_drawn_in_their_logarithm_spread_evenly_over_decades_and_change_no
     assert [[each[name] for name in others] for each in rates] == [
         [camera(recipe, index)[name] for name in others] for index in range(300)
     ]
-
-
-def test_a_logarithm_of_nothing_is_refused_by_name() -> None:
-    with pytest.raises(RecipeError, match=r"recipe shot_noise_hz = .*: a range that is drawn in its logarithm"):
-        preset("davis346").replace(rate_draw="log")
-
-
-def test_the_new_fields_are_left_out_of_the_plain_form_at_their_defaults() -> None:
-    assert not {"start", "rate_draw"} & Recipe().to_dict().keys()
-    changed = Recipe(start="triangular", rate_draw="log")
-    assert Recipe.from_dict(changed.to_dict()) == changed

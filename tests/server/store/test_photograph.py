@@ -240,31 +240,6 @@ def test_photographs_are_decoded_once_within_a_bound(
     assert len(photograph.kept_photographs) == 1
 
 
-@pytest.mark.parametrize("direction", ["forward", "backward"])
-@pytest.mark.parametrize("scale", [1.0, 0.7, 1.6])
-def test_flow_leads_from_frame_to_frame(catalogue: Catalogue, direction: str, scale: float) -> None:
-    """What a pixel shows is shown where its flow leads."""
-    from scipy.ndimage import map_coordinates  # type: ignore[import-untyped]
-
-    recipe = {"preset": "worlds", **FAST, "lead_frames": 1, "resize_scale": (scale, scale), "world_plain_share": 0.0}
-    row = Row(recipe, ("frames", "flow", "flow_valid"), {"flow_direction": direction}, count=4)
-    flips, moved, unmoved = set(), list[float](), list[float]()
-    for sample in samples_of(catalogue, row):
-        frames, flow, valid = (sample.arrays[name] for name in row.arrays)
-        flips.add(sample.provenance.params.flip)
-        pairs = ((at, at + 1) if direction == "forward" else (at + 1, at) for at in range(len(flow)))
-        for voxel, (here, there) in enumerate(pairs):
-            along = flow[voxel].astype(np.float64)
-            places = np.indices(frames.shape[2:]) + along[::-1]
-            reached = map_coordinates(frames[there, 0].astype(np.float64), places, order=1, mode="nearest")
-            is_seen = valid[voxel, 0] == 1
-            assert is_seen.mean() > 0.5
-            moved.append(abs(reached - frames[here, 0])[is_seen].mean())
-            unmoved.append(abs(frames[there, 0] - frames[here, 0].astype(float))[is_seen].mean())
-    assert np.mean(moved) < 0.35 * np.mean(unmoved)
-    assert len(flips) == 2 or direction == "backward"
-
-
 def test_paused_cameras_have_no_flow(catalogue: Catalogue) -> None:
     recipe = {"preset": "worlds", **FAST, "pause_probability": 1.0, "pause_stay_probability": 1.0, "lead_frames": 1}
     for sample in samples_of(catalogue, Row(recipe, ALL, count=2)):

@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
@@ -314,27 +314,24 @@ def test_jpeg_is_turned_upright_and_transparency_is_said(tmp_path: Path) -> None
     assert PictureSequence(write).facts().remark == "its transparency is left out"
 
 
+BREAKS: dict[str, Callable[[Path, Image.Image], object]] = {
+    "gap": lambda path, picture: path.unlink(),
+    "again": lambda path, picture: shutil.copy(path, path.with_name("second_0002.png")),
+    "unnumbered": lambda path, picture: shutil.copy(path, path.with_name("cover.png")),
+    "size": lambda path, picture: picture.resize((8, 8)).save(path),
+    "colour": lambda path, picture: picture.convert("RGB").save(path),
+    "format": lambda path, picture: path.write_bytes(encoded(picture, "bmp")),
+    "head": lambda path, picture: path.write_bytes(b"no picture"),
+    "empty": lambda path, picture: path.write_bytes(b""),
+}
+
+
 def broken(kind: str, folder: Path) -> None:
     """Break the third of four pictures."""
     path = folder / "0002.png"
     with Image.open(path) as file:
         picture = file.copy()
-    if kind == "gap":
-        path.unlink()
-    elif kind == "again":
-        shutil.copy(path, folder / "second_0002.png")
-    elif kind == "unnumbered":
-        shutil.copy(path, folder / "cover.png")
-    elif kind == "size":
-        picture.resize((8, 8)).save(path)
-    elif kind == "colour":
-        picture.convert("RGB").save(path)
-    elif kind == "format":
-        path.write_bytes(encoded(picture, "bmp"))
-    elif kind == "head":
-        path.write_bytes(b"no picture")
-    elif kind == "empty":
-        path.write_bytes(b"")
+    BREAKS[kind](path, picture)
 
 
 @pytest.mark.parametrize(

@@ -311,18 +311,19 @@ def test_the_size_changes_in_mid_file(tmp_path: Path) -> None:
     assert caught.value.frame == 20
 
 
-@pytest.mark.parametrize(("start", "count"), [(0, 0), (-1, 3), (0, 21), (20, 1)])
-def test_ranges_outside_the_index(tmp_path: Path, start: int, count: int) -> None:
+@pytest.mark.parametrize(
+    ("start", "count", "window", "words"),
+    [
+        *((*frames, (), r"holds 0 \.\. 19") for frames in ((0, 0), (-1, 3), (0, 21), (20, 1))),
+        *((0, 5, [each], "64x48 px") for each in ((0, 0, 49, 64), (0, 1, 48, 64), (-1, 0, 4, 4), (0, 0, 0, 4))),
+    ],
+)
+def test_ranges_outside_the_index_and_windows_outside_the_picture(
+    tmp_path: Path, start: int, count: int, window: list[tuple[int, int, int, int]], words: str
+) -> None:
     path = write_clip(tmp_path / "clip.mp4", panned_luma(20))
-    with pytest.raises(UsageError, match=r"holds 0 \.\. 19"):
-        decode_luma(path, probe(path).index, start, count)
-
-
-@pytest.mark.parametrize("window", [(0, 0, 49, 64), (0, 1, 48, 64), (-1, 0, 4, 4), (0, 0, 0, 4)])
-def test_windows_outside_the_picture(tmp_path: Path, window: tuple[int, int, int, int]) -> None:
-    path = write_clip(tmp_path / "clip.mp4", panned_luma(5))
-    with pytest.raises(UsageError, match="64x48 px"):
-        decode_luma(path, probe(path).index, 0, 5, window)
+    with pytest.raises(UsageError, match=words):
+        decode_luma(path, probe(path).index, start, count, *window)
 
 
 def test_missing_file(tmp_path: Path) -> None:

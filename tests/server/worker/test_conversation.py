@@ -178,18 +178,13 @@ def test_what_its_host_lacks_is_not_called_the_videos_fault(kind: type[VideoErro
     assert failed == [LeaseFailed(1, None, "cannot be read", here=True)]
 
 
-def test_a_worker_told_to_stop_begins_nothing_more() -> None:
+@pytest.mark.parametrize("by_signal", [False, True])
+def test_a_worker_told_to_stop_begins_nothing_of_what_it_holds(by_signal: bool) -> None:
     talk = at_work(1, 2)
+    if by_signal:
+        talk.conversation.stop()
     talk.makes(1)
-    assert talk.hears(Stop()) == [Result(1, begins=0), Goodbye()]
-    assert talk.step == Leave()
-
-
-def test_a_worker_stopped_by_a_signal_begins_nothing_of_what_it_holds() -> None:
-    talk = at_work(1, 2)
-    talk.conversation.stop()
-    talk.makes(1)
-    assert talk.hears() == [Result(1, begins=0), Goodbye()]
+    assert talk.hears(*[] if by_signal else [Stop()]) == [Result(1, begins=0), Goodbye()]
     assert talk.step == Leave()
 
 
@@ -337,14 +332,12 @@ class TestSiblings:
             done.append(Result(2, begins=3))
         assert talk.hears() == done
 
-    def test_do_not_wait_with_arrays_that_travel(self) -> None:
-        talk = self.at_first()
-        talk.makes(1, IN_MESSAGE)
-        assert talk.hears() == [Result(1, begins=2)]
-
-    def test_do_not_wait_where_the_server_cannot_see_which_one_is_in_work(self) -> None:
-        talk = self.at_first(is_watched=False)
-        talk.makes(1)
+    @pytest.mark.parametrize(("is_watched", "frames"), [(True, IN_MESSAGE), (False, IN_SLOT)])
+    def test_do_not_wait_with_arrays_that_travel_nor_where_the_server_cannot_see_which_is_in_work(
+        self, is_watched: bool, frames: Frames
+    ) -> None:
+        talk = self.at_first(is_watched=is_watched)
+        talk.makes(1, frames)
         assert talk.hears() == [Result(1, begins=2)]
 
     def test_that_are_done_are_announced_when_the_next_fails(self) -> None:

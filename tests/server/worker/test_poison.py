@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import cast
+from typing import Any, cast
 
 import pytest
 
@@ -28,6 +28,14 @@ def against(lease: Lease, reason: str = "a worker died over it", snapshot: int =
     return QuarantineEntry(snapshot, lease.video, lease.fingerprint, lease.start_frame, reason, TIME)
 
 
+def asked(*indices: int, at: Peers | None = None, **hello: Any) -> Peers:
+    """A server that a consumer asked for these samples of epoch 0; workers are still to join."""
+    at = at or peers()
+    at.hello(**hello)
+    at.want(*indices)
+    return at
+
+
 def poisoned(at: Peers, cause: Cause, index: int = 0, worker: bytes = b"w") -> Lease:
     """The next worker begins the sample and dies of that cause."""
     at.join(worker)
@@ -42,9 +50,7 @@ def poisoned(at: Peers, cause: Cause, index: int = 0, worker: bytes = b"w") -> L
 
 @pytest.mark.parametrize("cause", list(Cause))
 def test_a_sample_that_was_not_begun_is_never_refused(cause: Cause) -> None:
-    at = peers()
-    at.hello()
-    at.want(0)
+    at = asked(0)
     for _ in range(10):
         at.join()
         assert at.leases[b"w"][0].candidate == 0
@@ -54,9 +60,7 @@ def test_a_sample_that_was_not_begun_is_never_refused(cause: Cause) -> None:
 
 @pytest.mark.parametrize("cause", BLAMING)
 def test_a_crash_or_a_hang_refuses_the_begun_candidate_at_once(cause: Cause) -> None:
-    at = peers()
-    at.hello()
-    at.want(0, 1)
+    at = asked(0, 1)
     lease = poisoned(at, cause)
     assert at.recorded == [against(lease)]
     assert at.quarantine.lines == (against(lease),)
@@ -80,9 +84,7 @@ def test_a_crash_or_a_hang_refuses_the_begun_candidate_at_once(cause: Cause) -> 
 @pytest.mark.parametrize("answered", [True, False])
 def test_what_was_begun_along_with_a_result_is_to_blame_like_any_other(answered: bool) -> None:
     """Whether or not anybody waits for that result."""
-    at = peers()
-    at.hello()
-    at.want(0, identity=b"c")
+    at = asked(0)
     at.join()
     if not answered:
         at.consumer_says(b"c", Goodbye())
@@ -97,9 +99,7 @@ def test_what_was_begun_along_with_a_result_is_to_blame_like_any_other(answered:
 
 
 def test_only_the_worker_that_holds_a_lease_begins_it() -> None:
-    at = peers()
-    at.hello()
-    at.want(0, 1)
+    at = asked(0, 1)
     at.join(b"other", credit=1)
     at.join(b"w", credit=1)
     (others,) = at.leases[b"other"]
@@ -110,9 +110,7 @@ def test_only_the_worker_that_holds_a_lease_begins_it() -> None:
 
 
 def test_a_worker_that_hangs_is_blamed_through_its_end() -> None:
-    at = peers()
-    at.hello()
-    at.want(0, 1)
+    at = asked(0, 1)
     at.join()
     lease = at.begin()
     at.tick(DEADLINE + 1)
@@ -133,9 +131,7 @@ def test_a_worker_of_another_host_that_hangs_is_not_blamed_at_once() -> None:
 
 
 def test_unexplained_deaths_make_it_run_alone_and_one_more_refuses_it() -> None:
-    at = peers()
-    at.hello()
-    at.want(0, 1, 2, 3)
+    at = asked(0, 1, 2, 3)
     for _ in range(ALONE_AFTER):
         lease = poisoned(at, Cause.UNEXPLAINED)
         assert (lease.candidate, at.recorded) == (0, [])
@@ -164,9 +160,7 @@ def test_unexplained_deaths_make_it_run_alone_and_one_more_refuses_it() -> None:
 
 
 def test_a_lone_task_whose_video_fails_runs_in_company_again() -> None:
-    at = peers()
-    at.hello()
-    at.want(0, 1)
+    at = asked(0, 1)
     for _ in range(ALONE_AFTER):
         poisoned(at, Cause.UNEXPLAINED)
     at.join()
@@ -176,9 +170,7 @@ def test_a_lone_task_whose_video_fails_runs_in_company_again() -> None:
 
 
 def test_a_lone_task_waits_for_an_empty_worker_and_finds_one_under_load() -> None:
-    at = peers()
-    at.hello(batch_size=20)
-    at.want(0)
+    at = asked(0, batch_size=20)
     for _ in range(ALONE_AFTER):
         poisoned(at, Cause.UNEXPLAINED)
     at.hello(b"busy", batch_size=20)
@@ -202,9 +194,7 @@ def test_a_lone_task_waits_for_an_empty_worker_and_finds_one_under_load() -> Non
 
 
 def test_a_consumer_that_leaves_takes_its_lone_task_along_and_frees_the_worker_kept_for_it() -> None:
-    at = peers()
-    at.hello()
-    at.want(0)
+    at = asked(0)
     for _ in range(ALONE_AFTER):
         poisoned(at, Cause.UNEXPLAINED)
     at.join(b"w1", credit=3)
@@ -227,9 +217,7 @@ def test_a_consumer_that_leaves_takes_its_lone_task_along_and_frees_the_worker_k
 
 
 def test_the_verdict_is_written_before_anything_is_sent_under_it() -> None:
-    at = peers()
-    at.hello(batch_size=8)
-    at.want(*range(8))
+    at = asked(*range(8), batch_size=8)
     at.join(b"w1")
     at.join(b"w2")
     lease = at.begin(b"w1")
@@ -245,9 +233,7 @@ def test_the_verdict_is_written_before_anything_is_sent_under_it() -> None:
 
 
 def test_a_spec_that_substitutes_nothing_hears_of_it_after_the_record() -> None:
-    at = peers()
-    at.hello(on_bad_video="raise")
-    at.want(3)
+    at = asked(3, on_bad_video="raise")
     at.join()
     at.begin()
     at.sent.clear()
@@ -280,9 +266,7 @@ def test_one_sequence_that_crashes_for_several_consumers_gets_one_verdict() -> N
 
 
 def test_the_verdict_of_a_consumer_that_left_is_not_asked_for() -> None:
-    at = peers()
-    at.hello()
-    at.want(0)
+    at = asked(0)
     at.join()
     at.begin()
     at.dispatcher.consumer_lost(b"c")
@@ -317,9 +301,7 @@ def test_when_it_cannot_be_written_there_is_no_snapshot_and_the_sample_says_what
 
 def in_quarantine(index: int = 0, candidate: int = 0) -> QuarantineEntry:
     """A verdict on what index 0 of epoch 0 is made from."""
-    at = peers()
-    at.hello()
-    at.want(index)
+    at = asked(index)
     at.join()
     for _ in range(candidate):
         at.fail()
@@ -361,9 +343,7 @@ def test_a_consumer_that_resumes_an_older_snapshot_keeps_it() -> None:
 def test_a_crash_under_an_older_snapshot_moves_only_that_sample() -> None:
     """The verdict is there already, in a snapshot that this consumer does not see."""
     verdict = in_quarantine()
-    at = peers(quarantine=Quarantine([verdict]))
-    at.hello(quarantine=0)
-    at.want(0)
+    at = asked(0, at=peers(quarantine=Quarantine([verdict])), quarantine=0)
     poisoned(at, Cause.CRASHED)
     assert at.recorded == []
     at.join()
@@ -385,9 +365,7 @@ def test_a_snapshot_of_the_future_is_refused() -> None:
 
 def test_lines_that_others_wrote_meanwhile_are_taken_up_with_the_own_verdict() -> None:
     """Another server's verdict and a person's clearing have the numbers before it: the new snapshot is made of all."""
-    at = peers(quarantine=Quarantine([in_quarantine()]))
-    at.hello()
-    at.want(0, 1)
+    at = asked(0, 1, at=peers(quarantine=Quarantine([in_quarantine()])))
     at.join()
     assert [lease.candidate for lease in at.leases[b"w"]] == [1, 0]
     crashed = at.leases[b"w"][1]
@@ -465,9 +443,7 @@ def test_remake_chooses_what_the_dispatcher_chose(monkeypatch: pytest.MonkeyPatc
 
 
 def test_remake_says_what_the_dispatcher_says_when_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    at = peers(corpus(video("bad.mp4", frames=5)))
-    at.hello()
-    at.want(0)
+    at = asked(0, at=peers(corpus(video("bad.mp4", frames=5))))
     poisoned(at, Cause.CRASHED)
     at.join()
     (message,) = at.unavailable()
