@@ -185,17 +185,6 @@ def test_an_index_that_fails_after_the_probes_blames_no_video(corpus: Corpus, mo
         corpus.open(scene=True)
 
 
-def test_the_digest_of_scenes_is_computed_once(corpus: Corpus, monkeypatch: pytest.MonkeyPatch) -> None:
-    put_scenes(corpus, *corpus.names)
-    first, reads, all_figures = scenes(corpus), list[FigureKind](), Store.all_figures
-    monkeypatch.setattr(Store, "all_figures", lambda store, kind: reads.append(kind) or all_figures(store, kind))
-    assert scenes(corpus) == first
-    assert KIND not in reads
-    put_scenes(corpus, "007.mp4", boundary=100)
-    assert scenes(corpus)[0] != first[0]
-    assert KIND in reads
-
-
 # --- the table of videos ----------------------------------------------------------------------------------------------
 
 NAMES = sorted(f"{name}-{number}.mp4" for name in ("plain", "Größe", "日本", "𝄞", "a b") for number in range(40))

@@ -176,6 +176,7 @@ def test_what_is_cut_off_forgets_nothing(source: Path, out: Path) -> None:
     last = run(source, out, scene=True)
     assert (last.kept, last.looked_at, last.complete) == (1, 4, True)
     assert "4 were prepared earlier; only statistics" in summary(last, "dense", 0.0)[1]
+    assert run(source, out).kept == 5, "without them, what is there with them will do"
     assert inodes(out) == before
 
 

@@ -43,7 +43,6 @@ from v2v_server.corpus.scenes.scene import (
 )  # fmt: skip
 from v2v_server.corpus.scenes.stretches import duplicated, pattern_of, runs_of
 from v2v_server.corpus.videos import SplitVideos, encoded_pieces
-from v2v_server.prepare import prepare
 from v2v_server.system.isolate import run_twice
 from v2v_server.video.rows import Rows
 
@@ -301,25 +300,6 @@ def test_only_the_rows_in_use_are_looked_at(folder: Path) -> None:
 def test_processes_look_as_well_as_one(folder: Path, tmp_path: Path) -> None:
     with opened(folder) as one, opened(folder, cache_dir=tmp_path / "other", processes=2) as two:
         assert one.scene_digest == two.scene_digest
-
-
-def test_a_folder_prepared_without_scenes_gets_them_from_its_source(folder: Path, tmp_path: Path) -> None:
-    (folder / "broken.mp4").unlink()
-    target = tmp_path / "prepared"
-    with opened(folder, scene=False) as source:
-        plain = prepare(source, target, processes=0)
-        assert not any(video.scene for video in plain.videos)
-        before = {path.name: path.stat().st_ino for path in target.glob("*.mp4")}
-        again = prepare(source, target, processes=0, scene=True)
-        assert (plain.kept, again.kept) == (0, 0)
-        assert again.looked_at == 2
-        assert {path.name: path.stat().st_ino for path in target.glob("*.mp4")} == before
-        assert all(video.scene for video in again.prepared)
-        afresh = prepare(source, tmp_path / "afresh", processes=0, scene=True)
-        assert [video.scene for video in again.prepared] == [video.scene for video in afresh.prepared]
-        assert prepare(source, target, processes=0, scene=True).kept == 2
-        # Without them, what is there with them will do.
-        assert prepare(source, target, processes=0).kept == 2
 
 
 # --- pieces -----------------------------------------------------------------------------------------------------------
