@@ -484,20 +484,15 @@ def test_fingerprints(tmp_path: Path) -> None:
         check_fingerprint(path, max(seen))
 
 
-def test_a_small_index_is_handed_on_as_it_is_stored(tmp_path: Path) -> None:
+def test_a_small_index_is_handed_on_whole_and_of_a_large_one_the_encoded_slice_the_latest_of_which_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = write_clip(tmp_path / "clips" / "a.mp4", panned_luma(120), gop=12).parent
     with closing(open_catalogue(folder, processes=0)) as catalogue:
         whole = catalogue.frame_index("a.mp4").to_bytes()
         assert {catalogue.frame_index_bytes("a.mp4", start, 20) for start in (0, 50, 100)} == {whole}
-
-
-def test_the_encoded_part_of_a_large_index_is_that_of_its_slice_and_the_latest_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(catalogue_module, "_SMALL_INDEX_BYTES", 60)
-    monkeypatch.setattr(catalogue_module, "PIECE_FRAMES", 16)
-    folder = write_clip(tmp_path / "clips" / "a.mp4", panned_luma(120), gop=12).parent
-    with closing(open_catalogue(folder, processes=0)) as catalogue:
+        monkeypatch.setattr(catalogue_module, "_SMALL_INDEX_BYTES", 60)
+        monkeypatch.setattr(catalogue_module, "PIECE_FRAMES", 16)
         first = catalogue.frame_index_bytes("a.mp4", 0, 20)
         assert catalogue.frame_index_bytes("a.mp4", 0, 20) is first
         for start in range(1, 100):

@@ -300,17 +300,10 @@ def test_an_unknown_law_is_refused() -> None:
         Recipe(start="soft")
 
 
-def camera(recipe: Recipe, index: int) -> dict[str, float]:
-    params = draw(
-        recipe, seed=1, epoch=0, index=index, picture_height_px=200, picture_width_px=200, video_id="a"
-    )  # fmt: skip
-    return dict(params.effects)
-
-
 def test_rates_drawn_in_their_logarithm_spread_evenly_over_decades_and_change_no_other_draw() -> None:
     recipe = preset("davis346").replace(shot_noise_hz=(0.01, 10.0), leak_hz=0.1, photoreceptor_hz=0)
     log = recipe.replace(rate_draw="log")
-    rates = [camera(log, index) for index in range(300)]
+    rates = [params.effects for params in drawn(log, 300)]
     shares = np.log10([each["shot_noise_hz"] for each in rates]) / 3 + 2 / 3
     assert shares.min() >= 0.0
     assert shares.max() <= 1.0
@@ -318,5 +311,5 @@ def test_rates_drawn_in_their_logarithm_spread_evenly_over_decades_and_change_no
     assert {each["leak_hz"] for each in rates} == {0.1}
     others = ("refractory_seconds", "threshold_mismatch_sigma")
     assert [[each[name] for name in others] for each in rates] == [
-        [camera(recipe, index)[name] for name in others] for index in range(300)
+        [params.effects[name] for name in others] for params in drawn(recipe, 300)
     ]

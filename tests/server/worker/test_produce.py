@@ -151,47 +151,40 @@ def test_events_need_no_flow(catalogue: Catalogue, lease: Lease, monkeypatch: py
     assert signs.sum() == voxels.sum()
 
 
-class TestASecondAttempt:
+FIRST, SECOND = VideoError("a.mp4", 3, "does not decode"), VideoError("a.mp4", 3, "does not decode again")
+MISSING = VideoUnreadable("a.mp4", None, "cannot be read")
+
+
+@pytest.mark.parametrize(
+    ("ends", "is_replaced", "error", "words"),
+    [
+        pytest.param([FIRST], False, None, "", id="makes the sample"),
+        pytest.param([FIRST, SECOND], False, VideoError, "does not decode again", id="has the last word"),
+        pytest.param([FIRST], True, VideoChanged, "", id="finds a file that was replaced meanwhile"),
+        pytest.param([MISSING, SECOND], False, VideoUnreadable, "", id="is not made where the file is missing"),
+    ],
+)
+def test_a_second_attempt(
+    catalogue: Catalogue, lease: Lease, monkeypatch: pytest.MonkeyPatch, ends: list[VideoError], is_replaced: bool,
+    error: type[VideoError] | None, words: str,
+) -> None:  # fmt: skip
     """What a file does, it does again; storage may fail for a moment."""
+    left = list(ends)
 
-    @pytest.fixture
-    def failures(self, monkeypatch: pytest.MonkeyPatch) -> list[VideoError]:
-        """What the next attempts to decode end in."""
-        left: list[VideoError] = []
+    def decode(*arguments: Any) -> tuple[Decoded, ...]:
+        if left:
+            raise left.pop(0)
+        return decode_for(*arguments)
 
-        def decode(*arguments: Any) -> tuple[Decoded, ...]:
-            if left:
-                raise left.pop(0)
-            return decode_for(*arguments)
-
-        monkeypatch.setattr(clips, "decode_for", decode)
-        return left
-
-    def test_makes_the_sample(self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]) -> None:
-        failures.append(VideoError("a.mp4", 3, "does not decode"))
+    monkeypatch.setattr(clips, "decode_for", decode)
+    if is_replaced:
+        (catalogue.folder / "a.mp4").write_bytes(b"another")
+    if error is None:
         decoded, _ = clips.Clips(catalogue.source).take(lease)
         expected = make_sample(lease, decode_for(lease, lease.indices, catalogue.source)[0])
         assert np.array_equal(make_sample(lease, decoded).arrays["voxels"], expected.arrays["voxels"])
-
-    def test_has_the_last_word(self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]) -> None:
-        failures += [VideoError("a.mp4", 3, "first"), VideoError("a.mp4", 3, "second")]
-        with pytest.raises(VideoError, match="second"):
-            clips.Clips(catalogue.source).take(lease)
-
-    def test_finds_a_file_that_was_replaced_meanwhile(
-        self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]
-    ) -> None:
-        (catalogue.folder / "a.mp4").write_bytes(b"another")
-        failures.append(VideoError("a.mp4", 3, "does not decode"))
-        with pytest.raises(VideoChanged):
-            clips.Clips(catalogue.source).take(lease)
-
-    def test_is_not_made_where_the_file_is_missing(
-        self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]
-    ) -> None:
-        """The server looks whether it is there."""
-        failures += [VideoUnreadable("a.mp4", None, "cannot be read"), VideoError("a.mp4", 3, "asked again")]
-        with pytest.raises(VideoUnreadable):
+    else:
+        with pytest.raises(error, match=words):
             clips.Clips(catalogue.source).take(lease)
 
 
