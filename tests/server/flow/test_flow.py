@@ -391,12 +391,3 @@ def test_a_pan_is_found_scaled_and_mirrored(scale: float, flip: bool, direction:
     np.testing.assert_allclose(median_of(made.flow[[0, 2, 3]]), np.tile(expected, (3, 1)), atol=0.15)
     assert made.valid is not None
     assert made.valid.mean() > 0.8
-
-
-@pytest.mark.parametrize("name", ["auto", "dis-fast", "dis-fast-1"])
-def test_a_still_clip_has_exactly_zero_flow(name: str) -> None:
-    frames = np.repeat(panned(1, 120, 170, 0, 0), 9, axis=0)
-    made = flow_for(frames, camera_params(), RECIPE, FlowSettings(name, margin_px=None))
-    assert not made.flow.any()
-    if name == "auto":
-        assert set(made.methods) == {STILL_METHOD}

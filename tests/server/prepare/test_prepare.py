@@ -133,12 +133,6 @@ def test_a_corrupt_source_is_listed_and_the_others_go_on(prepared: tuple[Path, R
     assert not [path for path in target.rglob("*") if "partial" in path.name]
 
 
-def test_the_source_is_not_touched(source: Path, tmp_path: Path) -> None:
-    before = snapshot(source)
-    run(source, tmp_path / "again")
-    assert snapshot(source) == before
-
-
 @pytest.fixture
 def two(source: Path, tmp_path: Path) -> Path:
     """A folder with x.mp4 and y.mp4."""

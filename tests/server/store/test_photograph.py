@@ -6,7 +6,6 @@ import io
 import math
 from collections.abc import Iterator
 from contextlib import closing
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -252,16 +251,6 @@ def test_paused_cameras_have_no_flow(catalogue: Catalogue) -> None:
         assert not sample.arrays["flow"][0].any()
         assert not sample.arrays["flow_valid"][0].any()
         assert sample.arrays["flow"][1].any()
-
-
-def test_grids_of_a_duration(catalogue: Catalogue) -> None:
-    row = Row({"preset": "worlds", **FAST, "voxel_seconds": (0.05, 0.1)}, ALL, count=3)
-    for sample in samples_of(catalogue, row):
-        assert sample.provenance.grid_seconds == pytest.approx(
-            [len_ / 60 for len_ in sample.provenance.params.grid_steps]
-        )
-        for one, other in pairwise(sample.arrays["tracks"][..., :2]):
-            assert abs(other - one).max() < 300
 
 
 @pytest.mark.parametrize(
