@@ -137,6 +137,17 @@ def test_the_refractory_period_stretches_the_time_between_events(refractory: flo
     assert got.item() == 1 + math.floor((1 / FPS - 0.05 / slope) / (0.05 / slope + refractory))
 
 
+def test_dead_pixels_are_dead_and_no_others() -> None:
+    frames = moving_frames(21, 40, 40)
+    plain = simulate(frames, threshold_pos=0.2, noise_sigma=0.3, bins=20).voxels
+    got = simulate(frames, threshold_pos=0.2, noise_sigma=0.3, bins=20, dead_pixel_share=100 / 1600).voxels
+    position = dead_pixels.positions(noise_key_of_seed(0), 100 / 1600, 1600)
+    assert len(set(position.tolist())) == 100
+    expected = plain.reshape(20, -1).copy()
+    expected[:, position] = 0
+    np.testing.assert_array_equal(got.reshape(20, -1), expected)
+
+
 def test_an_effect_that_can_do_nothing_leaves_every_bit_alone() -> None:
     """The other kernel, without hot pixels, is the same arithmetic in the same order."""
     frames = moving_frames(31, 33, 47)

@@ -159,6 +159,20 @@ def test_colours_come_back_by_the_stated_matrix_and_range(colorspace: Any, colou
     assert np.abs(got[inner].astype(int) - colours).max() <= 4
 
 
+@pytest.mark.parametrize("name", ["gray", "rgb24", "yuv420p"])
+def test_a_grey_picture_is_the_same_in_all_channels(name: str) -> None:
+    picture = np.random.default_rng(1).integers(0, 256, (12, 16), np.uint8)
+    frame = VideoFrame.from_ndarray(picture, format="gray").reformat(format=name)
+    if name == "yuv420p":
+        for plane in frame.planes[1:]:
+            np.frombuffer(memoryview(plane), np.uint8)[...] = 128
+    red, green, blue = rgb_of(frame)
+    luma = LumaFormat.of(frame)
+    grey = range_table(luma.bits, luma.full_range)[luma_plane(frame, luma)]
+    for channel in (red, green, blue):
+        np.testing.assert_array_equal(channel, grey)
+
+
 def test_formats_without_planes_have_colour() -> None:
     colours = np.array([[250, 10, 20], [10, 240, 30], [15, 25, 230]], np.uint8)
     picture = np.ascontiguousarray(colours.repeat(8, 0)[:, None].repeat(8, 1))
