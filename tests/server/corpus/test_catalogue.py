@@ -491,8 +491,9 @@ def test_a_small_index_is_handed_on_whole_and_of_a_large_one_the_encoded_slice_t
     with closing(open_catalogue(folder, processes=0)) as catalogue:
         whole = catalogue.frame_index("a.mp4").to_bytes()
         assert {catalogue.frame_index_bytes("a.mp4", start, 20) for start in (0, 50, 100)} == {whole}
-        monkeypatch.setattr(catalogue_module, "_SMALL_INDEX_BYTES", 60)
-        monkeypatch.setattr(catalogue_module, "PIECE_FRAMES", 16)
+    monkeypatch.setattr(catalogue_module, "_SMALL_INDEX_BYTES", 60)
+    monkeypatch.setattr(catalogue_module, "PIECE_FRAMES", 16)
+    with closing(open_catalogue(folder, processes=0)) as catalogue:
         first = catalogue.frame_index_bytes("a.mp4", 0, 20)
         assert catalogue.frame_index_bytes("a.mp4", 0, 20) is first
         for start in range(1, 100):

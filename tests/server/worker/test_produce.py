@@ -160,8 +160,10 @@ MISSING = VideoUnreadable("a.mp4", None, "cannot be read")
     [
         pytest.param([FIRST], False, None, "", id="makes the sample"),
         pytest.param([FIRST, SECOND], False, VideoError, "does not decode again", id="has the last word"),
-        pytest.param([FIRST], True, VideoChanged, "", id="finds a file that was replaced meanwhile"),
-        pytest.param([MISSING, SECOND], False, VideoUnreadable, "", id="is not made where the file is missing"),
+        pytest.param([FIRST], True, VideoChanged, r"a\.mp4", id="finds a file that was replaced meanwhile"),
+        pytest.param(
+            [MISSING, SECOND], False, VideoUnreadable, "cannot be read", id="is not made where the file is missing"
+        ),
     ],
 )
 def test_a_second_attempt(
