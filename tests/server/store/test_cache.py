@@ -331,6 +331,15 @@ def test_a_file_that_is_replaced_counts_once(quota: QuotaFolder) -> None:
     assert quota.used_bytes == 0
 
 
+def test_the_oldest_without_a_reader_goes(quota: QuotaFolder) -> None:
+    for name in ("a", "b", "c"):
+        assert add(quota, name, 30)
+    with (quota.folder / "ab" / "a").open("rb") as reader:
+        fcntl.flock(reader, fcntl.LOCK_SH)
+        assert add(quota, "d", 30, evicts=True)
+    assert names(quota) == {"a", "c", "d"}
+
+
 def test_disk_space_that_others_need_is_freed(quota: QuotaFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("a", "b", "c"):
         assert add(quota, name, 10)
