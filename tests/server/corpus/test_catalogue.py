@@ -587,3 +587,9 @@ def test_the_index_of_a_long_video_is_opened_once(
         for name in names:
             catalogue.frame_index_bytes(name, start, 3)
     assert len(opened) == 2
+    monkeypatch.setattr(catalogue_module, "_KEPT_LONG_FRAMES", 1)
+    catalogue._long.clear()
+    for start in (1, 2, 3):
+        for name in names:
+            catalogue.frame_index_bytes(name, start, 3)
+            assert list(catalogue._long) == [name]

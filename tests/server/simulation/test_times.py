@@ -143,6 +143,20 @@ def test_kernel_equals_the_oracle(data: Any, precision: str, grids: int, bits: i
 # --- arrays against events --------------------------------------------------------------------------------------------
 
 
+def test_shot_noise_has_both_polarities_and_random_times() -> None:
+    made = simulate(
+        np.zeros((501, 8, 8), np.uint8), threshold_pos=0.2, bins=1, frames_per_bin=500, dtype="float32",
+        frames_per_second=FPS, shot_noise_hz=40.0,
+    )  # fmt: skip
+    counts = made.array("event_counts").reshape(2, -1)
+    for each in counts:
+        assert abs(each.mean() - 400) < 4 * 20 / 8
+    events = made.to_events(500e6 / FPS)
+    within = (events.t % 40_000) / 40_000
+    assert abs(within.mean() - 0.5) < 4 / np.sqrt(12 * len(within))
+    assert abs(np.corrcoef(within[:-1], within[1:])[0, 1]) < 0.05 or len(np.unique(events.t)) > 0.9 * len(events) / 2
+
+
 @pytest.mark.parametrize("dtype", ["float32", pytest.param("int16", marks=pytest.mark.slow)])  # another kernel
 @pytest.mark.parametrize("effects", [{}, ALL])
 @pytest.mark.parametrize("grids", [0, 3])
