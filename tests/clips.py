@@ -70,7 +70,7 @@ def write_clip(
     """Encode pictures of the given luma and neutral chroma.
 
     Args:
-        path: the file to write; its suffix chooses the container.
+        path: the file to write, in a folder that need not exist; its suffix chooses the container.
         luma: [n, height, width]; uint8, or wider for pixel formats of more than 8 bits.
         codec: PyAV's name of the encoder.
         pixel_format: any planar YUV or grey format, or an RGB one (which then shows ``luma`` as grey).
@@ -86,6 +86,7 @@ def write_clip(
         audio: add a tone.
     """
     n, height, width = luma.shape
+    path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w", format=container) as output:
         stream = cast(VideoStream, output.add_stream(codec, rate=rate, options=dict(options or {})))
         stream.width, stream.height, stream.pix_fmt = width, height, pixel_format

@@ -59,7 +59,7 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Return a function that runs the command, which probes in this process: the slow test starts the real ones."""
+    """Return a function that runs the command, which probes in this process."""
     monkeypatch.setattr(
         catalogue, "open_catalogue", lambda videos, **asked: open_catalogue(videos, **(asked | {"processes": 0}))
     )
@@ -86,54 +86,23 @@ def looked_into(said: str) -> int:
     return int(re.findall(r"probed (\d+) files", said)[-1])
 
 
-@pytest.mark.slow
-def test_parts_of_three_hosts_are_the_catalogue_of_one(corpus: Path, tmp_path: Path, run: Run) -> None:
-    parts, scene = str(tmp_path / "parts"), ("--scene", "auto", "--rows", "top:0.5")
-    status, whole, _ = run("one", *scene)
-    assert status == 0
-    assert len(digests(whole)) == 2
+def test_parts_of_two_hosts_are_the_catalogue_of_one_and_what_changed_since_is_looked_into_again(
+    corpus: Path, tmp_path: Path, run: Run
+) -> None:
+    videos, parts, scene = tmp_path / "videos", str(tmp_path / "parts"), ("--scene", "auto", "--rows", "top:0.5")
+    shutil.copytree(corpus, videos)
+    said = [run(f"host {n}", "--shard", f"{n}/2", "--out", parts, *scene, videos=str(videos))[1] for n in (1, 2)]
+    assert sum(int(re.findall(r": (\d+) of 11 videos", each)[0]) for each in said) == 11
+    status, whole, _ = run("one", *scene, videos=str(videos))
+    assert (status, len(digests(whole))) == (0, 2)
     assert "10 videos can be used" in whole
     assert "  broken.mp4" in whole
-    program = [
-        sys.executable,
-        "-m",
-        "v2v_protocol.programs",
-        "catalogue",
-        "--videos",
-        str(corpus),
-        *scene,
-        "--workers",
-        "1",
-    ]
-    hosts = [
-        subprocess.Popen(
-            [*program, "--cache-dir", str(tmp_path / f"host {number}"), "--shard", f"{number}/3", "--out", parts],
-            stdout=subprocess.PIPE, text=True,
-        )
-        for number in (1, 2, 3)
-    ]  # fmt: skip
-    said = [host.communicate()[0] for host in hosts]
-    assert [host.returncode for host in hosts] == [0, 0, 0]
-    taken_in = sum(int(re.findall(r": (\d+) of 11 videos", each)[0]) for each in said)
-    assert taken_in == 11
-    status, merged, _ = run("server", *scene, "--merge", parts)
-    assert status == 0
-    assert digests(merged) == digests(whole)
-    assert looked_into(merged) == 0
-    status, again, _ = run("server", *scene)  # as a server's start does
-    assert (digests(again), looked_into(again)) == (digests(whole), 0)
-
-
-def test_what_changed_after_its_shard_was_made_is_looked_into_again(corpus: Path, tmp_path: Path, run: Run) -> None:
-    videos = tmp_path / "videos"
-    shutil.copytree(corpus, videos)
-    for number in (1, 2):
-        run(f"host {number}", "--shard", f"{number}/2", "--out", str(tmp_path / "parts"), videos=str(videos))
-    write_clip(videos / "clip.mp4", panned_luma(12))
-    _, merged, _ = run("server", "--merge", str(tmp_path / "parts"), videos=str(videos))
-    _, whole, _ = run("one", videos=str(videos))
-    assert digests(merged) == digests(whole)
-    assert looked_into(merged) == 1
+    for looked in (0, 2):  # the changed one is probed, then analysed
+        if looked:
+            write_clip(videos / "clip.mp4", panned_luma(12))
+        _, merged, _ = run("server", *scene, "--merge", parts, videos=str(videos))
+        assert digests(merged) == digests(run("one", *scene, videos=str(videos))[1])
+        assert looked_into(merged) == looked
 
 
 def test_a_killed_shard_goes_on_where_it_was(corpus: Path, tmp_path: Path, run: Run) -> None:

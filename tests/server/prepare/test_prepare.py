@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import re
@@ -71,7 +72,6 @@ def opened(folder: Path, rows: str | None = None, list_file: Path | None = None)
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five clips of 64 px width: plain, odd size in AVI, rotated with varying rate, full range, and a damaged one."""
     folder = tmp_path_factory.mktemp("corpus") / "source"
-    (folder / "dir").mkdir(parents=True)
     write_clip(folder / "b.mp4", panned_luma(40, 50, 64), b_frames=2)
     write_clip(
         folder / "dir" / "odd.avi", panned_luma(33, 49, 63), codec="mjpeg", pixel_format="yuvj420p", full_range=True
@@ -133,48 +133,39 @@ def test_a_corrupt_source_is_listed_and_the_others_go_on(prepared: tuple[Path, R
     assert not [path for path in target.rglob("*") if "partial" in path.name]
 
 
-def test_the_source_is_not_touched(source: Path, tmp_path: Path) -> None:
-    before = snapshot(source)
-    run(source, tmp_path / "again")
-    assert snapshot(source) == before
-
-
-@pytest.mark.parametrize("crash", [0, 2])
-def test_a_video_that_cannot_be_written_fails_alone(source: Path, tmp_path: Path, crash: int) -> None:
-    """Where the file should be, there is a folder."""
+@pytest.fixture
+def two(source: Path, tmp_path: Path) -> Path:
+    """A folder with x.mp4 and y.mp4."""
     (tmp_path / "source").mkdir()
     for name in ("x.mp4", "y.mp4"):
         shutil.copy(source / "b.mp4", tmp_path / "source" / name)
-    run(tmp_path / "source", tmp_path / "out")
+    return tmp_path / "source"
+
+
+@pytest.mark.parametrize("crash", [0, 2])
+def test_a_video_that_cannot_be_written_fails_alone(two: Path, tmp_path: Path, crash: int) -> None:
+    """Where the file should be, there is a folder."""
+    run(two, tmp_path / "out")
     (tmp_path / "out" / "x.mp4").unlink()
     (tmp_path / "out" / "x.mp4").mkdir()
     (tmp_path / "out" / "x.mp4" / "in the way").touch()
-    report = run(tmp_path / "source", tmp_path / "out", processes=crash)
+    report = run(two, tmp_path / "out", processes=crash)
     assert [video.id for video in report.failed] == ["x.mp4"]
     assert [video.id for video in report.prepared] == ["y.mp4"]
 
 
 def test_a_source_that_is_waited_for_in_vain_fails_alone(
-    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    two: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "source").mkdir()
-    for name in ("x.mp4", "y.mp4"):
-        shutil.copy(source / "b.mp4", tmp_path / "source" / name)
     monkeypatch.setattr("v2v_server.prepare._deadline_seconds", lambda job: {"x.mp4": 0.1}.get(job.video.id, 60))
-    with closing(open_catalogue(tmp_path / "source", cache_dir=tmp_path / "cache", processes=0)) as catalogue:
-        (tmp_path / "source" / "x.mp4").unlink()
-        os.mkfifo(tmp_path / "source" / "x.mp4")
+    with closing(open_catalogue(two, cache_dir=tmp_path / "cache", processes=0)) as catalogue:
+        (two / "x.mp4").unlink()
+        os.mkfifo(two / "x.mp4")
         report = prepare(catalogue, tmp_path / "out", processes=1)
     assert [(video.id, video.problem) for video in report.failed] == [
         ("x.mp4", "hangs the transcoder: ended after 0 s without a result")
     ]
     assert [video.id for video in report.prepared] == ["y.mp4"]
-
-
-def test_rows_that_a_picture_has_not(source: Path, tmp_path: Path) -> None:
-    report = run(source, tmp_path / "out", rows="top:50px")
-    assert {video.id for video in report.failed} == {"a turned.mov", "dir/odd.avi", "dir/pc.mkv", CORRUPT}
-    assert "48 rows only" in str(next(video.problem for video in report.failed if video.id == "dir/pc.mkv"))
 
 
 def test_refused_places(source: Path, prepared: tuple[Path, Report], tmp_path: Path) -> None:
@@ -224,7 +215,6 @@ def test_one_video_may_be_prepared_in_its_own_folder(
 
 
 def test_labels_that_are_left_behind_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "films").mkdir()
     write_clip(tmp_path / "films" / "a.mp4", panned_luma(12))
     (tmp_path / "films" / "a.boxes.txt").write_text("1,1,2,3,4,5\n")
     place = tmp_path / "store"
@@ -318,8 +308,6 @@ def test_a_manifest_that_makes_no_sense(prepared: tuple[Path, Report], tmp_path:
 
 
 def test_one_run_at_a_time(source: Path, tmp_path: Path) -> None:
-    import fcntl
-
     (tmp_path / "out").mkdir()
     with (tmp_path / "out" / ".v2v-prepare.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

@@ -11,40 +11,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation import simulate, simulate_clip, simulate_log
+from v2v_server.simulation.clip import grey_levels
 from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.voxel import new_array
 
 FRAMES = (np.arange(11 * 6 * 7) * 37 % 256).astype(np.uint8).reshape(11, 6, 7)
 
 
-def test_shape_dtype_and_seed() -> None:
-    first = simulate(FRAMES, threshold_pos=0.2, noise_sigma=0.1, seed=1)
-    assert first.voxels.shape == (2, 5, 6, 7)
-    assert first.voxels.dtype == np.int8
-    np.testing.assert_array_equal(first.voxels, simulate(FRAMES, threshold_pos=0.2, noise_sigma=0.1, seed=1).voxels)
-    assert (first.voxels != simulate(FRAMES, threshold_pos=0.2, noise_sigma=0.1, seed=2).voxels).any()
-
-
-def test_bins_of_several_steps_sum_the_steps() -> None:
-    fine = simulate(FRAMES, threshold_pos=0.1, noise_sigma=0.2, bins=1, dtype="int16").voxels
-    coarse = simulate(FRAMES, threshold_pos=0.1, noise_sigma=0.2, bins=1, frames_per_bin=5, dtype="int16").voxels
-    np.testing.assert_array_equal(coarse[:, 0], fine.reshape(2, 5, 6, 7).sum(1))
-
-
 def test_views_that_are_not_contiguous_are_simulated_as_they_look() -> None:
     wide = np.repeat(FRAMES, 2, axis=2)[:, :, ::2]
     np.testing.assert_array_equal(simulate(wide, threshold_pos=0.2).voxels, simulate(FRAMES, threshold_pos=0.2).voxels)
-
-
-def test_double_precision_differs_in_rounding_only() -> None:
-    single = simulate(FRAMES, threshold_pos=0.2, noise_sigma=0.1).voxels.astype(int)
-    double = simulate(FRAMES, threshold_pos=0.2, noise_sigma=0.1, precision="float64").voxels.astype(int)
-    assert np.count_nonzero(single != double) <= 2
 
 
 @pytest.mark.parametrize(
@@ -98,26 +80,6 @@ def test_a_lead_voxel_is_one_more_in_front() -> None:
     np.testing.assert_array_equal(
         simulate_clip(FRAMES, PARAMS, recipe, "int8").voxels, simulate_clip(FRAMES, PARAMS, RECIPE, "int8").voxels
     )
-
-
-def test_one_second_steps_equal_noise_per_frame() -> None:
-    per_frame = simulate_clip(FRAMES, PARAMS, RECIPE, "int8").voxels
-    per_second = simulate_clip(FRAMES, PARAMS, RECIPE.replace(noise_unit="second"), "int8", np.ones(10)).voxels
-    np.testing.assert_array_equal(per_frame, per_second)
-
-
-def test_noise_per_second_does_not_depend_on_the_frame_rate() -> None:
-    # A still scene for a second, in 10 and in 160 steps: the sum of the noise has the same spread.
-    still, totals = Recipe(bins=10, voxels_per_clip=1, noise_unit="second"), []
-    still = still.replace(noise_sigma=1.0, crop_height_px=64, crop_width_px=64)
-    params = SampleParams(0.01, 0.01, 1.0, 0, 0.0, (), 1.0, 0, 0, False, 0.0, (5, 6, 7, 8))
-    for steps_per_bin in (1, 16):
-        recipe = still.replace(frames_per_bin=steps_per_bin)
-        frames = np.zeros((recipe.frames_needed, 64, 64), np.uint8)
-        durations = np.full(recipe.steps, 1.0 / recipe.steps)
-        totals.append(simulate_clip(frames, params, recipe, "float32", durations).voxels.sum((0, 1)) * 0.01)
-    for total in totals:
-        assert abs(total.std() - 1) < 4 / math.sqrt(2 * total.size)
 
 
 @pytest.mark.parametrize(
@@ -206,3 +168,56 @@ def test_after_warm_up_nothing_is_compiled() -> None:
     command = [sys.executable, "-c", WARM_UP_AND_COUNT]
     run = subprocess.run(command, capture_output=True, text=True, timeout=1200, check=True)
     assert json.loads(run.stdout) == [[3, 1, 1]] * 3
+
+
+# --- frames of every usual kind ---------------------------------------------------------------------------------------
+
+COLOUR = np.random.default_rng(3).integers(0, 256, (6, 8, 9, 3), np.uint8)
+GREY = np.floor(COLOUR @ np.array([0.299, 0.587, 0.114]) + 0.5 + 1e-9).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        GREY[..., None],
+        GREY[:, None],
+        GREY / 255,
+        (GREY / 255).astype(np.float32),
+        COLOUR,
+        np.moveaxis(COLOUR, 3, 1),
+        torch.from_numpy(GREY),
+        torch.from_numpy(GREY).float()[:, None] / 255,
+        torch.from_numpy(np.moveaxis(COLOUR, 3, 1).copy()),
+    ],
+    ids=lambda frames: f"{type(frames).__name__}-{frames.dtype}-{'x'.join(map(str, frames.shape))}",
+)
+def test_every_kind_gives_the_same_events(frames: Any) -> None:
+    np.testing.assert_array_equal(grey_levels(frames), GREY)
+    made = simulate(frames, threshold_pos=0.2).voxels
+    assert made.any()
+    np.testing.assert_array_equal(made, simulate(GREY, threshold_pos=0.2).voxels)
+
+
+def test_colours_in_floating_point_are_rounded_once() -> None:
+    np.testing.assert_array_equal(grey_levels(COLOUR / 255), GREY)
+
+
+def test_grey_levels_are_not_copied() -> None:
+    assert grey_levels(GREY) is GREY
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (GREY.astype(np.int16), "uint8 or floating"),
+        (GREY[0], "uint8 or floating"),
+        (np.zeros((6, 8, 9, 4), np.uint8), "uint8 or floating"),
+        (np.full((6, 8, 9), 1.5), "outside 0 .. 1"),
+        (np.full((6, 8, 9), np.nan, np.float32), "NaN"),
+        (GREY * 1.0, "outside 0 .. 1"),
+        (torch.zeros((6, 8, 9), requires_grad=True), "requires grad"),
+    ],
+)
+def test_frames_that_say_nothing_definite_are_refused(frames: Any, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        simulate(frames, threshold_pos=0.2)

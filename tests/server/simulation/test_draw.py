@@ -1,4 +1,4 @@
-"""Draws: in range, keyed by identity, independent of each other, stable."""
+"""Draws: in range, keyed by identity, independent of each other, stable; and where the residual of a pixel starts."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ import sys
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import PRESETS, Recipe
+from tests.oracles import noise
+from v2v_protocol.errors import RecipeError, UsageError
+from v2v_protocol.recipe import PRESETS, STARTS, Recipe, preset
 from v2v_protocol.sample import SampleParams
-from v2v_server.simulation.draw import admits, draw, resized_size, smallest_scale
+from v2v_server.simulation.clip import simulate, simulate_log
+from v2v_server.simulation.draw import admits, draw, noise_key_of_seed, resized_size, smallest_scale
 
 PAPER = Recipe()
 
@@ -242,3 +245,74 @@ def test_draw_needs_no_compiler() -> None:
     code = "import sys, v2v_server.simulation.draw; print(sorted({'numba', 'cv2', 'av', 'torch'} & set(sys.modules)))"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
+
+
+# --- where the residual of a pixel starts -----------------------------------------------------------------------------
+
+POSITIVE, NEGATIVE = 0.3, 0.2
+STEP = 1e-3
+Reals = npt.NDArray[np.float64]
+
+
+def residuals(law: str, uniform: Reals) -> Reals:
+    """Where a law puts the residuals of these uniform draws, by the inverse of its distribution function."""
+    span = POSITIVE + NEGATIVE
+    if law == "zero":
+        return np.zeros_like(uniform)
+    if law == "uniform":
+        return uniform * span - NEGATIVE
+    rising, falling = np.sqrt(uniform * span * NEGATIVE), np.sqrt((1.0 - uniform) * span * POSITIVE)
+    return np.where(uniform * span < NEGATIVE, rising - NEGATIVE, POSITIVE - falling)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("law", STARTS)
+def test_both_kernels_start_where_the_law_says(law: str, precision: str) -> None:
+    pixels = 700  # more than a block
+    ramp = np.arange(501.0)[:, None, None] * STEP * np.ones((1, 1, pixels))
+    made = simulate_log(
+        ramp, threshold_pos=POSITIVE, threshold_neg=NEGATIVE, bins=1, seed=5, precision=precision, start=law,
+        dtype="float32",
+    )  # fmt: skip
+    expected = residuals(law, noise.start_uniforms(noise_key_of_seed(5), pixels).astype(np.float64))
+    # The general kernel computes the law by the same functions in float64, in one more compiled form.
+    general = [made.array("event_counts")[:, 1, 0, 0]] if precision == "float32" else []
+    for rising in (made.voxels[:, 0, 0], *general):
+        assert (rising > 0).any(axis=0).all()
+        found = POSITIVE - STEP * (np.argmax(rising > 0, axis=0) + 1)
+        assert np.abs(found - expected + STEP / 2).max() < 0.52 * STEP
+
+
+@pytest.mark.parametrize("law", STARTS)
+def test_each_pixel_starts_between_its_own_thresholds(law: str) -> None:
+    still = np.full((6, 40, 40), 90, np.uint8)
+    made = simulate(still, threshold_pos=0.2, threshold_mismatch_sigma=0.25, bins=1, start=law)
+    assert not made.voxels.any()
+
+
+def test_a_set_residual_wins() -> None:
+    frames = np.array([100, 101, 99], np.uint8)[:, None, None] * np.ones((1, 8, 8), np.uint8)
+    given: dict[str, Any] = {"threshold_pos": 0.2, "bins": 1, "start_residual": 0.19}
+    assert (simulate(frames, start="triangular", **given).voxels == simulate(frames, **given).voxels).all()
+
+
+def test_an_unknown_law_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"start = 'soft': choose one of uniform, triangular, zero"):
+        simulate(np.zeros((2, 4, 4), np.uint8), threshold_pos=0.2, bins=1, start="soft")
+    with pytest.raises(RecipeError, match="recipe start = "):
+        Recipe(start="soft")
+
+
+def test_rates_drawn_in_their_logarithm_spread_evenly_over_decades_and_change_no_other_draw() -> None:
+    recipe = preset("davis346").replace(shot_noise_hz=(0.01, 10.0), leak_hz=0.1, photoreceptor_hz=0)
+    log = recipe.replace(rate_draw="log")
+    rates = [params.effects for params in drawn(log, 300)]
+    shares = np.log10([each["shot_noise_hz"] for each in rates]) / 3 + 2 / 3
+    assert shares.min() >= 0.0
+    assert shares.max() <= 1.0
+    assert np.abs(np.histogram(shares, 5, (0.0, 1.0))[0] - 60).max() < 25
+    assert {each["leak_hz"] for each in rates} == {0.1}
+    others = ("refractory_seconds", "threshold_mismatch_sigma")
+    assert [[each[name] for name in others] for each in rates] == [
+        [params.effects[name] for name in others] for params in drawn(recipe, 300)
+    ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -111,30 +112,6 @@ def test_bins_are_equal_parts_of_the_time_of_their_grid(spans: list[int], bins: 
     assert edges.step[::bins].tolist() == ends.tolist()
 
 
-def test_the_same_light_gives_the_same_events_at_every_rate() -> None:
-    """A ramp of log intensity: its events by bin do not depend on the frame rate, nor on a rate that varies."""
-    recipe = RECIPE.replace(
-        bins=4, threshold=0.1, threshold_ratio=1.0, noise_sigma=0.0, hot_pixel_share=0.0, pause_probability=0.0,
-        voxel_seconds=0.25,
-    )  # fmt: skip
-    random = np.random.default_rng(3)
-    times = [np.arange(0, 1.51, 1 / rate) for rate in (24, 30, 60, 240)]
-    times.append(np.concatenate(([0.0], np.cumsum(random.choice((1 / 24, 1 / 60, 1 / 240), 80)))))
-    found = []
-    for seconds in times:
-        grey = np.clip(255 * np.exp(2.0 * (seconds / seconds[-1] * seconds[-1] - 1.5) / 2.2), 0, 255)
-        frames = np.broadcast_to(np.round(grey).astype(np.uint8)[:, None, None], (len(grey), 8, 8)).copy()
-        rate = (len(seconds) - 1) / seconds[-1]
-        params = drawn(recipe, seconds, rate)
-        steps, _ = step_seconds(seconds, params.source_index(int(params.ends(recipe)[-1])), rate)
-        voxels = simulate_clip(frames, params, recipe, "int8", steps).voxels
-        assert voxels.shape == (4, 4, 8, 8)
-        # Events since the start by the time that has passed: the grids themselves differ by half a frame.
-        at = np.cumsum(lasting(params, recipe, seconds, rate))
-        found.append(voxels.sum(axis=1, dtype=int).cumsum(axis=0)[:, 0, 0] / at)
-    np.testing.assert_allclose(found, 20.0, atol=4.5)
-
-
 def test_bins_of_equal_steps_are_those_of_a_whole_number_of_frames() -> None:
     """Without noise, grids of 10 frames with 5 bins are what ``frames_per_bin=2`` makes, event for event."""
     recipe = RECIPE.replace(noise_sigma=0.0, hot_pixel_share=0.0, pause_probability=0.0, voxel_seconds=0.2)
@@ -177,3 +154,36 @@ def test_steps_by_rate() -> None:
     assert steps == [1, 2, 3, 12, 1, 50_000_000, 0, 0]
     assert RECIPE.steps_per_frame == MOST_STEPS_PER_GRID
     assert Recipe().steps_at(math.nan) == 5
+
+
+# --- durations of steps, from good and bad time stamps ----------------------------------------------------------------
+
+
+def test_regular_and_variable_rates_are_taken_as_they_are() -> None:
+    durations, irregular = step_seconds(np.array([0.0, 0.1, 0.4, 0.45]), np.arange(4), 25.0)
+    np.testing.assert_allclose(durations, [0.1, 0.3, 0.05])
+    assert irregular == 0
+
+
+def test_missing_and_non_increasing_stamps_use_the_average_and_are_counted() -> None:
+    seconds = np.array([0.0, np.nan, 0.2, 0.2, 0.1, 0.3])
+    durations, irregular = step_seconds(seconds, np.arange(6), 20.0)
+    np.testing.assert_allclose(durations, [0.05, 0.05, 0.05, 0.05, 0.2])
+    assert irregular == 4
+
+
+def test_a_paused_step_lasts_the_average_and_is_not_counted() -> None:
+    durations, irregular = step_seconds(np.array([0.0, 0.1, 0.2]), np.array([0, 1, 1, 1, 2]), 4.0)
+    np.testing.assert_allclose(durations, [0.1, 0.25, 0.25, 0.1])
+    assert irregular == 0
+
+
+@pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_useless_average_rate_is_refused(fps: Any) -> None:
+    with pytest.raises(UsageError, match="average_fps"):
+        step_seconds(np.arange(3.0), np.arange(3), fps)
+
+
+def test_too_few_stamps_are_refused() -> None:
+    with pytest.raises(UsageError, match="2 time stamps for 3 frames"):
+        step_seconds(np.arange(2.0), np.arange(3), 25.0)

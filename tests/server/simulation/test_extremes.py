@@ -1,8 +1,13 @@
-"""The edges of what a recipe may ask for: every row of the oracle, and cameras drawn at random."""
+"""The edges of what a recipe may ask for, and what a stream needs for it: arithmetic, compiled kernels, effects."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
+import subprocess
+import sys
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -10,44 +15,28 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.oracles.balance import Camera, arithmetic, balance, imbalance, trace_of
-from tests.oracles.extremes import Finding, Row, record_of, refused, rows, texture
-from tests.oracles.noise import error_bound, standard_normals, start_uniforms
-from tests.server.simulation import oracle, reference
-from v2v_protocol.errors import RecipeError, UsageError
-from v2v_protocol.recipe import LARGEST_EVENTS, LARGEST_NORMAL, PRESETS, Recipe, most_events
+from tests.oracles.balance import Camera, arithmetic, balance
+from tests.oracles.extremes import Row, record_of, rows, texture
+from tests.oracles.noise import error_bound
+from tests.server.simulation import reference
+from tests.server.simulation.test_times import real_frames
+from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import LARGEST_EVENTS, LARGEST_NORMAL, PRESETS, Recipe, most_events, preset
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation import noise, simulate, simulate_clip
-from v2v_server.simulation.draw import noise_key_of_seed
-from v2v_server.simulation.intensity import log_table_float64
-from v2v_server.simulation.pixel import hot_pixels
-from v2v_server.simulation.precision import AUTO, LIMITS, choose
-from v2v_server.simulation.voxel import rounding_tolerance
+from v2v_server.simulation.clip import COSTS, _log_ends, _most_events, changed_shares, left_out
+from v2v_server.simulation.draw import draw
+from v2v_server.simulation.intensity import Intensity, log_table_float64
+from v2v_server.simulation.kernels import KernelInput, Voxels
+from v2v_server.simulation.precision import AUTO, LIMITS, USUAL, Variant, choose, variants
+from v2v_server.simulation.voxel import bin_edges
+from v2v_server.video.picture import MOST_BITS, SDR, Signal
 
 
-@pytest.mark.parametrize("row", [row for row in rows() if not row.slow], ids=lambda row: row.name)
+@pytest.mark.parametrize("row", [pytest.param(row, marks=[pytest.mark.slow] * row.slow, id=row.name) for row in rows()])
 def test_row(row: Row) -> None:
     record = record_of(row)
     assert record["passed"], record
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("row", [row for row in rows() if row.slow], ids=lambda row: row.name)
-def test_slow_row(row: Row) -> None:
-    record = record_of(row)
-    assert record["passed"], record
-
-
-def test_a_refused_row_passes_by_the_stated_error_only() -> None:
-    def refuse() -> None:
-        raise RecipeError("value 7 is above the limit 5")
-
-    assert refused(RecipeError, (refuse, ("7", "5"))).measured == 0
-    assert refused(RecipeError, (refuse, ("7", "6"))).measured == 1
-    assert refused(RecipeError, (lambda: None, ())).measured == 1
-    assert refused(UsageError, (refuse, ("7", "5"))).measured == 1
-    with pytest.raises(ZeroDivisionError):
-        refused(UsageError, (lambda: 1 // 0, ()))
 
 
 def powers(low: float, high: float) -> st.SearchStrategy[float]:
@@ -75,33 +64,6 @@ def test_events_account_for_every_change_of_any_camera(camera: Camera, steps: in
     # The bound is the promise of precision.py: half a threshold, whatever the camera.
     assert found.bound <= min(camera.threshold_pos, camera.threshold_neg) / 2
     assert found.fired <= found.events * 48
-
-
-def test_the_balance_sees_a_lost_event() -> None:
-    camera, frames = Camera(noise_sigma=0.1), texture(20)
-    seen = trace_of(camera, frames, np.float32)
-    assert imbalance(camera, frames, seen) < 1e-4
-    seen.counts[3, 5] -= 1
-    assert imbalance(camera, frames, seen) > 0.19
-
-
-@pytest.mark.parametrize("threshold", [0.05, 0.3, 1e-4])
-def test_the_trace_agrees_with_the_oracle(threshold: float) -> None:
-    camera, frames = Camera(threshold, 1.3 * threshold, 0.05, 7, 3.0), texture(30)
-    normals = standard_normals(noise_key_of_seed(0), 30, 48).astype(np.float64) * camera.noise_sigma
-    position, hot = hot_pixels(noise_key_of_seed(0), 7, 48)
-    normals[:, position] += hot.astype(np.float64) * camera.hot_pixel_sigma
-    expected = oracle.simulate(
-        oracle.log_intensity(frames.reshape(31, 48), camera.gamma, camera.log_eps),
-        normals,
-        start_uniforms(noise_key_of_seed(0), 48).astype(np.float64),
-        threshold_pos=camera.threshold_pos,
-        threshold_neg=camera.threshold_neg,
-        tolerance=rounding_tolerance(camera.threshold_pos, camera.threshold_neg),
-    )
-    got = trace_of(camera, frames, np.float64)
-    np.testing.assert_array_equal(got.counts, expected.voxels)
-    np.testing.assert_allclose(got.residual_end, expected.residual_end, atol=1e-10)
 
 
 def test_the_arithmetic_follows_the_limits() -> None:
@@ -179,6 +141,186 @@ def test_float32_asked_for_by_name_is_kept_to_its_limit() -> None:
         simulate(frames, threshold_pos=1e-4, bins=60, precision="float32")
 
 
-@pytest.mark.parametrize(("measured", "passed"), [(2.0, False), (1.0, True), (float("nan"), False)])
-def test_a_row_beyond_its_bound_does_not_pass(measured: float, passed: bool) -> None:
-    assert record_of(Row("row", "counted", "things", lambda: Finding(measured, 1.0)))["passed"] is passed
+# --- kernels and effects of a stream ----------------------------------------------------------------------------------
+
+LOAD_AND_COUNT = """
+import json
+from dataclasses import replace
+from tests.server.simulation.test_clip import EFFECTS, FRAMES, PARAMS, RECIPE
+from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.kernels import simulate_general, simulate_pixels
+from v2v_server.simulation.precision import warm_up
+from v2v_server.simulation.precision import USUAL, Variant, load
+
+def count():
+    return [len(kernel.signatures) for kernel in (simulate_pixels, simulate_general)]
+
+warm_up()
+seen = [count()]
+for variant in USUAL:
+    load(variant)
+seen.append(count())
+load(Variant("int16", True, "float32"))
+load(Variant("int8", False, "float64"))
+seen.append(count())
+simulate_clip(FRAMES, replace(PARAMS, effects=EFFECTS[0]), RECIPE, "int16")
+simulate_clip(FRAMES, replace(PARAMS, threshold_pos=1e-5, threshold_neg=1e-5), RECIPE, "int8")
+seen.append(count())
+print(json.dumps(seen))
+"""
+
+
+def test_usual_ones_suffice_for_the_presets() -> None:
+    for name in ("paper", "clean", "davis346"):
+        assert variants(preset(name), "int8", 0.1) <= USUAL
+
+
+def test_effects_and_dtypes() -> None:
+    assert variants(Recipe(), "float32") == {Variant("float32", False, "float32")}
+    assert variants(preset("davis346"), "int16", 0.1) == {Variant("int16", True, "float32")}
+    assert variants(Recipe(), "int8", levels_per_step=15) == {Variant("int8", True, "float32", True)}
+    assert {each.bits for each in variants(Recipe(light="declared"), "int8", levels_per_step=15)} == {8}
+
+
+@pytest.mark.parametrize("step_seconds", [1 / 240, 1.0, 60.0])
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        Recipe(threshold=(1e-3, 2e-2)),
+        Recipe(threshold=(1e-3, 2e-2), grids_per_frame=3),
+        Recipe(threshold=(1e-3, 2e-2), light="declared"),
+        Recipe(threshold=(1e-3, 2e-2), threshold_source="video", threshold_mismatch_sigma=(0.0, 0.1)),
+        Recipe(threshold=(1e-3, 2e-2), threshold_source="video", noise_scales_with_threshold=True),
+        preset("davis346"),
+        preset("davis346").replace(threshold_source="video"),
+    ],
+)
+def test_every_draw_finds_its_kernel(recipe: Recipe, step_seconds: float) -> None:
+    """Thresholds about those at which float32 no longer counts exactly."""
+    seconds = np.full(recipe.steps, step_seconds)
+    units = seconds if recipe.noise_unit == "second" else np.ones(recipe.steps)
+    for stated in (None, (1e-4, 1.0), (1e-3, 2e-2), (0.3, 50.0), (1e-6, 1e-6)):
+        known = variants(recipe, "int8", step_seconds, stated)
+        for index in range(20):
+            params = draw(
+                recipe, seed=1, epoch=0, index=index, picture_height_px=128, picture_width_px=128, video_id="a.mp4",
+                video_thresholds=stated,
+            )  # fmt: skip
+            signal = SDR if recipe.light == "sdr" else Signal(10, "pq")
+            intensity = Intensity(recipe.gamma, params.log_eps or recipe.log_eps[0], signal)
+            edges = bin_edges(recipe.steps, recipe.frames_per_bin, recipe.grids_per_frame * recipe.bins or 1)
+            given = KernelInput(
+                np.empty((1, 1, 1), np.uint8), intensity, np.zeros(recipe.steps + 1, np.int64), params, units, seconds,
+                recipe.bins, edges, "int8",
+            )  # fmt: skip
+            real = choose(AUTO, _most_events(given, _log_ends(intensity)))
+            kernel = Variant("int8", given.needs_general, real.__name__)
+            assert kernel in known
+            assert (signal == SDR) == (kernel._replace(bits=MOST_BITS) not in known)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)  # it compiles kernels
+def test_what_is_loaded_is_what_is_used() -> None:
+    command = [sys.executable, "-c", LOAD_AND_COUNT]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=1200, check=True)
+    assert json.loads(run.stdout) == [[3, 1], [3, 1], [4, 2], [4, 2]]
+
+
+# --- effects that change little of a clip are left out ----------------------------------------------------------------
+
+CAMERA = Recipe(
+    crop_height_px=64, crop_width_px=64, pause_probability=0.0102, noise_sigma=0.0,
+    hot_pixel_share=(0.0, 5e-4), noise_unit="second", threshold=(0.1, 0.4), threshold_mismatch_sigma=(0.02, 0.1),
+    photoreceptor_hz=(2e3, 2e4), refractory_seconds=(1e-7, 1e-5), shot_noise_hz=(0.0, 0.002), leak_hz=(0.0, 0.002),
+    dead_pixel_share=(0.0, 1e-4),
+)  # fmt: skip
+"""A fast camera in bright light."""
+VIDEOS = (
+    "gopro_hero7_walk.mp4", "gopro_karma_drone.mp4", "intel_asl_walk.mkv", "mei_phone_geese_vfr.mp4",
+    "lerobot_chess_av1.mp4", "mdn_stream-of-water.mp4", "osp_diabolo_240fps.mp4", "mdn_flower.mp4",
+)  # fmt: skip
+
+
+def moving(count: int, side: int, seed: int) -> np.ndarray:
+    """Return a bright texture that moves by a pixel and more a frame, [count, side, side]."""
+    random = np.random.default_rng(seed)
+    x = np.arange(side)
+    y = x[:, None]
+    speed, waves = random.uniform(0.5, 3.0, 2), random.uniform(0.1, 0.5, (6, 2))
+    grey = [
+        160 + sum(15 * np.sin(u * (x - speed[0] * t) + v * (y - speed[1] * t)) for u, v in waves) for t in range(count)
+    ]
+    return np.clip(grey, 0, 255).astype(np.uint8)
+
+
+def simulated(frames: np.ndarray, index: int, tolerance: float, camera: Recipe = CAMERA) -> Voxels:
+    side, camera = frames.shape[1], camera.replace(voxels_per_clip=len(frames) // 5)
+    params = draw(camera, seed=1, epoch=0, index=index, picture_height_px=side, picture_width_px=side, video_id="")
+    return simulate_clip(frames, params, camera, "int8", np.full(len(frames) - 1, 0.04), tolerance=tolerance)
+
+
+def error(index: int, frames: np.ndarray) -> tuple[float, int]:
+    """Return the share of voxel content that a tolerance of 1 % changes, and the number of effects left out."""
+    full, part = simulated(frames, index, 0.0), simulated(frames, index, 0.01)
+    of = full.voxels.astype(int)
+    gone = full.given.params.effects.keys() - part.given.params.effects.keys()
+    assert not gone & {"threshold_mismatch_sigma", "dead_pixel_share"}
+    if not gone:
+        np.testing.assert_array_equal(part.voxels, full.voxels)
+    return float(np.abs(of - part.voxels).sum() / np.abs(of).sum()), len(gone)
+
+
+def test_the_changed_share_is_within_the_tolerance() -> None:
+    errors, gone = zip(*(error(index, moving(101, 64, index)) for index in range(8)), strict=True)
+    assert max(errors) <= 0.01
+    assert sum(gone) >= 8
+
+
+@pytest.mark.slow
+def test_forty_sequences_of_real_footage() -> None:
+    errors, gone = [], 0
+    for video in VIDEOS:
+        frames = real_frames(video, 81, (64, 64))
+        for index in range(5):
+            changed, without = error(index, frames)
+            errors.append(changed)
+            gone += without
+    assert sum(changed <= 0.01 for changed in errors) >= 38
+    assert max(errors) <= 0.02
+    assert gone >= 40
+
+
+def test_without_tolerance_every_effect_runs() -> None:
+    frames = moving(101, 64, 3)
+    effects = simulated(frames, 0, 0.0).given.params.effects
+    slow = CAMERA.replace(photoreceptor_hz=30.0, refractory_seconds=1e-3, shot_noise_hz=5.0, leak_hz=0.2)
+    assert set(COSTS) < set(effects)
+    assert set(COSTS) < set(simulated(frames, 0, 0.01, slow).given.params.effects)
+
+
+def test_a_still_clip_keeps_its_effects() -> None:
+    frames = np.full((101, 64, 64), 90, np.uint8)
+    assert changed_shares(simulated(frames, 0, 0.0).given) == {}
+    assert set(COSTS) < set(simulated(frames, 0, 0.5).given.params.effects)
+
+
+def test_the_choice_does_not_depend_on_the_dtype_or_the_arithmetic() -> None:
+    given = simulated(moving(101, 64, 5), 2, 0.0).given
+    shares = changed_shares(given)
+    assert shares.keys() == COSTS.keys()
+    assert changed_shares(dataclasses.replace(given, dtype="int16")) == shares
+
+
+_shares = st.dictionaries(st.sampled_from(sorted(COSTS)), st.floats(0.0, 0.1))
+
+
+@given(_shares, st.floats(1e-6, 0.2))
+def test_the_most_expensive_set_that_fits_is_left_out(shares: dict[str, float], tolerance: float) -> None:
+    chosen = left_out(shares, tolerance)
+    assert sum(sorted(shares[name] for name in chosen)) <= tolerance * (1 + 1e-9)
+    cost = sum(COSTS[name] for name in chosen)
+    for count in range(1, len(shares) + 1):
+        for names in combinations(shares, count):
+            if sum(shares[name] for name in names) < tolerance * (1 - 1e-9):
+                assert sum(COSTS[name] for name in names) <= cost

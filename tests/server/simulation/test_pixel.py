@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import hashlib
+import os
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import av
 import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.clips import panned_luma
 from tests.oracles.noise import standard_normals, start_uniforms
 from tests.server.simulation import oracle, reference
 from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.simulation import pixel, simulate, simulate_clip, simulate_log
+from v2v_server.simulation import pixel, simulate_clip, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.intensity import log_table
 from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.voxel import rounding_tolerance
-
-LOG_RANGE = 6.9
 
 
 def moving_frames(count: int, height: int, width: int, seed: int = 0) -> np.ndarray:
@@ -131,112 +133,6 @@ def test_log_frames_of_any_size_and_precision_equal_the_definition(precision: An
     np.testing.assert_array_equal(got.voxels.reshape(steps, -1), expected)
 
 
-@pytest.mark.parametrize(
-    ("threshold", "thresholds_crossed", "steps"),
-    [
-        (threshold, crossed, steps)
-        for threshold in (0.05, 0.1, 0.2, 1 / 3, 0.7, 1.0, 2.0)
-        for crossed, steps in ((20, 10), (20, 40), (3, 30), (2, 200), (1, 50), (100, 50))
-        if threshold * crossed < LOG_RANGE
-    ],
-)
-@pytest.mark.parametrize("sign", [1, -1])
-def test_a_ramp_of_k_thresholds_gives_k_events(
-    threshold: float, thresholds_crossed: int, steps: int, sign: int
-) -> None:
-    threshold = float(np.float32(threshold))
-    height = threshold * thresholds_crossed
-    ramp = height * np.arange(steps + 1) / steps
-    offsets = np.linspace(-LOG_RANGE, -height, 400) if sign > 0 else np.linspace(height - LOG_RANGE, 0.0, 400)
-    frames = (offsets + sign * ramp[:, None])[:, None, :]
-    got = simulate_log(frames, threshold_pos=threshold, bins=5, start_residual=0.0, dtype="int16")
-    np.testing.assert_array_equal(got.voxels.sum((0, 1, 2)), np.full(400, sign * thresholds_crossed))
-
-
-def test_a_ramp_of_two_log_units_at_a_tenth_gives_twenty_events() -> None:
-    ramp = np.broadcast_to(np.linspace(-5, -3, 11)[:, None, None], (11, 64, 65))
-    voxels = simulate_log(ramp, threshold_pos=0.1, bins=5, start_residual=0.0).voxels
-    np.testing.assert_array_equal(voxels, np.full((2, 5, 64, 65), 2))
-    # With the paper's random start, a pixel that starts below zero has to climb back first.
-    total = simulate_log(ramp, threshold_pos=0.1, bins=5, seed=4).voxels.sum((0, 1)).ravel()
-    start = start_uniforms(noise_key_of_seed(4), 64 * 65)
-    np.testing.assert_array_equal(total, np.where(start >= 0.5, 20, 19))
-
-
-def test_a_static_scene_is_silent_after_the_first_bin() -> None:
-    frames = np.broadcast_to(moving_frames(1, 64, 64), (21, 64, 64))
-    voxels = simulate(frames, threshold_pos=0.1, threshold_neg=0.13, bins=5).voxels.reshape(20, 64, 64)
-    assert not voxels[1:].any()
-    assert np.count_nonzero(voxels[0]) <= 1
-
-
-def test_equal_thresholds_swap_polarity_with_inverted_intensity() -> None:
-    level = np.cumsum(np.cos(np.arange(51 * 200) * 1.7).reshape(51, 10, 20), axis=0)
-    up = simulate_log(level, threshold_pos=0.1, threshold_neg=0.2, bins=1, dtype="float32").voxels
-    down = simulate_log(-level, threshold_pos=0.2, threshold_neg=0.1, bins=1, dtype="float32").voxels
-    # The start of the residual is mirrored too, so only totals are comparable, to one event.
-    assert np.abs(up.sum((0, 1)) + down.sum((0, 1))).max() <= 10
-    key = noise_key_of_seed(0)
-    start = start_uniforms(key, 200).astype(np.float64)
-    forward = oracle.simulate(
-        level.reshape(51, -1), np.zeros((50, 200)), start, threshold_pos=0.1, threshold_neg=0.2, tolerance=0.0
-    )
-    mirrored = oracle.simulate(
-        -level.reshape(51, -1), np.zeros((50, 200)), 1 - start, threshold_pos=0.2, threshold_neg=0.1, tolerance=0.0
-    )
-    np.testing.assert_array_equal(forward.voxels, -mirrored.voxels)
-    np.testing.assert_array_equal(forward.voxels, up.reshape(50, 200))
-
-
-def test_events_account_for_every_change() -> None:
-    steps, pixels = 60, 150
-    level = oracle.log_intensity(moving_frames(steps + 1, 10, 15).reshape(steps + 1, -1), 2.2, 1e-3)
-    key = noise_key_of_seed(3)
-    normals = standard_normals(key, steps, pixels).astype(np.float64) * 0.1
-    start = start_uniforms(key, pixels).astype(np.float64)
-    trace = oracle.simulate(
-        level, normals, start, threshold_pos=0.2, threshold_neg=0.3, tolerance=rounding_tolerance(0.2, 0.3)
-    )
-    change = level[-1] - level[0] + normals.sum(0)
-    np.testing.assert_allclose(trace.signed_change, change + trace.residual_start - trace.residual_end, atol=1e-12)
-    assert -0.3 < trace.residual_low < trace.residual_high < 0.2
-    # The kernel's voxels leave a residual in the same range: conservation seen from outside.
-    got = simulate(
-        moving_frames(steps + 1, 10, 15), threshold_pos=0.2, threshold_neg=0.2, noise_sigma=0.1, bins=1, seed=3,
-        dtype="float32",
-    )  # fmt: skip
-    equal = oracle.simulate(
-        level, normals, start, threshold_pos=0.2, threshold_neg=0.2, tolerance=rounding_tolerance(0.2, 0.2)
-    )
-    left = equal.residual_start + change - 0.2 * got.voxels.reshape(steps, -1).sum(0)
-    assert np.abs(left).max() < 0.2 + 1e-5
-
-
-def test_a_paused_camera_sees_noise_but_no_change() -> None:
-    recipe = Recipe(voxels_per_clip=4, crop_height_px=32, crop_width_px=32)
-    frames = moving_frames(2, 32, 32)
-    paused = ((2, recipe.steps - 1),)
-    still = SampleParams(0.1, 0.1, 0.0, 0, 0.0, paused, 1.0, 0, 0, False, 0.0, (9, 8, 7, 6))
-    voxels = simulate_clip(frames, still, recipe, "int8").voxels.reshape(recipe.steps, 32, 32)
-    assert voxels[0].any()
-    assert not voxels[1:].any()
-    noisy = SampleParams(0.1, 0.1, 0.1, 0, 0.0, paused, 1.0, 0, 0, False, 0.0, (9, 8, 7, 6))
-    voxels = simulate_clip(frames, noisy, recipe, "int8").voxels.reshape(recipe.steps, 32, 32)
-    assert all(step.any() for step in voxels)
-
-
-@pytest.mark.parametrize(("dtype", "limit"), [("int8", 127), ("int16", 32767)])
-def test_saturation_is_clipped_and_counted_never_wrapped(dtype: Any, limit: Any) -> None:
-    step = limit * 1.5 * 0.05
-    level = np.stack([np.zeros((1, 3)), [[step, -step, 0.01]], np.zeros((1, 3))])
-    got = simulate_log(level, threshold_pos=0.05, bins=1, dtype=dtype)
-    assert got.voxels[:, 0, 0, :2].tolist() == [[limit, -limit], [-limit, limit]]
-    assert got.saturated_bins == 4
-    exact = simulate_log(level, threshold_pos=0.05, bins=1, dtype="float32")
-    assert exact.saturated_bins == 0
-    assert abs(exact.voxels[0, 0, 0, 0] - limit * 1.5) <= 1
-
-
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("frames_per_bin", [1, 3])
 @pytest.mark.parametrize(("dtype", "limit"), [("int8", 127), ("int16", 32767)])
@@ -262,17 +158,6 @@ def test_saturation_in_some_blocks_equals_the_definition(
     np.testing.assert_array_equal(got.voxels.reshape(expected.shape), expected)
     assert got.saturated_bins == saturated > 0
     assert np.abs(expected[:, : pixel.PIXELS_A_BLOCK]).max() < limit
-
-
-def test_hot_pixels_fire_and_no_other_pixel_does() -> None:
-    frames = np.full((11, 50, 50), 80, np.uint8)
-    got = simulate(frames, threshold_pos=0.5, hot_pixel_count=25, hot_pixel_sigma=50.0, seed=2, dtype="float32").voxels
-    position, normal = hot_pixels(noise_key_of_seed(2), 25, 2500)
-    total = got.sum((0, 1)).ravel()
-    # One threshold either way for where the residual starts, one for where it ends.
-    np.testing.assert_allclose(total[position], normal * 50.0 / 0.5 * 10, atol=2)
-    total[position] = 0
-    assert np.count_nonzero(total) <= 1
 
 
 GOLDEN = {
@@ -303,3 +188,88 @@ def test_golden_voxels(dtype: Any) -> None:
 def test_a_generic_processor_gives_the_same_bytes(tmp_path: Path) -> None:
     code = "from tests.server.simulation.test_pixel import digest; print(digest('int8')); print(digest('float32'))"
     assert printed_on_a_generic_processor(code, tmp_path) == [GOLDEN["int8"], GOLDEN["float32"]]
+
+
+# --- against the oracle, on a panned photograph and on real footage ---------------------------------------------------
+
+FOLDER = Path(os.environ.get("V2V_TEST_VIDEOS", Path(__file__).parents[4] / "shared" / "data" / "videos"))
+VIDEOS = [
+    "gopro_hero7_walk.mp4", "intel_one-by-one-person.mp4", "mdn_stream-of-water.mp4", "osp_diabolo_240fps.mp4",
+    "mdn_flower.mp4",
+]  # fmt: skip
+SIDE_PX = 40
+RECIPE = Recipe(crop_height_px=SIDE_PX, crop_width_px=SIDE_PX)
+
+
+@cache
+def footage(name: str) -> np.ndarray:
+    """Middle of the first 201 frames, [201, 40, 40] uint8; a photograph panned by two pixels a frame for ``pan``."""
+    if name == "pan":
+        return panned_luma(RECIPE.frames_needed, SIDE_PX, SIDE_PX)
+    frames = []
+    with av.open(str(FOLDER / name)) as container:
+        for frame in container.decode(video=0):
+            luma = frame.to_ndarray(format="gray")
+            top, left = (luma.shape[0] - SIDE_PX) // 2, (luma.shape[1] - SIDE_PX) // 2
+            frames.append(luma[top : top + SIDE_PX, left : left + SIDE_PX].copy())
+            if len(frames) == RECIPE.frames_needed:
+                break
+    return np.stack(frames)
+
+
+def differing_ppm(names: list[str], threshold: float, ratio: float, sigma: float, plain_floor: bool) -> float:
+    """Bins in which kernel and oracle differ, per million, over all clips together."""
+    pixels, differing, bins = SIDE_PX**2, 0, 0
+    threshold_pos, threshold_neg = float(np.float32(threshold)), float(np.float32(threshold * ratio))
+    for number, name in enumerate(names):
+        frames = footage(name)
+        recipe = RECIPE if len(frames) == RECIPE.frames_needed else RECIPE.replace(voxels_per_clip=len(frames) // 5 - 1)
+        key = (number, 22, 333, 4444)
+        params = SampleParams(threshold_pos, threshold_neg, sigma, 2, 3.0, (), 1.0, 0, 0, False, 0.0, key)
+        got = simulate_clip(frames, params, recipe, "float32").voxels
+        noisy = standard_normals(key, recipe.steps, pixels).astype(np.float64) * sigma
+        position, normal = hot_pixels(key, 2, pixels)
+        noisy[:, position] += normal.astype(np.float64) * 3.0
+        level = oracle.log_intensity(
+            frames[: recipe.frames_needed].reshape(-1, pixels), recipe.gamma, recipe.log_eps[0]
+        )
+        trace = oracle.simulate(
+            level,
+            noisy,
+            start_uniforms(key, pixels).astype(np.float64),
+            threshold_pos=threshold_pos,
+            threshold_neg=threshold_neg,
+            tolerance=0.0 if plain_floor else rounding_tolerance(threshold_pos, threshold_neg),
+        )
+        difference = got.reshape(recipe.steps, pixels) - trace.voxels
+        assert np.abs(difference).max() <= 2
+        assert np.abs(difference.sum(0)).max() <= 4
+        differing += int(np.count_nonzero(difference))
+        bins += difference.size
+    return differing / bins * 1e6
+
+
+CASES = [(0.05, 1.0, 0.05, 60.0), (0.05, 1.3, 0.0, 60.0), (1.0, 1.2, 0.05, 2.0)]
+
+
+@pytest.mark.parametrize(("threshold", "ratio", "sigma", "limit_ppm"), CASES)
+def test_kernel_is_within_the_bar_of_the_oracle_on_a_pan(
+    threshold: Any, ratio: Any, sigma: Any, limit_ppm: Any
+) -> None:
+    assert differing_ppm(["pan"], threshold, ratio, sigma, plain_floor=False) <= limit_ppm
+
+
+def test_kernel_is_near_the_plain_floor_too() -> None:
+    assert differing_ppm(["pan"], 0.05, 1.0, 0.05, plain_floor=True) <= 60
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (FOLDER / VIDEOS[0]).exists(), reason=f"no videos in {FOLDER}; set V2V_TEST_VIDEOS")
+@pytest.mark.parametrize("plain_floor", [False, True])
+@pytest.mark.parametrize(("threshold", "ratio", "sigma", "limit_ppm"), CASES)
+def test_kernel_is_within_the_bar_of_the_oracle_on_real_footage(
+    threshold: Any, ratio: Any, sigma: Any, limit_ppm: Any, plain_floor: Any
+) -> None:
+    if plain_floor and threshold >= 1:
+        limit_ppm = 6.0  # the tolerance itself moves a few events by a step; it is part of the rule, not an error
+    assert differing_ppm(VIDEOS, threshold, ratio, sigma, plain_floor) <= limit_ppm

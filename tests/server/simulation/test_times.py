@@ -1,5 +1,4 @@
-"""Events in time: the general kernel against events one by one, against the paper's kernel, and against scenes that can
-be solved on paper."""
+"""Events in time: the general kernel against events one by one and against the paper's kernel."""
 
 from __future__ import annotations
 
@@ -19,12 +18,13 @@ from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_o
 from tests.server.simulation.test_pixel import moving_frames
 from tests.server.video.test_real_videos import FOLDER as REAL_VIDEOS
 from v2v_protocol.errors import UsageError
-from v2v_server.simulation import simulate, simulate_log
+from v2v_protocol.recipe import Recipe
+from v2v_server.simulation import simulate, simulate_clip, simulate_log
 from v2v_server.simulation.intensity import log_table
 from v2v_server.simulation.kernels import Voxels, fill, list_events
 from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.representations import NAMES
-from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, bin_edges, rounding_tolerance, timeline
+from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, rounding_tolerance, timeline
 from v2v_server.video.probe import probe
 
 FPS = 25.0
@@ -32,8 +32,6 @@ ALL = {
     "threshold_mismatch_sigma": 0.15, "shot_noise_hz": 20.0, "leak_hz": 3.0, "refractory_seconds": 0.005,
     "photoreceptor_hz": 20.0, "dead_pixel_share": 0.02,
 }  # fmt: skip
-RATES = {name: 1 / fps * np.ones(fps) for name, fps in (("24", 24), ("30", 30), ("60", 60), ("240", 240))}
-RATES["variable"] = np.random.default_rng(3).uniform(0.004, 0.042, 40)
 
 
 def again(made: Voxels, *names: str, precision: Any = None, **changes: Any) -> dict[str, Any]:
@@ -144,65 +142,7 @@ def test_kernel_equals_the_oracle(data: Any, grids: int, form: tuple[str, int, s
     assert wrong <= 6
 
 
-# --- what can be solved on paper --------------------------------------------------------------------------------------
-
-
-def at_seconds(seconds: Any, durations: Any) -> Moments:
-    """Return the moments of a clip whose steps have these durations."""
-    ends = np.r_[0.0, np.cumsum(durations)]
-    step = np.clip(np.searchsorted(ends, seconds, side="right") - 1, 0, len(durations))
-    return Moments(step, np.where(step < len(durations), (seconds - ends[step]) / np.append(durations, 1.0)[step], 0.0))
-
-
-@pytest.mark.parametrize("bin_ms", [1, 5, 10, 33])
-@pytest.mark.parametrize("rate", RATES)
-@pytest.mark.parametrize("scene", ["ramp", "exponential"])
-def test_bins_of_any_length(scene: str, rate: str, bin_ms: int) -> None:
-    """Every bin has the events of the change in it. A log intensity that is not linear is off by what lies between the
-    curve and the line from frame to frame."""
-    durations = RATES[rate]
-    ends = np.r_[0.0, np.cumsum(durations)]
-    slopes = np.array([-40.0, -3.0, -0.1, 0.0, 0.3, 7.0, 90.0])
-
-    def level(time: Any) -> Any:
-        return slopes * time if scene == "ramp" else slopes * 0.3 * (1 - np.exp(-time / 0.3))
-
-    count = int(ends[-1] / (bin_ms * 1e-3))
-    cuts = np.r_[np.arange(count) * bin_ms * 1e-3, ends[-1]]
-    made = simulate_log(level(ends[:, None])[:, None, :], threshold_pos=0.05, bins=len(durations), start_residual=0.0)
-    found = again(made, "voxels", "event_counts", edges=at_seconds(cuts, durations), bins=count, dtype="float32")
-    events = found["voxels"].reshape(count, -1)
-    lines = np.stack([np.interp(cuts, ends, level(ends[:, None])[:, each]) for each in range(len(slopes))], axis=1)
-    tolerance = 1e-4  # of sums of up to 1,600 thresholds in float32
-    assert (np.abs(0.05 * np.cumsum(events, axis=0) - lines[1:]) < 0.05 + tolerance).all()
-    change = np.diff(level(cuts[:, None]), axis=0)
-    bend = np.abs(lines - level(cuts[:, None])).max()
-    assert (
-        bend == pytest.approx(0.0, abs=1e-9) if scene == "ramp" else bend < 0.11 * 90 * durations.max() ** 2 / 0.3 * 4
-    )
-    assert (np.abs(0.05 * events - change) < 0.05 + 2 * bend + tolerance).all()
-    counts = found["event_counts"][0]
-    np.testing.assert_array_equal(counts[1] - counts[0], found["voxels"][0])
-    assert not counts[1][:, :, slopes < 0].any()
-    assert not counts[0][:, :, slopes > 0].any()
-
-
-def test_a_ramp_fires_at_even_times() -> None:
-    """A threshold every 100 microseconds, from half a threshold on."""
-    level = np.array([0.0, 2.0])[:, None, None]
-    made = simulate_log(level, threshold_pos=0.2, start_residual=0.1, bins=1, dtype="float32")
-    events = made.to_events(1000.0)
-    np.testing.assert_allclose(events.t, np.arange(50, 1000, 100), atol=1)
-    assert events.p.all()
-
-
-def test_what_cancels_in_a_bin_has_both_polarities() -> None:
-    made = simulate_log(
-        np.array([0.0, 1.0, 0.0])[:, None, None], threshold_pos=0.2, start_residual=0.01, frames_per_bin=2, bins=1,
-        dtype="float32",
-    )  # fmt: skip
-    assert made.voxels.ravel().tolist() == [1]
-    assert made.array("event_counts").ravel().tolist() == [4, 5]
+# --- arrays against events --------------------------------------------------------------------------------------------
 
 
 def test_shot_noise_has_both_polarities_and_random_times() -> None:
@@ -272,21 +212,6 @@ def test_the_published_stacked_histogram_of_the_events_is_the_array(video: str, 
         np.testing.assert_array_equal(got, expected.reshape(20, 30, 40))
 
 
-def test_steps_of_a_still_camera_are_still() -> None:
-    """A pause repeats a frame: nothing moves in any part of its step."""
-    frames = np.array([[[10]], [[200]], [[200]], [[30]]], np.uint8)
-    made = simulate(frames, threshold_pos=0.1, bins=2, grids_per_frame=2, start_residual=0.0)
-    paused = simulate(frames[[0, 1, 3]], threshold_pos=0.1, bins=2, grids_per_frame=2, start_residual=0.0)
-    index = np.array([0, 1, 1, 2])
-    again_paused = again(
-        paused, "voxels", source_index=index, noise_durations=np.ones(3), step_seconds=np.ones(3),
-        edges=bin_edges(3, 1, 4),
-    )["voxels"]  # fmt: skip
-    np.testing.assert_array_equal(again_paused, made.voxels)
-    assert not made.voxels[2:4].any()
-    assert made.voxels[:2].all()
-
-
 # --- limits -----------------------------------------------------------------------------------------------------------
 
 # Grey levels, not log intensities: each pair of types of frames and voxels is another kernel to compile.
@@ -300,20 +225,6 @@ def test_every_array_saturates_and_counts_it() -> None:
     assert made.voxels.ravel().tolist() == [0]
     assert arrays["event_counts"].ravel().tolist() == [127, 127]
     assert saturated == {"voxels": 0, "event_counts": 2, "voxels_bilinear": 0, "time_surface": 0}
-
-
-@pytest.mark.parametrize("height", [2047.5, 2049.5, 65503.5, 65504.5, 65521.5, 1e5 + 0.5])
-def test_float16_beyond_whole_numbers(height: float) -> None:
-    """Above 2,048 float16 rounds to every second number and more; beyond its largest number it is clipped."""
-    made = simulate(BLACK_WHITE_BLACK[:2], threshold_pos=CONTRAST / height, bins=1, start_residual=0.0)
-    arrays, saturated = fill(made.given, made.real, {"voxels_bilinear": None})
-    whole = np.floor(height)
-    assert arrays["voxels_bilinear"].dtype == np.float16
-    assert float(arrays["voxels_bilinear"].ravel()[0]) == float(np.float16(min(whole, 65504.0)))
-    assert saturated["voxels_bilinear"] == (whole > 65504)
-    exact = again(made, "voxels_bilinear", dtype="float32")["voxels_bilinear"]
-    assert exact.dtype == np.float32
-    assert float(exact.ravel()[0]) == whole
 
 
 def test_timeline_by_hand() -> None:
@@ -381,3 +292,97 @@ print(digest.hexdigest()[:32])
 def test_bytes_do_not_depend_on_the_processor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     exec(DIGEST)
     assert printed_on_a_generic_processor(DIGEST, tmp_path) == capsys.readouterr().out.split()
+
+
+# --- the time surface -------------------------------------------------------------------------------------------------
+
+NONE = np.inf
+
+
+def surface(made: Voxels, **changes: Any) -> np.ndarray:
+    """Return the surface of a clip, [grids, 2, bins, H, W]."""
+    return np.asarray(again(made, "time_surface", **changes)["time_surface"], np.float64)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_a_pixel_with_known_crossings(precision: str) -> None:
+    """It rises by 1 in 2 s from half a threshold: events every 0.4 s from 0.2 s on; it rests; it falls as fast."""
+    frames = np.array([0, 255, 255, 0], np.uint8)[:, None, None]  # log intensities would take another kernel
+    made = simulate(
+        frames, threshold_pos=0.2 * CONTRAST, start_residual=0.1 * CONTRAST, bins=1, dtype="float32",
+        precision=precision,
+    )  # fmt: skip
+    ages = surface(made, step_seconds=np.full(3, 2.0))
+    # The last positive event is at 1.8 s. Falling events are due 0.3 after the turn: at 4.6, 5.0, 5.4, 5.8 s.
+    np.testing.assert_allclose(ages[:, :, 0, 0, 0], [[NONE, 0.2], [NONE, 2.2], [0.2, 4.2]], atol=1e-5)
+
+
+def test_uneven_steps_last_as_long_as_they_do() -> None:
+    made = simulate_log(
+        np.array([0.0, 0.3, 0.3, 0.3])[:, None, None], threshold_pos=0.2, start_residual=0.0, bins=3, dtype="float32"
+    )
+    ages = surface(made, step_seconds=np.array([0.3, 1.0, 0.05]))
+    np.testing.assert_allclose(ages[0, 1].ravel(), [0.1, 1.1, 1.15], atol=1e-6)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    effects=st.sampled_from([{}, ALL]), grids=st.sampled_from([0, 2]), size=st.sampled_from([(1, 1), (5, 9), (3, 513)]),
+    seed=st.integers(0, 2**32),
+)  # fmt: skip
+def test_it_is_made_of_the_events_that_are_listed(effects: Any, grids: int, size: tuple[int, int], seed: int) -> None:
+    """From the event list, whose times are whole microseconds; and other arrays do not change beside it."""
+    made = simulate(
+        moving_frames(13, *size, seed % 256), threshold_pos=0.2, threshold_neg=0.25, noise_sigma=0.1, bins=3,
+        grids_per_frame=grids, seed=seed, dtype="float32", frames_per_second=FPS, **effects,
+    )  # fmt: skip
+    bins = 12 * grids * 3 if grids else 12
+    bin_us = 12e6 / FPS / bins
+    events, ages = made.to_events(bin_us), surface(made)
+    latest, expected = np.full((2, *size), -np.inf), np.empty((bins, 2, *size))
+    bin_of = np.minimum((events.t / bin_us).astype(int), bins - 1)
+    for number in range(bins):
+        here = bin_of == number
+        np.maximum.at(latest, (events.p[here].astype(int), events.y[here], events.x[here]), events.t[here])
+        expected[number] = (number + 1) * bin_us - latest
+    got = ages.transpose(0, 2, 1, 3, 4).reshape(expected.shape)
+    np.testing.assert_allclose(got * 1e6, expected, atol=2.1)
+    assert (got >= 0).all()
+    together = again(made, *NAMES)
+    np.testing.assert_array_equal(together["voxels"], made.voxels)
+    np.testing.assert_array_equal(together["time_surface"], surface(made))
+
+
+def test_float16_holds_what_ages_are_for() -> None:
+    """int8 voxels come with ages in float16: a relative error below 2**-11 from 61 microseconds on."""
+    made = simulate(moving_frames(31, 9, 12, 4), threshold_pos=0.2, bins=5, seed=3, frames_per_second=FPS)
+    ages, exact = made.array("time_surface"), surface(made, dtype="float32")
+    assert ages.dtype == np.float16
+    assert (np.isinf(ages) == np.isinf(exact)).all()
+    fired = np.isfinite(exact)
+    np.testing.assert_allclose(ages[fired], exact[fired], rtol=2.0**-11, atol=2.0**-24)
+
+
+def test_ages_beyond_float16_are_clipped_and_counted() -> None:
+    """Steps of a day: the event of the first is older than 65504 s at the end of the second."""
+    frames = np.array([0, 255, 255, 255], np.uint8)[:, None, None]
+    made = simulate(frames, threshold_pos=5.0, bins=1, start_residual=0.0, frames_per_second=1 / 86_400)
+    voxels = again(made, "time_surface")["time_surface"][:, :, 0, 0, 0]
+    assert voxels[:, 0].tolist() == [NONE] * 3
+    assert voxels[0, 1] < 65504
+    assert voxels[1:, 1].tolist() == [65504.0, 65504.0]
+    assert Voxels.of(made.given, made.real, {"time_surface": voxels.reshape(3, 2, 1, 1, 1).copy()}).saturated == {
+        "time_surface": 2
+    }
+
+
+def test_a_clip_needs_the_durations_of_its_steps_for_it() -> None:
+    recipe = Recipe(voxels_per_clip=2, bins=5, crop_height_px=6, crop_width_px=7, hot_pixel_share=0.0, noise_sigma=0.0)
+    frames = (np.arange(11 * 6 * 7) * 37 % 256).astype(np.uint8).reshape(11, 6, 7)
+    given = simulate(frames, threshold_pos=0.2).given
+    out = {"time_surface": np.empty((2, 2, 5, 6, 7), np.float16)}
+    with pytest.raises(UsageError, match="step_seconds is missing"):
+        simulate_clip(frames, given.params, recipe, "int8", out=out)
+    timed = simulate_clip(frames, given.params, recipe, "int8", np.full(10, 0.5), out | {"voxels": None})
+    plain = simulate_clip(frames, given.params, recipe, "int8")
+    np.testing.assert_array_equal(timed.voxels, plain.voxels)

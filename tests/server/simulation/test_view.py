@@ -47,12 +47,6 @@ def test_the_whole_picture_is_resized_before_the_crop(scale: Any, method: Any) -
         np.testing.assert_array_equal(frame, cv2.resize(source, (width, height), interpolation=method)[-24:, -32:])
 
 
-def test_halving_a_picture_of_pairs_gives_the_pairs() -> None:
-    small = panned_luma(2, 24, 32)
-    got = apply_view(small.repeat(2, 1).repeat(2, 2), params(scale=0.5), RECIPE)
-    np.testing.assert_array_equal(got, small)
-
-
 @pytest.mark.parametrize("scale", [1.0, 0.7, 1.2])
 def test_flip_mirrors_left_and_right(scale: Any) -> None:
     np.testing.assert_array_equal(seen(params(scale=scale, flip=True)), seen(params(scale=scale))[:, :, ::-1])

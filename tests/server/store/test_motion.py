@@ -42,7 +42,6 @@ def small_pieces(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("motion")
-    (folder / "source").mkdir()
     write_clip(folder / "source" / "turned.mov", panned_luma(40, 60, 80), rotation_degrees=90, b_frames=2)
     assert run(folder / "source", folder / "plain", rows=ROWS).complete
     assert run(folder / "source", folder / "planes", rows=ROWS, planes=PLANES).complete
@@ -91,7 +90,6 @@ def test_samples_with_sub_steps_are_those_of_the_source(
 
 @pytest.mark.parametrize("flow", [False, True])
 def test_where_nothing_moves_no_margin_is_read_for_sub_steps(tmp_path: Path, flow: bool) -> None:
-    (tmp_path / "source").mkdir()
     write_clip(tmp_path / "source" / "still.mp4", np.repeat(panned_luma(1, 80, 90), 20, axis=0))
     assert run(tmp_path / "source", tmp_path / "planes", rows=ROWS, planes=PLANES).complete
     spec = StreamSpec(recipe=RECIPE.replace(resize_scale=(1.0, 1.0)), substep_px=0.5, flow_margin_px=4)

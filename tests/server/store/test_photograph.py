@@ -6,7 +6,6 @@ import io
 import math
 from collections.abc import Iterator
 from contextlib import closing
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -240,40 +239,6 @@ def test_photographs_are_decoded_once_within_a_bound(
     assert len(photograph.kept_photographs) == 1
 
 
-@pytest.mark.parametrize("direction", ["forward", "backward"])
-@pytest.mark.parametrize("scale", [1.0, 0.7, 1.6])
-def test_flow_leads_from_frame_to_frame(catalogue: Catalogue, direction: str, scale: float) -> None:
-    """What a pixel shows is shown where its flow leads, and tracks go there."""
-    from scipy.ndimage import map_coordinates  # type: ignore[import-untyped]
-
-    recipe = {"preset": "worlds", **FAST, "lead_frames": 1, "resize_scale": (scale, scale), "world_plain_share": 0.0}
-    row = Row(recipe, ("frames", "flow", "flow_valid", "masks", "tracks"), {"flow_direction": direction}, count=4)
-    flips, moved, unmoved = set(), list[float](), list[float]()
-    for sample in samples_of(catalogue, row):
-        frames, flow, valid, masks, tracks = (sample.arrays[name] for name in row.arrays)
-        flips.add(sample.provenance.params.flip)
-        pairs = ((at, at + 1) if direction == "forward" else (at + 1, at) for at in range(len(flow)))
-        for voxel, (here, there) in enumerate(pairs):
-            along = flow[voxel].astype(np.float64)
-            places = np.indices(frames.shape[2:]) + along[::-1]
-            reached = map_coordinates(frames[there, 0].astype(np.float64), places, order=1, mode="nearest")
-            is_seen = valid[voxel, 0] == 1
-            assert is_seen.mean() > 0.5
-            moved.append(abs(reached - frames[here, 0])[is_seen].mean())
-            unmoved.append(abs(frames[there, 0] - frames[here, 0].astype(float))[is_seen].mean())
-            for x, y, is_visible in tracks[here]:
-                assert not is_visible or (0 <= x < frames.shape[3] and 0 <= y < frames.shape[2])
-            for before, after in zip(tracks[here], tracks[there], strict=True):
-                row_, column = (math.floor(place - 0.5) for place in before[1::-1])
-                around = masks[here, 0, row_ : row_ + 2, column : column + 2]
-                if before[2] and around.shape == (2, 2) and len(np.unique(around)) == 1:
-                    at = [[before[1] - 0.5], [before[0] - 0.5]]
-                    step = [float(map_coordinates(part, at, order=1)[0]) for part in along]
-                    assert after[:2] - before[:2] == pytest.approx(step, abs=0.02)
-    assert np.mean(moved) < 0.35 * np.mean(unmoved)
-    assert len(flips) == 2 or direction == "backward"
-
-
 def test_paused_cameras_have_no_flow(catalogue: Catalogue) -> None:
     recipe = {"preset": "worlds", **FAST, "pause_probability": 1.0, "pause_stay_probability": 1.0, "lead_frames": 1}
     for sample in samples_of(catalogue, Row(recipe, ALL, count=2)):
@@ -286,28 +251,6 @@ def test_paused_cameras_have_no_flow(catalogue: Catalogue) -> None:
         assert not sample.arrays["flow"][0].any()
         assert not sample.arrays["flow_valid"][0].any()
         assert sample.arrays["flow"][1].any()
-
-
-def test_substeps_are_rendered(catalogue: Catalogue) -> None:
-    row = Row({"preset": "worlds", **FAST, "contrast_probability": 1.0}, ("voxels", "frames"), count=4)
-    plain = samples_of(catalogue, row)
-    divided = samples_of(catalogue, Row(row.recipe, row.arrays, {"substep_px": 0.5}, count=4))
-    assert all(np.array_equal(a.arrays["frames"], b.arrays["frames"]) for a, b in zip(plain, divided, strict=True))
-    assert any(each.provenance.substeps > 6 for each in divided)
-    assert not all(map(same, plain, divided))
-
-
-def test_grids_of_a_duration(catalogue: Catalogue) -> None:
-    row = Row({"preset": "worlds", **FAST, "voxel_seconds": (0.05, 0.1)}, ALL, count=3)
-    for sample in samples_of(catalogue, row):
-        assert sample.provenance.grid_seconds == pytest.approx(
-            [len_ / 60 for len_ in sample.provenance.params.grid_steps]
-        )
-        for one, other in pairwise(sample.arrays["tracks"][..., :2]):
-            assert abs(other - one).max() < 300
-
-
-WORLDS, PAPER = StreamSpec.from_dict({"preset": "worlds"}), StreamSpec()
 
 
 @pytest.mark.parametrize(
@@ -340,7 +283,7 @@ def test_what_photographs_do_not_need_is_refused(folder: Path, catalogue: Catalo
     with pytest.raises(UsageError, match="--scene auto"), opened(folder, scene=True):
         pass
     with pytest.raises(UsageError, match="stand still"):
-        SequenceTable(catalogue.videos, catalogue.rows, PAPER)
+        SequenceTable(catalogue.videos, catalogue.rows, StreamSpec())
     assert catalogue.facts.missing.keys() >= {"frames_rgb", "boxes"}
     assert "tracks" not in catalogue.facts.missing
 
@@ -370,15 +313,6 @@ def test_a_picture_is_no_video(folder: Path, tmp_path: Path) -> None:
         open_catalogue(folder / "b.jpg", cache_dir=tmp_path, processes=0)
     with closing(open_catalogue(folder / "b.jpg", cache_dir=tmp_path, kind=PHOTOGRAPHS, processes=0)) as one:
         assert list(one.videos.ids) == ["b.jpg"]
-
-
-def test_a_list_names_photographs(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "list.txt").write_text("b.jpg\nd.tiff\n")
-    kind = PHOTOGRAPHS
-    with closing(
-        open_catalogue(folder, list_file=tmp_path / "list.txt", cache_dir=tmp_path, kind=kind, processes=0)
-    ) as c:
-        assert list(c.videos.ids) == ["b.jpg", "d.tiff"]
 
 
 def test_a_stream_of_bytes_is_not_read_to_its_end(tmp_path: Path, picture: Grey) -> None:

@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
@@ -46,6 +46,7 @@ def write_lossless(path: Path, pixel_format: str) -> None:
         deep = luma.astype(np.uint16) * 255 + luma[::-1] if pixel_format == "gray16le" else luma
         write_clip(path, deep, codec="ffv1", pixel_format=pixel_format, full_range=True)
         return
+    path.parent.mkdir()
     with av.open(str(path), "w") as container:
         stream = container.add_stream("ffv1", rate=25)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixel_format
@@ -94,7 +95,6 @@ def refusal(folder: Path, kind: VideosKind = SEQUENCES) -> str:
 def grey(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a lossless clip in `clips`, and its pictures in `seqs/a`."""
     folder = tmp_path_factory.mktemp("grey")
-    (folder / "clips").mkdir()
     write_lossless(folder / "clips/a.mkv", "gray")
     export(folder / "clips/a.mkv", folder / "seqs/a", "gray", first=7)
     return folder
@@ -108,7 +108,6 @@ def grey(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )  # fmt: skip
 def test_exported_frames_give_the_samples_of_their_clip(tmp_path: Path, clip: str, picture: str, codec: str) -> None:
-    (tmp_path / "clips").mkdir()
     write_lossless(tmp_path / "clips/a.mkv", clip)
     export(tmp_path / "clips/a.mkv", tmp_path / "seqs/a", picture, codec)
     row = DEEP if "16" in clip else ROW
@@ -281,6 +280,7 @@ def encoded(picture: Image.Image, form: str, **options: Any) -> bytes:
 
 
 def grey_of(tmp_path: Path, data: bytes, ending: str) -> npt.NDArray[Any]:
+    tmp_path.mkdir(exist_ok=True)
     (tmp_path / f"1.{ending}").write_bytes(data)
     pixels = PictureSequence(tmp_path)
     return pixels.clips(ClipRequest(pixels.facts().index, 0, (Cut(1),)))[0].frames[0]
@@ -292,10 +292,8 @@ def grey_of(tmp_path: Path, data: bytes, ending: str) -> npt.NDArray[Any]:
 def test_every_grey_is_exact(tmp_path: Path, form: str, options: dict[str, Any]) -> None:
     ramp = np.arange(256, dtype=np.uint8).reshape(16, 16)
     for number, mode in enumerate(("L", "RGB", *(["LA", "P"] if form == "png" else []))):
-        folder = tmp_path / str(number)
-        folder.mkdir()
         data = encoded(Image.fromarray(ramp).convert(mode), form, **options)
-        np.testing.assert_array_equal(grey_of(folder, data, form), ramp)
+        np.testing.assert_array_equal(grey_of(tmp_path / str(number), data, form), ramp)
 
 
 def test_jpeg_is_turned_upright_and_transparency_is_said(tmp_path: Path) -> None:
@@ -304,7 +302,6 @@ def test_jpeg_is_turned_upright_and_transparency_is_said(tmp_path: Path) -> None
     for orientation, turns in ((1, 0), (3, 2), (6, -1), (8, 1)):
         exif[0x0112] = orientation
         write = tmp_path / f"{orientation}"
-        write.mkdir()
         found = grey_of(write, encoded(Image.fromarray(ramp), "jpeg", exif=exif, quality=98), "jpg")
         assert np.abs(found.astype(int) - np.rot90(ramp, turns)).max() < 4
         assert not PictureSequence(write).facts().remark
@@ -313,9 +310,20 @@ def test_jpeg_is_turned_upright_and_transparency_is_said(tmp_path: Path) -> None
         grey_of(write, encoded(Image.fromarray(ramp), "jpeg", exif=exif), "jpg")
     clear = np.dstack([ramp, 255 - ramp])
     write = tmp_path / "clear"
-    write.mkdir()
     np.testing.assert_array_equal(grey_of(write, encoded(Image.fromarray(clear, "LA"), "png"), "png"), ramp)
     assert PictureSequence(write).facts().remark == "its transparency is left out"
+
+
+BREAKS: dict[str, Callable[[Path, Image.Image], object]] = {
+    "gap": lambda path, picture: path.unlink(),
+    "again": lambda path, picture: shutil.copy(path, path.with_name("second_0002.png")),
+    "unnumbered": lambda path, picture: shutil.copy(path, path.with_name("cover.png")),
+    "size": lambda path, picture: picture.resize((8, 8)).save(path),
+    "colour": lambda path, picture: picture.convert("RGB").save(path),
+    "format": lambda path, picture: path.write_bytes(encoded(picture, "bmp")),
+    "head": lambda path, picture: path.write_bytes(b"no picture"),
+    "empty": lambda path, picture: path.write_bytes(b""),
+}
 
 
 def broken(kind: str, folder: Path) -> None:
@@ -323,22 +331,7 @@ def broken(kind: str, folder: Path) -> None:
     path = folder / "0002.png"
     with Image.open(path) as file:
         picture = file.copy()
-    if kind == "gap":
-        path.unlink()
-    elif kind == "again":
-        shutil.copy(path, folder / "second_0002.png")
-    elif kind == "unnumbered":
-        shutil.copy(path, folder / "cover.png")
-    elif kind == "size":
-        picture.resize((8, 8)).save(path)
-    elif kind == "colour":
-        picture.convert("RGB").save(path)
-    elif kind == "format":
-        path.write_bytes(encoded(picture, "bmp"))
-    elif kind == "head":
-        path.write_bytes(b"no picture")
-    elif kind == "empty":
-        path.write_bytes(b"")
+    BREAKS[kind](path, picture)
 
 
 @pytest.mark.parametrize(

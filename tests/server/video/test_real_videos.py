@@ -75,21 +75,6 @@ def test_random_ranges_equal_sequential_decoding(name: str) -> None:
         np.testing.assert_array_equal(got.frames, reference[start : start + count, top : top + 32, left : left + 32])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SOUND)
-def test_late_ranges_equal_decoding_on_from_an_early_frame(name: str) -> None:
-    """Ranges behind several keyframes, sought, against one pass over everything."""
-    path, rng = FOLDER / name, random.Random(name)
-    facts = probe(path)
-    window = (facts.height_px // 2, facts.width_px // 2, 48, 48)
-    whole = decode_luma(path, facts.index, 0, facts.frames, window).frames
-    for _ in range(6):
-        start = rng.randrange(facts.frames)
-        count = rng.randint(1, min(25, facts.frames - start))
-        got = decode_luma(path, facts.index.slice(start, count), start, count, window)
-        np.testing.assert_array_equal(got.frames, whole[start : start + count])
-
-
 def test_the_corrupt_clip() -> None:
     path, sound = FOLDER / CORRUPT, FRAMES[CORRUPT]
     index = probe(path).index

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.__main__ import main
 from bench.corpus import webvid_like
 from tests.clips import panned_luma, write_clip
 from tests.oracles.decoded import decode_luma
@@ -28,11 +27,3 @@ def test_form_and_ping_pong(tmp_path: Path) -> None:
     distance = np.abs(shown - shown[0]).mean(axis=(1, 2))
     assert np.argmax(distance[:15]) == 7
     assert distance[14] < distance[1]
-
-
-def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = write_clip(tmp_path / "source.mp4", panned_luma(4, 240, 320))
-    assert main(["corpus", "--out", str(tmp_path / "out"), "--clips", "2", "--frames", "3", str(source)]) == 0
-    assert capsys.readouterr().out.count(".mp4") == 4
-    assert main(["corpus", "--out", str(tmp_path / "out"), str(tmp_path / "missing.mp4")]) == 2
-    assert "cannot be opened" in capsys.readouterr().err

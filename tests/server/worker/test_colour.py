@@ -1,9 +1,10 @@
-"""Frames in colour, and all frames: the pixels of ``frames``, and no effect on other arrays."""
+"""Frames in colour, and all frames, beside ``frames``; and transfer and bit depth: decoded, simulated and cached."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -12,24 +13,38 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from av.video.frame import VideoFrame
+from av.video.reformatter import ColorTrc
 from av.video.stream import VideoStream
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.clips import panned_luma, write_clip
-from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe
+from tests.oracles.leases import open_leases, whole_sample
+from tests.server.prepare.test_lossless_served import require_equal
+from tests.server.prepare.test_prepare import run
+from v2v_protocol.errors import UsageError, VideoError
+from v2v_protocol.messages import Lease
+from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.scenes.picture_check import look_at_pictures
+from v2v_server.corpus.sources.folder import Folder
 from v2v_server.prepare import prepare
 from v2v_server.schedule import Schedule, SequenceTable
+from v2v_server.simulation.intensity import light_table
 from v2v_server.store.cache import Cache, make_cache
+from v2v_server.store.planes.detail import detail_of, levels_of
 from v2v_server.store.store_file import StoreFile
+from v2v_server.video.picture import Signal, range_table
 from v2v_server.video.rows import Rows
+from v2v_server.worker.process import Clips
 from v2v_server.worker.produce import decode_for, make_sample
+from v2v_tools.motion import WholePictures, predicted_loss
+from v2v_tools.preview import _signal_note
 from v2v_tools.remake import Remaker, lease_for
+from v2v_tools.tradeoff.measures import Leases, seen, simulated
 
 RECIPE = Recipe(
     voxels_per_clip=4, bins=2, crop_height_px=24, crop_width_px=32, lead_frames=1, pause_probability=0.3,
@@ -45,6 +60,7 @@ def coloured(frames: int = 30, height: int = 56, width: int = 72) -> npt.NDArray
 
 
 def write_coloured(path: Path, pictures: npt.NDArray[np.uint8]) -> Path:
+    path.parent.mkdir(exist_ok=True)
     with av.open(str(path), "w") as output:
         stream = cast(VideoStream, output.add_stream("libx264", rate=25, options={"crf": "1"}))
         stream.height, stream.width = pictures.shape[1:3]
@@ -111,15 +127,23 @@ def test_a_grey_video_has_equal_channels(tmp_path: Path) -> None:
     assert np.array_equal(sample.arrays["frames_rgb"], sample.arrays["frames"].repeat(3, axis=1))
 
 
-def samples_of(folder: Path, recipe: Recipe = RECIPE) -> list[bytes]:
-    with closing(open_catalogue(folder, processes=0, rows=Rows.parse("0.1:0.9"))) as catalogue:
-        samples = [made(catalogue, recipe, ("frames", "frames_rgb"), seed) for seed in range(4)]
-    return [sample.arrays["frames_rgb"].tobytes() for sample in samples]
+def test_a_prepared_folder_without_chroma_has_no_colour(tmp_path: Path) -> None:
+    source, grey = tmp_path / "source", tmp_path / "grey"
+    write_coloured(source / "a.mp4", coloured(12))
+    with closing(open_catalogue(source, processes=0)) as catalogue:
+        prepare(catalogue, grey, "fast", processes=0)
+    with (
+        closing(open_catalogue(grey, processes=0)) as catalogue,
+        pytest.raises(
+            UsageError,
+            match=r"frames_rgb needs the plane chroma, .*: prepare .* with v2v-prepare --planes chroma, or serve",
+        ),
+    ):
+        made(catalogue, RECIPE, ("frames", "frames_rgb"))
 
 
 def test_colour_stays_with_another_plane_and_without_some_files(tmp_path: Path) -> None:
     source, prepared = tmp_path / "source", tmp_path / "prepared"
-    source.mkdir()
     for name in "ab":
         write_coloured(source / f"{name}.mp4", coloured(12))
     for planes in (("chroma",), ("motion",)):
@@ -133,29 +157,8 @@ def test_colour_stays_with_another_plane_and_without_some_files(tmp_path: Path) 
         catalogue.facts.require_arrays(("frames_rgb",))
 
 
-@pytest.mark.parametrize("recipe", [RECIPE, RECIPE.replace(frame_stride=2, resize_scale=(0.7, 1.6))])
-def test_a_prepared_folder_with_chroma_gives_the_same_colour(tmp_path: Path, recipe: Recipe) -> None:
-    source, prepared, whole, grey = (tmp_path / name for name in ("source", "prepared", "whole", "grey"))
-    source.mkdir()
-    write_coloured(source / "a.mp4", coloured(40))
-    with closing(open_catalogue(source, processes=0, rows=Rows.parse("0.1:0.9"))) as catalogue:
-        prepare(catalogue, prepared, "fast", processes=0, planes=("chroma",))
-        prepare(catalogue, grey, "fast", processes=0)
-    with closing(open_catalogue(source, processes=0)) as catalogue:
-        prepare(catalogue, whole, "dense", processes=0, planes=("chroma",))
-    expected = samples_of(source, recipe)
-    assert samples_of(prepared, recipe) == expected
-    assert samples_of(whole, recipe) == expected
-    with pytest.raises(
-        UsageError,
-        match=r"frames_rgb needs the plane chroma, .*: prepare .* with v2v-prepare --planes chroma, or serve",
-    ):
-        samples_of(grey, recipe)
-
-
 def test_the_cache_keeps_colour_once_a_stream_needs_it(tmp_path: Path) -> None:
     folder = tmp_path / "videos"
-    folder.mkdir()
     write_coloured(folder / "a.mp4", coloured(40))
     make_cache(tmp_path / "cache")
     cache = Cache(tmp_path / "cache", 1 << 30, 0)
@@ -173,3 +176,159 @@ def test_the_cache_keeps_colour_once_a_stream_needs_it(tmp_path: Path) -> None:
             for name, array in make_sample(lease, plain).arrays.items():
                 assert make_sample(lease, cached).arrays[name].tobytes() == array.tobytes()
     assert origins == ["", "", "cache", "cache"]
+
+
+# --- transfer and bit depth, from the file to the sample --------------------------------------------------------------
+
+SDR = preset("noise-free").replace(
+    voxels_per_clip=2,
+    bins=3,
+    crop_height_px=48,
+    crop_width_px=64,
+    flip_probability=0.0,
+    threshold=(0.1, 0.1),
+    threshold_ratio=(1.0, 1.0),
+)
+DECLARED = SDR.replace(light="declared")
+ARRAYS = ("voxels", "frames", "frames_u16")
+LUMA = panned_luma(8, full_range=False)
+
+
+@pytest.fixture(autouse=True)
+def own_index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path / "index"))
+
+
+def leases_of(source: Path, recipe: Recipe, **fields: float) -> Iterator[tuple[Path, Lease]]:
+    with open_leases(source, "full", StreamSpec(recipe=recipe, **fields)) as (root, leases):  # type: ignore[arg-type]
+        yield root, replace(next(leases), arrays=ARRAYS)
+
+
+def sample_of(source: Path, recipe: Recipe, **fields: float) -> Sample:
+    with closing(leases_of(source, recipe, **fields)) as leases:
+        root, lease = next(leases)
+        return whole_sample(lease, root)
+
+
+def ten_bits(folder: Path, transfer: ColorTrc | None) -> npt.NDArray[np.uint16]:
+    """Write ``folder``/a.mkv, and return its levels, 0 .. 1023: its lowest bits vary."""
+    luma = LUMA.astype(np.uint16) * 4
+    luma += np.arange(luma.shape[2], dtype=np.uint16) % 4
+    write_clip(folder / "a.mkv", luma, codec="ffv1", pixel_format="yuv420p10le", transfer=transfer)
+    levels: npt.NDArray[np.uint16] = np.clip((2046 * (luma.astype(np.int64) - 64) + 876) // 1752, 0, 1023).astype(
+        np.uint16
+    )
+    return levels
+
+
+@pytest.mark.slow  # another compiled kernel
+@pytest.mark.parametrize(("transfer", "name"), [(None, ""), (ColorTrc.SMPTE2084, "pq"), (ColorTrc.ARIB_STD_B67, "hlg")])
+def test_a_deep_clip_is_simulated_from_the_light_that_it_states(
+    tmp_path: Path, transfer: ColorTrc | None, name: str
+) -> None:
+    levels, signal = ten_bits(tmp_path / "clips", transfer), Signal(10, name)
+    sample = sample_of(tmp_path / "clips", DECLARED)
+    assert sample.provenance.decoder == f"ffv1, 10 bits, {name.upper() or 'SDR'}"
+    light = light_table(2.2, signal)
+    before, after = np.log(1e-3 + light[levels[[0, 6]]])
+    change = 0.1 * sample.arrays["voxels"].sum(axis=(0, 1), dtype=np.int64)
+    # The residual at the start and that at the end are at most a threshold each.
+    assert np.abs(change - (after - before)).max() < 0.2001
+    shown = levels[[3, 6]][:, None]
+    np.testing.assert_array_equal(sample.arrays["frames_u16"], np.floor(shown * (65535 / 1023) + 0.5))
+    grey = 255.0 * np.minimum(light[shown], 1.0) ** (1 / 2.2)
+    assert np.abs(sample.arrays["frames"] - grey).max() <= 0.5 + 1e-9
+    assert sample_of(tmp_path / "clips", SDR).provenance.decoder == "ffv1"
+
+
+def test_what_a_video_states_changes_no_name_that_does_not_ask_for_it(tmp_path: Path) -> None:
+    """Recipes without it ignore a stated transfer, and clips of 8-bit SDR give the same arrays with it."""
+    for name, transfer in (("plain", None), ("hlg", ColorTrc.ARIB_STD_B67)):
+        write_clip(tmp_path / name / "a.mp4", LUMA, transfer=transfer)
+    made = {
+        (name, recipe.light): sample_of(tmp_path / name, recipe)
+        for name in ("plain", "hlg")
+        for recipe in (SDR, DECLARED)
+    }
+    first = made["plain", "sdr"].arrays
+    for key in (("plain", "declared"), ("hlg", "sdr")):
+        for name, array in first.items():
+            np.testing.assert_array_equal(made[key].arrays[name], array)
+    assert (made["hlg", "declared"].arrays["voxels"] != first["voxels"]).any()
+    np.testing.assert_array_equal(made["hlg", "declared"].arrays["frames_u16"], first["frames_u16"])
+    assert "light" not in SDR.to_dict()
+    assert Recipe.from_dict(DECLARED.to_dict()) == DECLARED
+
+
+@pytest.mark.parametrize("is_deep", [False, pytest.param(True, marks=pytest.mark.slow)])  # another compiled kernel
+def test_the_cache_keeps_transfer_and_bits(tmp_path: Path, is_deep: bool) -> None:
+    if is_deep:
+        ten_bits(tmp_path / "clips", ColorTrc.SMPTE2084)
+    else:
+        write_clip(tmp_path / "clips" / "a.mp4", LUMA, transfer=ColorTrc.ARIB_STD_B67)
+    exact = sample_of(tmp_path / "clips", DECLARED)
+    make_cache(tmp_path / "cache")
+    clips = Clips(Folder(tmp_path / "clips"), Cache(tmp_path / "cache", 1 << 30))
+    # A piece of an older stream does not state the transfer, so it is not used for one that needs it.
+    for recipe, said in ((SDR, "miss"), (SDR, "hit"), (DECLARED, "miss"), (DECLARED, "hit")):
+        with closing(leases_of(tmp_path / "clips", recipe)) as leases:
+            _, lease = next(leases)
+            decoded, _ = clips.take(lease)
+            assert clips.said_of_cache(decoded) == said
+    require_equal(make_sample(lease, decoded), exact, "cache")
+
+
+def test_preview_and_doctor_name_what_a_video_has(tmp_path: Path) -> None:
+    ten_bits(tmp_path / "clips", ColorTrc.SMPTE2084)
+    provenance = sample_of(tmp_path / "clips", SDR).provenance
+    with closing(open_catalogue(tmp_path / "clips", processes=0)) as catalogue:
+        assert _signal_note(catalogue, provenance, DECLARED) == "a.mkv has 10 bits, PQ"
+        note = _signal_note(catalogue, provenance, SDR)
+        lines = list(look_at_pictures(catalogue, 7))
+    assert note.startswith("a.mkv has 10 bits, PQ, and is read as 8 bits, SDR: --set light=declared")
+    assert lines[-1][2] == "1 of 1 videos have other levels than 8 bits, SDR (a.mkv: 10 bits, PQ)"
+
+
+@pytest.mark.slow  # another compiled kernel
+def test_deep_clips_offline(tmp_path: Path) -> None:
+    """The parts of preview and tradeoff that simulate by themselves."""
+    ten_bits(tmp_path / "clips", ColorTrc.SMPTE2084)
+    spec = StreamSpec(recipe=DECLARED)
+    with closing(open_catalogue(tmp_path / "clips", processes=0)) as catalogue:
+        remaker = Remaker(catalogue, spec)
+        made = remaker.made(0, 0, 0)
+        assert predicted_loss(made).loss().low >= 0
+        whole = WholePictures(catalogue, spec).camera(remaker.sequence(0, 0, 0))
+        (view,) = seen(Leases(tmp_path / "clips", [replace(made.lease, indices=(0, 1))]), 0)
+    assert whole.voxels.any()
+    voxels = simulated(view, made.sample.provenance.params)
+    np.testing.assert_array_equal(voxels, made.sample.arrays["voxels"])
+
+
+def test_sub_steps_are_made_of_8_bits(tmp_path: Path) -> None:
+    ten_bits(tmp_path / "clips", ColorTrc.SMPTE2084)
+    assert sample_of(tmp_path / "clips", DECLARED, substep_px=0.5).provenance.decoder == "ffv1, 8 bits, PQ"
+
+
+@given(bits=st.integers(9, 12), full_range=st.booleans())
+@settings(deadline=None)
+def test_detail_gives_every_level_back(bits: int, full_range: bool) -> None:
+    signal = Signal(bits)
+    grey, levels = range_table(bits, full_range)[None], range_table(bits, full_range, signal)[None]
+    detail = detail_of(levels, grey, signal)
+    assert np.abs(detail).max() <= 9
+    np.testing.assert_array_equal(levels_of(grey, detail[0], signal), levels)
+
+
+def test_a_clip_of_two_transfers_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "clips").mkdir()
+    parts = [
+        write_clip(tmp_path / f"{number}.h264", LUMA[:4], gop=4, transfer=transfer).read_bytes()
+        for number, transfer in enumerate((ColorTrc.SMPTE2084, ColorTrc.ARIB_STD_B67))
+    ]
+    (tmp_path / "clips" / "a.h264").write_bytes(b"".join(parts))
+    assert sample_of(tmp_path / "clips", SDR).arrays["voxels"].any()
+    with pytest.raises(VideoError, match="different transfer characteristics"):
+        sample_of(tmp_path / "clips", DECLARED)
+    report = run(tmp_path / "clips", tmp_path / "store")
+    assert "its transfer changes from pq" in str(report.failed)

@@ -76,16 +76,6 @@ def holds(arena: Arena, value: int) -> bool:
 
 
 @needs_memfd
-def test_a_worker_writes_where_its_pool_says(book: Logbook) -> None:
-    arena = Arena(LAYOUT, 2)
-    before = len(os.listdir("/proc/self/fd"))
-    book.lend(str(name_of(arena)))
-    assert write(book, arena.slot(0), 7)
-    assert len(os.listdir("/proc/self/fd")) == before
-    assert holds(arena, 7)
-
-
-@needs_memfd
 def test_a_descriptor_may_come_after_its_lease_but_not_much(book: Logbook) -> None:
     arena = Arena(LAYOUT, 2)
     book.arenas.settimeout(60.0)

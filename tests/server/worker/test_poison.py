@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import cast
+from typing import Any, cast
 
 import pytest
 
@@ -28,6 +28,14 @@ def against(lease: Lease, reason: str = "a worker died over it", snapshot: int =
     return QuarantineEntry(snapshot, lease.video, lease.fingerprint, lease.start_frame, reason, TIME)
 
 
+def asked(*indices: int, at: Peers | None = None, **hello: Any) -> Peers:
+    """A server that a consumer asked for these samples of epoch 0; workers are still to join."""
+    at = at or peers()
+    at.hello(**hello)
+    at.want(*indices)
+    return at
+
+
 def poisoned(at: Peers, cause: Cause, index: int = 0, worker: bytes = b"w") -> Lease:
     """The next worker begins the sample and dies of that cause."""
     at.join(worker)
@@ -40,27 +48,9 @@ def poisoned(at: Peers, cause: Cause, index: int = 0, worker: bytes = b"w") -> L
 # --- which deaths count -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("begun", [True, False])
-def test_kills_from_outside_never_refuse_a_candidate_however_many(begun: bool) -> None:
-    at = peers()
-    at.hello()
-    at.want(0, 1)
-    for _ in range(50):
-        at.join()
-        first, second = at.leases[b"w"]
-        assert (first.indices, first.candidate, second.indices, second.candidate) == ((0,), 0, (1,), 0)
-        if begun:
-            at.begin()
-        at.die(cause=Cause.KILLED)
-    assert (at.recorded, at.passed_over, at.quarantine.latest) == ([], [], 0)
-    assert at.dispatcher.counters.refused_candidates == 0
-
-
 @pytest.mark.parametrize("cause", list(Cause))
 def test_a_sample_that_was_not_begun_is_never_refused(cause: Cause) -> None:
-    at = peers()
-    at.hello()
-    at.want(0)
+    at = asked(0)
     for _ in range(10):
         at.join()
         assert at.leases[b"w"][0].candidate == 0
@@ -70,9 +60,7 @@ def test_a_sample_that_was_not_begun_is_never_refused(cause: Cause) -> None:
 
 @pytest.mark.parametrize("cause", BLAMING)
 def test_a_crash_or_a_hang_refuses_the_begun_candidate_at_once(cause: Cause) -> None:
-    at = peers()
-    at.hello()
-    at.want(0, 1)
+    at = asked(0, 1)
     lease = poisoned(at, cause)
     assert at.recorded == [against(lease)]
     assert at.quarantine.lines == (against(lease),)
@@ -96,9 +84,7 @@ def test_a_crash_or_a_hang_refuses_the_begun_candidate_at_once(cause: Cause) -> 
 @pytest.mark.parametrize("answered", [True, False])
 def test_what_was_begun_along_with_a_result_is_to_blame_like_any_other(answered: bool) -> None:
     """Whether or not anybody waits for that result."""
-    at = peers()
-    at.hello()
-    at.want(0, identity=b"c")
+    at = asked(0)
     at.join()
     if not answered:
         at.consumer_says(b"c", Goodbye())
@@ -113,9 +99,7 @@ def test_what_was_begun_along_with_a_result_is_to_blame_like_any_other(answered:
 
 
 def test_only_the_worker_that_holds_a_lease_begins_it() -> None:
-    at = peers()
-    at.hello()
-    at.want(0, 1)
+    at = asked(0, 1)
     at.join(b"other", credit=1)
     at.join(b"w", credit=1)
     (others,) = at.leases[b"other"]
@@ -126,9 +110,7 @@ def test_only_the_worker_that_holds_a_lease_begins_it() -> None:
 
 
 def test_a_worker_that_hangs_is_blamed_through_its_end() -> None:
-    at = peers()
-    at.hello()
-    at.want(0, 1)
+    at = asked(0, 1)
     at.join()
     lease = at.begin()
     at.tick(DEADLINE + 1)
@@ -149,9 +131,7 @@ def test_a_worker_of_another_host_that_hangs_is_not_blamed_at_once() -> None:
 
 
 def test_unexplained_deaths_make_it_run_alone_and_one_more_refuses_it() -> None:
-    at = peers()
-    at.hello()
-    at.want(0, 1, 2, 3)
+    at = asked(0, 1, 2, 3)
     for _ in range(ALONE_AFTER):
         lease = poisoned(at, Cause.UNEXPLAINED)
         assert (lease.candidate, at.recorded) == (0, [])
@@ -180,18 +160,14 @@ def test_unexplained_deaths_make_it_run_alone_and_one_more_refuses_it() -> None:
 
 
 def test_deaths_count_separately_for_each_candidate() -> None:
-    at = peers()
-    at.hello()
-    at.want(0)
+    at = asked(0)
     candidates = [poisoned(at, Cause.UNEXPLAINED).candidate for _ in range(3 * (ALONE_AFTER + 1))]
     assert candidates == [number // (ALONE_AFTER + 1) for number in range(len(candidates))]
     assert len(at.recorded) == 3
 
 
 def test_a_lone_task_whose_video_fails_runs_in_company_again() -> None:
-    at = peers()
-    at.hello()
-    at.want(0, 1)
+    at = asked(0, 1)
     for _ in range(ALONE_AFTER):
         poisoned(at, Cause.UNEXPLAINED)
     at.join()
@@ -201,9 +177,7 @@ def test_a_lone_task_whose_video_fails_runs_in_company_again() -> None:
 
 
 def test_a_lone_task_waits_for_an_empty_worker_and_finds_one_under_load() -> None:
-    at = peers()
-    at.hello(batch_size=20)
-    at.want(0)
+    at = asked(0, batch_size=20)
     for _ in range(ALONE_AFTER):
         poisoned(at, Cause.UNEXPLAINED)
     at.hello(b"busy", batch_size=20)
@@ -227,9 +201,7 @@ def test_a_lone_task_waits_for_an_empty_worker_and_finds_one_under_load() -> Non
 
 
 def test_a_consumer_that_leaves_takes_its_lone_task_along_and_frees_the_worker_kept_for_it() -> None:
-    at = peers()
-    at.hello()
-    at.want(0)
+    at = asked(0)
     for _ in range(ALONE_AFTER):
         poisoned(at, Cause.UNEXPLAINED)
     at.join(b"w1", credit=3)
@@ -252,9 +224,7 @@ def test_a_consumer_that_leaves_takes_its_lone_task_along_and_frees_the_worker_k
 
 
 def test_the_verdict_is_written_before_anything_is_sent_under_it() -> None:
-    at = peers()
-    at.hello(batch_size=8)
-    at.want(*range(8))
+    at = asked(*range(8), batch_size=8)
     at.join(b"w1")
     at.join(b"w2")
     lease = at.begin(b"w1")
@@ -270,9 +240,7 @@ def test_the_verdict_is_written_before_anything_is_sent_under_it() -> None:
 
 
 def test_a_spec_that_substitutes_nothing_hears_of_it_after_the_record() -> None:
-    at = peers()
-    at.hello(on_bad_video="raise")
-    at.want(3)
+    at = asked(3, on_bad_video="raise")
     at.join()
     at.begin()
     at.sent.clear()
@@ -282,25 +250,6 @@ def test_a_spec_that_substitutes_nothing_hears_of_it_after_the_record() -> None:
     assert message.text.endswith("sequence in quarantine snapshot 1: a worker was ended by SIGSEGV over it")
     assert [kind for kind, _ in at.sent] == ["record", "to consumer"]
     assert not at.leases[b"w"]
-
-
-def test_a_second_verdict_on_a_video_refuses_all_of_it() -> None:
-    at = peers(corpus(video("good.mp4", frames=50), video("bad.mp4", frames=50)))
-    at.hello(shuffle=False, batch_size=20)
-    indices = range(10, 20)  # catalogue order: those of bad.mp4
-    at.want(*indices)
-    for _ in range(2):
-        at.join()
-        bad = next(lease for lease in at.leases[b"w"] if lease.video == "bad.mp4")
-        at.worker_says(b"w", Begun(bad.lease))
-        at.die(cause=Cause.CRASHED)
-    at.join(credit=10)
-    leases = list(at.leases[b"w"])
-    assert sorted(lease.indices[0] for lease in leases) == list(indices)
-    assert {lease.video for lease in leases} == {"good.mp4"}
-    for lease in leases:
-        assert "video in quarantine snapshot 2 (2 verdicts)" in lease.refusals["refusals"][0]["reason"]
-    assert at.quarantine.latest == 2
 
 
 def test_one_sequence_that_crashes_for_several_consumers_gets_one_verdict() -> None:
@@ -324,9 +273,7 @@ def test_one_sequence_that_crashes_for_several_consumers_gets_one_verdict() -> N
 
 
 def test_the_verdict_of_a_consumer_that_left_is_not_asked_for() -> None:
-    at = peers()
-    at.hello()
-    at.want(0)
+    at = asked(0)
     at.join()
     at.begin()
     at.dispatcher.consumer_lost(b"c")
@@ -361,39 +308,11 @@ def test_when_it_cannot_be_written_there_is_no_snapshot_and_the_sample_says_what
 
 def in_quarantine(index: int = 0, candidate: int = 0) -> QuarantineEntry:
     """A verdict on what index 0 of epoch 0 is made from."""
-    at = peers()
-    at.hello()
-    at.want(index)
+    at = asked(index)
     at.join()
     for _ in range(candidate):
         at.fail()
     return against(at.begin())
-
-
-def test_what_is_in_quarantine_is_passed_over_without_a_lease() -> None:
-    verdict = in_quarantine()
-    at = peers(quarantine=Quarantine([verdict]))
-    assert at.hello().quarantine == 1
-    at.want(0)
-    at.join()
-    (lease,) = at.leases[b"w"]
-    assert (lease.candidate, lease.quarantine) == (1, 1)
-    (refusal,) = lease.refusals["refusals"]
-    assert refusal == {
-        "kind": "quarantined",
-        "video": verdict.path,
-        "frame": None,
-        "reason": "sequence in quarantine snapshot 1: a worker died over it",
-    }
-    assert at.passed_over == []
-
-
-def test_a_changed_file_is_not_the_one_in_quarantine() -> None:
-    at = peers(quarantine=Quarantine([replace(in_quarantine(), fingerprint="of before")]))
-    at.hello()
-    at.want(0)
-    at.join()
-    assert at.leases[b"w"][0].candidate == 0
 
 
 def test_a_consumer_that_resumes_an_older_snapshot_keeps_it() -> None:
@@ -431,9 +350,7 @@ def test_a_consumer_that_resumes_an_older_snapshot_keeps_it() -> None:
 def test_a_crash_under_an_older_snapshot_moves_only_that_sample() -> None:
     """The verdict is there already, in a snapshot that this consumer does not see."""
     verdict = in_quarantine()
-    at = peers(quarantine=Quarantine([verdict]))
-    at.hello(quarantine=0)
-    at.want(0)
+    at = asked(0, at=peers(quarantine=Quarantine([verdict])), quarantine=0)
     poisoned(at, Cause.CRASHED)
     assert at.recorded == []
     at.join()
@@ -453,21 +370,9 @@ def test_a_snapshot_of_the_future_is_refused() -> None:
     assert len(at.dispatcher.sessions) == 0
 
 
-def test_after_a_clearing_the_newest_admits_it_and_the_old_one_does_not() -> None:
-    at = peers(quarantine=Quarantine([in_quarantine(), replace(clearing(TIME), snapshot=2)]))
-    at.hello(b"new")
-    at.hello(b"old", quarantine=1)
-    for identity in (b"new", b"old"):
-        at.want(0, identity=identity)
-    at.join()
-    assert {at.asked_by(lease): lease.candidate for lease in at.leases[b"w"]} == {b"new": 0, b"old": 1}
-
-
 def test_lines_that_others_wrote_meanwhile_are_taken_up_with_the_own_verdict() -> None:
     """Another server's verdict and a person's clearing have the numbers before it: the new snapshot is made of all."""
-    at = peers(quarantine=Quarantine([in_quarantine()]))
-    at.hello()
-    at.want(0, 1)
+    at = asked(0, 1, at=peers(quarantine=Quarantine([in_quarantine()])))
     at.join()
     assert [lease.candidate for lease in at.leases[b"w"]] == [1, 0]
     crashed = at.leases[b"w"][1]
@@ -545,9 +450,7 @@ def test_remake_chooses_what_the_dispatcher_chose(monkeypatch: pytest.MonkeyPatc
 
 
 def test_remake_says_what_the_dispatcher_says_when_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    at = peers(corpus(video("bad.mp4", frames=5)))
-    at.hello()
-    at.want(0)
+    at = asked(0, at=peers(corpus(video("bad.mp4", frames=5))))
     poisoned(at, Cause.CRASHED)
     at.join()
     (message,) = at.unavailable()

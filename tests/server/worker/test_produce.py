@@ -1,4 +1,4 @@
-"""From a lease to a sample: what may be wrong with a lease that a sound server sent."""
+"""From a lease to a sample: what may be wrong with a lease of a sound server, and with the sidecars of its video."""
 
 from __future__ import annotations
 
@@ -13,22 +13,37 @@ import numpy as np
 import pytest
 
 from tests.clips import panned_luma, write_clip
+from tests.protocol.persisted_values import example
 from tests.server.named_corpus import SMALL_SPEC
-from v2v_protocol.errors import ProtocolError, VideoChanged, VideoError, VideoUnreadable
-from v2v_protocol.messages import Lease
-from v2v_protocol.sample import Provenance
+from v2v_protocol import sample
+from v2v_protocol.errors import ProtocolError, SidecarError, VideoChanged, VideoError, VideoUnreadable
+from v2v_protocol.messages import Lease, LeaseFailed, WorkerHello, decode, encode
+from v2v_protocol.sample import FromSidecar, Provenance
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.sources.folder import Folder
+from v2v_server.corpus.sources.source import sidecar_fingerprint
 from v2v_server.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.worker import process as clips
 from v2v_server.worker import produce
-from v2v_server.worker.produce import Decoded, decode_for, make_sample
+from v2v_server.worker import produce as reading
+from v2v_server.worker.conversation import Make, Readiness, Send, WorkerConversation
+from v2v_server.worker.produce import (
+    Decoded,
+    decode_for,
+    errors_of_sidecar,
+    make_sample,
+    open_sidecars,
+    refused_sidecars,
+    sidecar_files,
+)
 from v2v_tools.remake import lease_for, remake
 from v2v_tools.simulate import main as simulate
 
 CHANGED = ("voxels_per_clip", "bins", "crop_height_px", "crop_width_px")
 """Fields of the small recipe that are not the paper's."""
+SMALL_RECIPE = [f"--set={name}={value}" for name, value in SMALL_SPEC.recipe.to_dict().items() if name in CHANGED]
 
 
 @pytest.fixture
@@ -136,47 +151,42 @@ def test_events_need_no_flow(catalogue: Catalogue, lease: Lease, monkeypatch: py
     assert signs.sum() == voxels.sum()
 
 
-class TestASecondAttempt:
+FIRST, SECOND = VideoError("a.mp4", 3, "does not decode"), VideoError("a.mp4", 3, "does not decode again")
+MISSING = VideoUnreadable("a.mp4", None, "cannot be read")
+
+
+@pytest.mark.parametrize(
+    ("ends", "is_replaced", "error", "words"),
+    [
+        pytest.param([FIRST], False, None, "", id="makes the sample"),
+        pytest.param([FIRST, SECOND], False, VideoError, "does not decode again", id="has the last word"),
+        pytest.param([FIRST], True, VideoChanged, r"a\.mp4", id="finds a file that was replaced meanwhile"),
+        pytest.param(
+            [MISSING, SECOND], False, VideoUnreadable, "cannot be read", id="is not made where the file is missing"
+        ),
+    ],
+)
+def test_a_second_attempt(
+    catalogue: Catalogue, lease: Lease, monkeypatch: pytest.MonkeyPatch, ends: list[VideoError], is_replaced: bool,
+    error: type[VideoError] | None, words: str,
+) -> None:  # fmt: skip
     """What a file does, it does again; storage may fail for a moment."""
+    left = list(ends)
 
-    @pytest.fixture
-    def failures(self, monkeypatch: pytest.MonkeyPatch) -> list[VideoError]:
-        """What the next attempts to decode end in."""
-        left: list[VideoError] = []
+    def decode(*arguments: Any) -> tuple[Decoded, ...]:
+        if left:
+            raise left.pop(0)
+        return decode_for(*arguments)
 
-        def decode(*arguments: Any) -> tuple[Decoded, ...]:
-            if left:
-                raise left.pop(0)
-            return decode_for(*arguments)
-
-        monkeypatch.setattr(clips, "decode_for", decode)
-        return left
-
-    def test_makes_the_sample(self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]) -> None:
-        failures.append(VideoError("a.mp4", 3, "does not decode"))
+    monkeypatch.setattr(clips, "decode_for", decode)
+    if is_replaced:
+        (catalogue.folder / "a.mp4").write_bytes(b"another")
+    if error is None:
         decoded, _ = clips.Clips(catalogue.source).take(lease)
         expected = make_sample(lease, decode_for(lease, lease.indices, catalogue.source)[0])
         assert np.array_equal(make_sample(lease, decoded).arrays["voxels"], expected.arrays["voxels"])
-
-    def test_has_the_last_word(self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]) -> None:
-        failures += [VideoError("a.mp4", 3, "first"), VideoError("a.mp4", 3, "second")]
-        with pytest.raises(VideoError, match="second"):
-            clips.Clips(catalogue.source).take(lease)
-
-    def test_finds_a_file_that_was_replaced_meanwhile(
-        self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]
-    ) -> None:
-        (catalogue.folder / "a.mp4").write_bytes(b"another")
-        failures.append(VideoError("a.mp4", 3, "does not decode"))
-        with pytest.raises(VideoChanged):
-            clips.Clips(catalogue.source).take(lease)
-
-    def test_is_not_made_where_the_file_is_missing(
-        self, catalogue: Catalogue, lease: Lease, failures: list[VideoError]
-    ) -> None:
-        """The server looks whether it is there."""
-        failures += [VideoUnreadable("a.mp4", None, "cannot be read"), VideoError("a.mp4", 3, "asked again")]
-        with pytest.raises(VideoUnreadable):
+    else:
+        with pytest.raises(error, match=words):
             clips.Clips(catalogue.source).take(lease)
 
 
@@ -198,10 +208,12 @@ def test_a_sample_is_made_again_under_its_quarantine_snapshot(catalogue: Catalog
     cache = str(tmp_path / "cache")
 
     def made(*flags: str) -> str:
-        recipe = [f"--set={name}={value}" for name, value in SMALL_SPEC.recipe.to_dict().items() if name in CHANGED]
         out = tmp_path / "sample.npz"
         assert (
-            simulate([str(catalogue.folder), f"--out={out}", f"--cache-dir={cache}", "--index=2", *recipe, *flags]) == 0
+            simulate(
+                [str(catalogue.folder), f"--out={out}", f"--cache-dir={cache}", "--index=2", *SMALL_RECIPE, *flags]
+            )
+            == 0
         )
         with np.load(out) as content:
             video: str = json.loads(str(content["provenance"]))["video"]
@@ -232,8 +244,7 @@ def test_a_damaged_index_costs_its_video_only(catalogue: Catalogue, lease: Lease
 
 def _simulated(catalogue: Catalogue, folder: Path, file: str) -> int | None:
     """Simulate one sample with the command; return its exit status."""
-    recipe = [f"--set={name}={value}" for name, value in SMALL_SPEC.recipe.to_dict().items() if name in CHANGED]
-    return simulate([str(catalogue.folder / "a.mp4"), f"--out={folder / file}", f"--cache-dir={folder}", *recipe])
+    return simulate([str(catalogue.folder / "a.mp4"), f"--out={folder / file}", f"--cache-dir={folder}", *SMALL_RECIPE])
 
 
 def test_a_sample_lies_where_it_is_said_to(
@@ -251,3 +262,100 @@ def test_a_sample_gets_no_name_of_another_kind(
     assert _simulated(catalogue, tmp_path, file) == 2
     assert f"{file}: unknown ending; give a name that ends in .npz" in capsys.readouterr().err
     assert not (tmp_path / file).exists()
+
+
+# --- what a lease says of sidecars ------------------------------------------------------------------------------------
+
+ENDING = ".label.json"
+
+
+@pytest.fixture(autouse=True)
+def _label(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sample.ARRAYS, "label", FromSidecar(ENDING, lambda recipe, _: ("float32", (1,))))
+
+
+def leased(**changes: object) -> Lease:
+    plain = {"video": "deep/a.mp4", "arrays": ("frames", "label"), "sidecars": {}}
+    return dataclasses.replace(example(Lease), **plain | changes)  # type: ignore[arg-type]
+
+
+def test_only_the_sidecars_of_asked_arrays_are_opened(tmp_path: Path) -> None:
+    file = tmp_path / "deep" / "a.label.json"
+    file.parent.mkdir()
+    file.write_text("[1]")
+    mark = sidecar_fingerprint(file)
+    known = leased(sidecars={ENDING: mark, ".other": "3-x"})
+    assert sidecar_files(known) == {ENDING: ("deep/a.label.json", mark)}
+    assert sidecar_files(leased(arrays=("frames",), sidecars={ENDING: mark})) == {}
+    with open_sidecars(known, Folder(tmp_path)) as opened:
+        assert opened == {ENDING: file}
+    with open_sidecars(leased(), Folder(tmp_path)) as opened:
+        assert opened == {ENDING: None}
+    for text, reason in (("[2]", "changed since it was catalogued"), (None, "there is no such sidecar")):
+        file.unlink() if text is None else file.write_text(text)
+        with pytest.raises(SidecarError, match=reason) as raised, open_sidecars(known, Folder(tmp_path)):
+            pass
+        assert (raised.value.video, raised.value.ending, raised.value.here) == ("deep/a.mp4", ENDING, True)
+
+
+def test_a_malformed_lease_is_refused() -> None:
+    with pytest.raises(ProtocolError, match=r"fingerprint 7 of the sidecar \.label\.json"):
+        sidecar_files(leased(sidecars={ENDING: 7}))
+
+
+def test_any_error_over_a_sidecar_is_the_sidecars(tmp_path: Path) -> None:
+    opened = {ENDING: tmp_path}
+    text = r"^a\.mp4: its sidecar \.label\.json: KeyError: 'boxes'$"
+    with pytest.raises(SidecarError, match=text) as raised, errors_of_sidecar("a.mp4", "label", opened):
+        raise KeyError("boxes")
+    assert not raised.value.here
+    with pytest.raises(VideoError), errors_of_sidecar("a.mp4", "label", opened):
+        raise VideoError("a.mp4", 3, "is damaged")
+    for array, sidecars in (("frames", opened), ("label", {ENDING: None})):
+        with pytest.raises(KeyError), errors_of_sidecar("a.mp4", array, sidecars):
+            raise KeyError("a fault of the program")
+
+
+def test_the_worker_reports_the_sidecar_and_not_the_video() -> None:
+    talk = WorkerConversation(WorkerHello("w", 1, 2), "ipc://x", is_watched=True)
+    talk.start(0.0)
+    talk.on_messages([encode(leased(lease=5))[0]], 0.0)
+    assert isinstance(talk.on_inspected(Readiness(True, True, False), 0.0)[-1], Make)
+    (said, *_) = talk.on_failure(SidecarError("a.mp4", ENDING, "has no frame 3", here=True), 1.0)
+    assert isinstance(said, Send)
+    assert decode(said.frames[0]) == LeaseFailed(5, None, "has no frame 3", True, ENDING)
+
+
+def test_a_sidecar_that_the_catalogue_refuses_is_not_opened(tmp_path: Path) -> None:
+    refused = leased(sidecars={ENDING: ["3-abc", "has labels of frame 9"]})
+    assert sidecar_files(refused) == {}
+    assert refused_sidecars(refused) == {ENDING: "has labels of frame 9"}
+    with open_sidecars(refused, Folder(tmp_path)) as opened:
+        assert opened == {ENDING: None}
+    with (
+        pytest.raises(SidecarError, match=r"^a\.mp4: its sidecar \.label\.json: has labels of frame 9$") as raised,
+        errors_of_sidecar("a.mp4", "label", opened, refused_sidecars(refused)),
+    ):
+        pytest.fail("the array is made")
+    assert not raised.value.here
+    assert decode(encode(refused)[0]) == refused
+    for malformed in ([1, b""], ["3-abc", 7], ["3-abc"], {}):
+        with pytest.raises(ProtocolError, match="fingerprint"):
+            sidecar_files(leased(sidecars={ENDING: malformed}))
+
+
+def test_memory_that_labels_take_is_their_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = {ENDING: tmp_path}
+    with pytest.raises(SidecarError, match="MemoryError") as raised, errors_of_sidecar("a.mp4", "label", opened):
+        raise MemoryError
+    assert not raised.value.here
+
+    def short(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(reading, "open_sidecar", short)
+    with (
+        pytest.raises(SidecarError, match="too much memory"),
+        open_sidecars(leased(sidecars={ENDING: "3-abc"}), Folder(tmp_path)),
+    ):
+        pass

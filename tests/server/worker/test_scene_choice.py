@@ -18,7 +18,6 @@ from v2v_server.worker.scene_choice import LEAN_METHOD, CleanFrames, FlowPlan, c
 
 RECIPE = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=32)
 AUTO = StreamSpec(recipe=RECIPE, scene="auto")
-OFF = StreamSpec(recipe=RECIPE)
 SIZE_PX = 128
 """Of the square picture: a crop at a multiple of 32 px is one tile."""
 

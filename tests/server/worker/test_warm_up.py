@@ -87,23 +87,6 @@ def test_a_confined_process_compiles_in_its_own_memory(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], env=environment, check=True)
 
 
-def test_one_that_is_killed_leaves_the_work_to_the_next(tmp_path: Path) -> None:
-    code = (
-        "import sys, time\nfrom pathlib import Path\nfrom v2v_server.worker.warm_up import one_compiles\n"
-        f"with one_compiles(Path(sys.argv[1]), {KEY!r}):\n    print('in', flush=True)\n    time.sleep(600)\n"
-    )
-    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout is not None
-        try:
-            assert holder.stdout.readline() == "in\n"
-            assert is_held(tmp_path)
-        finally:
-            holder.kill()
-    with one_compiles(tmp_path, KEY) as is_first:
-        assert is_first
-        assert is_held(tmp_path)
-
-
 def test_the_wait_for_a_stuck_process_is_bounded(tmp_path: Path) -> None:
     with one_compiles(tmp_path, KEY), one_compiles(tmp_path, KEY, longest_wait_seconds=0.0) as is_first:
         assert is_first

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.oracles.known_motion import photograph
-from tests.oracles.worlds import Oracle
+from tests.oracles.worlds import Oracle, event_errors
+from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from v2v_protocol.recipe import PRESETS, Recipe
 from v2v_server.simulation.draw import draw
 from v2v_server.worlds.render import (
@@ -211,3 +214,75 @@ def test_levels_between_are_pictures_at_their_times() -> None:
     assert few is None or len(few.grey) < len(levels.grey)
     still = world_of(RECIPE.replace(world_still_share=1.0, world_patches=0), 1)
     assert levels_between(pyramid(), still, seconds, source, 1.0, 16) is None
+
+
+# --- events against the exact crossings of the light ------------------------------------------------------------------
+
+GREY = (40.0, 250.0)
+HZ = 60.0
+
+
+@pytest.mark.parametrize("threshold", [0.1, 0.3])
+@pytest.mark.parametrize(("period_px", "px_per_frame"), [(32.0, 0.5), (32.0, 2.0), (32.0, 8.0), (100.0, 8.0)])
+def test_signed_events_are_off_by_at_most_two_percent(period_px: float, px_per_frame: float, threshold: float) -> None:
+    """Levels between frames are rendered, not guessed; `python -m tests.oracles.worlds` prints the rest."""
+    found = event_errors(GREY, period_px, px_per_frame * HZ, threshold, HZ, substep_px=1.0)
+    assert found.signed <= 0.02
+    assert abs(found.count) <= 0.02
+
+
+def test_sub_steps_restore_what_a_fast_pattern_loses() -> None:
+    """A period a frame: without them, the frames hardly differ."""
+    coarse, fine = (event_errors(GREY, 8.0, 8.0 * HZ, 0.1, HZ, substep_px) for substep_px in (0.0, 0.5))
+    assert coarse.count < -0.5
+    assert abs(fine.count) < 0.02
+    assert fine.signed <= 0.02
+
+
+# --- the same bytes everywhere ----------------------------------------------------------------------------------------
+
+GOLDEN = {
+    "pictures": "dfe0d0f09c13f7f0",
+    "levels": "bbac211f57deeb64",
+    "flow": "866803faaea8e770",
+    "masks": "cae9e0dedced0ec4",
+    "tracks": "59dafcb16167657d",
+}
+TILTED = {"resize_scale": (0.6, 0.9), "world_tilt": 0.2, "flip_probability": 1.0}
+SEED = 2**64 - 1
+CODE = "from tests.server.worlds.test_render import digests; print(*digests().values())"
+
+
+def digests() -> dict[str, str]:
+    """Return digests of the arrays of sixteen worlds."""
+    y, x = np.mgrid[:97, :131]
+    grey = ((x * x * 3 + y * y * 5 + x * y * 7) // 64 + 60 * ((x // 9 + y // 7) % 3) & 255).astype(np.uint8)
+    pyramid, seconds = pyramid_of(grey), np.arange(31) / 30
+    found = {name: hashlib.sha256() for name in ("pictures", "levels", "flow", "masks", "tracks")}
+    for index in range(16):
+        recipe = PRESETS["worlds"].replace(crop_height_px=40, crop_width_px=52, **(TILTED if index % 2 else {}))
+        params = draw(recipe, seed=SEED, epoch=3, index=index, picture_height_px=97, picture_width_px=131, video_id="")
+        world = draw_world(
+            recipe, params, seed=SEED, epoch=3, index=index, picture_px=(97, 131), seconds=(0.0, 1.0)
+        )  # fmt: skip
+        levels = levels_between(pyramid, world, seconds, np.arange(31), 1.0, 16)
+        arrays = {
+            "pictures": render(pyramid, world, seconds),
+            "levels": np.empty(0) if levels is None else levels.grey,
+            "flow": np.concatenate(flow_of(world, 0.2, 0.3)),
+            "masks": masks_of(world, 0.7),
+            "tracks": tracks_of(world, seconds),
+        }
+        for name, array in arrays.items():
+            found[name].update(array.tobytes())
+    return {name: digest.hexdigest()[:16] for name, digest in found.items()}
+
+
+def test_pictures_and_truth_keep_their_bytes() -> None:
+    assert digests() == GOLDEN
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(COMPILE_SECONDS + 60)
+def test_a_generic_processor_gives_the_same_bytes(tmp_path: Path) -> None:
+    assert printed_on_a_generic_processor(CODE, tmp_path) == list(GOLDEN.values())

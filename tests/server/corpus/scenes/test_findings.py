@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
+from contextlib import closing
 from functools import cache
 from pathlib import Path
 
@@ -13,9 +15,13 @@ import numpy.typing as npt
 import pytest
 from skimage import data
 
-from tests.clips import write_clip
+from tests.clips import panned_luma, write_clip
 from tests.oracles.decoded import stream_luma
 from v2v_protocol.errors import VideoError
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.scenes import picture_check
 from v2v_server.corpus.scenes.analysis import analyse
 from v2v_server.corpus.scenes.picture_check import (
     BARS,
@@ -28,6 +34,7 @@ from v2v_server.corpus.scenes.picture_check import (
     STILL,
     WHITE,
     Defect,
+    check_in_background,
     defects_of,
 )  # fmt: skip
 from v2v_server.corpus.scenes.scene import Sides
@@ -227,3 +234,27 @@ def test_false_alarms_on_real_clips() -> None:
         said |= {(path.name, defect.kind) for defect in defects}
     assert len(said - TRUE_DEFECTS) <= 2, said
     assert ("lerobot_chess_av1.mp4", DUPLICATES) in said
+
+
+@pytest.mark.parametrize("ends_first", [False, True])
+def test_a_server_says_once_which_share_of_its_sequences_has_defects(
+    ends_first: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(picture_check, "_SERVER_WAITS_SECONDS", 0.0)
+    moving = panned_luma(60, 96, 128)
+    for name, luma in {"clean": moving, "twos": moving[np.arange(60) // 2]}.items():
+        write_clip(tmp_path / f"{name}.mkv", luma, codec="ffv1", pixel_format="gray", full_range=True)
+    spec = StreamSpec(recipe=Recipe(voxels_per_clip=1, bins=29, crop_height_px=32, crop_width_px=32))
+    said, stop = list[str](), threading.Event()
+    with closing(open_catalogue(tmp_path, cache_dir=tmp_path / "index", processes=0)) as catalogue:
+        if ends_first:
+            stop.set()
+        thread = check_in_background(catalogue, spec, stop, said.append, processes=0)
+        assert thread is not None
+        thread.join(60)
+        assert not thread.is_alive()
+    expected = (
+        "pictures: of 4 sequences of 2 videos, 50% have duplicated frames: --scene auto leaves these out; "
+        "v2v-doctor --videos names the videos"
+    )
+    assert said == ([] if ends_first else [expected])

@@ -35,10 +35,14 @@ from v2v_server.corpus.scenes.scene import (
     SEGMENT_FRAMES,
     UNKNOWN,
     Flag,
+    Pieces,
     Scene,
     Sides,
+    clip_pieces,
+    firsts_of,
 )  # fmt: skip
-from v2v_server.prepare import prepare
+from v2v_server.corpus.scenes.stretches import duplicated, pattern_of, runs_of
+from v2v_server.corpus.videos import SplitVideos, encoded_pieces
 from v2v_server.system.isolate import run_twice
 from v2v_server.video.rows import Rows
 
@@ -71,14 +75,6 @@ def test_a_still_clip_neither_moves_nor_changes() -> None:
 def test_motion_is_in_pixels_a_frame(pace_px: int) -> None:
     motion = analyse(pan(32, pace_px)).values(0, 32)[:, MOTION]
     assert np.median(motion) == pytest.approx(pace_px, rel=0.15)
-
-
-def test_only_the_tiles_that_change_do() -> None:
-    luma = np.repeat(pan(1, 0, 96, 128), 17, axis=0)
-    luma[:, :24, :32] = other(17, 3, 24, 32)
-    change = analyse(luma).values(0, 17)[0, CHANGE]
-    assert change[0] > 5
-    assert not change[1:].any()
 
 
 def test_change_and_contrast_against_their_definitions() -> None:
@@ -224,7 +220,6 @@ def test_a_scene_that_contradicts_itself_is_refused() -> None:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     made = tmp_path / "videos"
-    made.mkdir()
     write_clip(made / "cut.mkv", np.concatenate([pan(30, 2), other(40)]), codec="ffv1", pixel_format="gray")
     write_clip(made / "whole.mp4", pan(50, 1), gop=50)
     damaged(made / "whole.mp4", made / "broken.mp4", 30)
@@ -307,32 +302,119 @@ def test_processes_look_as_well_as_one(folder: Path, tmp_path: Path) -> None:
         assert one.scene_digest == two.scene_digest
 
 
-def test_a_prepared_folder_has_the_scenes_of_its_source(folder: Path, tmp_path: Path) -> None:
-    (folder / "broken.mp4").unlink()
-    target = tmp_path / "prepared"
-    with opened(folder) as source:
-        prepare(source, target, processes=0, scene=True)
-        looked: list[int] = []
-        with opened(target, progress=lambda done, total: looked.append(done)) as prepared:
-            for video in source.videos:
-                assert prepared.scene(video.id).to_bytes() == source.scene(video.id).to_bytes()
-            assert [video.pieces for video in prepared.videos] == [video.pieces for video in source.videos]
+# --- pieces -----------------------------------------------------------------------------------------------------------
+
+TELLING = Flag.CUT | Flag.REPEAT | Flag.FADE | Flag.COMBED
+SIDES = st.sampled_from([NO_BARS, Sides(2, 4, 0, 0)])
 
 
-def test_a_folder_prepared_without_scenes_gets_them_from_its_source(folder: Path, tmp_path: Path) -> None:
-    (folder / "broken.mp4").unlink()
-    target = tmp_path / "prepared"
-    with opened(folder, scene=False) as source:
-        plain = prepare(source, target, processes=0)
-        assert not any(video.scene for video in plain.videos)
-        before = {path.name: path.stat().st_ino for path in target.glob("*.mp4")}
-        again = prepare(source, target, processes=0, scene=True)
-        assert (plain.kept, again.kept) == (0, 0)
-        assert again.looked_at == 2
-        assert {path.name: path.stat().st_ino for path in target.glob("*.mp4")} == before
-        assert all(video.scene for video in again.prepared)
-        afresh = prepare(source, tmp_path / "afresh", processes=0, scene=True)
-        assert [video.scene for video in again.prepared] == [video.scene for video in afresh.prepared]
-        assert prepare(source, target, processes=0, scene=True).kept == 2
-        # Without them, what is there with them will do.
-        assert prepare(source, target, processes=0).kept == 2
+@st.composite
+def videos(draw: st.DrawFn) -> tuple[int, Pieces]:
+    """Draw the frames of a video and the pieces of the part that was analysed."""
+    ends = sorted(draw(st.sets(st.integers(1, 40), max_size=6)))
+    drawn = pieces(*((end, draw(st.integers(0, 127)), draw(SIDES)) for end in ends))
+    return draw(st.integers(1, 50)), draw(st.sampled_from([drawn, pieces()]))
+
+
+def by_frame(part: Pieces, first: int) -> list[tuple[int, ...]]:
+    """Return flags (a cut at its frame only) and bars of each frame."""
+    found = []
+    for low, (end, flags, *sides) in zip(firsts_of(part, first).tolist(), part.tolist(), strict=True):
+        found += [(flags if frame == low else flags & ~Flag.CUT, *sides) for frame in range(low, end)]
+    return found
+
+
+@given(videos(), st.integers(0, 45), st.integers(1, 20))
+def test_clipped_pieces_say_the_same_of_each_frame(drawn: tuple[int, Pieces], start: int, count: int) -> None:
+    _, whole = drawn
+    seen = by_frame(whole, 0)
+    spoilt = any(flags & TELLING or any(sides) for flags, *sides in seen)
+    all_frames = [*seen, *[(Flag.UNSEEN if spoilt else 0, *NO_BARS)] * 70]
+    assert by_frame(clip_pieces(whole, 0, start, start + count), start) == all_frames[start : start + count]
+
+
+@given(st.lists(videos()))
+def test_columns_hold_the_pieces_of_the_videos_that_are_divided(drawn: list[tuple[int, Pieces]]) -> None:
+    encoded = [encoded_pieces(each, frames) for frames, each in drawn]
+    for (frames, each), one in zip(drawn, encoded, strict=True):
+        said = set(by_frame(clip_pieces(each, 0, 0, frames), 0))
+        assert bool(one) == (said != {(0, *NO_BARS)} or len(clip_pieces(each, 0, 0, frames)) > 1)
+    split = SplitVideos.of(encoded)
+    assert split.numbers.tolist() == [number for number, one in enumerate(encoded) if one]
+    assert [split.encoded(number) for number in range(len(drawn))] == encoded
+    assert split.firsts().tolist() == [
+        first for frames, each in drawn if encoded_pieces(each, frames)
+        for first in firsts_of(clip_pieces(each, 0, 0, frames), 0).tolist()
+    ]  # fmt: skip
+    part = split.between(1, 3)
+    assert [part.encoded(number) for number in (1, 2)] == [*encoded, b"", b"", b""][1:3]
+    assert part.bounds.dtype == split.bounds.dtype == split.numbers.dtype == np.int32
+
+
+# --- repeats and stretches --------------------------------------------------------------------------------------------
+
+BLOCKS = 100
+MOVING = 64**2 * BLOCKS
+"""Sum of squares where each block changes by a grey level."""
+
+
+@given(st.integers(2, 12), st.data())
+def test_one_repeat_in_each_period_is_found_and_named(period: int, data: st.DataObject) -> None:
+    offset = data.draw(st.integers(0, period - 1))
+    changes = [
+        MOVING * data.draw(st.integers(1, 3)) if at % period != offset else data.draw(st.integers(0, MOVING // 25))
+        for at in range(10 * period)
+    ]
+    flags = duplicated(changes, BLOCKS)
+    np.testing.assert_array_equal(flags, np.arange(len(changes)) % period == offset)
+    special = {2: "every picture twice", 5: "24 in 30", 6: "25 in 30"}
+    assert pattern_of(flags) == special.get(period, f"1 of every {period}")
+
+
+def test_motion_that_comes_to_rest_or_begins_is_no_repeat() -> None:
+    resting = [MOVING] * 20 + [0] * 20 + [MOVING] * 20
+    assert not duplicated(resting, BLOCKS).any()
+
+
+def test_a_cut_in_slow_motion_makes_no_repeats() -> None:
+    assert not duplicated(([MOVING] * 10 + [900 * MOVING]) * 6, BLOCKS).any()
+
+
+def test_changes_below_coder_noise_are_no_motion() -> None:
+    assert not duplicated([MOVING // 30, 0] * 30, BLOCKS).any()
+
+
+@pytest.mark.parametrize("repeats", [3, 4])
+def test_a_few_repeats_in_a_long_video_may_be_chance(repeats: int) -> None:
+    """Their step is an eighth of the others, and the next one makes up for it."""
+    changes = [MOVING] * 100
+    changes[10 : 10 * (repeats + 1) : 10] = [MOVING // 8] * repeats
+    changes[11 : 10 * (repeats + 1) + 1 : 10] = [2 * MOVING] * repeats
+    assert duplicated(changes, BLOCKS).sum() == (repeats if repeats >= 4 else 0)
+
+
+@given(st.integers(0, 59), st.integers(0, MOVING // 12), st.data())
+def test_a_single_repeat_amid_motion_is_found(place: int, change: int, data: st.DataObject) -> None:
+    changes = [MOVING + data.draw(st.integers(0, MOVING)) for _ in range(60)]
+    changes[place] = change
+    expected = [place] if 4 <= place < 56 else []
+    assert np.flatnonzero(duplicated(changes, BLOCKS)).tolist() == expected
+
+
+def test_a_keyframe_that_a_coder_repeats_is_no_repeat() -> None:
+    changes = [MOVING] * 60
+    changes[29:31] = [30 * MOVING, 0]
+    assert not duplicated(changes, BLOCKS).any()
+
+
+@given(st.lists(st.booleans(), max_size=40), st.integers(1, 5), st.integers(0, 3))
+def test_stretches_cover_what_they_say(flags: list[bool], least: int, gap: int) -> None:
+    covered = {at for first, end in runs_of(np.array(flags, bool), least, gap) for at in range(first, end)}
+    for first, end in runs_of(np.array(flags, bool), least, gap):
+        assert end - first >= least
+        assert flags[first]
+        assert flags[end - 1]
+    if least == 1:
+        assert covered >= {at for at, flag in enumerate(flags) if flag}
+    if gap == 0:
+        assert all(flags[at] for at in covered)

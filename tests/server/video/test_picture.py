@@ -1,7 +1,8 @@
-"""Colour: the stored samples at the right pixels in all formats and orientations, and red, green and blue from them."""
+"""Pictures: grey by the range tables, stored colour at the right pixels, red, green and blue of it, bands of rows."""
 
 from __future__ import annotations
 
+from fractions import Fraction
 from itertools import product
 from typing import Any
 
@@ -13,6 +14,7 @@ from av.video.reformatter import ColorRange, Colorspace
 from hypothesis import given
 from hypothesis import strategies as st
 
+from v2v_protocol.errors import UsageError
 from v2v_server.video.picture import (
     ChromaCut,
     ChromaStack,
@@ -21,8 +23,10 @@ from v2v_server.video.picture import (
     luma_plane,
     range_table,
     stated_matrix,
+    stretch,
 )
 from v2v_server.video.rgb import add_colour, differences_of
+from v2v_server.video.rows import Rows
 
 FORMATS = ("yuv420p", "yuvj420p", "yuv422p", "yuv444p", "yuv411p", "nv12", "nv21", "nv24", "yuv420p10le", "yuv444p12be")
 ORIENTATIONS = [Orientation(*flags) for flags in product((False, True), repeat=3)]
@@ -174,3 +178,119 @@ def test_formats_without_planes_have_colour() -> None:
     picture = np.ascontiguousarray(colours.repeat(8, 0)[:, None].repeat(8, 1))
     got = rgb_of(VideoFrame.from_ndarray(picture, format="rgb24"))
     assert np.abs(got[:, 2::8, 2].T.astype(int) - colours).max() <= 4
+
+
+# --- grey -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12])
+def test_limited_range_table_is_the_rounded_line(bits: int) -> None:
+    scale = 2 ** (bits - 8)
+    for value, grey in enumerate(range_table(bits, False)):
+        exact = Fraction((value - 16 * scale) * 255, 219 * scale)
+        assert grey == min(255, max(0, int(exact + Fraction(1, 2)) if exact > 0 else 0))
+
+
+def test_full_range_tables() -> None:
+    np.testing.assert_array_equal(range_table(8, True), np.arange(256))
+    ten = range_table(10, True)
+    assert (ten[0], ten[1023]) == (0, 255)
+    assert np.all(np.diff(ten.astype(int)) >= 0)
+
+
+def test_the_colours_beside_it_and_the_matrix_that_a_file_states_change_nothing() -> None:
+    """They would in a conversion by way of red, green and blue."""
+    luma = np.tile(np.arange(16, 236, dtype=np.uint8), (16, 1))
+    chroma = [np.full((4, 220), value, np.uint8) for value in (90, 200)]
+    frame = VideoFrame.from_ndarray(np.concatenate([luma, *chroma]), format="yuv420p")
+    frame.color_range, frame.colorspace = ColorRange.MPEG, Colorspace.ITU709
+    np.testing.assert_array_equal(luma_plane(frame, LumaFormat.of(frame)), luma)
+    assert np.any(frame.reformat(format="gray").to_ndarray() != range_table(8, False)[luma])
+
+
+def test_stretching_is_the_table_for_every_value_in_every_layout() -> None:
+    luma = np.arange(256, dtype=np.uint8)
+    whole = np.stack([np.roll(luma, shift) for shift in range(256)]).reshape(4, 64, 256)  # every value at every column
+    limited = LumaFormat("yuv420p", int(ColorRange.MPEG), 8, full_range=False, has_plane=True)
+    for part in (np.s_[:], np.s_[1:3], np.s_[:, 5:60], np.s_[:, :, 3:200], np.s_[::2, ::3, 7:8], np.s_[:0]):
+        frames = whole.copy()
+        stretch(frames[part], limited)
+        expected = whole.copy()
+        expected[part] = range_table(8, False)[whole[part]]
+        np.testing.assert_array_equal(frames, expected)
+
+
+@pytest.mark.parametrize(("bits", "full_range"), [(8, True), (10, False), (10, True)])
+def test_what_is_grey_already_is_not_stretched(bits: int, full_range: bool) -> None:
+    frames = np.arange(256, dtype=np.uint8).reshape(1, 16, 16)
+    stretch(frames, LumaFormat("any", 0, bits, full_range, has_plane=True))
+    np.testing.assert_array_equal(frames.ravel(), np.arange(256))
+
+
+@pytest.mark.parametrize(
+    ("pixel_format", "stated", "full"),
+    [
+        ("yuv420p", ColorRange.UNSPECIFIED, False),
+        ("yuv420p", ColorRange.JPEG, True),
+        ("yuv420p", ColorRange.MPEG, False),
+        ("yuvj420p", ColorRange.UNSPECIFIED, True),
+        ("gray", ColorRange.UNSPECIFIED, True),
+        ("gray", ColorRange.MPEG, False),
+        ("yuv420p10le", ColorRange.UNSPECIFIED, False),
+    ],
+)
+def test_range_rule(pixel_format: str, stated: ColorRange, full: bool) -> None:
+    frame = VideoFrame(16, 16, pixel_format)
+    frame.color_range = stated
+    assert LumaFormat.of(frame).full_range == full
+
+
+@pytest.mark.parametrize("pixel_format", ["rgb24", "pal8", "gbrp", "yuyv422", "ya8"])
+def test_formats_without_a_luma_plane(pixel_format: str) -> None:
+    assert not LumaFormat.of(VideoFrame(16, 16, pixel_format)).has_plane
+
+
+# --- bands of rows ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "height", "bounds"),
+    [
+        ("full", 336, (0, 336)),
+        ("top:0.54", 336, (0, 181)),
+        ("top:1", 336, (0, 336)),
+        ("top:180px", 336, (0, 180)),
+        ("0.1:0.6", 336, (33, 201)),
+        (" 0:.5 ", 7, (0, 3)),
+    ],
+)
+def test_bounds(text: str, height: int, bounds: tuple[int, int]) -> None:
+    assert Rows.parse(text).bounds(height) == bounds
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "top", "top:", "top:0", "top:1.5", "top:0px", "top:-3px", "0.6:0.1", "0.2:0.2", "0:2", "nan:1", "bottom:1"],
+)
+def test_nonsense(text: str) -> None:
+    with pytest.raises(UsageError, match="rows"):
+        Rows.parse(text)
+
+
+def test_pictures_that_are_too_small() -> None:
+    with pytest.raises(UsageError, match="120 rows only"):
+        Rows.parse("top:180px").bounds(120)
+    with pytest.raises(UsageError, match="no row is left"):
+        Rows.parse("0.1:0.2").bounds(3)
+
+
+@given(st.floats(0, 1), st.floats(0, 1))
+def test_text_round_trip(top: float, bottom: float) -> None:
+    if top < bottom:
+        rows = Rows(top, bottom)
+        assert Rows.parse(str(rows)) == rows
+
+
+@pytest.mark.parametrize("text", ["full", "top:0.54", "top:180px", "0.1:0.6"])
+def test_canonical_text(text: str) -> None:
+    assert str(Rows.parse(text)) == text

@@ -1,7 +1,8 @@
-"""The three formats of boxes say the same, and each error names its line and what to write."""
+"""Labels: three formats of boxes say the same, errors name line and remedy, and labels follow the view."""
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,8 +14,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import SampleParams
 from v2v_server import labels as formats
-from v2v_server.labels import READERS, Box, BoxTable, check_labels, frame_of, numbered_files
+from v2v_server.labels import (
+    LEAST_SHARE,
+    LEAST_SIDE_PX,
+    READERS,
+    Box,
+    BoxTable,
+    check_labels,
+    frame_of,
+    kept_boxes,
+    numbered_files,
+    read_mask,
+    view_boxes,
+)
+from v2v_server.simulation.view import Window
 
 PICTURE_PX = (60, 80)
 Boxes = list[tuple[int, int, int, int, int, int, int]]
@@ -289,3 +305,61 @@ def test_boxes_of_a_frame_keep_their_order() -> None:
     assert table.at(1)[1][:, 0].tolist() == [1, 3]
     assert table.at(3)[1][:, 0].tolist() == [0, 2]
     assert len(table.at(2)[0]) == 0
+
+
+# --- labels of a view -------------------------------------------------------------------------------------------------
+
+
+def test_the_share_counts_what_lies_in_the_crop() -> None:
+    recipe = Recipe(crop_height_px=10, crop_width_px=10)
+    params = SampleParams(0.2, 0.2, 0.0, 0, 0.0, (), 1.0, 20, 30, True, 0.0, (0, 0, 0, 0))
+    boxes = np.array([[25.0, 20, 35, 30], [0, 0, 5, 5], [31, 21, 31, 25], [28, 18, 42, 32]])
+    corners, share = view_boxes(boxes, Window(0, 0, 60, 80), params, recipe)
+    assert corners[0].tolist() == [5.0, 0.0, 10.0, 10.0]
+    np.testing.assert_allclose(share, [0.5, 0.0, 0.0, 100 / 196])
+    assert kept_boxes(corners, share).tolist() == [3, 0], "the largest first; the empty ones are left out"
+    thin = np.array([[0.0, 0, LEAST_SIDE_PX, 9], [0, 0, LEAST_SIDE_PX - 0.01, 9], [0, 0, 9, 9]])
+    assert kept_boxes(thin, np.array([LEAST_SHARE, 1.0, LEAST_SHARE - 0.01])).tolist() == [0]
+
+
+def png(path: Path, picture: Image.Image) -> Path:
+    picture.save(path)
+    return path
+
+
+def test_classes_are_grey_levels_or_palette_indices(tmp_path: Path) -> None:
+    classes = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    grey = Image.fromarray(classes)
+    palette = Image.fromarray(classes, "P")
+    palette.putpalette([number % 256 for number in range(768)])
+    for name, picture in (("grey", grey), ("palette", palette)):
+        np.testing.assert_array_equal(read_mask(png(tmp_path / f"{name}.png", picture), (3, 4)), classes)
+    few = png(tmp_path / "few.png", Image.fromarray(classes % 2 == 1))
+    np.testing.assert_array_equal(read_mask(few, (3, 4)), classes % 2)
+
+
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        (Image.new("RGB", (4, 3)), "is neither 8-bit grey nor a palette"),
+        (Image.new("I;16", (4, 3)), "is neither 8-bit grey nor a palette"),
+        (Image.new("L", (3, 4)), "has 3x4 px: the video has 4x3 px"),
+        (None, "cannot identify"),
+    ],
+)
+def test_other_pictures_are_refused(tmp_path: Path, picture: Image.Image | None, message: str) -> None:
+    path = tmp_path / "12.png"
+    if picture is None:
+        path.write_bytes(b"no picture")
+    else:
+        png(path, picture)
+    with pytest.raises(ValueError, match=rf"^12\.png {message}"):
+        read_mask(path, (3, 4))
+
+
+def test_a_truncated_picture_is_refused(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    Image.fromarray(np.random.default_rng(0).integers(0, 9, (64, 64), np.uint8)).save(stream, "PNG")
+    (tmp_path / "3.png").write_bytes(stream.getvalue()[:-200])
+    with pytest.raises(ValueError, match=r"^3\.png .*truncated"):
+        read_mask(tmp_path / "3.png", (64, 64))
