@@ -50,6 +50,11 @@ UNCOMPILED = (
     "tests/server/simulation/test_effects.py::test_kernel_equals_the_oracle",
 )
 """Tests of the kernels that take seconds uncompiled, by file or by name."""
+COMPILED_ONLY = (
+    "tests/server/simulation/test_pixel.py::test_kernel_is_",
+    "tests/server/simulation/test_draw.py::test_both_kernels_start_where_the_law_says",
+)
+"""Tests of those files that take minutes uncompiled, by the start of their name."""
 _BLOCK = 32
 """PIXELS_A_BLOCK of the kernels there: each block is simulated whole, however small the picture."""
 
@@ -292,10 +297,13 @@ def _pass(stage: Stage, tree: Path) -> bool | None:
     """Return whether tests pass; None if they take longer than TIMEOUT_SECONDS."""
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", __spec__.name]
     environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+    if not stage.is_compiled:
+        command += [f"--deselect={name}" for name in COMPILED_ONLY]
+        environment["NUMBA_DISABLE_JIT"] = "1"
     running = subprocess.Popen(
         [*command, "-m", "not slow", *stage.tests],
         cwd=tree,
-        env=environment if stage.is_compiled else environment | {"NUMBA_DISABLE_JIT": "1"},
+        env=environment,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,

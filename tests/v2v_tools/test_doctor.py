@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.processes import free_ports
 from tests.clips import damaged, panned_luma, truncated, write_clip
 from v2v_protocol.recipe import Recipe
 from v2v_server.corpus.catalogue import open_catalogue
@@ -37,7 +38,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def told(capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
-    status = command.main(("--port", "0", *flags))  # the system chooses one that is free
+    status = command.main(("--port", str(free_ports(1)[0]), *flags))
     return status, capsys.readouterr().out
 
 
