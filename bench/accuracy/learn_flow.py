@@ -4,7 +4,7 @@
 
 Two networks of `evflownet-worlds` start with equal weights and see equal batches in equal order, each world once. One
 learns the exact flow of pixels that are seen at both ends; the other what a stream of videos would have: the flow of
-DIS (``auto``, with the stream's margin of 64 px) between the frames, where forward and backward flow agree. `SETTINGS`
+DIS (``auto``, with a margin of 32 px) between the frames, where forward and backward flow agree. `SETTINGS`
 states where recipe and optimiser differ from that configuration, so that a network learns in an hour of one thread.
 
 Errors are endpoint errors of pixels that are seen at both ends, of the networks' averaged weights. Two more methods are
@@ -39,16 +39,16 @@ from v2v_client import Batch, V2VDataset
 from v2v_protocol.command import Parser
 from v2v_server.flow import METHODS, choose, consistent, estimator
 
-SIDE_PX, MARGIN_PX = 64, MARGINS_PX[0]
+SIDE_PX, MARGIN_PX = 64, MARGINS_PX[1]
 SETTINGS = (
     *(f"stream.recipe.crop_{side}_px={SIDE_PX + 2 * MARGIN_PX}" for side in ("height", "width")),
     "stream.recipe.voxels_per_clip=1",
-    "stream.recipe.world_speed_px=[4, 120]",
+    "stream.recipe.world_speed_px=[10, 120]",
     "stream.recipe.threshold=[0.1, 0.4]",
     "stream.recipe.noise_sigma=[0.0, 0.02]",
     "stream.recipe.pause_probability=0.0",
     "stream.batch_size=4",
-    "optimizer.learning_rate=3.0e-4",
+    "optimizer.learning_rate=1.0e-3",
     "optimizer.ema_decay=0.999",
     "compute.channels_last=true",
 )
@@ -128,6 +128,9 @@ def add_flags(parser: Parser) -> None:
         help="numbers of optimiser steps after which both networks are judged (default 1000)",
     )  # fmt: skip
     add_whole(parser, "--batches", 40, "batches of held-out worlds, 4 in each")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="change the training, as v2v-train"
+    )
     add_whole(parser, "--seed", 0, "seed of the weights, and of the worlds to train on", least=0)
 
 
@@ -139,7 +142,7 @@ def measure(asked: argparse.Namespace) -> Report:
     """
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
-    config = load_config("evflownet-worlds", (*SETTINGS, f"compute.seed={asked.seed}"))
+    config = load_config("evflownet-worlds", (*SETTINGS, f"compute.seed={asked.seed}", *asked.set))
     judged = list(itertools.islice(batches(asked.held_out, config, HELD_OUT_SEED), asked.batches))
     found = itertools.islice(batches(asked.photographs, config, asked.seed), max(asked.steps))
     records: list[Record] = []
