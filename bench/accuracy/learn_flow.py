@@ -16,8 +16,9 @@ from __future__ import annotations
 import argparse
 import itertools
 import time
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -37,6 +38,7 @@ from trainer.models import VoxelNetwork
 from trainer.run.distributed import Ranks
 from v2v_client import Batch, V2VDataset
 from v2v_protocol.command import Parser
+from v2v_protocol.errors import UsageError
 from v2v_server.flow import METHODS, choose, consistent, estimator
 
 SIDE_PX, MARGIN_PX = 64, MARGINS_PX[1]
@@ -67,31 +69,29 @@ def batches(photographs: str, config: TrainConfig, seed: int) -> Iterator[Batch]
 
 def arms(batch: Batch) -> dict[str, Batch]:
     """Return the crop of a batch as each network sees it: with exact flow, and with that of DIS in its place."""
-    frames, flow, valid = (
-        batch.frames[:, :, 0].numpy(),
-        torch.empty_like(batch.flow),
-        torch.empty_like(batch.flow_valid),
-    )
+    flow, valid = (torch.empty_like(array) for array in (batch.flow, batch.flow_valid))
     estimators = {method: estimator(method) for method in METHODS}
     for clip, grid in np.ndindex(*flow.shape[:2]):
-        first, second = frames[clip, grid : grid + 2]
+        first, second = batch.frames[clip, grid : grid + 2, 0].numpy()
         estimate = estimators[choose(first, second)]
         field = estimate(first, second)
         flow[clip, grid] = torch.from_numpy(field.transpose(2, 0, 1))
         valid[clip, grid] = torch.from_numpy(consistent(field, estimate(second, first)))
-    inner = slice(MARGIN_PX, -MARGIN_PX)
     return {
-        arm: replace(batch, arrays={name: array[..., inner, inner] for name, array in (batch.arrays | truth).items()})
-        for arm, truth in ((EXACT, {}), (ESTIMATED, {"flow": flow, "flow_valid": valid}))
+        arm: replace(
+            batch,
+            arrays={name: array[..., MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX] for name, array in arrays.items()},
+        )
+        for arm, arrays in ((EXACT, batch.arrays), (ESTIMATED, {**batch.arrays, "flow": flow, "flow_valid": valid}))
     }
 
 
 def learn(
-    found: Iterable[Batch], config: TrainConfig, ends: Container[int]
+    found: Iterable[Batch], config: TrainConfig, ends: Sequence[int]
 ) -> Iterator[tuple[int, dict[str, VoxelNetwork]]]:
     """Train one network in each arm on the batches; yield each number of steps in ``ends``, and the networks then."""
     learners = {arm: build(config, Ranks(0, 1, torch.device("cpu"))) for arm in (EXACT, ESTIMATED)}
-    for step, batch in enumerate(found):
+    for step, batch in zip(range(max(ends)), found, strict=False):
         for arm, seen in arms(batch).items():
             learners[arm].step(learners[arm].task.prepare(seen, None), step, 0)
         if step + 1 in ends:
@@ -104,19 +104,17 @@ def judge(
 ) -> tuple[dict[str, npt.NDArray[Any]], npt.NDArray[Any], npt.NDArray[np.bool_]]:
     """Return endpoint errors by method, lengths of the exact flow, and where it is visible, each [N, T, H, W]."""
     rows: list[tuple[Tensor, ...]] = []
-    methods = (*networks, "no motion", "DIS itself")
-    for batch in found:
-        seen = arms(batch)
+    for seen in map(arms, found):
         voxels, exact = seen[EXACT].voxels, seen[EXACT].flow.float()
-        guesses = [
+        guesses = (
             *(network(voxels)[0] for network in networks.values()),
             torch.zeros_like(exact),
             seen[ESTIMATED].flow,
-        ]
-        errors = [torch.linalg.vector_norm(guess - exact, dim=2) for guess in guesses]
+        )
+        errors = (torch.linalg.vector_norm(guess - exact, dim=2) for guess in guesses)
         rows.append((*errors, torch.linalg.vector_norm(exact, dim=2), seen[EXACT].flow_valid[:, :, 0] > 0))
     *errors, length, visible = (torch.cat(column).numpy() for column in zip(*rows, strict=True))
-    return dict(zip(methods, errors, strict=True)), length, visible
+    return dict(zip((*networks, "no motion", "DIS itself"), errors, strict=True)), length, visible
 
 
 def add_flags(parser: Parser) -> None:
@@ -138,16 +136,17 @@ def measure(asked: argparse.Namespace) -> Report:
     """Train and judge.
 
     Raises:
-        UsageError, CorpusError: the photographs cannot be used.
+        UsageError, CorpusError: the photographs cannot be used, or those to judge on are those to train on.
     """
+    if Path(asked.photographs).resolve() == Path(asked.held_out).resolve():
+        raise UsageError(f"--held-out {asked.held_out}: the networks are trained on it; give other photographs")
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     config = load_config("evflownet-worlds", (*SETTINGS, f"compute.seed={asked.seed}", *asked.set))
     judged = list(itertools.islice(batches(asked.held_out, config, HELD_OUT_SEED), asked.batches))
-    found = itertools.islice(batches(asked.photographs, config, asked.seed), max(asked.steps))
     records: list[Record] = []
     lines: list[str] = []
-    for steps, networks in learn(found, config, asked.steps):
+    for steps, networks in learn(batches(asked.photographs, config, asked.seed), config, asked.steps):
         errors, length, visible = judge(judged, networks)
         table = by_length(errors, length, visible, {"all": visible})
         records += [{"steps": steps, "seed": asked.seed, **record} for record in table]

@@ -41,7 +41,7 @@ def test_the_arms_differ_in_nothing_but_the_flow() -> None:
 
 def test_equal_flow_makes_equal_networks() -> None:
     for right_px in (0, 3):
-        [(steps, networks)] = learn([batch(seed, right_px) for seed in range(3)], CONFIG, (3,))
+        [(steps, networks)] = learn((batch(seed, right_px) for seed in range(9)), CONFIG, (3,))
         mine, other = (network.state_dict() for network in networks.values())
         assert steps == 3
         assert all(torch.equal(mine[key], other[key]) for key in mine) == (right_px == 0)
