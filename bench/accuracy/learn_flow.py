@@ -111,8 +111,8 @@ def judge(
             torch.zeros_like(exact),
             seen[ESTIMATED].flow,
         )
-        errors = (torch.linalg.vector_norm(guess - exact, dim=2) for guess in guesses)
-        rows.append((*errors, torch.linalg.vector_norm(exact, dim=2), seen[EXACT].flow_valid[:, :, 0] > 0))
+        apart = (torch.linalg.vector_norm(guess - exact, dim=2) for guess in guesses)
+        rows.append((*apart, torch.linalg.vector_norm(exact, dim=2), seen[EXACT].flow_valid[:, :, 0] > 0))
     *errors, length, visible = (torch.cat(column).numpy() for column in zip(*rows, strict=True))
     return dict(zip((*networks, "no motion", "DIS itself"), errors, strict=True)), length, visible
 
