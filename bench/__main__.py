@@ -43,6 +43,7 @@ BENCHES = {
     "defects": "accuracy.defects",
     "flow": "accuracy.flow",
     "learn": "accuracy.learn",
+    "learn_flow": "accuracy.learn_flow",
     "recordings": "accuracy.recordings",
     "chaos": "chaos.chaos",
     "chaos_across": "chaos.across",

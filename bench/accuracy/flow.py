@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,7 @@ _COLUMNS: tuple[Column, ...] = (
 LENGTHS_PX = (0.0, 0.5, 2.0, 8.0, 32.0, np.inf)
 HIDDEN_PX = 8
 FRAMES_PER_SECOND = 60.0
-_WORLD_COLUMNS: tuple[Column, ...] = (
+WORLD_COLUMNS: tuple[Column, ...] = (
     ("method", "method", "{}", 1),
     ("where", "exact flow", "{}", 1),
     ("share", "pixels", "{:.1%}", 1),
@@ -160,13 +160,29 @@ def beside_worlds(names: Sequence[str], count: int) -> list[dict[str, Any]]:
         for name, estimate in estimators.items():
             error = np.linalg.norm(estimate(first, second) - exact.transpose(1, 2, 0), axis=-1)
             errors[name].append(error[inner, inner])
-    length, near = np.stack(lengths), np.stack(beside)
-    bins = {f"{low:g} to {high:g} px": ~near & (low <= length) & (length < high)
-            for low, high in itertools.pairwise(LENGTHS_PX)}  # fmt: skip
+    near = np.stack(beside)
+    stacked = {name: np.stack(found) for name, found in errors.items()}
+    return by_length(stacked, np.stack(lengths), ~near, {"beside what is hidden": near})
+
+
+def by_length(
+    errors: Mapping[str, npt.NDArray[Any]],
+    length: npt.NDArray[Any],
+    counted: npt.NDArray[np.bool_],
+    more: Mapping[str, npt.NDArray[np.bool_]],
+) -> list[dict[str, Any]]:
+    """Return one record for each method and length of the exact flow, of the pixels that count, and for more places.
+
+    Args:
+        errors: endpoint errors of each method, px.
+        length, counted: of the exact flow, px, and which pixels count; of the shape of an error, as are ``more``.
+    """
+    places = {f"{low:g} to {high:g} px": counted & (low <= length) & (length < high)
+              for low, high in itertools.pairwise(LENGTHS_PX)}  # fmt: skip
     return [
-        {"method": name, "where": where, "share": float(chosen.mean()), **_figures(np.stack(errors[name])[chosen])}
-        for name in names
-        for where, chosen in {**bins, "beside what is hidden": near}.items()
+        {"method": name, "where": where, "share": float(chosen.mean()), **_figures(error[chosen])}
+        for name, error in errors.items()
+        for where, chosen in {**places, **more}.items()
         if chosen.any()
     ]
 
@@ -207,7 +223,7 @@ def measure(asked: argparse.Namespace) -> Report:
     cv2.setNumThreads(1)
     if asked.worlds:
         found = beside_worlds((*METHODS, AUTO), asked.worlds)
-        return Report(found, [(found, _WORLD_COLUMNS)])
+        return Report(found, [(found, WORLD_COLUMNS)])
     pairs = scenes(textures(asked.videos), HEIGHT_PX, WIDTH_PX, every=asked.every)
     records: list[dict[str, Any]] = []
     for name in (*METHODS, AUTO):
