@@ -14,11 +14,13 @@ def shared_memory() -> set[str]:
 
 
 def abandoned_memory(before: set[str]) -> list[str]:
-    """Return the names of shared memory created since ``before`` that no living process maps."""
+    """Return the names of this user's shared memory created since ``before`` that no living process maps."""
     found: dict[str, str] = {}
     for name in shared_memory() - before:
         with suppress(FileNotFoundError):  # removed meanwhile
-            found[str(os.stat(f"/dev/shm/{name}").st_ino)] = name
+            status = os.stat(f"/dev/shm/{name}")
+            if status.st_uid == os.geteuid():  # who maps another user's is not told
+                found[str(status.st_ino)] = name
     for maps in Path("/proc").glob("[0-9]*/maps") if found else ():
         try:
             text = maps.read_text(encoding="utf-8", errors="replace")

@@ -49,12 +49,15 @@ _LAUNCHED = {
 _STANDS_FOR_ANY = {"train.py": "the reader's own script"}
 PAGES = sorted(
     page
-    for pattern in ("README.md", "docs/*.md", "docs/guides/*.md", "docs/reference/*.md", "deploy/**/*", "examples/*.py")
+    for pattern in (
+        *("README.md", "docs/*.md", "docs/guides/*.md", "docs/reference/*.md"),
+        *("deploy/**/*", "examples/*.py", "examples/*.sh"),
+    )
     for page in ROOT.glob(pattern)
     if page.is_file()
 )
 """Decisions and notes are of their day, and stay as they were."""
-_LINE = re.compile(r"\b(v2v-[a-z]+)((?: [^\n`|;&#)]*)?)")
+_LINE = re.compile(r"\b(v2v[- ][a-z]+)((?: [^\n`|;&#)]*)?)")
 _FLAG = re.compile(r"(?<=\s)(--[a-z][a-z-]*)")
 
 
@@ -89,11 +92,15 @@ def flags_of(program: str) -> frozenset[str]:
 def command_lines(text: str) -> list[tuple[str, list[str]]]:
     """Yield (program, its flags) for each command line in a text. A backslash at the end continues a line."""
     joined = re.sub(r"\\\n\s*#?\s*", " ", text)
-    return [(program, _FLAG.findall(rest)) for program, rest in _LINE.findall(joined) if program in MODULES]
+    return [
+        (program, _FLAG.findall(rest))
+        for said, rest in _LINE.findall(joined)
+        if (program := said.replace(" ", "-")) in MODULES
+    ]
 
 
 def test_command_lines_are_found_in_texts() -> None:
-    text = "Say `v2v-serve --videos DIR --bind=x`, or\n    v2v-worker --connect A \\\n      --cache B  # --no flag\n"
+    text = "Say `v2v-serve --videos DIR --bind=x`, or\n    v2v worker --connect A \\\n      --cache B  # --no flag\n"
     assert command_lines(text) == [("v2v-serve", ["--videos", "--bind"]), ("v2v-worker", ["--connect", "--cache"])]
 
 

@@ -213,7 +213,7 @@ WRONG = [
     # videos
     ("v2v-preview nowhere.mp4 --out x.png", "nowhere.mp4"),
     ("v2v-preview e.dat --out x.png", "e.dat"),
-    ("v2v-serve --videos run", "run"),
+    ("v2v-serve --videos run --bind tcp://127.0.0.1:*", "run"),
     ("v2v-preview a.mp4 --out x.png --rows top:2", "0 <= top < bottom <= 1"),
     ("v2v-simulate a.mp4 --out x.npz --arrays voxel", "voxels"),
     ("v2v-simulate a.mp4 --out x.npz", "voxels_per_clip at most 5"),
@@ -298,20 +298,18 @@ def test_all_commands_that_make_samples_take_the_flags_of_the_stream(program: st
 @pytest.mark.parametrize(
     ("scheme", "words"),
     [
-        ("tcp://127.0.0.1:{free}", "nothing listens there"),
+        ("tcp://127.0.0.1:{unused}", "nothing listens there"),
         ("tcp://no-such-host.invalid:5555", "host name cannot be resolved"),
         ("tcp://127.0.0.1:{page}", "another program listens there, or the server's page"),
     ],
 )
 def test_an_address_without_a_server_is_explained_in_the_log_and_in_the_error(
-    scheme: str, words: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    scheme: str, words: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, unused_port: int
 ) -> None:
     monkeypatch.setattr("v2v_client.connection._REPORT_SECONDS", 0.2)
-    with HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as page, socket.create_server(("127.0.0.1", 0)) as unused:
+    with HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as page:
         threading.Thread(target=page.serve_forever, args=(0.01,), daemon=True).start()
-        free = unused.getsockname()[1]
-        unused.close()
-        address = scheme.format(free=free, page=page.server_port)
+        address = scheme.format(unused=unused_port, page=page.server_port)
         with pytest.raises(ServerLost, match=words):
             next(iter(V2VStreamDataset(address, timeout_seconds=0.6)))
         page.shutdown()

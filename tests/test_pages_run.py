@@ -27,6 +27,7 @@ SMALLER = {
     "v2v-serve": ["--workers", "1", "--bind", "tcp://127.0.0.1:*", "--port-file", "port"],
     "v2v-train": ["--workers", "1", "--set", "stream.batch_size=1"],
     "v2v-prepare": ["--workers", "1"],
+    "v2v-doctor": ["--port", "0"],
     "v2v-simulate": ["--index", "0", "--quarantine", "0"],
     "v2v-tradeoff": ["--clips", "1", "--forms", "lossless fast"],
 }

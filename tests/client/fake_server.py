@@ -174,7 +174,7 @@ class FakeServer:
         """
         all_left: Future[None] = Future()
         self.call(lambda: self._waiting.append(all_left))
-        all_left.result(20.0)
+        all_left.result(60.0)
 
     # --- the thread ---------------------------------------------------------------------------------------------------
 

@@ -145,7 +145,7 @@ def test_another_process_of_this_user_can_write(arena: Arena) -> None:
     )
     slot = arena.slot(3)
     command = [sys.executable, "-c", code, slot.arena, str(slot.number)]
-    assert subprocess.run(command, timeout=60, check=False).returncode == 0
+    assert subprocess.run(command, check=False).returncode == 0
     assert holds(arena.arrays(ignore), 3, 4)
 
 

@@ -63,7 +63,7 @@ def nothing_leaks(old_objects):
     gc.collect()
     others = [thread for thread in threading.enumerate() if thread not in before]
     for thread in others:
-        thread.join(10.0)  # PyTorch closes the queues of its workers without waiting for the threads that feed them
+        thread.join(60.0)  # PyTorch closes the queues of its workers without waiting for the threads that feed them
     assert [thread.name for thread in others if thread.is_alive()] == []
     # Pools of OpenMP and of multiprocessing's helpers may begin in a test; a leak in each of them would add up.
     assert process.num_fds() - files <= 4
@@ -72,7 +72,7 @@ def nothing_leaks(old_objects):
 
 
 def dataset(server, **options):
-    options = {"batch_size": 4, "seed": SEED, "timeout_seconds": 20.0, "patience": QUICK} | options
+    options = {"batch_size": 4, "seed": SEED, "timeout_seconds": 60.0, "patience": QUICK} | options
     return V2VStreamDataset(server.address, **options)
 
 
@@ -532,9 +532,9 @@ def test_a_dead_server_raises_with_address_and_last_sample(server):
         list(batches)
 
 
-def test_an_address_without_a_server_raises():
+def test_an_address_without_a_server_raises(unused_port):
     with pytest.raises(ServerLost, match="no sample was received"):
-        next(iter(V2VStreamDataset("tcp://127.0.0.1:9", timeout_seconds=0.3, patience=QUICK)))
+        next(iter(V2VStreamDataset(f"tcp://127.0.0.1:{unused_port}", timeout_seconds=0.3, patience=QUICK)))
 
 
 def test_a_refusal_quotes_the_server(server):

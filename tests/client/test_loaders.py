@@ -46,7 +46,7 @@ def test_a_spawned_process_sends_its_queued_batches_before_it_exits() -> None:
     queue = spawn.Queue()
     process = spawn.Process(target=hand_over_and_leave, args=(queue,))
     process.start()
-    assert queue.get(timeout=60) == "arrived"
+    assert queue.get(timeout=600) == "arrived"
     process.join()
     assert process.exitcode == 0
     queue.close()
@@ -93,4 +93,4 @@ def _queue_something_else() -> None:
     queue: multiprocessing.queues.Queue[Any] = multiprocessing.get_context("fork").Queue()
     queue.put(Unsendable())
     queue.put("next")
-    assert queue.get(timeout=60) == "next"
+    assert queue.get(timeout=600) == "next"

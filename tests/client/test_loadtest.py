@@ -136,8 +136,8 @@ def test_a_local_server_gets_the_requested_recipe(server, monkeypatch):
     assert started[1][2][-4:] == ["--scene", "auto", *rows]
 
 
-def test_no_server_is_status_2(capsys):
-    arguments = ["--connect", "tcp://127.0.0.1:9", "--timeout-seconds", "0.2"]
+def test_no_server_is_status_2(capsys, unused_port):
+    arguments = ["--connect", f"tcp://127.0.0.1:{unused_port}", "--timeout-seconds", "0.2"]
     assert loadtest.main(arguments) == 2
     assert "nothing received" in capsys.readouterr().err
 

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, get_worker_info
 
 from tests.clips import panned_luma, write_clip
 from tests.leftovers import abandoned_memory, shared_memory
-from tests.waiting import until
+from tests.waiting import has_ended, until
 from v2v_client import V2VStreamDataset
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_server.keys import KeyFolder
@@ -36,7 +36,7 @@ if __name__ == "__main__":
 
 
 @pytest.fixture(scope="module")
-def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def clips(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("local-clips")
     for number in range(4):
         write_clip(folder / f"{number}.mp4", panned_luma(40, 48, 64, step=(1, 1 + number)))
@@ -154,7 +154,7 @@ def test_loader_workers_end_with_a_program_that_is_terminated(clips: Path, tmp_p
         started = psutil.Process(program.pid).children(recursive=True)
         program.terminate()
     assert program.returncode == -signal.SIGTERM
-    until(lambda: not [each for each in started if each.is_running() and each.status() != psutil.STATUS_ZOMBIE])
+    until(lambda: all(map(has_ended, started)))
 
 
 @pytest.mark.slow
@@ -177,7 +177,7 @@ def test_no_process_is_left_when_the_program_ends(clips: Path, tmp_path: Path, e
         started = [each for each in psutil.process_iter() if str(clips) in command(each) and each.pid != program.pid]
         program.wait()
     assert program.returncode == status
-    until(lambda: not [each for each in started if each.is_running() and each.status() != psutil.STATUS_ZOMBIE])
+    until(lambda: all(map(has_ended, started)))
     until(lambda: not abandoned_memory(memory))
 
 

@@ -1,11 +1,11 @@
 import os
 import tempfile
-import time
 from types import SimpleNamespace
 
 import psutil
 import pytest
 
+from tests.waiting import has_ended, until
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import ServerLost, UsageError
 
@@ -44,7 +44,7 @@ def test_the_server_runs_inside_the_block_and_stops_with_its_children(program):
         assert server.cpu_seconds().keys() == pids
         assert server.rss_bytes().keys() == pids
         assert all(size > 0 for size in server.rss_bytes().values())
-    assert not any(process.is_running() for process in tree)
+    assert all(map(has_ended, tree))
     with pytest.raises(UsageError, match="is not running"):
         server.cpu_seconds()
     server.stop()
@@ -103,7 +103,5 @@ def test_output_written_while_it_is_read_is_not_lost(program):
         + POLITE
     )
     with LocalServer("videos") as server:
-        deadline = time.monotonic() + 60.0
-        while "line 0599" not in server.last_lines() and time.monotonic() < deadline:
-            pass  # as often as possible
+        until(lambda: "line 0599" in server.last_lines())
         assert os.fstat(server._errors.fileno()).st_size == 600 * len("line 0000\n")

@@ -96,7 +96,7 @@ def server():
 
 
 def dataset(server, **options):
-    return V2VStreamDataset(server.address, **({"batch_size": 4, "timeout_seconds": 20.0} | options))
+    return V2VStreamDataset(server.address, **({"batch_size": 4, "timeout_seconds": 60.0} | options))
 
 
 def test_each_loader_worker_resumes_at_its_own_position(server):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -27,18 +28,10 @@ from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.prepared import read_manifest
 from v2v_server.prepare import PARTIAL_SUFFIX, prepare
 from v2v_server.quarantine import read_quarantine
-from v2v_server.simulation.precision import warm_up
 from v2v_server.store.store_file import StoreFile
 
 INJECT = Path(__file__).parent / "inject"
-COMPILED = pytest.mark.usefixtures("_compiled")
 INDEX_NOTE = re.compile(r"the catalogue's index \S+ cannot be used \((disk I/O error|database or disk is full)\)")
-
-
-@pytest.fixture(scope="module")
-def _compiled() -> None:
-    """The kernel's compiled form is on disk already: it is not what is tested, and has a cache of its own."""
-    warm_up()
 
 
 def _limited(limit_bytes: int, *command: str) -> list[str]:
@@ -95,7 +88,6 @@ def cache(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-@COMPILED
 def test_an_index_that_cannot_be_written_costs_one_line(clips: Path, cache: Path, server: LocalServer) -> None:
     expected = [digest(batch) for batch in epoch_of(server.address)]
     with _serving(cache.parent, _limited(64, *_server(clips, cache))) as served:
@@ -109,7 +101,6 @@ def test_an_index_that_cannot_be_written_costs_one_line(clips: Path, cache: Path
 
 
 @pytest.mark.slow
-@COMPILED
 def test_a_full_disk_for_the_index(clips: Path, cache: Path, server: LocalServer) -> None:
     expected = [digest(batch) for batch in epoch_of(server.address)]
     with _serving(cache.parent, _full(cache, [sys.executable, "-m", *_server(clips, cache)])) as served:
@@ -140,7 +131,6 @@ def _require_passed_over_once(
 
 
 @pytest.mark.slow
-@COMPILED
 def test_a_quarantine_that_cannot_be_written(
     monkeypatch: pytest.MonkeyPatch, clips: Path, cache: Path, server: LocalServer
 ) -> None:
@@ -152,7 +142,6 @@ def test_a_quarantine_that_cannot_be_written(
 
 
 @pytest.mark.slow
-@COMPILED
 def test_a_full_disk_for_the_quarantine(
     monkeypatch: pytest.MonkeyPatch, clips: Path, cache: Path, server: LocalServer
 ) -> None:
@@ -215,7 +204,8 @@ def test_preparing_onto_a_full_disk(source: Path, tmp_path: Path, cache: Path, r
         "prepare.LEAST_FREE_BYTES = -(1 << 40); "
         "import sys; from v2v_server.commands.prepare import main; sys.exit(main())"
     )
-    run = f'{sys.executable} -c "{program}" "$@" || echo "ended with status $?"; cp -r "{disk}/out" "{after}"'
+    python = shlex.quote(sys.executable)
+    run = f'{python} -c "{program}" "$@" || echo "ended with status $?"; cp -r "{disk}/out" "{after}"'
     setup = f'mount -t tmpfs -o size={size}k tmpfs "{disk}"; head -c {filler}K /dev/zero > "{disk}/filler"'
     command = mounted(setup, ["sh", "-c", run, "sh", *_preparing(source, disk / "out", cache)[2:]])
     done = subprocess.run(command, capture_output=True, text=True, check=False)

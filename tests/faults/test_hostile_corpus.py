@@ -32,7 +32,7 @@ SMALL = {"voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}
 
 
 @pytest.fixture
-def corpus(tmp_path: Path) -> Path:
+def corpus(compiled: None, tmp_path: Path) -> Path:
     """Good clips, playlists that name a file outside, a link to another, and clips with bytes changed or cut out."""
     folder, outside = tmp_path / "corpus", tmp_path / "outside"
     folder.mkdir()

@@ -12,8 +12,6 @@ from v2v_client import ServerLost, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_client.options import Patience
 
-pytestmark = pytest.mark.timeout(60)
-
 QUICK = Patience(ping_seconds=0.2, rewant_seconds=0.6)
 NEVER_BY_THE_CLOCK = Patience(ping_seconds=1000.0, rewant_seconds=1000.0)
 """A client that recovers with this patience noticed the cut itself."""
@@ -31,7 +29,7 @@ def proxy(server: LocalServer) -> Iterator[Proxy]:
 
 
 def dataset(
-    proxy: Proxy, patience: Patience = QUICK, timeout_seconds: float = 30.0, *, shared_memory: bool = False
+    proxy: Proxy, patience: Patience = QUICK, timeout_seconds: float = 60.0, *, shared_memory: bool = False
 ) -> V2VStreamDataset:
     """As on another host, unless it shares memory with the workers: then little but headers goes through the proxy."""
     return V2VStreamDataset(
@@ -146,6 +144,7 @@ def test_a_dead_connection_is_left_for_another(proxy: Proxy, undisturbed: list[s
     assert proxy.connections >= 2 + 3
 
 
+@pytest.mark.usefixtures("undisturbed")  # the workers have compiled
 def test_nothing_heard_within_the_deadline_names_address_and_last_sample(proxy: Proxy) -> None:
     batches = iter(dataset(proxy, timeout_seconds=3.5))
     first = next(batches)

@@ -13,13 +13,12 @@ from pathlib import Path
 
 import pytest
 
+from bench.processes import free_ports
 from tests.clips import panned_luma, write_clip
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
 from v2v_client import ServerLost, StateMismatch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_client.options import Patience
-
-pytestmark = pytest.mark.timeout(120)
 
 BATCHES_BEFORE = 2
 QUICK = Patience(ping_seconds=0.2, rewant_seconds=1.0)
@@ -58,33 +57,37 @@ def kill(server: LocalServer) -> None:
     os.kill(server.pid, signal.SIGKILL)
 
 
-def same_address(address: str) -> tuple[str, ...]:
-    return (*SMALL_FLAGS, "--bind", address)
+@pytest.fixture
+def flags() -> list[str]:
+    """Return flags with an address for two servers in turn: no connection gets its port in between."""
+    return [*SMALL_FLAGS, "--bind", f"tcp://127.0.0.1:{free_ports(1)[0]}"]
 
 
-def test_the_client_goes_on_with_a_restarted_server(clips: Path) -> None:
-    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as first:
+def test_the_client_goes_on_with_a_restarted_server(clips: Path, flags: list[str]) -> None:
+    with LocalServer(clips, workers=1, flags=flags) as first:
         address = first.address
         expected = [digest(batch) for batch in epoch_of(address)]
         with iterating(address) as (client, go_on):
             kill(first)
             go_on.set()  # it waits for samples while there is no server
-            with LocalServer(clips, workers=2, flags=same_address(address)):
+            with LocalServer(clips, workers=2, flags=flags):
                 assert client.result() == expected
     assert len(expected) > 2 * BATCHES_BEFORE
 
 
-def test_a_server_restarted_over_other_videos_is_refused_naming_both(clips: Path, tmp_path: Path) -> None:
+def test_a_server_restarted_over_other_videos_is_refused_naming_both(
+    clips: Path, tmp_path: Path, flags: list[str]
+) -> None:
     videos = tmp_path / "videos"
     shutil.copytree(clips, videos)
-    with LocalServer(videos, workers=1, flags=SMALL_FLAGS) as first:
+    with LocalServer(videos, workers=1, flags=flags) as first:
         address = first.address
         before = _catalogue(address)
         with iterating(address) as (client, go_on):
             kill(first)
             go_on.set()
             write_clip(videos / "one_more.mp4", panned_luma(64, 48, 64))
-            with LocalServer(videos, workers=1, flags=same_address(address)):
+            with LocalServer(videos, workers=1, flags=flags):
                 after = _catalogue(address)
                 assert before != after
                 expected = rf"catalogue_digest: this dataset has {before}, {address} has {after}; serve the same folder"
@@ -95,6 +98,7 @@ def test_a_server_restarted_over_other_videos_is_refused_naming_both(clips: Path
 def test_a_server_that_is_gone_for_good_is_given_up_naming_the_last_sample(clips: Path) -> None:
     with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:
         address = server.address
+        _catalogue(address)  # its worker is there, and has compiled
         with iterating(address, timeout_seconds=3.5) as (client, go_on):
             kill(server)
             go_on.set()

@@ -203,7 +203,7 @@ def event_errors(
     pyramid = pyramid_of(photograph)
     made = simulate(
         render(pyramid, world, seconds), threshold_pos=threshold, bins=1, gamma=GAMMA, log_eps=LOG_EPS, bits=12,
-        start_residual=START_LOG_UNITS, dtype="float32",
+        start_residual=START_LOG_UNITS,
     )  # fmt: skip
     given = made.given
     if substep_px:

@@ -126,6 +126,9 @@ def test_a_named_recipe_of_the_file_is_changed_too_and_without_one_the_papers(tm
         ServeConfig.load(str(file), {}, ["bins=3"])
 
 
+SMALL = "--videos a --bind tcp://127.0.0.1:* --set voxels_per_clip=1 --set crop_height_px=8 --set crop_width_px=8"
+
+
 @pytest.mark.parametrize(
     ("flags", "expected"), [("", 2), ("--workers 0 --expect-workers 64", 64), ("--workers 9 --expect-workers 5", 9)]
 )
@@ -141,7 +144,7 @@ def test_the_workers_that_a_credit_is_settled_for(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("v2v_server.serve.load_catalogue", lambda config: corpus(video("a.mp4")))
     monkeypatch.setattr("v2v_server.serve.Dispatcher", dispatcher)
     with pytest.raises(Stopped, match=f"^{expected}$"):
-        serve(f"--videos a --set voxels_per_clip=1 --set crop_height_px=8 --set crop_width_px=8 {flags}".split())
+        serve(f"{SMALL} {flags}".split())
 
 
 def test_an_empty_file_says_nothing(tmp_path: Path) -> None:

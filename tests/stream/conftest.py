@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -21,8 +22,17 @@ SMALL_FLAGS = ("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--se
 """The same for a server: it refuses to start when its own recipe gives no sequence."""
 
 
+@pytest.fixture(scope="package", autouse=True)
+def _patient_consumers() -> Iterator[None]:
+    """Let consumers wait ten minutes for a sample: on a busy host, a worker takes longer than one minute to start."""
+    defaults: Any = V2VStreamDataset.__init__.__kwdefaults__
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(defaults, "timeout_seconds", 600.0)
+        yield
+
+
 @pytest.fixture(scope="session")
-def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def clips(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Seven clips in several codecs and folders: 25 sequences under SMALL."""
     folder = tmp_path_factory.mktemp("clips")
     (folder / "deep" / "er").mkdir(parents=True)
@@ -50,7 +60,7 @@ def server(clips: Path) -> Iterator[LocalServer]:
 
 
 @pytest.fixture(scope="session")
-def clips_with_a_broken_one(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def clips_with_a_broken_one(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four good clips and one with garbage in the middle, which its container does not know of."""
     folder, aside = tmp_path_factory.mktemp("mixed"), tmp_path_factory.mktemp("aside")
     for number in range(4):
@@ -67,7 +77,7 @@ def _no_process_left() -> Iterator[None]:
     yield
     left = [process for process in psutil.Process().children(recursive=True) if process not in before]
     left = [process for process in left if "resource_tracker" not in _command(process)]
-    _, alive = psutil.wait_procs(left, timeout=30)
+    _, alive = psutil.wait_procs(left, timeout=60)
     for process in alive:
         with suppress(psutil.NoSuchProcess):
             process.kill()

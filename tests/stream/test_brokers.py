@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import time
 from pathlib import Path
 from typing import Any
 
@@ -48,12 +47,10 @@ def test_a_killed_broker_loses_and_repeats_no_sample(
         for process in ranks:
             process.start()
         for _ in ranks:
-            assert begun.acquire(timeout=60)
+            assert begun.acquire(timeout=600)
         psutil.Process(one.pid).kill()
-        killed = time.monotonic()
         go_on.set()
         by_rank = dict(results.get() for _ in ranks)
-        print(f"the epoch was whole {time.monotonic() - killed:.1f} s after the kill")
         for process in ranks:
             process.join()
     assert len(whole) == 26

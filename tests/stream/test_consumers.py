@@ -83,7 +83,7 @@ ALLOWANCE_BYTES = 24 << 20
 
 def _take_one(address: str, control: Connection) -> None:
     """Takes one batch, keeps it, and reads no more until it is told to; tells its memory at first."""
-    next(iter(V2VStreamDataset(address, batch_size=1, recipe=SMALL)))
+    next(iter(V2VStreamDataset(address, batch_size=1, recipe=SMALL, timeout_seconds=600.0)))  # of a new server
     control.send(psutil.Process().memory_info().rss)
     batches = iter(V2VStreamDataset(address, batch_size=BATCH_SIZE, recipe=LARGE, voxel_dtype="float32"))
     kept = next(batches)

@@ -17,6 +17,7 @@ from urllib.parse import unquote
 
 import pytest
 
+from bench.processes import free_ports
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
@@ -47,7 +48,7 @@ class Bucket:
 
     def __init__(self) -> None:
         self.fetched: list[str] = []
-        self._server = _server_at("127.0.0.1", 0)
+        self._server = _server_at("127.0.0.1", free_ports(1)[0])  # which it gets again after a pause
         host, port = self._server.get_host_and_port()
         self.address = f"http://{host}:{port}"
         handler = logging.Handler()
@@ -158,7 +159,7 @@ def test_a_deleted_object_is_a_refusal_with_its_reason(bucket: Bucket, tmp_path:
         assert refusals == {"a.mp4": f"is not in {URL} any more"}
     shown = subprocess.run(
         [sys.executable, "-m", "v2v_server.commands.quarantine", "--videos", URL],
-        capture_output=True, text=True, check=True, timeout=60,
+        capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert "holds 0 entries" in shown.stdout
     with LocalServer(URL, workers=0, flags=[*SMALL_FLAGS, "--list-refused"]) as server:

@@ -71,25 +71,18 @@ def workers() -> list[psutil.Process]:
     return sorted(found, key=lambda process: process.create_time())
 
 
-def test_a_cluster_gives_the_bytes_of_local_workers_whatever_dies(
-    clips: Path, cluster: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cluster_gives_the_bytes_of_local_workers_whatever_dies(clips: Path, cluster: Any) -> None:
     with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as local:
         reference = [digest(batch) for epoch in range(_EPOCHS) for batch in epoch_of(local.address, epoch=epoch)]
-    started = time.monotonic()
     with LocalServer(clips, workers=2, flags=flags_for(cluster)) as server:
         until(lambda: len(workers()) == 2)
-        first = time.monotonic() - started
         nodes = [raylet_of(process) for process in workers()]
         assert len(set(nodes)) == 2, "they are not spread"
         got: list[str] = []
-        took: dict[str, float] = {}
 
-        def back(what: str, gone: list[psutil.Process]) -> None:
-            """Waits until two others than those are at work."""
-            begun = time.monotonic()
+        def back(gone: list[psutil.Process]) -> None:
+            """Wait until two others than those are at work."""
             until(lambda: len(set(workers()) - set(gone)) == 2)
-            took[what] = time.monotonic() - begun
 
         for epoch in range(_EPOCHS):
             for number, batch in enumerate(
@@ -101,25 +94,23 @@ def test_a_cluster_gives_the_bytes_of_local_workers_whatever_dies(
                 victim = workers()[0]
                 if epoch == 0:
                     victim.kill()
-                    back("a worker killed", [victim])
+                    back([victim])
                 elif epoch == 1:
                     os.kill(victim.ppid(), signal.SIGKILL)  # its actor: the kernel ends the worker along with it
-                    back("an actor killed", [victim])
+                    back([victim])
                 else:
                     node = raylet_of(victim)
                     lost = [process for process in workers() if raylet_of(process) == node]
                     cluster.remove_node(
                         next(each for each in cluster.worker_nodes if pid_of_raylet(each) == node), allow_graceful=False
                     )
-                    back("a node killed", lost)
+                    back(lost)
                     assert {raylet_of(process) for process in workers()} != {node}
         said = log_of(server)
     assert got == reference
     assert "workers have a place on 2 nodes" in said
     assert "was lost with its actor on" in said
     until(lambda: not workers())
-    with capsys.disabled():
-        print(f"\nray: two workers up after {first:.1f} s; " + ", ".join(f"{k}: {v:.1f} s" for k, v in took.items()))
 
 
 def log_of(server: LocalServer) -> str:
@@ -135,7 +126,7 @@ def test_a_cluster_grows_while_a_consumer_waits_and_shrinks_again(clips: Path, c
         dataset = V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3)
 
         def until_there_are(count: int, pause: float) -> None:
-            deadline = time.monotonic() + 80.0
+            deadline = time.monotonic() + 300.0
             while len(workers()) != count and time.monotonic() < deadline:
                 epochs.append([])
                 for batch in dataset:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from bench.processes import free_ports
 from tests.clips import panned_luma, write_clip
-from tests.server.page.test_child import free_port
 
 pytestmark = [
     pytest.mark.skipif(
@@ -29,7 +29,8 @@ ROOT, OTHER_USER, ALICE = 0, 65534, 12345
 TAKE_A_BATCH = """
 import sys
 from v2v_client import V2VStreamDataset
-print(next(iter(V2VStreamDataset(sys.argv[1], batch_size=2))).voxels.shape)
+# This user's worker may have to compile the kernels.
+print(next(iter(V2VStreamDataset(sys.argv[1], batch_size=2, timeout_seconds=600.0))).voxels.shape)
 """
 
 
@@ -143,7 +144,7 @@ def test_the_page_is_for_the_same_user_unless_it_is_insecure(serve: Callable[...
             if asked.stdout != "503\n":  # not answered by the server yet
                 return asked.stdout
 
-    closed, opened = free_port(), free_port()
+    closed, opened = free_ports(2)
     _, log = serve(ALICE, "--workers", "0", "--page", str(closed))
     assert got(closed, ALICE) == "200\n"
     assert got(closed, ROOT) == "200\n"

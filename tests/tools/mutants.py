@@ -1,12 +1,19 @@
 """Measure the power of the tests: change one operator or constant at a time and see whether a test fails.
 
-Run: python -m tests.tools.mutants --count 500 --seed 1 --coverage .coverage --out mutants.json
+Run: python -m pytest -m "not slow" --cov --cov-branch --cov-context=test --cov-report=
+     python -m tests.tools.mutants --count 500 --seed 1 --coverage .coverage --out mutants.json
 
-The tests of a changed line come from a coverage database with one context per test (pytest-cov's
-`--cov-context=test`); lines without one (compiled kernels, subprocesses) use the folder of tests that mirrors the
-module. Mutants of the kernels come last: each of them compiles every kernel again. Two runs with one seed on the same
-product code draw the same mutants, so that a suite before and after a change of its tests can be compared module by
-module (`--compare BEFORE.json`).
+The tests of a changed line come from the coverage database, which has a context for each test. What survives them, and
+lines without a context (compiled kernels, subprocesses), meet a second stage: the tests that mirror the module, and
+whole files of others that run the line or import the module. A run that was stopped continues from its file. Two runs
+with one seed on the same product code draw the same mutants, so that a suite before and after a change of its tests
+can be compared module by module (`--compare BEFORE.json`).
+
+Compiling the kernels takes longer than their tests, and each of their mutants compiles them. So its first stage is the
+tests of UNCOMPILED, in which the kernels run as Python. Only survivors are compiled. Mutants of the kernels come last.
+
+This module is also the plugin of pytest in these runs. Examples of hypothesis are the same in every run, and one that
+fails is not made smaller. For uncompiled kernels it defines in Python what only compiled code has.
 """
 
 import argparse
@@ -14,6 +21,7 @@ import ast
 import json
 import os
 import random
+import re
 import signal
 import sqlite3
 import subprocess
@@ -24,13 +32,26 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
 from shutil import copytree, ignore_patterns
+from typing import Any, NamedTuple
+
+import numpy as np
+from hypothesis import Phase, settings
 
 PACKAGES = ("v2v_protocol", "v2v_server", "v2v_tools", "v2v_client", "v2v_pictures", "v2v_recordings", "trainer")
 MOST_TESTS = 40
+MOST_FILES = 20
 TIMEOUT_SECONDS = 300
-KERNELS = ("v2v_server/simulation/", "v2v_server/motion/")
+KERNELS = ("v2v_server/simulation/", "v2v_server/motion/", "v2v_server/worlds/")
+UNCOMPILED = (
+    *(f"tests/server/simulation/test_{name}.py" for name in ("pixel", "draw", "view", "durations")),
+    "tests/server/simulation/test_effects.py::test_kernel_equals_the_oracle",
+)
+"""Tests of the kernels that take seconds uncompiled, by file or by name."""
+_BLOCK = 32
+"""PIXELS_A_BLOCK of the kernels there: each block is simulated whole, however small the picture."""
 
 _COMPARISONS: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Lt: ast.LtE,
@@ -63,19 +84,6 @@ class Mutant:
     column: int
     old: str
     new: str
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """What the tests said of a mutant: "killed", "survived", "untested" (no test reaches it) or "unfinished".
-
-    Tests that take longer than TIMEOUT_SECONDS are unfinished: the mutant never ends, or the machine is slow.
-    """
-
-    mutant: Mutant
-    outcome: str
-    tests: int
-    seconds: float
 
 
 def mutants_of(path: str, source: str) -> Iterator[tuple[Mutant, str]]:
@@ -172,31 +180,101 @@ def lines_of(contexts: Mapping[tuple[str, int], list[str]]) -> Counter[str]:
     return Counter(name for names in contexts.values() for name in set(names))
 
 
-def tests_for(
+class Stage(NamedTuple):
+    """Tests that run together, and whether kernels are compiled for them."""
+
+    tests: list[str]
+    is_compiled: bool = True
+
+
+def stages_for(
     mutant: Mutant, contexts: Mapping[tuple[str, int], list[str]], lines: Mapping[str, int], root: Path
-) -> list[list[str]]:
+) -> list[Stage]:
     """Choose the tests of a mutant: at most MOST_TESTS that run its line, those that run the fewest lines first.
 
-    What survives them meets the folder of tests that mirrors the module: results of fixtures that tests share count
-    for one test only.
+    What survives them meets the tests that mirror the module, and at most MOST_FILES whole files of tests that run the
+    line, or import the module if none is known to: results of fixtures that tests share count for one test only.
     """
-    package, *rest = Path(mutant.path).with_suffix("").parts
-    mirror = Path("tests", package.removeprefix("v2v_"), *rest[:-1])
     names = sorted(set(contexts.get((mutant.path, mutant.line), [])), key=lambda name: (lines[name], name))
-    folder = [str(mirror)] if (root / mirror).is_dir() else []
-    return [chosen for chosen in (names[:MOST_TESTS], folder) if chosen]
+    mirror = mirror_of(mutant.path, root)
+    files = dict.fromkeys(name.partition("::")[0] for name in names) or importers_of(mutant.path, root)
+    others = [file for file in files if not file.startswith(tuple(mirror))][:MOST_FILES]
+    first = Stage(names[:MOST_TESTS])
+    if mutant.path.startswith(KERNELS):
+        own = [name for name in names if name.startswith(UNCOMPILED)][:MOST_TESTS]
+        first = Stage(own or [file for file in UNCOMPILED if file.startswith(tuple(mirror))], is_compiled=False)
+    return [stage for stage in (first, Stage([*mirror, *others])) if stage.tests]
 
 
-def judge(mutant: Mutant, source: str, tests: list[list[str]], tree: Path) -> Verdict:
-    """Run a mutant's tests in a copy of the tree until some fail, and restore the file."""
+def mirror_of(path: str, root: Path) -> list[str]:
+    """Name the folder of tests nearest to a module's place, or else the files of its package's tests."""
+    package, *rest = Path(path).with_suffix("").parts
+    home = root / "tests" / package
+    home = home if home.is_dir() else home.with_name(package.removeprefix("v2v_"))
+    place = home.joinpath(*rest)
+    folders = [folder for folder in (place, *place.parents[: len(rest) - 1]) if folder.is_dir()]
+    return [str(file.relative_to(root)) for file in folders[:1] or sorted(home.glob("test_*.py"))]
+
+
+def importers_of(path: str, root: Path) -> list[str]:
+    """Name the test files that import a module, by the text of their imports."""
+    module = ".".join(Path(path).with_suffix("").parts).removesuffix(".__init__")
+    package, _, name = module.rpartition(".")
+    imported = re.compile(
+        rf"\b{re.escape(module)}(?![.\w])|^from {re.escape(package)} import .*\b{name}\b", re.MULTILINE
+    )
+    files = sorted((root / "tests").rglob("test_*.py"))
+    return [str(file.relative_to(root)) for file in files if imported.search(file.read_text("utf-8"))]
+
+
+def pytest_configure() -> None:
+    """Choose the examples of hypothesis, and let the kernels run as Python under ``NUMBA_DISABLE_JIT=1``."""
+    phases = (Phase.explicit, Phase.generate)
+    settings.register_profile("mutants", parent=settings.get_profile("ci"), phases=phases)
+    settings.load_profile("mutants")
+    if "NUMBA_DISABLE_JIT" in os.environ:
+        _define_in_python()
+
+
+def _define_in_python() -> None:
+    """Replace what numba's language adds to numpy."""
+    in_python: dict[str, Any] = {
+        "float_of_bits": lambda bits: bits.view(np.float32),
+        "bits_of_float": lambda value: value.view(np.int32),
+        "use_widest_vectors": lambda: None,
+        "look_up_by_permutation": lambda *_: 0,
+    }
+    numba: Any = import_module("numba.extending")
+    numba.intrinsic = lambda function: in_python.get(function.__name__, function)
+    pixel: Any = import_module("v2v_server.simulation.pixel")
+    pixel._log_intensity = lambda table, value: table[value] if isinstance(value, np.integer) else value
+    pixel.PIXELS_A_BLOCK = _BLOCK  # modules that import it come later
+    narrow = pixel.store
+
+    def store(counts: Any, limit: Any, stored: Any) -> Any:
+        wide = np.empty(len(stored))  # before they are clipped, numpy refuses counts that the dtype does not hold
+        clipped = narrow(counts, limit, wide)
+        stored[:] = wide
+        return clipped
+
+    pixel.store = store
+    np.seterr(over="ignore")  # words of 32 bits wrap around
+
+
+def judge(mutant: Mutant, source: str, stages: list[Stage], tree: Path) -> dict[str, object]:
+    """Run a mutant's tests in a copy of the tree until some fail, and restore the file; return a row of the results.
+
+    Its outcome is "killed", "survived", "untested" (no test reaches it) or "unfinished": tests took longer than
+    TIMEOUT_SECONDS, so the mutant never ends, or the machine is slow.
+    """
     began = time.monotonic()
     path = tree / mutant.path
     healthy, when = path.read_bytes(), path.stat()
     path.write_text(source, "utf-8")
     outcome = "untested"
     try:
-        for chosen in tests:
-            passed = _pass(chosen, tree)
+        for stage in stages:
+            passed = _pass(stage, tree)
             if passed is None and outcome != "survived":
                 outcome = "unfinished"
             elif passed is not None:
@@ -206,15 +284,18 @@ def judge(mutant: Mutant, source: str, tests: list[list[str]], tree: Path) -> Ve
     finally:
         path.write_bytes(healthy)
         os.utime(path, ns=(when.st_atime_ns, when.st_mtime_ns))  # its bytecode is valid again
-    return Verdict(mutant, outcome, sum(map(len, tests)), time.monotonic() - began)
+    tests = sum(len(stage.tests) for stage in stages)
+    return asdict(mutant) | {"outcome": outcome, "tests": tests, "seconds": time.monotonic() - began}
 
 
-def _pass(tests: list[str], tree: Path) -> bool | None:
+def _pass(stage: Stage, tree: Path) -> bool | None:
     """Return whether tests pass; None if they take longer than TIMEOUT_SECONDS."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", __spec__.name]
+    environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     running = subprocess.Popen(
-        [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests],
+        [*command, "-m", "not slow", *stage.tests],
         cwd=tree,
-        env=os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"},
+        env=environment if stage.is_compiled else environment | {"NUMBA_DISABLE_JIT": "1"},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
@@ -269,18 +350,22 @@ def main() -> int:
                 stdout=subprocess.DEVNULL,
                 check=True,
             )  # writes the bytecode, which each mutant's tests read
+        if any(mutant.path.startswith(KERNELS) for mutant, _ in todo) and not _pass(
+            Stage(list(UNCOMPILED), is_compiled=False), trees[0]
+        ):
+            raise SystemExit(f"a test of UNCOMPILED fails without a mutant, or all take over {TIMEOUT_SECONDS} s")
         free = list(trees)
 
-        def run(pair: tuple[Mutant, str]) -> Verdict:
+        def run(pair: tuple[Mutant, str]) -> dict[str, object]:
             tree = free.pop()
             try:
-                return judge(*pair, tests_for(pair[0], contexts, lines, root), tree)
+                return judge(*pair, stages_for(pair[0], contexts, lines, root), tree)
             finally:
                 free.append(tree)
 
         with ThreadPoolExecutor(options.jobs) as pool:
-            for verdict in pool.map(run, todo):
-                rows.append(asdict(verdict.mutant) | {k: v for k, v in asdict(verdict).items() if k != "mutant"})
+            for row in pool.map(run, todo):
+                rows.append(row)
                 options.out.write_text(json.dumps(rows, indent=1))
     found, total = kills(rows), Counter(module_of(str(row["path"])) for row in rows)
     before = kills(json.loads(options.compare.read_text())) if options.compare else Counter[str]()

@@ -137,7 +137,7 @@ def test_two_ranks_with_validation_go_on_after_a_kill_as_if_there_had_been_none(
 
 
 @pytest.fixture(scope="module")
-def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def clips(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four small films: 16 sequences of 16 frames."""
     folder = tmp_path_factory.mktemp("clips")
     for number in range(4):

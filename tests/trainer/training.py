@@ -19,7 +19,7 @@ SMALL: dict[str, Any] = {
     "stream": {
         "batch_size": 4,
         "recipe": {"voxels_per_clip": 3, "bins": 2, "crop_height_px": 16, "crop_width_px": 20},
-        "timeout_seconds": 30,
+        "timeout_seconds": 60,
     },
     "optimizer": {
         "learning_rate": 0.01,

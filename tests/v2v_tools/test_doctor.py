@@ -37,19 +37,12 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def told(capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
-    status = command.main(flags)
+    status = command.main(("--port", "0", *flags))  # the system chooses one that is free
     return status, capsys.readouterr().out
 
 
-def free_port() -> int:
-    with socket.socket() as taker:
-        taker.bind(("127.0.0.1", 0))
-        port: int = taker.getsockname()[1]
-        return port
-
-
 def test_nothing_is_in_the_way_where_tests_run(capsys: pytest.CaptureFixture[str]) -> None:
-    status, said = told(capsys, "--port", str(free_port()))
+    status, said = told(capsys)
     assert status == 0
     assert "is free" in said
     assert ", libx264\n" in said
@@ -122,7 +115,7 @@ def test_a_server_without_torch_is_whole(monkeypatch: pytest.MonkeyPatch, capsys
 
     monkeypatch.setattr(command.metadata, "version", without_torch)
     monkeypatch.setattr(command, "_torch", lambda: Finding(BAD, "torch", "was loaded"))
-    status, said = told(capsys, "--port", str(free_port()))
+    status, said = told(capsys)
     assert status == 0
     assert "torch" not in said
     assert "no problems found" in said
@@ -177,7 +170,7 @@ def test_it_starts_where_nothing_else_is_installed() -> None:
     """It has to say so there: what it imports at its start is the standard library, numpy and msgpack."""
     others = ("av", "zmq", "numba", "cv2", "yaml", "rich", "torch", "psutil")
     program = f"import sys, v2v_tools.doctor.command\nprint(*sorted(set({others!r}) & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
 
 

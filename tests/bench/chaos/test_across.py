@@ -11,7 +11,7 @@ from bench.__main__ import main
 from bench.chaos.chaos import FAILING
 from tests.bench.small import clips, records
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
+pytestmark = pytest.mark.slow
 
 
 def test_nothing_is_lost_on_a_lossy_cable_that_is_cut(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

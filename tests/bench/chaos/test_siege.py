@@ -28,7 +28,6 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)  # after each kind it waits until the server's memory is back
 @pytest.mark.parametrize("kinds", [tuple(KINDS)[0::3], tuple(KINDS)[1::3], tuple(KINDS)[2::3]])
 def test_every_kind_is_survived_and_the_memory_comes_back(tmp_path: Path, corpus: Path, kinds: tuple[str, ...]) -> None:
     fleet = Fleet(tmp_path / "fleet", corpus, 1, 2, 60.0, server_module=MODULE, server_flags=CREDIT_FLAGS)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from bench.processes import free_ports
 from tests.clips import panned_luma, write_clip
-from tests.server.page.test_child import free_port
 from tests.waiting import until
 from v2v_server.commands import serve as command
 from v2v_server.config import ServeConfig
@@ -46,7 +46,14 @@ def test_every_line_of_a_run_is_an_object(tmp_path: Path) -> None:
     (videos / "other.foo").write_bytes(b"")
     flags = [
         *("--videos", str(videos), "--bind", "tcp://127.0.0.1:*", "--workers", "0", "--log-format", "json"),
-        *("--page", str(free_port()), "--cache-dir", str(tmp_path / "cache"), "--port-file", str(tmp_path / "port")),
+        *(
+            "--page",
+            str(free_ports(1)[0]),
+            "--cache-dir",
+            str(tmp_path / "cache"),
+            "--port-file",
+            str(tmp_path / "port"),
+        ),
         *("--set", "crop_height_px=48", "--set", "crop_width_px=64", "--set", "voxels_per_clip=4"),
     ]
     command_line = [sys.executable, "-m", "v2v_protocol.programs", "serve", *flags]

@@ -17,6 +17,7 @@ from typing import Any
 import psutil
 import pytest
 
+from bench.processes import free_ports
 from tests.clips import panned_luma, write_clip
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
@@ -26,11 +27,6 @@ from v2v_server.config import ServeConfig
 from v2v_server.page.child import PageProcess
 
 SMALL = ("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=40")
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        return int(listening.getsockname()[1])
 
 
 def got(port: int, path: str, host: str | None = None) -> tuple[int, str]:
@@ -72,7 +68,7 @@ def test_an_unknown_host_is_reported() -> None:
 def test_a_package_that_is_missing_is_said_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("v2v_server.page.child.find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"starlette, which is not installed; the extra 'page' brings it"):
-        PageProcess("127.0.0.1", free_port())
+        PageProcess("127.0.0.1", 0)
 
 
 def test_a_page_that_others_can_reach_is_typed_out() -> None:
@@ -103,7 +99,7 @@ def test_a_process_that_ends_is_said_and_started_again_ever_more_slowly(monkeypa
 
     started: list[float] = []
     monkeypatch.setattr(PageProcess, "_started", lambda self: started.append(now) or Ended())
-    page, said, now = PageProcess("127.0.0.1", free_port()), [], 0.0
+    page, said, now = PageProcess("127.0.0.1", 0), [], 0.0
     assert page.watch(now) == []  # not started yet
     page.start("ipc://somewhere")
     while now < 20.0:
@@ -116,7 +112,7 @@ def test_a_process_that_ends_is_said_and_started_again_ever_more_slowly(monkeypa
 
 
 @pytest.fixture
-def clips(tmp_path: Path) -> Path:
+def clips(compiled: None, tmp_path: Path) -> Path:
     for number in range(3):
         write_clip(tmp_path / f"{number}.mp4", panned_luma(60, 48, 64, step=(1, 1 + number)))
     return tmp_path
@@ -124,7 +120,7 @@ def clips(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def served(clips: Path) -> Iterator[tuple[LocalServer, int]]:
-    port = free_port()
+    (port,) = free_ports(1)
     with LocalServer(clips, workers=1, flags=[*SMALL, "--page", str(port)]) as server:
         yield server, port
 
@@ -136,7 +132,7 @@ def test_a_server_with_a_page_is_watched_over_http_and_survives_the_pages_death(
     server, port = served
     until(lambda: got(port, "/readyz")[0] == 200)
     assert got(port, "/state", "evil.example")[0] == 421
-    batches = iter(V2VStreamDataset(server.address, batch_size=2, patience=None))
+    batches = iter(V2VStreamDataset(server.address, batch_size=2, timeout_seconds=600.0))
     next(batches)
     state: dict[str, Any] = {}
 
@@ -160,14 +156,14 @@ def test_a_server_with_a_page_is_watched_over_http_and_survives_the_pages_death(
     page.kill()
     next(batches)
     until(lambda: page_of(server.pid) not in (None, page))
-    assert got(port, "/healthz")[0] == 200
+    until(lambda: got(port, "/healthz")[0] == 200)
     assert "the page's process was ended by SIGKILL; samples are not affected" in server.last_lines()
     batches.close()  # type: ignore[attr-defined]
 
 
 @pytest.mark.slow
 def test_the_page_ends_with_its_server_even_when_that_is_killed(clips: Path) -> None:
-    port = free_port()
+    (port,) = free_ports(1)
     server = subprocess.Popen(
         [
             *(sys.executable, "-m", "v2v_server", "--videos", str(clips), "--workers", "0", *SMALL),
@@ -191,7 +187,7 @@ def test_the_page_ends_with_its_server_even_when_that_is_killed(clips: Path) -> 
 
 @pytest.mark.slow
 def test_with_keys_the_page_needs_none(clips: Path, tmp_path: Path) -> None:
-    keys, port = tmp_path / "keys", free_port()
+    keys, (port,) = tmp_path / "keys", free_ports(1)
     made = subprocess.run(
         [sys.executable, "-m", "v2v_protocol.programs", "keys", "init", "--dir", str(keys)], check=False
     )
@@ -211,7 +207,10 @@ def test_a_browser_that_reads_nothing_does_not_stall_others(served: tuple[LocalS
         one.sendall(b"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
     for epoch in range(4):  # states go on being made, and samples on being sent
         before = got(port, "/state")[1]
-        assert next(iter(V2VStreamDataset(server.address, batch_size=2, epoch=epoch))).epoch == epoch
+        assert (
+            next(iter(V2VStreamDataset(server.address, batch_size=2, epoch=epoch, timeout_seconds=600.0))).epoch
+            == epoch
+        )
         until(lambda before=before: got(port, "/state")[1] != before)  # type: ignore[misc]
     for one in stalled:
         one.close()

@@ -11,9 +11,10 @@ from typing import Any
 import psutil
 import pytest
 
+from bench.processes import free_ports
 from tests.clips import panned_luma, write_clip
 from tests.server.page.browser import CHROMIUM, Browser
-from tests.server.page.test_child import SMALL, free_port, got
+from tests.server.page.test_child import SMALL, got
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
@@ -56,7 +57,7 @@ class Consumer:
 
 
 @pytest.fixture(scope="module")
-def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def clips(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("page-clips")
     for number in range(8):
         write_clip(folder / f"{number}.mp4", panned_luma(120, 64, 80))
@@ -67,7 +68,7 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def port() -> int:
-    return free_port()
+    return free_ports(1)[0]
 
 
 @pytest.fixture

@@ -173,12 +173,12 @@ from tests.server.simulation.test_clip import EFFECTS, FRAMES, PARAMS, RECIPE
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.kernels import simulate_general, simulate_pixels
 from v2v_server.simulation.pixel import words
-from v2v_server.simulation.precision import warm_up
+from v2v_server.worker.warm_up import warm_up_in_turn
 
 def count():
     return [len(kernel.signatures) for kernel in (simulate_pixels, simulate_general, words)]
 
-warm_up()
+warm_up_in_turn()
 seen = [count()]
 for dtype in ("int8", "int16", "float32"):
     simulate_clip(FRAMES, PARAMS, RECIPE, dtype)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.server.simulation.test_pixel import moving_frames
-from tests.server.simulation.test_times import ALL, FPS, again
+from tests.server.simulation.test_times import ALL, CONTRAST, FPS, again
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_server.simulation import simulate, simulate_clip, simulate_log
@@ -28,8 +28,11 @@ def surface(made: Voxels, **changes: Any) -> np.ndarray:
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_a_pixel_with_known_crossings(precision: str) -> None:
     """It rises by 1 in 2 s from half a threshold: events every 0.4 s from 0.2 s on; it rests; it falls as fast."""
-    level = np.array([0.0, 1.0, 1.0, 0.0])[:, None, None]
-    made = simulate_log(level, threshold_pos=0.2, start_residual=0.1, bins=1, dtype="float32", precision=precision)
+    frames = np.array([0, 255, 255, 0], np.uint8)[:, None, None]  # log intensities would take another kernel
+    made = simulate(
+        frames, threshold_pos=0.2 * CONTRAST, start_residual=0.1 * CONTRAST, bins=1, dtype="float32",
+        precision=precision,
+    )  # fmt: skip
     ages = surface(made, step_seconds=np.full(3, 2.0))
     # The last positive event is at 1.8 s. Falling events are due 0.3 after the turn: at 4.6, 5.0, 5.4, 5.8 s.
     np.testing.assert_allclose(ages[:, :, 0, 0, 0], [[NONE, 0.2], [NONE, 2.2], [0.2, 4.2]], atol=1e-5)

@@ -27,7 +27,7 @@ MUCH = {
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Clips that take next to nothing to decode."""
     folder = tmp_path_factory.mktemp("small")
     for number in range(4):
@@ -36,7 +36,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def large(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Clips that have to be decoded from far before."""
     folder = tmp_path_factory.mktemp("large")
     for number in range(2):
@@ -45,7 +45,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def near(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def near(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Clips as large that are decoded from just before."""
     folder = tmp_path_factory.mktemp("near")
     for number in range(2):

@@ -72,8 +72,8 @@ def test_many_are_counted() -> None:
     assert "and 70 more" in drawn(state)
 
 
-def test_an_absent_server_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--connect", "tcp://127.0.0.1:1", "--once", "--timeout-seconds", "0.2"]) == 1
+def test_an_absent_server_is_an_error(capsys: pytest.CaptureFixture[str], unused_port: int) -> None:
+    assert main(["--connect", f"tcp://127.0.0.1:{unused_port}", "--once", "--timeout-seconds", "0.2"]) == 1
     assert "no answer for 0.2 s; is v2v-serve running there?" in capsys.readouterr().err
 
 

@@ -66,6 +66,13 @@ def all_dead(pool: Pool) -> None:
     until(lambda: pool.running == 0)
 
 
+def deaths_at(pool: Pool, now: float) -> list[Death]:
+    """Start workers that end by themselves, perhaps before this call of ``watch`` returns; return their deaths."""
+    deaths = pool.watch(now, 0)
+    all_dead(pool)
+    return deaths + pool.watch(now, 0)
+
+
 def is_loaded(pid: int) -> bool:
     """Whether the process runs its program: before that it still has the signal handlers of the one it came from."""
     return b"label-" in Path(f"/proc/{pid}/cmdline").read_bytes()
@@ -261,17 +268,14 @@ def test_all_that_are_killed_at_once_for_want_of_memory_are_told_so_and_none_lon
 
 
 def test_the_kernels_count_of_such_kills_is_read() -> None:
-    said = Path("/proc/vmstat").read_text(encoding="ascii")
-    assert f"\noom_kill {child_module.out_of_memory_kills()}\n" in said
+    counted = child_module.out_of_memory_kills
+    until(lambda: f"\noom_kill {counted()}\n" in Path("/proc/vmstat").read_text(encoding="ascii"))
 
 
 @pytest.mark.parametrize("status", [0, 1, 3])
 def test_an_exit_is_not_blamed_on_the_sample(start: Callable[[int, str], Pool], status: int) -> None:
     pool = start(1, f"import sys\nsys.exit({status})")
-    deaths = pool.watch(0.0, 0)  # it may have ended before this returns
-    all_dead(pool)
-    deaths += pool.watch(0.0, 0)
-    assert deaths == [Death(b"label-0.1", Loss(Cause.UNEXPLAINED, f"exited with status {status}"))]
+    assert deaths_at(pool, 0.0) == [Death(b"label-0.1", Loss(Cause.UNEXPLAINED, f"exited with status {status}"))]
 
 
 def test_a_worker_that_was_given_up_is_killed_and_not_reported_again(start: Callable[[int, str], Pool]) -> None:
@@ -417,14 +421,10 @@ def test_workers_that_only_die_use_up_the_budget(start: Callable[[int, str], Poo
     assert crash_budget(1) == 7
     now = 0.0
     for _ in range(crash_budget(1)):
-        pool.watch(now, 0)
-        all_dead(pool)
-        assert len(pool.watch(now, 0)) == 1
+        assert len(deaths_at(pool, now)) == 1
         now += 60.0
-    pool.watch(now, 0)
-    all_dead(pool)
     with pytest.raises(WorkerCrashLoop, match=r"8 server workers died in a row .* \(limit 7\).*exited with status 3"):
-        pool.watch(now, 0)
+        deaths_at(pool, now)
 
 
 def test_any_finished_sample_forgives(start: Callable[[int, str], Pool]) -> None:

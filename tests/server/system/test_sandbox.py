@@ -36,7 +36,7 @@ def in_thread(what):
 
 def said(program: str, *arguments: str) -> list[str]:
     done = subprocess.run(
-        [sys.executable, "-c", TRY + program, *arguments], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", TRY + program, *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.split()

@@ -17,7 +17,7 @@ from typing import Any
 import psutil
 import pytest
 
-from tests.waiting import until
+from tests.waiting import has_ended, until
 from v2v_server.worker import warm_up as module
 from v2v_server.worker.warm_up import one_compiles, warm_up_in_turn
 
@@ -32,14 +32,6 @@ def is_held(folder: Path) -> bool:
         except BlockingIOError:
             return True
     return False
-
-
-def has_ended(process: psutil.Process) -> bool:
-    """Return whether the process is gone or a zombie that its new parent has not reaped."""
-    try:
-        return process.status() == psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return True
 
 
 def test_the_first_process_holds_the_lock_and_later_ones_need_none(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ from v2v_server.worker import process as worker_module
 from v2v_server.worker.conversation import Reconnect, Send
 from v2v_server.worker.process import Clips, OutputBuffer, Worker, run_worker
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 LEASE: Lease = replace(example(Lease), indices=(3,), arena="", slot=0)
 LAYOUT: Layout = {"voxels": ("int8", (2, 2))}
 VARIANT = Variant("int16", True, "float32")
@@ -180,9 +180,9 @@ def test_a_new_connection_has_a_new_routing_id(tmp_path: Path) -> None:
     assert all(len(identity) == 16 and identity != b"w" for identity in found)
 
 
-def test_a_worker_whose_server_is_away_keeps_to_the_ip_version(tmp_path: Path) -> None:
+def test_a_worker_whose_server_is_away_keeps_to_the_ip_version(tmp_path: Path, unused_port: int) -> None:
     """With the other one it would not find the server again until its next new connection, minutes later."""
-    worker = Worker("w", Folder(tmp_path), "tcp://localhost:1")
+    worker = Worker("w", Folder(tmp_path), f"tcp://localhost:{unused_port}")
     try:
         for _ in range(3):
             worker._do(Reconnect())

@@ -189,7 +189,9 @@ def test_a_lost_server_costs_no_steps(tmp_path: Path, capsys: pytest.CaptureFixt
     assert (tmp_path / "run" / METRICS_FILE).is_file()
 
 
-def test_an_unreachable_server_leaves_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    message = refused(tmp_path, f"ipc://{tmp_path}/unbound", capsys, stream__timeout_seconds=0.1)
+def test_an_unreachable_server_leaves_no_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], unused_port: int
+) -> None:
+    message = refused(tmp_path, f"tcp://127.0.0.1:{unused_port}", capsys, stream__timeout_seconds=0.1)
     assert "nothing received" in message
     assert not (tmp_path / "run" / LAST).exists()
