@@ -258,6 +258,7 @@ if [ -f "$backbone" ] && [ -f "$heads" ]; then
     firenet=(--set "loss.lpips_backbone=$backbone" --set "loss.lpips_heads=$heads")
     lpips=(--lpips squeeze "$backbone" "$heads")
 fi
+firenet+=(--set stream.videos_kind=videos --set stream.recipe.preset=paper) # the configuration is for photographs
 backbone=$WEIGHTS/vgg16-397923af.pth heads=$WEIGHTS/lpips-v0.1-vgg.pth
 if [ -f "$backbone" ] && [ -f "$heads" ]; then
     e2vid=(--set "loss.lpips_backbone=$backbone" --set "loss.lpips_heads=$heads")

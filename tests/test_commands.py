@@ -40,8 +40,8 @@ _LAUNCHED = {
     "examples/overfit.py": "examples.overfit",
     "examples/detect.py": "examples.detect",
     "examples/render_sprites.py": "examples.render_sprites",
-    "examples/pan_photographs.py": "examples.pan_photographs",
     "examples/draw_curve.py": "examples.draw_curve",
+    "examples.firenet_data": "examples.firenet_data",
     "examples.ray_train": "examples.ray_train",
     "trainer.run.export": "trainer.run.export",
 }

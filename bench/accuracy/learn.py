@@ -1,13 +1,14 @@
 """Judge networks on simulated samples of held-out videos, by LPIPS and correlation.
 
-    python -m bench learn --held-out DIR --lpips squeeze BACKBONE HEADS \\
+    python -m bench learn --held-out DIR --photographs DIR --lpips squeeze BACKBONE HEADS \\
         --weights ours=runs/firenet/last.pt --ema-weights average=runs/firenet/last.pt \\
         --normalized-weights published=firenet.pth --json FILE
 
-All networks get the same samples of 128 x 128 pixels and 20 voxel grids, once under each of two sets of cameras:
-`ordinary` has the ranges of `tiny-cpu` (thresholds .1 to .4, little noise, no pauses), `paper` those of the paper
-(thresholds .05 to 3, noise, hot pixels, pauses). Only the later half of every clip counts, where a network has seen
-enough events. The baseline is a constant picture: the mean grey of the judged frames.
+All networks get the same samples of 128 x 128 pixels and 20 voxel grids, once under each set of cameras: `ordinary`
+has the ranges of `tiny-cpu` (thresholds .1 to .4, little noise, no pauses), `paper` those of the paper (thresholds .05
+to 3, noise, hot pixels, pauses), and `worlds` the ordinary ranges over photographs that move. Only the later half of
+every clip counts, where a network has seen enough events. The baseline is a constant picture: the mean grey of the
+judged frames.
 """
 
 from __future__ import annotations
@@ -32,14 +33,14 @@ from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Recipe
+from v2v_protocol.recipe import PRESET_FIELDS, Recipe
 
 SIDE_PX = 128
 STEPS = 20
-CAMERAS: Mapping[str, Mapping[str, Any]] = {
-    "ordinary": {"threshold": (0.1, 0.4), "noise_sigma": (0.0, 0.02), "pause_probability": 0.0},
-    "paper": {},
-}
+_ORDINARY: Mapping[str, Any] = {"threshold": (0.1, 0.4), "noise_sigma": (0.0, 0.02), "pause_probability": 0.0}
+CLIPS: Mapping[str, Mapping[str, Any]] = {"ordinary": _ORDINARY, "paper": {}}
+PHOTOGRAPHS: Mapping[str, Mapping[str, Any]] = {"worlds": PRESET_FIELDS["worlds"] | _ORDINARY}
+"""Recipe fields of each set of cameras, for clips and for photographs."""
 _SEED = 2**32
 _BATCH = 4
 _GREY = "constant grey"
@@ -54,20 +55,23 @@ _COLUMNS: tuple[Column, ...] = (
 )
 
 Predict = Callable[[Tensor], Tensor]
+Samples = tuple[Tensor, Tensor]
 
 
-def held_out(videos: str, samples: int) -> dict[str, tuple[Tensor, Tensor]]:
+def held_out(videos: str, kind: str, cameras: Mapping[str, Mapping[str, Any]], samples: int) -> dict[str, Samples]:
     """Return the samples to judge by, by set of cameras: voxels int8 [N, T, bins, H, W], frames [N, T, 1, H, W]."""
     recipes = {
         name: Recipe(voxels_per_clip=STEPS, crop_height_px=SIDE_PX, crop_width_px=SIDE_PX, **changes)
-        for name, changes in CAMERAS.items()
+        for name, changes in cameras.items()
     }
-    flags = ["--set", f"voxels_per_clip={STEPS}"]
-    with LocalServer(videos, workers=1, flags=flags) as server:
+    preset = ["--preset", "worlds"] if kind == "photographs" else []
+    with LocalServer(
+        videos, workers=1, flags=["--videos-kind", kind, *preset, "--set", f"voxels_per_clip={STEPS}"]
+    ) as server:
         return {name: _samples(server.address, recipe, samples) for name, recipe in recipes.items()}
 
 
-def _samples(address: str, recipe: Recipe, samples: int) -> tuple[Tensor, Tensor]:
+def _samples(address: str, recipe: Recipe, samples: int) -> Samples:
     dataset = V2VStreamDataset(address, batch_size=1, recipe=recipe, seed=_SEED, preset="exact")
     with contextlib.closing(endless(dataset)) as batches:
         found = list(itertools.islice(batches, samples))
@@ -121,6 +125,7 @@ def networks(asked: argparse.Namespace) -> dict[str, VoxelNetwork]:
 def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     parser.add_argument("--held-out", required=True, metavar="DIR", help="videos that no network was trained on")
+    parser.add_argument("--photographs", metavar="DIR", help="photographs that none was trained on: cameras `worlds`")
     for flag, what in (
         ("--weights", "a network to judge, may be repeated"),
         ("--ema-weights", "the same, the averaged weights of a checkpoint of v2v-train"),
@@ -140,7 +145,10 @@ def measure(asked: argparse.Namespace) -> Report:
     names = ["mse", "correlation", *([] if asked.lpips is None else [f"lpips_{asked.lpips[0]}"])]
     metrics = make_metrics(names, {} if asked.lpips is None else {asked.lpips[0]: tuple(asked.lpips[1:])})
     records: list[Record] = []
-    for cameras, (voxels, frames) in held_out(asked.held_out, asked.samples).items():
+    sets = held_out(asked.held_out, "videos", CLIPS, asked.samples)
+    if asked.photographs:
+        sets |= held_out(asked.photographs, "photographs", PHOTOGRAPHS, asked.samples)
+    for cameras, (voxels, frames) in sets.items():
         predictors: dict[str, Predict] = {_GREY: _grey(frames)}
         predictors |= {name: network.forward_sequence for name, network in judged.items()}
         for name, predict in predictors.items():

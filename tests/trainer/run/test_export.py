@@ -40,18 +40,6 @@ def test_the_averaged_weights_are_exported_where_there_are_any(
         assert torch.equal(tensor, (average if is_averaged else model)[key])
 
 
-def test_the_weights_of_several_runs_are_averaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    states = [network(seed).state_dict() for seed in range(3)]
-    files = [saved(tmp_path / f"{number}.pt", 7 + number, state) for number, state in enumerate(states)]
-    assert main([*files, str(tmp_path / "mean.pt")]) == 0
-    assert "trained for 24 steps" in capsys.readouterr().out
-    for key, tensor in load_network(tmp_path / "mean.pt")[0].state_dict().items():
-        torch.testing.assert_close(tensor, sum(state[key] for state in states) / 3)
-    other = saved(tmp_path / "other.pt", 10, states[0], normalize_voxels=True)
-    assert main([files[0], other, str(tmp_path / "mixed.pt")]) == 2
-    assert "give one network" in capsys.readouterr().err
-
-
 def test_a_file_that_is_not_a_checkpoint_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(SHIPPED), str(tmp_path / "firenet.pt")]) == 2
     assert "is no checkpoint of a training run" in capsys.readouterr().err
