@@ -54,7 +54,7 @@ COMPILED_ONLY = (
     "tests/server/simulation/test_pixel.py::test_kernel_is_",
     "tests/server/simulation/test_draw.py::test_both_kernels_start_where_the_law_says",
 )
-"""Tests of those files that take minutes uncompiled, by the start of their name."""
+"""Tests of those files that together take most of a minute uncompiled, by the start of their name."""
 _BLOCK = 32
 """PIXELS_A_BLOCK of the kernels there: each block is simulated whole, however small the picture."""
 
