@@ -20,7 +20,7 @@ from trainer.unpickle import Placeholder, read_torch_file
 from v2v_protocol.errors import UsageError
 
 SHIPPED = Path(__file__).parent / "shipped" / "firenet.pt"
-"""FireNet trained by the configuration ``firenet-cpu`` on the stream alone. docs/model-card.md has its training data
+"""FireNet trained on the stream alone. docs/model-card.md has its training data
 and scores."""
 
 Plain = str | int | float | bool | None
