@@ -39,7 +39,7 @@ SIDE_PX = 128
 STEPS = 20
 _ORDINARY: Mapping[str, Any] = {"threshold": (0.1, 0.4), "noise_sigma": (0.0, 0.02), "pause_probability": 0.0}
 CLIPS: Mapping[str, Mapping[str, Any]] = {"ordinary": _ORDINARY, "paper": {}}
-PHOTOGRAPHS: Mapping[str, Mapping[str, Any]] = {"worlds": PRESET_FIELDS["worlds"] | _ORDINARY}
+PHOTOGRAPHS: Mapping[str, Mapping[str, Any]] = {"worlds": {**PRESET_FIELDS["worlds"], **_ORDINARY}}
 """Recipe fields of each set of cameras, for clips and for photographs."""
 _SEED = 2**32
 _BATCH = 4
