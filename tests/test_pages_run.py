@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
+from bench.processes import free_ports
 from tests.clips import panned_luma, write_panned
 from tests.test_commands import MODULES, ROOT
 
@@ -27,7 +28,7 @@ SMALLER = {
     "v2v-serve": ["--workers", "1", "--bind", "tcp://127.0.0.1:*", "--port-file", "port"],
     "v2v-train": ["--workers", "1", "--set", "stream.batch_size=1"],
     "v2v-prepare": ["--workers", "1"],
-    "v2v-doctor": ["--port", "0"],
+    "v2v-doctor": ["--port", str(free_ports(1)[0])],
     "v2v-simulate": ["--index", "0", "--quarantine", "0"],
     "v2v-tradeoff": ["--clips", "1", "--forms", "lossless fast"],
 }
@@ -36,7 +37,7 @@ CANNOT = {
     r"^v2v-(serve|tradeoff) .*my_camera": "a recipe that v2v-fit writes",
     r"^v2v-convert ": "recordings that may not be redistributed",
     r"^v2v-eval ": "weights and recordings that may not be redistributed; the trainer's tests use synthetic ones",
-    r"^v2v-train (e2vid|firenet-cpu|my\.yaml) ": "weights of LPIPS, or the reader's own file",
+    r"^v2v-train (e2vid |firenet-cpu|my\.yaml )": "weights of LPIPS, or the reader's own file",
     r"^v2v-serve .*--page": "a port that may be in use; tests of the page start it on a free one",
     r"^v2v-serve .*s3://": "another owner's bucket; tests/stream/test_object_storage.py starts it on its own",
 }
