@@ -53,8 +53,8 @@ def digest_of(data: bytes) -> str:
 
 def _wheel(package: str, folder: Path, *, download: bool) -> Path:
     if download:
-        command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", str(folder), package]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
+        done = subprocess.run([*command, "--dest", str(folder), package], capture_output=True, text=True, check=False)
         if done.returncode:
             raise UsageError(f"{package} cannot be downloaded: {done.stderr.strip()[-300:]}")
     stem = package.replace("==", "-").replace("-", "_").lower()

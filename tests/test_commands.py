@@ -40,7 +40,6 @@ _LAUNCHED = {
     "examples/overfit.py": "examples.overfit",
     "examples/detect.py": "examples.detect",
     "examples/render_sprites.py": "examples.render_sprites",
-    "examples/draw_curve.py": "examples.draw_curve",
     "examples.firenet_data": "examples.firenet_data",
     "examples.ray_train": "examples.ray_train",
     "trainer.run.export": "trainer.run.export",

@@ -64,10 +64,8 @@ def held_out(videos: str, kind: str, cameras: Mapping[str, Mapping[str, Any]], s
         name: Recipe(voxels_per_clip=STEPS, crop_height_px=SIDE_PX, crop_width_px=SIDE_PX, **changes)
         for name, changes in cameras.items()
     }
-    preset = ["--preset", "worlds"] if kind == "photographs" else []
-    with LocalServer(
-        videos, workers=1, flags=["--videos-kind", kind, *preset, "--set", f"voxels_per_clip={STEPS}"]
-    ) as server:
+    flags = ["--videos-kind", kind, "--preset", "worlds" if kind == "photographs" else "exact"]
+    with LocalServer(videos, workers=1, flags=[*flags, "--set", f"voxels_per_clip={STEPS}"]) as server:
         return {name: _samples(server.address, recipe, samples) for name, recipe in recipes.items()}
 
 

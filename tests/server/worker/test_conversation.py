@@ -519,7 +519,7 @@ def test_a_corpus_that_cannot_be_looked_at_is_said(capsys: pytest.CaptureFixture
 
 
 def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Each is process 1 there, as here. Of two of one name the server hears one, and the other waits for ever."""
+    """Each is process 1 there, as here. The server hears only one of two workers with the same name."""
     names: list[str] = []
 
     class Named(Worker):
