@@ -270,31 +270,32 @@ def judge(mutant: Mutant, source: str, stages: list[Stage], tree: Path) -> dict[
     """Run a mutant's tests in a copy of the tree until some fail, and restore the file; return a row of the results.
 
     Its outcome is "killed", "survived", "untested" (no test reaches it) or "unfinished": tests took longer than
-    TIMEOUT_SECONDS, so the mutant never ends, or the machine is slow.
+    TIMEOUT_SECONDS, so the mutant never ends, or the machine is slow. `by` is pytest's line about the test that failed.
     """
     began = time.monotonic()
     path = tree / mutant.path
     healthy, when = path.read_bytes(), path.stat()
     path.write_text(source, "utf-8")
     outcome = "untested"
+    failed: str | None = ""
     try:
         for stage in stages:
-            passed = _pass(stage, tree)
-            if passed is None and outcome != "survived":
+            failed = _failure(stage, tree)
+            if failed is None and outcome != "survived":
                 outcome = "unfinished"
-            elif passed is not None:
-                outcome = "survived" if passed else "killed"
+            elif failed is not None:
+                outcome = "killed" if failed else "survived"
             if outcome != "survived":
                 break
     finally:
         path.write_bytes(healthy)
         os.utime(path, ns=(when.st_atime_ns, when.st_mtime_ns))  # its bytecode is valid again
     tests = sum(len(stage.tests) for stage in stages)
-    return asdict(mutant) | {"outcome": outcome, "tests": tests, "seconds": time.monotonic() - began}
+    return asdict(mutant) | {"outcome": outcome, "by": failed, "tests": tests, "seconds": time.monotonic() - began}
 
 
-def _pass(stage: Stage, tree: Path) -> bool | None:
-    """Return whether tests pass; None if they take longer than TIMEOUT_SECONDS."""
+def _failure(stage: Stage, tree: Path) -> str | None:
+    """Return pytest's line about the first test that fails, "" if all pass, None after TIMEOUT_SECONDS."""
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", __spec__.name]
     environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     if not stage.is_compiled:
@@ -304,16 +305,19 @@ def _pass(stage: Stage, tree: Path) -> bool | None:
         [*command, "-m", "not slow", *stage.tests],
         cwd=tree,
         env=environment,
-        stdout=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
     try:
-        return running.wait(TIMEOUT_SECONDS) in (0, 5)
+        said = running.communicate(timeout=TIMEOUT_SECONDS)[0].decode().splitlines()
     except subprocess.TimeoutExpired:
         os.killpg(running.pid, signal.SIGKILL)
-        running.wait()
+        running.communicate()
         return None
+    if running.returncode in (0, 5):
+        return ""
+    return next((line for line in said if line.startswith(("FAILED ", "ERROR "))), "ended without a result")
 
 
 def module_of(path: str) -> str:
@@ -358,7 +362,7 @@ def main() -> int:
                 stdout=subprocess.DEVNULL,
                 check=True,
             )  # writes the bytecode, which each mutant's tests read
-        if any(mutant.path.startswith(KERNELS) for mutant, _ in todo) and not _pass(
+        if any(mutant.path.startswith(KERNELS) for mutant, _ in todo) and _failure(
             Stage(list(UNCOMPILED), is_compiled=False), trees[0]
         ):
             raise SystemExit(f"a test of UNCOMPILED fails without a mutant, or all take over {TIMEOUT_SECONDS} s")
