@@ -15,8 +15,9 @@ from tests.server.named_corpus import corpus, video
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.spec import StreamSpec
-from v2v_server.commands.serve import main as serve
+from v2v_server.commands.serve import main
 from v2v_server.config import DEFAULT_BIND, ServeConfig, read_yaml_mapping, recipe_setting
+from v2v_server.serve import serve
 
 
 def load(tmp_path: Path, text: str | None = None, settings: Sequence[str] = (), **flags: Any) -> ServeConfig:
@@ -101,10 +102,10 @@ def test_single_fields_are_changed_in_the_recipe_of_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: str, recipe: str
 ) -> None:
     file = tmp_path / "serve.yaml"
-    file.write_text("videos: a\nrecipe: {preset: clean, gamma: 1.5}\n")
+    file.write_text("videos: a\nworkers: 0\nrecipe: {preset: clean, gamma: 1.5}\n")
     served: list[ServeConfig] = []
     monkeypatch.setattr("v2v_server.serve.serve", lambda config, *_: served.append(config))
-    serve(["--config", str(file), *flags.split()])
+    main(["--config", str(file), *flags.split()])
     name, *changes = recipe.split()
     assert served[0].spec.recipe == recipe_setting(name, changes)
 
@@ -120,25 +121,6 @@ def test_a_named_recipe_of_the_file_is_changed_too_and_without_one_the_papers(tm
     assert load(tmp_path, None, ["bins=3"], videos="a").spec.recipe == Recipe(bins=3)
     with pytest.raises(RecipeError, match="unknown recipe 5"):
         load(tmp_path, "videos: a\nrecipe: 5\n", ["bins=3"])
-
-
-@pytest.mark.parametrize(
-    ("flags", "expected"), [("", 2), ("--workers 0 --expect-workers 64", 64), ("--workers 9 --expect-workers 5", 9)]
-)
-def test_the_workers_that_a_credit_is_settled_for(monkeypatch: pytest.MonkeyPatch, flags: str, expected: int) -> None:
-    class Stopped(Exception):
-        pass
-
-    def dispatcher(*given: Any, expected_workers: int, **settings: Any) -> None:
-        raise Stopped(expected_workers)
-
-    for what_changes_this_process in ("keep_freed_memory", "open_many_files"):
-        monkeypatch.setattr(f"v2v_server.serve.{what_changes_this_process}", lambda: None)
-    monkeypatch.setattr("v2v_server.serve.load_catalogue", lambda config: corpus(video("a.mp4")))
-    monkeypatch.setattr("v2v_server.serve.Dispatcher", dispatcher)
-    small = "--set voxels_per_clip=1 --set crop_height_px=8 --set crop_width_px=8"
-    with pytest.raises(Stopped, match=f"^{expected}$"):
-        serve(f"--videos a --bind tcp://127.0.0.1:* {small} {flags}".split())
 
 
 @pytest.mark.parametrize(
@@ -159,6 +141,13 @@ def test_the_workers_that_a_credit_is_settled_for(monkeypatch: pytest.MonkeyPatc
         ("workers: 2.0", "--workers = 2.0"),
         ("workers: -1", "--workers = -1: give a whole number, or LEAST:MOST, from 0 to 4096"),
         ("workers: 4097", "--workers = 4097"),
+        ("workers: '8:'", "--workers = '8:': give a whole number, or LEAST:MOST, from 0 to 4096"),
+        ("workers: '1:2:3'", "--workers = '1:2:3': give a whole number"),
+        ("workers: '-1:4'", "--workers = '-1:4': give a whole number"),
+        ("workers: 8:5000", "--workers = '8:5000': give a whole number"),
+        ("workers: [1.5, 2]", "--workers = .*: give a whole number"),
+        ("workers: []", "--workers = .*: give a whole number"),
+        ("workers: 8:4", "the lowest value comes first"),
         ("expect_workers: -1", "--expect-workers = -1: give a whole number from 0 to 4096"),
         ("expect-workers: 4097", "--expect-workers = 4097"),
         ("max_credit_bytes: 0", "--max-credit-bytes = 0"),
@@ -308,10 +297,6 @@ def test_an_empty_worker_address_is_a_private_one_and_an_empty_bind_is_none() ->
 # --- --recipe and --set -----------------------------------------------------------------------------------------------
 
 
-def test_nothing_asked_leaves_the_file_its_say() -> None:
-    assert recipe_setting(None, []) is None
-
-
 def test_settings_change_the_named_preset(tmp_path: Path) -> None:
     assert recipe_setting("paper-eraft", []) == preset("paper-eraft")
     assert recipe_setting(None, ["bins=3"]) == Recipe(bins=3)
@@ -352,27 +337,37 @@ def test_settings_that_make_no_sense(setting: str, message: str) -> None:
         recipe_setting(None, [setting])
 
 
-def test_an_unknown_preset() -> None:
-    with pytest.raises(RecipeError, match="unknown recipe 'papr'"):
-        recipe_setting("papr", [])
+@pytest.mark.parametrize(
+    ("said", "meant"),
+    [
+        ("3", (3, 3)),
+        ("'3'", (3, 3)),
+        ("8:32", (8, 32)),  # in YAML 1.1 a number of base 60
+        ("[0, 4]", (0, 4)),
+    ],
+)
+def test_workers_are_a_number_or_two(tmp_path: Path, said: str, meant: tuple[int, int]) -> None:
+    config = load(tmp_path, f"videos: a\nworkers: {said}\n")
+    assert (config.least_workers, config.most_workers) == config.workers == meant
 
 
-@pytest.mark.parametrize(("said", "meant"), [(3, (3, 3)), ("3", (3, 3)), ("8:64", (8, 64)), ([0, 4], (0, 4))])
-def test_workers_are_a_number_or_two(said: object, meant: tuple[int, int]) -> None:
-    config = ServeConfig.load(None, {"videos": "a", "workers": said})
-    assert (config.least_workers, config.most_workers) == meant
+@pytest.mark.parametrize(
+    ("workers", "expected"),
+    [({}, 2), ({"workers": 0, "expect_workers": 64}, 64), ({"workers": 9, "expect_workers": 5}, 9)],
+)
+def test_the_workers_that_a_credit_is_settled_for(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, workers: dict[str, int], expected: int
+) -> None:
+    class Stopped(Exception):
+        pass
 
+    def dispatcher(*given: Any, expected_workers: int, **settings: Any) -> None:
+        raise Stopped(expected_workers)
 
-@pytest.mark.parametrize("said", ["8:", "a", "1:2:3", "-1:4", "8:5000", True, [1.5, 2], []])
-def test_other_workers_are_none(said: object) -> None:
-    with pytest.raises(UsageError, match=r"--workers = .*a whole number, or LEAST:MOST, from 0 to 4096"):
-        ServeConfig.load(None, {"videos": "a", "workers": said})
-
-
-def test_the_least_comes_first() -> None:
-    with pytest.raises(UsageError, match="the lowest value comes first"):
-        ServeConfig.load(None, {"videos": "a", "workers": "8:4"})
-
-
-def test_in_a_file_two_numbers_are_no_number_of_base_sixty(tmp_path: Path) -> None:
-    assert load(tmp_path, "videos: a\nworkers: 8:32\n").workers == (8, 32)
+    for what_changes_this_process in ("keep_freed_memory", "open_many_files"):
+        monkeypatch.setattr(f"v2v_server.serve.{what_changes_this_process}", lambda: None)
+    monkeypatch.setattr("v2v_server.serve.load_catalogue", lambda config: corpus(video("a.mp4")))
+    monkeypatch.setattr("v2v_server.serve.Dispatcher", dispatcher)
+    small = ["voxels_per_clip=1", "crop_height_px=8", "crop_width_px=8"]
+    with pytest.raises(Stopped, match=f"^{expected}$"):
+        serve(load(tmp_path, None, small, videos="a", bind="tcp://127.0.0.1:*", **workers))

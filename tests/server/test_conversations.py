@@ -228,33 +228,6 @@ class World:
         raise AssertionError({name: consumer.owed for name, consumer in self.consumers.items()})
 
 
-def test_a_stream_from_want_to_sample_over_queues(tmp_path: Path) -> None:
-    world = World(tmp_path)
-    consumer = world.consumers[b"c"]
-    for first in range(0, 40, 4):
-        consumer.ask(set(range(first, first + 4)))
-        world.settle()
-    assert consumer.samples == Counter(range(40))
-    assert len(world.workers) == WORKERS
-    assert world.dispatcher.counters.samples == 40
-    assert world.dispatcher.counters.refused_candidates > 0  # one of the videos fails
-    world.server.close()
-    assert world.supervisor.running == 0
-
-
-def test_workers_come_and_go_as_the_supervisor_is_told(tmp_path: Path) -> None:
-    world = World(tmp_path)
-    world.consumers[b"c"].ask(set(range(8)))
-    world.settle()
-    for count in (5, 1, 3):
-        world.supervisor.scale(count)
-        world.now += 1.0
-        world.consumers[b"c"].ask({10 + count})
-        world.settle()
-        assert len(world.workers) == count
-    assert world.consumers[b"c"].samples == Counter([*range(8), 11, 13, 15])
-
-
 class AnyOrder(RuleBasedStateMachine):
     """Messages are taken and steps are made in any order; workers die, hang and leave; the server restarts."""
 

@@ -229,11 +229,6 @@ def test_who_cannot_be_reached_is_reported_unless_its_end_will_be(watched: bool,
     assert dispatcher.told == ([] if watched else [("unreachable", b"toy1")])
 
 
-def test_what_is_passed_over_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    served(Scripted([ReportRefusal(Refusal("a.mp4", 7, "cut short"))]), tmp_path)
-    assert "passed over a.mp4 at frame 7: cut short\n" in capsys.readouterr().err
-
-
 def test_a_time_in_which_the_server_was_stopped_is_no_silence_of_others(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -296,6 +291,7 @@ def test_with_json_every_line_is_an_object_and_one_on_a_sample_has_its_identity(
         "spec_digest": session.spec.digest, "catalogue_digest": "c" * 32, "numerics_version": NUMERICS_VERSION,
         "seed": 5, "epoch": 2, "index": 7,
     }  # fmt: skip
+    assert passed_over["text"].startswith("passed over a.mp4 at frame 7: cut short")
     assert (passed_over["level"], passed_over["video"]) == ("warning", "a.mp4")
     assert (condemned["sample"], condemned["video"]) == (passed_over["sample"], "v.mp4")
     status = next(line for line in lines if "slow_part" in line)
@@ -307,7 +303,9 @@ def test_with_json_every_line_is_an_object_and_one_on_a_sample_has_its_identity(
 def test_the_end_is_summed_up_unless_the_server_was_never_ready(
     workers: int, is_ready: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    served(Scripted(), tmp_path, workers=workers).close()  # it tells a worker that is not there
+    supervisor = toys(2)
+    served(Scripted(), tmp_path, supervisor, workers=workers).close()  # it tells a worker that is not there
+    assert supervisor.running == 0
     said = capsys.readouterr().err
     assert ("in total 0 samples" in said, "\nfaults 0\n" in said) == (is_ready, is_ready)
 

@@ -47,33 +47,30 @@ def test_time_stopped_is_not_time_worked() -> None:
     assert overdue_workers(book, 1.5 * DEADLINE + 0.5) == [A, B]
 
 
-def where_others_are_quick() -> LeaseBook:
-    """A has begun a sample; those before took a tenth of a second each."""
+@pytest.mark.parametrize(
+    ("stall", "deadlines"),
+    [
+        (Stall(queued_seconds=0.75), 4),  # when it has worked for its time
+        (Stall(stopped_seconds=1.0), 2),  # after twice its time
+    ],
+)
+def test_one_that_cannot_run_is_overdue_later_and_slow_at_once(stall: Stall, deadlines: int) -> None:
+    """Others took a tenth of a second each."""
     book = practised(0.1)
     book.mark_begun(book.grant(REQUEST, A, 0.0), A, 0.0)
-    return book
-
-
-def test_one_that_waits_for_a_core_is_overdue_when_it_has_worked_for_its_time_and_slow_before() -> None:
-    book = where_others_are_quick()
     for second in range(10 * int(DEADLINE)):
-        book.extend_deadlines(A, Stall(queued_seconds=0.75))
-        assert (overdue_workers(book, second + 1.0) == [A]) is (second + 1.0 > 4 * DEADLINE)
+        book.extend_deadlines(A, stall)
+        assert (overdue_workers(book, second + 1.0) == [A]) is (second + 1.0 > deadlines * DEADLINE)
         assert bool(book.slow(second + 1.0)) is (second + 1.0 > 1.0)
+
+
+def test_the_wait_of_one_sample_is_no_time_of_the_next() -> None:
     book = LeaseBook(DEADLINE)
     first, second = (book.grant(numbered(index), A, 0.0) for index in range(2))
     book.mark_begun(first, A, 0.0)
     book.extend_deadlines(A, Stall(queued_seconds=100.0))
-    book.mark_begun(second, A, 50.0)  # what it waited over the first is no time of the second
+    book.mark_begun(second, A, 50.0)
     assert overdue_workers(book, 50.5 + DEADLINE) == [A]
-
-
-def test_a_worker_that_stays_stopped_is_overdue_after_twice_its_time_and_slow_before() -> None:
-    book = where_others_are_quick()
-    for second in range(10 * int(DEADLINE)):
-        book.extend_deadlines(A, Stall(stopped_seconds=1.0))
-        assert (overdue_workers(book, second + 1.0) == [A]) is (second + 1.0 > 2 * DEADLINE)
-        assert bool(book.slow(second + 1.0)) is (second + 1.0 > 1.0)
 
 
 def test_what_a_consumer_gave_up_is_counted_until_the_workers_are_through_with_it() -> None:
@@ -90,24 +87,6 @@ def test_what_a_consumer_gave_up_is_counted_until_the_workers_are_through_with_i
     assert book.abandoned(b"consumer") == 2
     book.lost(A)
     assert book.abandoned(b"consumer") == 0
-
-
-# --- twins ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("fast", [A, B])
-def test_the_first_answer_retires_the_twin(fast: bytes) -> None:
-    """Whether it is a sample or a failure: the book cannot tell, and both answer for the two of them."""
-    book = LeaseBook(DEADLINE)
-    numbers = {A: book.grant(REQUEST, A, 0.0), B: book.grant(REQUEST, B, 5.0)}
-    slow = B if fast == A else A
-    assert book.finished(numbers[fast], fast, 6.0) is REQUEST
-    assert book.request(numbers[slow], slow) is None
-    # The slower one does not know: it is still at it, fills its worker, and may be overdue.
-    assert (len(book), book.held_by(slow), list(book.requests_of(slow))) == (1, 1, [])
-    assert overdue_workers(book, DEADLINE + 5.5) == [slow]
-    assert book.finished(numbers[slow], slow, 7.0) is None
-    assert (len(book), book.held_by(A), book.held_by(B)) == (0, 0, 0)
 
 
 # --- the slow ---------------------------------------------------------------------------------------------------------

@@ -41,13 +41,14 @@ def say(at: Peers, identity: bytes, message: Message, user: str) -> list[Message
     return [decode(action.frames[0]) for action in actions if isinstance(action, ToConsumer)]
 
 
-def test_a_hello_with_another_secret_changes_nothing() -> None:
+def test_a_hello_that_is_refused_changes_nothing() -> None:
     at = peers()
     at.consumer_says(b"c", hello(OURS))
     at.want(0, 1)
     text = refused(at.consumer_says(b"c", hello(THEIRS, seed=9)), ErrorCode.MALFORMED)
     assert text == "this routing id belongs to the session of another consumer: connect with a random one"
     refused(at.consumer_says(b"c", hello(b"", seed=9)), ErrorCode.MALFORMED)
+    refused(at.consumer_says(b"c", Hello({"colour": 1}, ("voxels",), 4, 0, secret=OURS)), ErrorCode.SPEC)
     at.join()
     at.work_off()
     assert at.samples() == [(0, 0), (0, 1)]

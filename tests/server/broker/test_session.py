@@ -109,24 +109,6 @@ def test_all_consumers_that_do_not_read_share_one_limit(count: int) -> None:
     assert all(held.values())
 
 
-# --- asking -----------------------------------------------------------------------------------------------------------
-
-
-def test_what_is_waited_for_already_is_not_made_twice() -> None:
-    a = session()
-    sessions = opened(a)
-    sessions.want(a, 0, [1, 1, 2])
-    taken = take(sessions)
-    assert taken.index == 1
-    sessions.want(a, 0, [2, 1, 3, 3])
-    assert [request.index for request in a.waiting] == [2, 3]
-    sessions.want(a, 1, [1])
-    assert len(a.unanswered) == 4
-    assert sessions.mark_answered(taken, 0.0)
-    sessions.want(a, 0, [1])
-    assert [(request.epoch, request.index) for request in a.waiting] == [(0, 2), (0, 3), (1, 1), (0, 1)]
-
-
 # --- coming and going -------------------------------------------------------------------------------------------------
 
 
@@ -147,15 +129,6 @@ def test_nothing_comes_back_to_a_session_that_is_gone_or_was_opened_again() -> N
     assert not sessions.mark_answered(request, 1.0)
     assert sessions.next_request() is None
     assert len(sessions) == 1
-
-
-def test_the_silent_are_idle() -> None:
-    a, b = session(b"a", last_heard=0.0), session(b"b", last_heard=100.0)
-    sessions = opened(a, b)
-    assert sessions.idle(599.5) == []
-    assert sessions.idle(600.0) == [b"a"]
-    b.liveness.mark_heard(0.0)
-    assert sorted(sessions.idle(601.0)) == [b"a", b"b"]
 
 
 # --- sharing ----------------------------------------------------------------------------------------------------------
@@ -185,17 +158,6 @@ def serve(
         assert sessions.mark_answered(request, costs[request.session])
         got[request.session] += 1
     return got
-
-
-def test_a_consumer_in_debt_that_waits_alone_is_served_at_once() -> None:
-    a, b = session(b"a"), session(b"b")
-    sessions = opened(a, b)
-    sessions.want(a, 0, [0, 1, 2])
-    for cost in (1e-9, 0.05, 1e6):
-        request = take(sessions)
-        assert request.session == b"a"
-        sessions.want(a, 1, [request.index])
-        assert sessions.mark_answered(request, cost)
 
 
 @pytest.mark.parametrize(

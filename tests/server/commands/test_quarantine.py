@@ -33,12 +33,6 @@ def fill(corpus: Path, *frames: int) -> Path:
     return file
 
 
-def test_nothing_is_in_quarantine_at_first(corpus: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run(corpus)
-    assert capsys.readouterr().out.startswith("snapshot 0 holds 0 entries (")
-    assert not (corpus.parent / "cache").exists()
-
-
 def test_of_object_storage_nothing_is_asked_or_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--videos", "s3://bucket/videos/", "--cache-dir", str(tmp_path / "cache")]) == 0
     file = quarantine_path("s3://bucket/videos", tmp_path / "cache")
@@ -140,9 +134,3 @@ def test_failures_end_in_one_line_and_a_status(
     if damage == "unwritable":
         monkeypatch.undo()
         assert read_quarantine(file).latest == 1
-
-
-def test_debug_shows_the_trace(corpus: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fill(corpus, 40).write_text("damaged\n")
-    assert run(corpus, "--debug") == 2
-    assert "Traceback" in capsys.readouterr().err

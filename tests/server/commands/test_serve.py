@@ -25,16 +25,16 @@ def test_a_page_has_a_port_of_its_own_or_the_usual_one(
 ) -> None:
     asked: list[ServeConfig] = []
     monkeypatch.setattr("v2v_server.serve.serve", lambda config, *_: asked.append(config))
-    assert command.main(["--videos", "a", *flags]) == 0
-    assert command.main([*flags, "--videos", "a"]) == 0
+    assert command.main(["--videos", "a", "--workers", "0", *flags]) == 0
+    assert command.main([*flags, "--videos", "a", "--workers", "0"]) == 0
     assert [config.page for config in asked] == [port, port]
 
 
 def test_an_error_that_ends_it_is_an_object_too_where_programs_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    missing = str(tmp_path / "missing")
-    assert command.main(["--videos", missing, "--log-format", "json"]) == command.main(["--videos", missing])
+    missing = ["--videos", str(tmp_path / "missing"), "--workers", "0"]
+    assert command.main([*missing, "--log-format", "json"]) == command.main(missing)
     as_object, for_people = capsys.readouterr().err.splitlines()
     assert (json.loads(as_object)["level"], json.loads(as_object)["text"] in for_people) == ("error", True)
 

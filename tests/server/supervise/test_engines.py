@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 
 from tests.server.supervise.toy_host import ToyHost
@@ -115,15 +116,39 @@ def test_its_surplus_workers_leave_and_hung_ones_are_killed(pool: Pool) -> None:
     third.die(Cause.UNEXPLAINED, returncode=0)
     assert pool.watch(1.0, 0) == []
     assert third.told == ["leave", "release"]
+    assert pool.give_up(b"label-9.9", "slept") is None
     assert pool.give_up(b"label-0.1", "slept") == Loss(Cause.HUNG, "slept", 7, for_all=True)
     assert first.told == ["SIGKILL"]
     assert not pool.watches(b"label-0.1")
     assert pool.watch(2.0, 0) == []
     assert pool.watches(b"label-1.1")
+    # The next life of the slot is a new worker: its death is reported.
+    assert pool.watch(100.0, 0) == []
+    first.die(Cause.CRASHED)
+    assert [death.identity for death in pool.watch(200.0, 0)] == [b"label-0.2"]
+    # And a new slot has a new number.
+    pool.scale(3)
+    assert pool.watch(300.0, 0) == []
+    assert pool.watches(b"label-3.1")
     pool.stop(0.0, 0.0)
     assert second.told == ["SIGTERM", "release"]
-    assert host_of(pool).requested == [3, 2]
+    assert host_of(pool).requested == [3, 2, 3]
     assert host_of(pool).is_closed
+
+
+@pytest.mark.parametrize(
+    ("state", "loss"),
+    [
+        (psutil.STATUS_STOPPED, Loss(Cause.KILLED, "was stopped from outside and killed")),
+        # All workers of a host wait then, each at a sound clip.
+        (psutil.STATUS_DISK_SLEEP, Loss(Cause.UNEXPLAINED, "waited for its storage and slept", 7, for_all=True)),
+    ],
+)
+def test_one_that_cannot_run_is_not_called_hung(pool: Pool, state: str, loss: Loss) -> None:
+    pool.scale(1)
+    pool.watch(0.0, 0)
+    host_of(pool).places[0].state = state
+    assert pool.give_up(b"label-0.1", "slept") == loss
 
 
 def test_a_slot_without_a_worker_is_released_at_once(pool: Pool) -> None:

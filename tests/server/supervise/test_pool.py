@@ -10,7 +10,6 @@ import sys
 from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import psutil
@@ -110,19 +109,6 @@ def test_it_starts_as_many_as_asked_each_with_a_name_of_its_own(start: Callable[
     assert names() == [b"label-0.1", b"label-1.1"]
     assert pool.watch(100.0, 0) == []
     assert pids_of(pool) == pids
-
-
-def test_those_that_are_too_many_are_told_to_leave_and_not_missed(start: Callable[[int, str], Pool]) -> None:
-    pool = start(3, "import signal, sys, time\nsignal.signal(15, lambda *_: sys.exit(0))\n" + NAPS)
-    assert pool.watch(0.0, 0) == []
-    pool.scale(1)
-    assert [pool.watches(name) for name in (b"label-0.1", b"label-2.1")] == [True, True]
-    until(lambda: pool.running == 1)
-    assert pool.watch(100.0, 0) == []
-    assert not pool.watches(b"label-2.1")
-    pool.scale(2)
-    assert pool.watch(200.0, 0) == []
-    assert (pool.running, pool.watches(b"label-3.1")) == (2, True)
 
 
 def test_one_that_dies_while_it_leaves_is_reported_and_not_replaced(start: Callable[[int, str], Pool]) -> None:
@@ -252,32 +238,6 @@ def test_an_exit_is_not_blamed_on_the_sample(start: Callable[[int, str], Pool], 
     assert deaths_at(pool, 0.0) == [Death(b"label-0.1", Loss(Cause.UNEXPLAINED, f"exited with status {status}"))]
 
 
-def test_a_worker_that_was_given_up_is_killed_and_not_reported_again(start: Callable[[int, str], Pool]) -> None:
-    pool = started(start(2, SLEEPS))
-    hung, other = pids_of(pool)
-    assert pool.watches(b"label-0.1")
-    assert pool.give_up(b"label-9.9", "slept") is None
-    assert pool.give_up(b"label-0.1", "slept") == Loss(Cause.HUNG, "slept", for_all=False)
-    assert [pool.watches(name) for name in (b"label-0.1", b"label-1.1", b"label-9.9", b"")] == [
-        False,
-        True,
-        False,
-        False,
-    ]
-    until(lambda: pool.running == 1)
-    assert pool.watch(0.0, 0) == []
-    assert pids_of(pool) == [other]
-    assert pool.watch(100.0, 0) == []
-    assert pool.running == 2
-    assert is_gone(hung)
-    # The next life of the slot is a new worker: its death is reported.
-    assert pool.watches(b"label-0.2")
-    os.kill(pids_of(pool)[0], signal.SIGKILL)
-    until(lambda: pool.running == 1)
-    assert [death.identity for death in pool.watch(200.0, 0)] == [b"label-0.2"]
-    assert not pool.watches(b"label-0.2")
-
-
 def test_a_worker_that_somebody_stopped_is_not_called_hung(start: Callable[[int, str], Pool]) -> None:
     pool = started(start(1, SLEEPS))
     (pid,) = pids_of(pool)
@@ -324,55 +284,7 @@ def test_it_says_how_long_a_worker_waited_for_a_core(start: Callable[[int, str],
     until(all_waited)
 
 
-def test_one_that_hangs_in_a_decoder_speaks_against_the_video(start: Callable[[int, str], Pool]) -> None:
-    pool = started(start(1, SLEEPS))
-    book = pool._slots[0].place.child.logbook
-    with open(f"/proc/self/fd/{book.descriptor}", "r+b") as worker:
-        note(worker.fileno(), 7, decodes=True)
-    assert pool.give_up(b"label-0.1", "slept") == Loss(Cause.HUNG, "slept", 7, for_all=True)
-    all_dead(pool)
-
-
-def test_a_worker_whose_storage_does_not_answer_is_not_called_hung(
-    start: Callable[[int, str], Pool], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All workers of a host wait then, each at a sound clip."""
-    pool = started(start(1, SLEEPS))
-    monkeypatch.setattr(psutil.Process, "status", lambda self: psutil.STATUS_DISK_SLEEP)
-    expected = Loss(Cause.UNEXPLAINED, "waited for its storage and gave no answer for 60 s", for_all=False)
-    assert pool.give_up(b"label-0.1", "gave no answer for 60 s") == expected
-    all_dead(pool)
-
-
-# --- restarting -------------------------------------------------------------------------------------------------------
-
-
-def test_the_wait_is_bounded_however_large_the_pool() -> None:
-    """A thousand deaths in a row are within the budget of a large pool; two to the thousandth seconds are not."""
-    pool = Pool(LocalHost("/corpus"), "label")
-    pool.scale(1000)
-    for slot in pool._slots[1:]:
-        slot.start_at = float("inf")
-    pool._restarts._deaths_in_a_row = crash_budget(1000) - 1
-    dead = subprocess.Popen([sys.executable, "-S", "-E", "-c", ""])
-    dead.wait()
-    pool._slots[0].place.child = SimpleNamespace(
-        process=dead, post_mortem=lambda **_: Loss(Cause.UNEXPLAINED, "exited"), end=lambda: None
-    )
-    pool._slots[0].is_started, pool._slots[0].name = True, "label-0.1"
-    (death,) = pool.watch(100.0, 0)
-    assert death.identity == b"label-0.1"
-    assert pool._slots[0].start_at == 110.0
-
-
 # --- stopping ---------------------------------------------------------------------------------------------------------
-
-
-def test_stop_waits_for_those_that_leave_by_themselves(start: Callable[[int, str], Pool]) -> None:
-    pool = started(start(2, "import time\ntime.sleep(0.05)"))
-    pids = pids_of(pool)
-    pool.stop(join_seconds=60.0)
-    assert all(is_gone(pid) for pid in pids)
 
 
 def test_stop_reaps_what_ignores_every_request(start: Callable[[int, str], Pool], tmp_path: Path) -> None:
@@ -405,6 +317,8 @@ def test_only_a_death_while_decoding_speaks_against_the_video(decodes: bool) -> 
     child = WorkerProcess()
     with open(f"/proc/self/fd/{child.logbook.descriptor}", "r+b") as worker:
         note(worker.fileno(), 7, decodes=decodes)
+    seen = child.status()
+    assert (seen.lease, seen.decodes) == (7, decodes)
     child.process.send_signal(signal.SIGSEGV)
     child.process.wait()
     assert child.post_mortem(short_of_memory=False) == Loss(Cause.CRASHED, "was ended by SIGSEGV", 7, for_all=decodes)

@@ -114,6 +114,12 @@ def test_the_wait_doubles_and_any_sample_forgives() -> None:
     assert restarts.delay(2, LOSS) == 0.2
 
 
+def test_the_wait_is_bounded_however_large_the_pool() -> None:
+    """A thousand deaths in a row are within the budget of a large pool; two to the thousandth seconds are not."""
+    restarts = Restarts()
+    assert {restarts.delay(1000, LOSS) for _ in range(crash_budget(1000))} == {0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10.0}
+
+
 def test_the_budget_grows_with_the_workers() -> None:
     restarts = Restarts()
     for _ in range(crash_budget(1)):

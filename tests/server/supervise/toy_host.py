@@ -14,6 +14,7 @@ class ToyPlace:
     def __init__(self) -> None:
         self.name, self.address, self.told = "", "", []
         self.end: Exit | None = None
+        self.state = "running"
 
     @property
     def is_running(self) -> bool:
@@ -29,7 +30,7 @@ class ToyPlace:
         return end
 
     def status(self, now: float) -> ProcessStatus | None:
-        return ProcessStatus("running", lease=7, decodes=True, seen_at=now) if self.name else None
+        return ProcessStatus(self.state, lease=7, decodes=True, seen_at=now) if self.name else None
 
     def lend(self, arena: str) -> None:
         self.told.append(f"lend {arena}")
