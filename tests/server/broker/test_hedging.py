@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import pytest
 
+from tests.server.broker.test_slots import ARENA
 from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import Peers, peers, serving
+from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.messages import Lease
 from v2v_server.broker.leases import ALONE_AFTER, Cause
 
@@ -21,7 +23,7 @@ def practised() -> tuple[Peers, Lease]:
         at.finish(b"before")
     at.die(b"before")
     at.join(b"slow", credit=1)
-    at.want(20)
+    at.want(20, arena=ARENA, slots=[5])
     return at, at.begin(b"slow")
 
 
@@ -33,7 +35,8 @@ def slowed() -> tuple[Peers, Lease, Lease]:
     assert not at.leases[b"fast"]
     at.tick(0.1)
     (second,) = at.leases[b"fast"]
-    assert second == replace(first, lease=second.lease)
+    assert (first.arena, first.slot) == (ARENA, 5)
+    assert second == replace(first, lease=second.lease, arena="", slot=NO_SLOT)  # the first may still write to it
     assert at.dispatcher.counters.second_leases == 1
     return at, first, second
 
@@ -44,6 +47,7 @@ def test_the_first_answer_is_delivered_and_the_second_dropped(order: tuple[bytes
     before = at.samples()
     at.finish(order[0])
     assert at.samples() == [*before, (0, 20)]
+    assert at.heard[b"c"][-1].slot == (5 if order[0] == b"slow" else NO_SLOT)  # type: ignore[union-attr]
     at.finish(order[1])
     assert at.samples() == [*before, (0, 20)]
     assert at.dispatcher.counters.late_results == 1

@@ -74,15 +74,6 @@ def test_samples_that_are_not_read_yet_count_against_the_credit() -> None:
     assert sessions.room(a) == sessions.room(b) == 7
 
 
-def test_a_consumer_that_does_not_read_is_passed_over_until_it_does() -> None:
-    sessions, a, _ = two(2)
-    sessions.set_in_flight(b"a", 3 * sum(a.form.sizes))
-    assert [take(sessions).session for _ in range(2)] == [b"b", b"b"]
-    assert sessions.next_request() is None
-    assert sessions.set_in_flight(b"a", 0) is a
-    assert [take(sessions).session for _ in range(2)] == [b"a", b"a"]
-
-
 def test_what_is_in_flight_outlives_a_hello() -> None:
     """It lies in the same connection's queue, whatever the consumer says."""
     sessions = opened(session(b"a"))

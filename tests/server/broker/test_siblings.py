@@ -14,7 +14,6 @@ from tests.server.peers import SMALL_SPEC, Peers, peers
 from v2v_protocol.errors import UsageError
 from v2v_protocol.messages import ErrorCode, Hello
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.leases import Cause
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.video.rows import Rows
 
@@ -65,6 +64,13 @@ def test_every_sequence_that_is_not_dropped_comes_once_for_each_view(
         for sequence in (of.candidate(seed, epoch, index, 0) for index in range(of.count))
     )
     assert set(found.values()) <= {views}
+    # A refused candidate is refused for all views, which move on together.
+    moved = {
+        (of.place(index), sequence.video.id, sequence.start_frame)
+        for index in range(of.count)
+        for sequence in [of.candidate(seed, epoch, index, 1)]
+    }
+    assert len(moved) == of.count // views
     everything = schedule(30, 1, 0).count
     assert len(found) == (everything if views == 1 else everything // spacing * spacing)
 
@@ -121,40 +127,6 @@ def test_siblings_that_were_not_asked_for_yet_come_later() -> None:
     assert [lease.indices for lease in at.leases[b"w"]] == [(1,), (2, 6), (6,)]
     at.work_off()
     assert sorted(at.samples()) == [(0, index) for index in (0, 1, 2, 4, 6, 8)]
-
-
-def test_only_the_sibling_in_work_is_blamed_for_a_death() -> None:
-    at = opened(credit=1)
-    at.begin()
-    at.finish()
-    at.begin()
-    at.die(cause=Cause.UNEXPLAINED)
-    at.join(b"other", credit=1)
-    assert sorted(lease.indices[0] for lease in at.leases[b"other"]) == [4, 8]
-    at.begin(b"other")
-    at.die(b"other", cause=Cause.CRASHED)
-    assert len(at.recorded) == 1
-    at.join(b"third", credit=1)
-    at.work_off(b"third")
-    assert sorted(at.samples()) == [(0, index) for index in range(2 * BATCH * VIEWS)]
-
-
-def test_a_failing_video_moves_all_siblings_to_the_same_next_candidate() -> None:
-    at = opened(credit=1)
-    lease = at.leases[b"w"][0]
-    bad = (lease.video, lease.start_frame)
-    moved = []
-    while at.leases[b"w"]:
-        lease = at.begin()
-        if (lease.video, lease.start_frame) == bad:
-            at.fail()
-        else:
-            if lease.candidate:
-                moved.append(lease)
-            at.finish()
-    assert sorted(lease.indices[0] for lease in moved) == [0, 4, 8]
-    assert len({(lease.video, lease.start_frame, lease.candidate) for lease in moved}) == 1
-    assert sorted(at.samples()) == [(0, index) for index in range(2 * BATCH * VIEWS)]
 
 
 def test_an_epoch_without_a_whole_block_is_refused() -> None:

@@ -71,15 +71,6 @@ def test_a_sidecar_that_fails_is_an_error_of_that_sample(at: Peers, here: bool) 
     assert (counters.unavailable, counters.refused_candidates) == (1, 0)
 
 
-def test_a_sidecar_that_only_the_workers_host_lacks_is_read_elsewhere(at: Peers) -> None:
-    hello(at)
-    ask_for_a_label(at)
-    first = at.fail(b"w1", "cannot be read: No such file or directory", None, here=True, sidecar=ENDING)
-    (second,) = at.leases[b"w2"]
-    assert (second.video, second.indices, second.candidate) == (first.video, first.indices, 0)
-    assert at.dispatcher.counters.unavailable == 0
-
-
 def test_a_worker_cannot_name_a_sidecar_that_the_lease_has_not(at: Peers) -> None:
     hello(at, ("voxels",))
     at.want(0)

@@ -72,29 +72,20 @@ def test_every_line_of_a_run_is_an_object(tmp_path: Path) -> None:
 # --- v2v-worker -------------------------------------------------------------------------------------------------------
 
 
-def test_it_takes_as_videos_what_the_server_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    roots: list[Any] = []
-    monkeypatch.setattr(
-        "v2v_server.commands.worker.run_worker", lambda address, source, *more: roots.append(source.folder)
-    )
+@pytest.mark.parametrize("source", [".", "clip.mp4", "list.txt"])
+def test_it_takes_as_videos_what_the_server_takes_and_logs_for_people_or_for_programs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str
+) -> None:
+    given: list[Any] = []
+    monkeypatch.setattr("v2v_server.commands.worker.run_worker", lambda *each: given.append(each))
     (tmp_path / "clip.mp4").touch()
     (tmp_path / "list.txt").touch()
-    for source in (tmp_path, tmp_path / "clip.mp4", tmp_path / "list.txt"):
-        worker(["--connect", "tcp://127.0.0.1:1", "--videos", str(source)])
-    assert roots == [tmp_path.resolve()] * 3
+    for flags in ([], ["--log-format", "json"]):
+        assert worker(["--connect", "tcp://127.0.0.1:1", "--videos", str(tmp_path / source), *flags]) == 0
+    assert [videos.folder for _, videos, *_ in given] == [tmp_path.resolve()] * 2
+    assert [log.is_json for run in given for log in run if isinstance(log, Log)] == [False, True]
 
 
 def test_a_corpus_that_is_not_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert worker(["--connect", "tcp://127.0.0.1:1", "--videos", str(tmp_path / "missing")]) == 2
     assert "there is no such folder, video or list file on this host" in capsys.readouterr().err
-
-
-def test_its_log_is_for_people_or_for_programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    logs: list[Any] = []
-    monkeypatch.setattr(
-        "v2v_server.commands.worker.run_worker",
-        lambda *given: logs.extend(each for each in given if isinstance(each, Log)),
-    )
-    for flags in ([], ["--log-format", "json"]):
-        assert worker(["--connect", "tcp://127.0.0.1:1", "--videos", str(tmp_path), *flags]) == 0
-    assert [log.is_json for log in logs] == [False, True]

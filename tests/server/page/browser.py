@@ -84,14 +84,6 @@ class Browser:
                 raise TimeoutError(f"{expression}: {self.value('document.body.innerText')[:2000]} {self.complaints}")
             time.sleep(0.05)
 
-    def resize(self, width_px: int, height_px: int = 900, *, dark: bool = False) -> None:
-        """The window's size, and which of the two themes the person prefers."""
-        self._tell(
-            "Emulation.setDeviceMetricsOverride", width=width_px, height=height_px, deviceScaleFactor=1, mobile=False
-        )
-        theme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        self._tell("Emulation.setEmulatedMedia", features=[theme])
-
     def _tell(self, method: str, **parameters: Any) -> dict[str, Any]:
         return self._ask(method, session=self._session, **parameters)
 

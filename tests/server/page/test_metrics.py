@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import pytest
@@ -70,20 +69,8 @@ def test_a_server_that_does_not_answer_is_down() -> None:
     assert values(None) == {("v2v_up", ()): 0.0}
 
 
-def test_names_and_units_keep_to_the_convention(state: dict[str, Any]) -> None:
-    content, _ = exposition(state)
-    for family in text_string_to_metric_families(content.decode()):
-        assert re.fullmatch(r"v2v_[a-z_]+", family.name)
-        assert family.documentation.endswith((".", "1."))
-        assert not re.search(r"(millis|_ms|_gib|_percent)", family.name)
-        for sample in family.samples:
-            assert sample.name.endswith("_total") == (family.type == "counter")
-            if family.name.endswith("_ratio"):
-                assert 0.0 <= sample.value <= 1.0
-
-
 def test_every_verdict_of_the_sentence_has_its_sample() -> None:
-    from tests.server.status.test_bottleneck import CASES
+    from tests.server.status.test_snapshot import CASES
 
     assert {case[1] for case in CASES} == set(meanings_at("waiting")["part"].states)
 

@@ -28,7 +28,6 @@ pytestmark = [
 HOSTILE = "<img src=x onerror=document.title='taken'>.mp4"
 CUT = "<b>cut<b>.mp4"
 SENT = "document.querySelector('#tiles dd small').textContent"
-WIDTHS_PX = (360, 1280, 1920)
 
 
 class Consumer:
@@ -93,7 +92,6 @@ def states(port: int) -> dict[str, Any]:
 
 def test_a_stream_is_seen_and_a_killed_worker_soon(served: LocalServer, port: int, browser: Browser) -> None:
     with Consumer(served.address):
-        browser.resize(1280)
         browser.open(f"http://127.0.0.1:{port}/")
         browser.until("document.querySelectorAll('#workers tbody tr').length === 2")
         browser.until("document.querySelectorAll('#consumers .taking, #consumers .stalled').length === 1")
@@ -122,33 +120,6 @@ def test_a_stream_is_seen_and_a_killed_worker_soon(served: LocalServer, port: in
         browser.until(f"{restarts}.includes('1') || document.querySelectorAll('#workers tbody tr').length < 2")
         browser.until(f"{restarts}.includes('1')")
         assert browser.complaints == []
-
-
-def test_it_fits_every_screen_and_both_themes(served: LocalServer, port: int, browser: Browser) -> None:
-    browser.open(f"http://127.0.0.1:{port}/")
-    browser.until("document.querySelectorAll('#workers tbody tr').length === 2")
-    papers = set()
-    for dark in (False, True):
-        for width in WIDTHS_PX:
-            browser.resize(width, dark=dark)
-            browser.until(f"window.innerWidth === {width} && charts.speed.width <= {width}")
-            assert browser.value("document.documentElement.scrollWidth - document.documentElement.clientWidth") == 0
-            papers.add(browser.value("getComputedStyle(document.body).backgroundColor"))
-    assert len(papers) == 2
-    assert browser.complaints == []
-
-
-def test_the_axis_of_time_shows_a_minute_whatever_has_arrived(served: LocalServer, port: int, browser: Browser) -> None:
-    browser.open(f"http://127.0.0.1:{port}/")
-    browser.until("fields.length")
-    browser.value("show = () => {}")  # the server's own states would come between
-    for points in range(3):
-        browser.value("past.speed.forEach((column) => column.splice(0))")
-        for point in range(points):
-            browser.value(f"remember('speed', [Date.now() / 1000 + {point}, 1, 2])")
-        browser.value("drawCharts()")
-        browser.until("charts.speed.scales.x.max - charts.speed.scales.x.min === 60")
-        browser.until("Math.abs(charts.speed.scales.x.max - Date.now() / 1000) < 30")
 
 
 def test_a_server_that_is_gone_is_said_and_one_that_comes_back_is_shown(

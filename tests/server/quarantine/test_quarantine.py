@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import stat
@@ -91,12 +90,6 @@ def test_every_snapshot_against_its_definition(verdicts: list[QuarantineEntry]) 
                     hit = any((v.path, v.fingerprint, v.frame) == (path, fingerprint, frame) for v in expected)
                     refused = quarantine.refusal(number, path, fingerprint, frame) is not None
                     assert refused == (hit or counts[path, fingerprint] >= 2)
-
-
-def test_lines_read_well() -> None:
-    one, two = numbered(verdict("a/b.mp4", 40, reason="was ended by SIGSEGV"), clearing(TIME))
-    assert str(one) == f"snapshot 1 ({TIME}): a/b.mp4 from frame 40: was ended by SIGSEGV"
-    assert str(two) == f"snapshot 2 ({TIME}): cleared"
 
 
 # --- the file ---------------------------------------------------------------------------------------------------------
@@ -261,14 +254,3 @@ def test_other_users_cannot_lock_the_file(tmp_path: Path) -> None:
     file.touch(0o644)
     write(file, verdict("a.mp4"))
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
-
-
-def test_a_lock_that_another_process_keeps_is_not_waited_for(tmp_path: Path) -> None:
-    file = tmp_path / "q.jsonl"
-    file.touch()
-    with file.open("rb") as reader:
-        fcntl.flock(reader, fcntl.LOCK_SH)
-        with pytest.raises(OSError, match="another process keeps it locked"):
-            write_entry(file, verdict(), Quarantine(), wait_seconds=0.05)
-    assert file.read_bytes() == b""
-    assert len(write_entry(file, verdict(), Quarantine())) == 1

@@ -1,11 +1,12 @@
-"""Test the status: every number is right, plain, and bounded."""
+"""Test the status: every number is right, plain, and bounded, and the bottleneck follows from them."""
 
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.server.named_corpus import SMALL_SPEC
@@ -14,10 +15,11 @@ from tests.server.status.services import WALL, Published, View, json_of, publish
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION
 from v2v_protocol.messages import GetStatus, Goodbye, Hello, Result, Want, WorkerHello, encode
 from v2v_protocol.sample import Refusal
+from v2v_server.broker.leases import Stall
 from v2v_server.broker.session import RETURN_SECONDS
 from v2v_server.broker.state import RefusalPart, SendStatus, ToConsumer, ToWorker
 from v2v_server.quarantine import QuarantineEntry
-from v2v_server.status.snapshot import ANSWER_SECONDS, MOST_SHOWN, STATUS_VERSION, to_json
+from v2v_server.status.snapshot import ANSWER_SECONDS, MOST_SHOWN, STATUS_VERSION, Shares, find_bottleneck, to_json
 
 
 def finish(at: Peers, worker: bytes = b"w", **took: float) -> None:
@@ -184,7 +186,7 @@ def test_a_reconnect_continues_the_row_and_a_later_run_begins_one(at: Peers, ser
     assert later.served == 0
 
 
-@pytest.mark.slow
+@settings(max_examples=50, deadline=None)
 @given(
     epochs=st.lists(
         st.tuples(
@@ -210,7 +212,8 @@ def test_rows_add_up_to_the_totals(epochs: list[tuple[bytes, int, float, bool]])
             at.work_off()
         if leaves:
             at.consumer_says(identity, Goodbye(0.1 * batches))
-        service.pass_seconds(pause)
+        at.now += pause
+        service.publisher.tick(at.now)
         totals = list(at.dispatcher.sessions.totals())
         assert len({each.number for each in totals}) == len(totals)
         assert sum(each.served for each in totals) == at.dispatcher.counters.samples
@@ -269,13 +272,18 @@ def test_refusals_and_verdicts_are_listed_newest_first(at: Peers, service: Publi
     assert state.totals.refused_candidates == 2
 
 
-def test_of_many_refusals_the_last_few_are_listed(at: Peers) -> None:
+def test_of_many_refusals_and_verdicts_with_long_texts_the_last_few_are_listed(at: Peers) -> None:
     for number in range(100):
-        at.dispatcher.refusals.append(RefusalPart.of(Refusal("v.mp4", None, "x" * 500), str(number)))
-    state = published(at).view()
-    assert len(state.refusals) == 20
-    assert state.refusals[0].time == "99"
-    assert len(state.refusals[0].reason) == 200
+        at.dispatcher.refusals.append(RefusalPart.of(Refusal("\x01" * 4000, None, "x" * 4000), str(number)))
+    at.quarantine.extend(
+        [QuarantineEntry(number + 1, "\x03" * 4000, "f", 0, "\x04" * 4000, WALL) for number in range(100)]
+    )
+    service = published(at, cache="/not-utf8-\udcff")
+    encoded, state = to_json(service.status()), service.view()
+    assert len(encoded) < 1 << 18
+    assert json.loads(encoded)["cache"]["folder"] == "/not-utf8-?"
+    assert (len(state.refusals), state.refusals[0].time, len(state.refusals[0].reason)) == (20, "99", 200)
+    assert (len(state.verdicts), state.quarantined, state.verdicts[0].snapshot) == (20, 100, 100)
 
 
 def test_what_peers_call_themselves_is_short_and_printable(at: Peers) -> None:
@@ -287,16 +295,6 @@ def test_what_peers_call_themselves_is_short_and_printable(at: Peers) -> None:
 
 
 # --- its form ---------------------------------------------------------------------------------------------------------
-
-
-def test_the_state_is_plain_json(at: Peers) -> None:
-    service = published(at, cache="/nowhere")
-    hello(at)
-    at.join()
-    at.want(0, 1)
-    at.begin()
-    assert service.plain() == json.loads(json.dumps(service.status()))
-    assert service.plain()["workers"][0]["name"] == "w"
 
 
 def test_thousands_of_peers_fit_into_one_message_after_a_few_encodings(
@@ -319,19 +317,6 @@ def test_thousands_of_peers_fit_into_one_message_after_a_few_encodings(
     values = json.loads(encoded)
     assert 0 < len(values["workers"]) <= MOST_SHOWN
     assert 1 < len(encodings) <= 3  # lists that do not fit are halved, not shortened one by one
-
-
-def test_names_that_are_no_text_and_very_long_ones_do_no_harm(at: Peers) -> None:
-    for _ in range(20):
-        at.dispatcher.refusals.append(RefusalPart.of(Refusal("\x01" * 4000, None, "\x02" * 4000), WALL))
-    at.quarantine.extend(
-        [QuarantineEntry(number + 1, "\x03" * 4000, "f", 0, "\x04" * 4000, WALL) for number in range(100)]
-    )
-    service = published(at, cache="/not-utf8-\udcff")
-    encoded, state = to_json(service.status()), service.view()
-    assert len(encoded) < 1 << 18
-    assert json.loads(encoded)["cache"]["folder"] == "/not-utf8-?"
-    assert (len(state.verdicts), state.quarantined, state.verdicts[0].snapshot) == (20, 100, 100)
 
 
 # --- requests ---------------------------------------------------------------------------------------------------------
@@ -393,3 +378,103 @@ def test_a_consumer_cannot_have_waited_longer_than_it_was_there(at: Peers, servi
     at.consumer_says(b"c", Goodbye(4.0))
     assert service.view().totals.waited_seconds == 4.0
     assert service.view().consumers == []
+
+
+# --- who waits for whom: each verdict from its shares, and the shares from what was noted -----------------------------
+
+
+FULL = {"seconds": 10.0, "consumers": 0.8, "idle": 0.02, "broker": 0.2}
+CASES: list[tuple[dict[str, Any], str, str, str]] = [
+    ({"there": {"is_attended": False}}, "no_consumers", "No consumer is connected", ""),
+    ({"seconds": 1.0}, "start", "too early", ""),
+    ({"there": {"workers": 0, "trouble": "no worker is there", "starting": 0}}, "workers", "no worker is there", ""),
+    ({"there": {"workers": 0, "trouble": "no worker is there", "starting": 3}}, "workers", "3 are starting", ""),
+    ({"consumers": 0.03, "idle": 0.6}, "consumers", "Workers wait for consumers", "fewer workers would do"),
+    ({"consumers": 0.03, "idle": 0.4}, "consumers", "idle 40% of theirs", ""),
+    ({"consumers": 0.03, "idle": 0.1}, "even", "Hardly any waiting", ""),
+    ({"decode": 0.7, "simulate": 0.2, "handover": 0.05}, "decode", "which decode 70% of theirs", "--cache"),
+    ({"decode": 0.2, "simulate": 0.7, "handover": 0.05}, "simulate", "which simulate 70% of theirs", "fewer effects"),
+    ({"decode": 0.2, "simulate": 0.2, "handover": 0.5}, "handover", "which deliver samples 50%", "shared memory"),
+    ({"broker": 0.95, "idle": 0.5, "decode": 0.4}, "broker", "busy 95% of its time", "two servers"),
+    ({"broker": 0.95, "idle": 0.0, "decode": 0.4}, "broker", "busy 95% of its time", "two servers"),
+    ({"decode": 0.9, "queued": 0.75, "cores": 0.15}, "cores", "75% of theirs for a core and get 0.15 of a core each",
+     "more workers on this host would not help"),
+    ({"decode": 0.9, "queued": 0.3, "cores": 0.6}, "decode", "which decode 90% of theirs", "start more workers"),
+    ({"idle": 0.5, "decode": 0.4}, "transit", "although workers are idle 50%", "network"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("case", "part", "sentence", "remedy"), CASES)
+def test_each_verdict_follows_from_the_shares(case: dict[str, Any], part: str, sentence: str, remedy: str) -> None:
+    there = {"is_attended": True, "workers": 4} | case.get("there", {})
+    shares = Shares(**{**FULL, **{name: value for name, value in case.items() if name != "there"}})
+    said = find_bottleneck(shares, **there)
+    assert said.part == part
+    assert sentence in said.sentence
+    assert remedy in said.remedy
+    assert "\n" not in said.sentence
+
+
+def test_a_cache_that_is_there_is_no_remedy() -> None:
+    shares = Shares(**FULL, decode=0.9)
+    assert "--cache" in find_bottleneck(shares, is_attended=True, workers=1).remedy
+    assert "--cache" not in find_bottleneck(shares, is_attended=True, workers=1, has_cache=True).remedy
+
+
+def test_the_shares_are_of_the_time_that_was_noted(at: Peers, service: Published) -> None:
+    at.join(b"busy")
+    at.join(b"idle")
+    at.hello(b"waits")
+    at.hello(b"does not")
+    service.pass_seconds(2.0)
+    at.want(0, identity=b"waits")
+    for _ in range(8):
+        service.pass_seconds(1.0, busy_share=0.5)
+        lease = at.leases[b"busy"].popleft()
+        result = Result(lease.lease, 0, decode_seconds=0.25, simulate_seconds=0.5, handover_seconds=0.125)
+        at.worker_says(b"busy", result, *answer_to(lease))
+        at.dispatcher.worker_stalled(b"busy", Stall(queued_seconds=0.5))
+        waited = at.dispatcher.sessions.get(b"waits").waited_seconds + 0.5  # type: ignore[union-attr]
+        at.consumer_says(b"waits", Want(0, (lease.indices[0] + 1,), waited_seconds=waited))
+    shares = service.view().waiting.shares
+    assert shares.seconds == pytest.approx(10.0)
+    assert shares.consumers == pytest.approx(4.0 / 20.0)
+    assert shares.broker == pytest.approx(0.4, abs=0.01)
+    assert (shares.decode, shares.simulate, shares.handover) == pytest.approx((0.1, 0.2, 0.05))
+    assert shares.idle == pytest.approx((20.0 - 8.0) / 20.0)
+    assert (shares.queued, shares.cores) == pytest.approx((0.2, 0.04))
+
+
+def test_what_was_long_ago_counts_no_more(at: Peers, service: Published) -> None:
+    at.join()
+    at.hello()
+    at.consumer_says(b"c", Want(0, (), waited_seconds=50.0))
+    service.pass_seconds(1.0, busy_share=1.0)
+    service.pass_seconds(30.0)
+    shares = service.view().waiting.shares
+    assert (shares.consumers, shares.broker) == (0.0, pytest.approx(0.0))
+    assert shares.seconds == pytest.approx(10.0, abs=1.1)
+
+
+def test_the_time_before_the_first_consumer_does_not_count(at: Peers, service: Published) -> None:
+    at.join()
+    service.pass_seconds(9.0)
+    at.hello()
+    at.want(0, 1)
+    service.pass_seconds(1.0, busy_share=0.5)
+    assert service.view().waiting.part == "start"
+    service.pass_seconds(2.0, busy_share=0.5)
+    shares = service.view().waiting.shares
+    assert shares.seconds == pytest.approx(3.0, abs=0.2)
+    assert (shares.idle, shares.broker) == pytest.approx((0.0, 0.5), abs=0.05)
+
+
+def test_a_consumer_that_comes_again_for_the_next_epoch_was_not_away(at: Peers, service: Published) -> None:
+    at.join()
+    at.hello(b"c1")
+    service.pass_seconds(5.0)
+    at.consumer_says(b"c1", Goodbye())
+    service.pass_seconds(1.0)
+    assert service.view().waiting.part != "no_consumers"
+    service.pass_seconds(1.5)
+    assert service.view().waiting.part == "no_consumers"

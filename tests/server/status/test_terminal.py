@@ -1,20 +1,33 @@
-"""Test what a running server shows of its status."""
+"""Test what a running server and `v2v-top` show of the status."""
 
 from __future__ import annotations
 
 import io
 import json
+import os
+import pty
+import signal
+import subprocess
+import sys
 import threading
+from contextlib import suppress
 from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
+from tests.clips import panned_luma, write_clip
 from tests.server.peers import Peers, peers
 from tests.server.status.services import Published, published
+from tests.waiting import until
+from v2v_client.local_server import LocalServer
 from v2v_server.broker.state import Counters
+from v2v_server.commands.top import main
 from v2v_server.status.snapshot import StatusFields
-from v2v_server.status.terminal import StatusView, format_shutdown_summary
+from v2v_server.status.terminal import StatusView, draw, format_shutdown_summary, line
 from v2v_server.system.log import Log
 
 
@@ -46,16 +59,21 @@ def test_the_line_counts_what_happened(at: Peers, service: Published) -> None:
     )
 
 
-def test_a_log_gets_a_line_every_ten_seconds_without_control_sequences() -> None:
-    out, status = io.StringIO(), published(peers()).status()
+def test_a_log_gets_a_line_every_ten_seconds_without_control_sequences(at: Peers, service: Published) -> None:
+    out, status = io.StringIO(), service.status()
     view = StatusView(Log(), out)
     assert view.is_due(100.0)
     view.show(100.0, status)
     assert not view.is_due(109.9)
     assert view.is_due(110.0)
     view.interrupt()
-    view.close()
+    for now in (110.0, 120.0):  # an idle server says so once
+        view.show(now, status)
     assert out.getvalue() == said(status) + "\n"
+    at.join()
+    view.show(130.0, service.status())
+    view.close()
+    assert out.getvalue() == said(status) + "\n" + said(service.status()) + "\n"
 
 
 def test_a_line_of_any_thread_stays_above_what_a_terminal_shows(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,22 +93,12 @@ def test_a_line_of_any_thread_stays_above_what_a_terminal_shows(monkeypatch: pyt
     assert again == shown
 
 
-def test_an_idle_server_says_so_once_in_a_log(at: Peers, service: Published) -> None:
-    stream = io.StringIO()
-    view = StatusView(Log(), stream)
-    for now in (0.0, 10.0, 20.0):
-        view.show(now, service.status())
-    assert stream.getvalue().count("\n") == 1
-    at.join()
-    view.show(30.0, service.status())
-    assert stream.getvalue().count("\n") == 2
-
-
 def test_programs_get_the_same_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     status = published(peers()).status()
     StatusView(Log(is_json=True), Terminal()).show(0.0, status)
     line: dict[str, Any] = json.loads(capsys.readouterr().err)
     assert line["text"] == status["waiting"]["sentence"]
+    assert datetime.fromisoformat(line["time"]).utcoffset() is not None
     names = ("samples_per_second", "batches_per_second", "workers", "consumers", "queue", "faults", "samples")
     assert [line[name] for name in names] == [0] * 7
     assert line["slow_part"] == "no_consumers"
@@ -159,12 +167,6 @@ def test_faults_are_the_counters_that_say_so() -> None:
     assert replace(counters, returned_leases=5).faults == 15
 
 
-def test_a_server_that_did_nothing_says_so() -> None:
-    assert format_shutdown_summary(published(peers()).status()) == [
-        "in total 0 samples (0.0 batches, 0.00 GiB) in 0.0 s: 0.00 samples/s", "faults 0",
-    ]  # fmt: skip
-
-
 def test_samples_faults_and_rates_are_summed_up(at: Peers) -> None:
     counters = at.dispatcher.counters
     counters.samples, counters.batches, counters.decodes, counters.bytes = 600, 50.0, 200, 3 << 30
@@ -177,3 +179,89 @@ def test_samples_faults_and_rates_are_summed_up(at: Peers) -> None:
         "faults 3; 2 refused candidates, 4 returned leases, 1 workers lost",
         "workers spent 7 min on them: decoding 50%, simulating 38%, delivering 12%; consumers waited 90.0 s",
     ]
+
+
+# --- `v2v-top`: what is drawn, and the program beside a real server ---------------------------------------------------
+
+
+HOSTILE = "[red]x[/red]\x1b[2J<b>.mp4"
+
+
+def drawn(state: dict[str, Any], note: str = "") -> str:
+    console = Console(width=160, force_terminal=False)
+    with console.capture() as capture:
+        console.print(draw(state, note))
+    return capture.get()
+
+
+def busy() -> dict[str, Any]:
+    """A state with a worker, a consumer, and hostile names."""
+    at = peers()
+    service = published(at)
+    at.join(b"w", credit=2)
+    at.hello()
+    at.want(0, 1, 2)
+    service.pass_seconds(3.0)
+    state: dict[str, Any] = service.plain()
+    state["workers"][0]["clip"] = HOSTILE
+    state["refusals"] = [{"time": "t", "video": HOSTILE, "frame": None, "reason": "[bold]cut", "kind": "failed"}]
+    return state
+
+
+def test_the_sentence_is_shown_names_are_text_many_are_counted_and_an_old_state_is_said_to_be_one() -> None:
+    state = busy()
+    state["workers"] *= 100
+    text = drawn(state, "no answer for 10 s")
+    assert state["waiting"]["sentence"] in text
+    assert state["waiting"]["sentence"] in line(state)
+    assert "1 consumers" in text
+    assert "1 workers" in text
+    assert "and 70 more" in text
+    assert "no answer for 10 s" in text
+    assert "[red]x[/red]" in text
+    assert "[bold]cut" in text
+    assert "\x1b" not in text
+
+
+def test_an_absent_server_is_an_error(capsys: pytest.CaptureFixture[str], unused_port: int) -> None:
+    assert main(["--connect", f"tcp://127.0.0.1:{unused_port}", "--once", "--timeout-seconds", "0.2"]) == 1
+    assert "no answer for 0.2 s; is v2v-serve running there?" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_beside_a_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_clip(tmp_path / "a.mp4", panned_luma(60, 64, 80))
+    small = ("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=40")
+    with LocalServer(tmp_path, workers=1, flags=small) as server:
+        assert main(["--connect", server.address, "--once"]) == 0
+        assert "No consumer is connected" in capsys.readouterr().out
+
+        # On a terminal: again and again, until Ctrl-C.
+        ours, theirs = pty.openpty()
+        program = subprocess.Popen(
+            [sys.executable, "-m", "v2v_protocol.programs", "top", "--connect", server.address],
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            env=os.environ | {"TERM": "xterm-256color", "COLUMNS": "120", "LINES": "40"},
+            # A shell that runs the tests in the background passes on that SIGINT is ignored.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+        os.close(theirs)
+        os.set_blocking(ours, False)
+        said = b""
+
+        def seen(times: int) -> bool:
+            nonlocal said
+            with suppress(BlockingIOError):
+                said += os.read(ours, 1 << 16)
+            return said.count(b"No consumer is connected") >= times
+
+        try:
+            until(lambda: seen(2))
+            program.send_signal(signal.SIGINT)
+            assert program.wait(60) == 130
+        finally:
+            program.kill()
+            program.wait()
+            os.close(ours)

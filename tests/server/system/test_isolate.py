@@ -71,21 +71,14 @@ def test_a_field_is_of_its_type_or_refused(name: str, value: object) -> None:
     assert isinstance(answer.source, Path)
 
 
-def half(number: int) -> int | None:
-    return None if number % 2 else number // 2
+def half(number: int) -> float | None:
+    return None if number % 2 else number // 2  # a whole number where a float is meant
 
 
-def test_nothing_is_a_result_too() -> None:
-    assert dict(run_isolated(half, range(4), 2, lambda job: 60.0)) == {0: 0, 1: None, 2: 1, 3: None}
-
-
-def share(number: int) -> float | None:
-    return number if number else None  # a whole number where a float is meant
-
-
-def test_a_whole_number_is_a_float_where_one_is_meant() -> None:
-    (found,) = dict(run_isolated(share, [3], 1)).values()
-    assert (type(found), found) == (float, 3.0)
+def test_nothing_is_a_result_too_and_a_whole_number_a_float_where_one_is_meant() -> None:
+    found = dict(run_isolated(half, range(4), 2, lambda job: 60.0))
+    assert found == {0: 0.0, 1: None, 2: 1.0, 3: None}
+    assert (type(found[0]), type(found[2])) == (float, float)
 
 
 @pytest.mark.parametrize(
