@@ -8,7 +8,7 @@ from typing import cast
 
 import hypothesis.strategies as st
 import pytest
-from hypothesis import given, settings
+from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from v2v_protocol.liveness import Liveness
@@ -83,7 +83,7 @@ def test_what_is_in_flight_outlives_a_hello() -> None:
     assert sessions.next_request() is None
 
 
-@given(st.integers(1, 400))
+@pytest.mark.parametrize("count", [1, 2, 3, 20, 133, 400])
 def test_all_consumers_that_do_not_read_share_one_limit(count: int) -> None:
     """Each may hold one sample, and the next ones as long as all of them hold less than the limit."""
     everyone = [session(b"%d" % number, credit=400) for number in range(count)]
