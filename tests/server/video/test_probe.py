@@ -57,6 +57,30 @@ def remuxed(
     return target
 
 
+def stored_packets(path: Path) -> int:
+    with av.open(str(path)) as container:
+        return sum(packet.size > 0 for packet in container.demux(video=0))
+
+
+def test_hidden_vp8_frames_are_not_counted(tmp_path: Path) -> None:
+    plain = write_clip(tmp_path / "plain.webm", panned_luma(30), codec="libvpx", gop=30)
+
+    def not_shown(packet: av.Packet, number: int) -> av.Packet:
+        content = bytearray(bytes(packet))
+        content[0] &= ~0x10 if number in (7, 20) else 0xFF  # show_frame
+        again = av.Packet(bytes(content))
+        again.pts, again.dts, again.time_base = packet.pts, packet.dts, packet.time_base
+        again.is_keyframe = packet.is_keyframe
+        return again
+
+    hidden = remuxed(plain, tmp_path / "hidden.webm", not_shown)
+    facts = probe(hidden)
+    assert (stored_packets(hidden), facts.frames) == (30, 28)
+    shown = np.delete(decode_luma(plain, probe(plain).index, 0, 30).frames, [7, 20], axis=0)
+    np.testing.assert_array_equal(decode_luma(hidden, facts.index, 0, 28).frames, shown)
+    np.testing.assert_array_equal(decode_luma(hidden, facts.index, 15, 10).frames, shown[15:25])
+
+
 @pytest.mark.parametrize(
     ("codec", "packet", "hidden"),
     [
