@@ -185,25 +185,6 @@ def test_a_shard_without_a_video_is_a_part_too(tmp_path: Path, run: Run) -> None
     assert looked_into(merged) == 0
 
 
-def test_what_lies_in_object_storage_is_catalogued_in_shards_too(corpus: Path, tmp_path: Path, run: Run) -> None:
-    pytest.importorskip("fsspec", reason="the extra 'cloud' is not installed")
-    address = f"file://{corpus}"
-    for number in (1, 2):
-        host = f"host {number}"
-        flags = [
-            "--shard",
-            f"{number}/2",
-            "--out",
-            str(tmp_path / "parts"),
-            "--copies",
-            str(tmp_path / f"{host} copies"),
-        ]
-        assert run(host, *flags, videos=address)[0] == 0
-    _, merged, _ = run("server", "--merge", str(tmp_path / "parts"), videos=address)
-    assert digests(merged) == digests(run("one")[1])
-    assert looked_into(merged) == 0
-
-
 @given(ids=st.sets(st.text(min_size=1)), count=st.integers(1, 40))
 def test_each_file_is_of_one_shard(ids: set[str], count: int) -> None:
     shards = [Shard.parse(f"{number}/{count}") for number in range(1, count + 1)]

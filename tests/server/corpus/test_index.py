@@ -32,7 +32,7 @@ from v2v_server.corpus.probe import SceneCollection, figures
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, COLUMNS, Flag, Scene
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.source import silent
-from v2v_server.corpus.videos import NO_THRESHOLDS, SplitVideos, StringColumn, Thresholds, Videos, VideoTable, joined
+from v2v_server.corpus.videos import NO_THRESHOLDS, SplitVideos, Thresholds, Videos, VideoTable, joined
 from v2v_server.video.rows import Rows
 
 KIND = SceneCollection(Rows()).kind
@@ -119,67 +119,45 @@ def test_figures_count_for_their_kind_version_and_fingerprint_only(corpus: Corpu
 # --- scenes -----------------------------------------------------------------------------------------------------------
 
 
-def scene_of(name: str, boundary: int = 200) -> Scene:
+def scene_of(name: str) -> Scene:
     """Return a scene with one shot boundary, at a frame of its own for each video."""
-    return Scene.of(shots(300, boundary + int(name[:3])), np.full((19, COLUMNS), 2.0))
+    return Scene.of(shots(300, 200 + int(name[:3])), np.full((19, COLUMNS), 2.0))
 
 
-def scenes(corpus: Corpus) -> tuple[str | None, list[tuple[str, object]]]:
+def scenes(corpus: Corpus) -> list[tuple[str, object]]:
     with closing(corpus.open(scene=True)) as catalogue:
-        return catalogue.scene_digest, [(video.id, video.pieces) for video in catalogue.videos]
+        return [(video.id, video.pieces) for video in catalogue.videos]
 
 
-def put_scenes(corpus: Corpus, *names: str, boundary: int = 200) -> None:
+def put_scenes(corpus: Corpus) -> None:
     with closing(Store(corpus.index)) as store:
         store.make_figures()
-        store.put_figures(KIND, [figures(corpus.row(name), scene_of(name, boundary)) for name in names])
-
-
-def test_scenes_come_from_the_index(corpus: Corpus) -> None:
-    put_scenes(corpus, *corpus.names)
-    first = scenes(corpus)
-    assert dict(first[1])["007.mp4"] == shots(300, 207).tobytes()
-    assert scenes(corpus) == first
-    put_scenes(corpus, "007.mp4", boundary=100)
-    digest, runs = scenes(corpus)
-    assert digest != first[0]
-    assert dict(runs)["007.mp4"] == shots(300, 107).tobytes()
-    (corpus.folder / "003.mp4").unlink()
-    fewer = scenes(corpus)
-    assert fewer[0] not in (digest, first[0])
-    assert fewer[1] == [each for each in runs if each[0] != "003.mp4"]
+        store.put_figures(KIND, [figures(corpus.row(name), scene_of(name)) for name in corpus.names])
 
 
 def test_figures_of_other_versions_are_known(corpus: Corpus) -> None:
-    put_scenes(corpus, *corpus.names)
+    put_scenes(corpus)
     with closing(Store(corpus.index)) as store:
         assert not store.has_other_versions("scene", f", look {ANALYSIS_VERSION}")
         assert store.has_other_versions("scene", ", look 1")
         assert not store.has_other_versions("other", ", look 1")
 
 
-def test_damaged_runs_count_as_unknown(corpus: Corpus) -> None:
-    put_scenes(corpus, *corpus.names)
+@pytest.mark.parametrize("damaged", ["x'010203'", "'text'"])
+def test_damaged_runs_count_as_unknown_and_refuse_no_video(corpus: Corpus, damaged: str) -> None:
+    put_scenes(corpus)
     with closing(sqlite3.connect(corpus.index)) as database, database:
-        database.execute("UPDATE figures SET summary = x'010203' WHERE id = '005.mp4'")
-    assert dict(scenes(corpus)[1])["005.mp4"] == b""
-
-
-def test_a_summary_of_another_type_is_missing_and_refuses_no_video(corpus: Corpus) -> None:
-    put_scenes(corpus, *corpus.names)
-    with closing(sqlite3.connect(corpus.index)) as database, database:
-        database.execute("UPDATE figures SET summary = 'text' WHERE id = '005.mp4'")
-    with closing(Store(corpus.index)) as store:
-        table, _ = VideoTable.read(store.rows(KIND), len(corpus.names))
-    assert table.row(5).problem is None
-    assert table.summaries.lengths[4:7].tolist() == [table.summaries.lengths[4], 0, table.summaries.lengths[4]]
+        database.execute(f"UPDATE figures SET summary = {damaged} WHERE id = '005.mp4'")
+    assert scenes(corpus) == [
+        (name, b"" if name == "005.mp4" else shots(300, 200 + int(name[:3])).tobytes()) for name in corpus.names
+    ]
 
 
 def test_an_index_that_fails_after_the_probes_blames_no_video(corpus: Corpus, monkeypatch: pytest.MonkeyPatch) -> None:
     def locked(store: Store, kind: FigureKind) -> None:
         raise sqlite3.OperationalError("database is locked")
 
-    put_scenes(corpus, *corpus.names)
+    put_scenes(corpus)
     monkeypatch.setattr(Store, "all_figures", locked)
     with pytest.raises(IndexUnreadable, match="cannot be read: database is locked; start again"):
         corpus.open(scene=True)
@@ -240,13 +218,6 @@ def test_a_table_holds_its_rows(table: VideoTable) -> None:
         table.ids[200]
 
 
-def test_an_empty_table() -> None:
-    table = read([])
-    assert len(table) == len(table.ids) == 0
-    assert list(table.ids) == table.ids[0:5] == []
-    assert table.ids.find("a") is None
-
-
 @settings(max_examples=25)
 @given(st.lists(st.booleans(), min_size=len(NAMES), max_size=len(NAMES)))
 def test_a_mask_selects_rows(mask: list[bool]) -> None:
@@ -266,7 +237,7 @@ def test_rows_are_joined_with_the_ids_that_are_asked(asked: set[str], known: set
 def test_an_id_without_a_row_has_to_be_probed() -> None:
     table, states = VideoTable.read(joined(["a"], [], []), 1)
     assert states.tolist() == [[-1, 0, 0]]
-    assert table.problem[0] is not None
+    assert table.problem[0] == "the index lost its record; start again to probe it"
 
 
 _INTEGERS = ["size_bytes", "mtime_ns", "ctime_ns", "frames", "width_px", "height_px", "interlaced"]
@@ -300,17 +271,6 @@ def test_a_damaged_row_has_to_be_probed_and_harms_no_other(
     assert found[20].id == NAMES[20]
     assert found[20].problem is not None
     assert found[:20] + found[21:] == ROWS[:20] + ROWS[21:]
-
-
-def test_a_row_with_a_problem_needs_no_frames() -> None:
-    unusable = IndexRow("a", -1, problem="is no video")
-    assert rows_of(read([unusable.columns, ROWS[0].columns])) == [unusable, ROWS[0]]
-
-
-def test_strings_are_one_piece_of_utf_8() -> None:
-    column = StringColumn("aßc".encode(), np.array([1, 0, 3]))
-    assert list(column) == ["a", "", "ßc"]
-    assert [column[at] for at in range(3)] == list(column)
 
 
 @pytest.mark.parametrize("all_usable", [False, True])
@@ -349,15 +309,11 @@ def test_videos_are_the_usable_ones_and_have_the_digest_of_all_that_shapes_sampl
 COUNT = 700
 
 
-@pytest.fixture
-def ids(tmp_path: Path) -> list[str]:
+def test_a_changed_a_missing_and_an_unknown_file_are_found(tmp_path: Path) -> None:
     ids = [f"{number:04d}.mp4" for number in range(COUNT)]
     for id in ids:
         (tmp_path / id).touch()
-    return ids
 
-
-def test_a_changed_a_missing_and_an_unknown_file_are_found(tmp_path: Path, ids: list[str]) -> None:
     def states(*unknown: int) -> npt.NDArray[np.int64]:
         rows = []
         for number, id in enumerate(ids):
@@ -367,8 +323,6 @@ def test_a_changed_a_missing_and_an_unknown_file_are_found(tmp_path: Path, ids: 
         return np.array(rows)
 
     notices: list[str] = []
-    assert refresh._changed(Folder(tmp_path), ids, states(), notices.append) == []
-    assert notices[-1] == f"looking at files in {tmp_path}: {COUNT} of {COUNT}, 0 of them new or changed"
     known = states(300, 301)
     (tmp_path / ids[5]).write_bytes(b"x")
     (tmp_path / ids[130]).chmod(0o600)  # changes only the ctime
@@ -376,24 +330,8 @@ def test_a_changed_a_missing_and_an_unknown_file_are_found(tmp_path: Path, ids: 
     (tmp_path / ids[699]).unlink()
     assert refresh._changed(Folder(tmp_path), ids, known, notices.append) == [5, 130, 300, 301, 699]
     assert notices[-1] == f"looking at files in {tmp_path}: {COUNT} of {COUNT}, 5 of them new or changed"
-
-
-def test_a_record_that_another_process_removes_meanwhile_is_no_video(
-    tmp_path: Path, ids: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    index, put = tmp_path / "index", Store.put
-
-    def put_and_lose(store: Store, records: list[IndexRow]) -> None:
-        put(store, records)
-        with closing(Store(index)) as other:
-            other.forget([ids[0]])
-
-    monkeypatch.setattr(Store, "put", put_and_lose)
-    store, table, notes = refresh.refresh_index(Folder(tmp_path), ids[:3], index, None, 0, silent, silent)
-    store.close()
-    assert notes == []
-    assert table.problem[0] == "the index lost its record; start again to probe it"
-    assert "lost" not in table.problem[1]
+    assert refresh._gone(Folder(tmp_path), ids, notices.append) == [ids[301], ids[699]]
+    assert notices[-1] == f"looking for files that are gone from {tmp_path}: {COUNT} of {COUNT} that are not listed"
 
 
 # --- many videos ------------------------------------------------------------------------------------------------------

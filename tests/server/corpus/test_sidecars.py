@@ -19,7 +19,7 @@ from v2v_protocol.sample import FromSidecar
 from v2v_server.corpus import probe as collecting
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources import source as asking
-from v2v_server.corpus.sources.source import SourceOptions, open_sidecar, open_source, read_files, sidecar_id
+from v2v_server.corpus.sources.source import SourceOptions, open_sidecar, open_source, read_files
 
 JSON, MASKS = ".boxes.json", ".masks/"
 ARRAYS = ("boxes", "masks")
@@ -60,11 +60,6 @@ def name_of(corpus: Path, kind: str) -> str:
 def opened(corpus: Path, kind: str) -> Iterator[Catalogue]:
     with closing(open_catalogue(name_of(corpus, kind), cache_dir=corpus.parent / "cache", processes=0)) as catalogue:
         yield catalogue
-
-
-def test_ids() -> None:
-    assert sidecar_id("deep/b.x.mp4", JSON) == "deep/b.x.boxes.json"
-    assert sidecar_id("a.mp4", MASKS) == "a.masks/"
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -146,33 +141,25 @@ def test_a_bucket_has_those_of_its_folder(corpus: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_is_opened_like_the_video(corpus: Path, kind: str) -> None:
+def test_it_is_opened_like_the_video_and_a_changed_and_a_missing_one_are_told_apart(corpus: Path, kind: str) -> None:
+    table = read_files(corpus / "deep/b.x.masks")[1]
     with opened(corpus, kind) as catalogue:
         boxes = catalogue.facts.sidecars_of("a.mp4", ARRAYS)[JSON]
         masks = catalogue.facts.sidecars_of("deep/b.x.mp4", ARRAYS)[MASKS]
-    source = open_source(name_of(corpus, kind), SourceOptions(cache_dir=corpus.parent / "other"))
-    source.make()
-    files = {"a.boxes.json": boxes, "deep/b.x.masks/": masks}
-    assert source.has(files) is source.is_local
-    source.fetch(files)
-    assert source.has(files)
-    with open_sidecar(source, "a.boxes.json", boxes) as file:
-        assert file.read_text() == "[1]"
-    table = read_files(corpus / "deep" / "b.x.masks")[1]
-    with open_sidecar(source, "deep/b.x.masks/", masks, table) as folder:
-        assert (folder / "2.png").read_bytes() == b"2.png"
-        assert (folder / "more" / "3.png").read_bytes() == b"more/3.png"
-    source.release()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_changed_and_a_missing_one_are_told_apart(corpus: Path, kind: str) -> None:
-    with opened(corpus, kind) as catalogue:
-        boxes = catalogue.facts.sidecars_of("a.mp4", ARRAYS)[JSON]
-        masks = catalogue.facts.sidecars_of("deep/b.x.mp4", ARRAYS)[MASKS]
-        table = read_files(corpus / "deep/b.x.masks")[1]
         catalogue.check("a.mp4", boxes, JSON)
         catalogue.check("deep/b.x.mp4", masks, MASKS)
+        source = open_source(name_of(corpus, kind), SourceOptions(cache_dir=corpus.parent / "other"))
+        source.make()
+        files = {"a.boxes.json": boxes, "deep/b.x.masks/": masks}
+        assert source.has(files) is source.is_local
+        source.fetch(files)
+        assert source.has(files)
+        with open_sidecar(source, "a.boxes.json", boxes) as file:
+            assert file.read_text() == "[1]"
+        with open_sidecar(source, "deep/b.x.masks/", masks, table) as folder:
+            assert (folder / "2.png").read_bytes() == b"2.png"
+            assert (folder / "more" / "3.png").read_bytes() == b"more/3.png"
+        source.release()
         (corpus / "a.boxes.json").write_text("[2]")
         (corpus / "deep/b.x.masks/3.png").write_text("new")
         for id, ending, mark in (("a.mp4", JSON, boxes), ("deep/b.x.mp4", MASKS, masks)):
@@ -185,7 +172,7 @@ def test_a_changed_and_a_missing_one_are_told_apart(corpus: Path, kind: str) -> 
                 catalogue.check(id, mark, ending)
         for video in catalogue.videos:
             catalogue.check(video.id, video.fingerprint)
-    fresh = open_source(name_of(corpus, kind), SourceOptions(cache_dir=corpus.parent / "other"))
+    fresh = open_source(name_of(corpus, kind), SourceOptions(cache_dir=corpus.parent / "fresh"))
     fresh.make()
     with pytest.raises(VideoGone), open_sidecar(fresh, "a.boxes.json", boxes):
         pass

@@ -38,7 +38,7 @@ from v2v_server.flow import (
     guarded,
     one_thread,
 )
-from v2v_server.simulation.draw import draw, resized_size
+from v2v_server.simulation.draw import draw
 from v2v_server.simulation.view import Window, apply_view, source_window, without_margin
 
 RECIPE = Recipe(voxels_per_clip=4, bins=2, crop_height_px=64, crop_width_px=80)
@@ -256,10 +256,10 @@ def window_of(frames: np.ndarray, params: SampleParams, recipe: Recipe, margin: 
 
 
 cameras = st.builds(
-    lambda index, scales, flips: (
+    lambda index, scales, flips, leads: (
         recipe := RECIPE.replace(
-            resize_scale=scales, flip_probability=flips, pause_probability=0.3, pause_stay_probability=0.6,
-            contrast_probability=0.5,
+            lead_voxels=leads, lead_frames=leads, resize_scale=scales, flip_probability=flips,
+            pause_probability=0.3, pause_stay_probability=0.6, contrast_probability=0.5,
         ),
         draw(
             recipe, seed=1, epoch=0, index=index, picture_height_px=HEIGHT, picture_width_px=WIDTH, video_id="v"
@@ -268,6 +268,7 @@ cameras = st.builds(
     st.integers(0, 10**6),
     st.sampled_from([(1.0, 1.0), (0.6, 0.95), (1.05, 1.7)]),
     st.sampled_from([0.0, 1.0]),
+    st.integers(0, 1),
 )  # fmt: skip
 
 
@@ -277,7 +278,7 @@ def test_flow_lies_on_the_pixels_of_the_view(
     camera: tuple[Recipe, SampleParams], margin: int | None, backward: bool
 ) -> None:
     recipe, params = camera
-    frames = video()
+    frames, lead = video(recipe.frames_needed), 2 * recipe.lead_voxels
     chosen = FlowSettings("dis-fast", "backward" if backward else "forward", margin_px=margin)
     window = window_of(frames, params, recipe, margin)
     with every_method_is(recording):
@@ -286,7 +287,7 @@ def test_flow_lies_on_the_pixels_of_the_view(
     seen = apply_view(without_margin(window, params, recipe, margin), plain, recipe).astype(np.float16)
     source = params.source_index(recipe.steps)
     for voxel in range(4):
-        start, end = source[2 * voxel], source[2 * voxel + 2]
+        start, end = source[lead + 2 * voxel], source[lead + 2 * voxel + 2]
         if start == end:
             assert not made[voxel].any()
             continue
@@ -315,19 +316,6 @@ def test_the_view_is_the_same_whichever_window_was_decoded(
     alone = apply_view(decoded(source_window(params, recipe, Window(top, 0, HEIGHT, WIDTH))), params, recipe)
     window = decoded(source_window(params, recipe, Window(top, 0, HEIGHT, WIDTH), margin))
     np.testing.assert_array_equal(apply_view(without_margin(window, params, recipe, margin), params, recipe), alone)
-
-
-def test_flow_t_belongs_to_voxel_t_behind_a_lead_voxel() -> None:
-    recipe = RECIPE.replace(lead_voxels=1, lead_frames=1)
-    frames = video(11)
-    params = camera_params()
-    window = window_of(frames, params, recipe, 0)
-    with every_method_is(recording):
-        made = flow_for(window, params, recipe, FlowSettings("dis-fast", margin_px=0)).flow
-    assert made.shape == (4, 2, 64, 80)
-    for voxel in range(4):
-        np.testing.assert_array_equal(made[voxel, 0], frames[2 * voxel + 2, :64, :80])
-        np.testing.assert_array_equal(made[voxel, 1], frames[2 * voxel + 4, :64, :80])
 
 
 def test_steps_before_the_first_are_not_computed() -> None:
@@ -366,28 +354,3 @@ def test_what_does_not_fit_is_refused() -> None:
         flow_for(video(8), camera_params(), RECIPE, FlowSettings())
     with pytest.raises(UsageError, match=r"150x60 pixels.*source_window"):
         flow_for(video()[:, :60], camera_params(), RECIPE, FlowSettings())
-
-
-def median_of(made: np.ndarray) -> np.ndarray:
-    """[T, 2]: of the middle of each field."""
-    return np.median(made[:, :, 12:-12, 12:-12].astype(np.float64), axis=(2, 3))
-
-
-@pytest.mark.parametrize("scale", [1.0, 0.8, 1.5])
-@pytest.mark.parametrize("flip", [False, True])
-@pytest.mark.parametrize("direction", ["forward", "backward"])
-def test_a_pan_is_found_scaled_and_mirrored(scale: float, flip: bool, direction: str) -> None:
-    """Two frames a voxel: 4 px right and 2 px up of the video a step."""
-    frames = panned(9, 120, 170, 2, -1)
-    height, width = resized_size(120, 170, scale)
-    params = camera_params(
-        scale=scale, flip=flip, crop_top_px=(height - 64) // 2, crop_left_px=(width - 80) // 2, pauses=((3, 2),)
-    )
-    chosen = FlowSettings("dis-fast-1", direction, margin_px=20)
-    made = flow_for(window_of(frames, params, RECIPE, 20), params, RECIPE, chosen, validity=True)
-    expected = np.float64([4.0, -2.0]) * scale * (1 if direction == "forward" else -1)
-    expected[0] *= -1 if flip else 1
-    assert not made.flow[1].any()
-    np.testing.assert_allclose(median_of(made.flow[[0, 2, 3]]), np.tile(expected, (3, 1)), atol=0.15)
-    assert made.valid is not None
-    assert made.valid.mean() > 0.8

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +20,6 @@ from v2v_server.labels import (
     LEAST_SHARE,
     LEAST_SIDE_PX,
     READERS,
-    Box,
     BoxTable,
     check_labels,
     frame_of,
@@ -112,6 +110,9 @@ def mot(frame: int, tail: str = "") -> str:
     return f"{frame},7,11,21,30,20{tail}\n"
 
 
+GOOD = {"images": [{"id": 1, "frame_id": 0}], "annotations": []}
+
+
 @pytest.mark.parametrize(
     ("ending", "content", "message"),
     [
@@ -162,6 +163,29 @@ def mot(frame: int, tail: str = "") -> str:
         (".boxes/", {"0": "2 50.5 33.1 18.75 16.7"}, "give shares of the picture"),
         (".boxes/", {"classes": "person"}, r"has no file named by the number of a frame, like 000012\.txt"),
         (".boxes/", {"0": "2 0.5 0.5 0.1 0.1 3\n" * 2}, "has track 3 of class 2 twice"),
+        (".boxes.json", "{", "line 1"),
+        (".boxes.json", "[]", "is not a JSON object"),
+        (".boxes.json", {"images": []}, "has no list 'annotations'"),
+        (".boxes.json", GOOD | {"videos": [{}, {}]}, "describes 2 videos: write one file for each"),
+        (".boxes.json", {"images": [{"id": 1}], "annotations": []}, r"images\[0\].frame_id is None"),
+        (".boxes.json", GOOD | {"annotations": [{"image_id": 2}]}, r"annotations\[0\]: images has no id 2"),
+        (".boxes.json", GOOD | {"annotations": [3]}, r"annotations\[0\] is 3"),
+        (
+            ".boxes.json",
+            GOOD | {"annotations": [{"image_id": 1, "bbox": [1, 2, 3], "category_id": 1}]},
+            r"annotations\[0\].bbox is \[1, 2, 3\]: it must be \[left, top, width, height\]",
+        ),
+        (
+            ".boxes.json",
+            GOOD | {"annotations": [{"image_id": 1, "bbox": [1, 2, -3, 4], "category_id": 1}]},
+            r"annotations\[0\]: box .* width and height are at least 0",
+        ),
+        (".boxes.txt", "1,1,2,3\n", "line 1 has 4 values: give frame, track"),
+        (".boxes.txt", "1,1,2,3,4,5\n\n2,1,2,x,4,5\n", "line 3: could not convert"),
+        (".boxes.txt", "0,1,2,3,4,5\n", "line 1: frame 0: MOT counts frames from 1"),
+        (".boxes.txt", "1.5,1,2,3,4,5\n", "line 1: 1.5 is not a whole number"),
+        (".boxes.txt", "1,1,nan,3,4,5\n", "line 1: box .*: coordinates are at most"),
+        (".boxes.txt", "1,99999999,2,3,4,5\n", "line 1: track 99999999: give"),
     ],
 )
 def test_labels_that_do_not_fit_are_refused_in_words(
@@ -241,46 +265,6 @@ def test_the_number_at_the_end_of_a_name_is_the_frame(number: int, before: str, 
     assert frame_of("classes.txt") is None
 
 
-GOOD = {"images": [{"id": 1, "frame_id": 0}], "annotations": []}
-
-
-@pytest.mark.parametrize(
-    ("ending", "content", "message"),
-    [
-        (".boxes.json", "{", "line 1"),
-        (".boxes.json", "[]", "is not a JSON object"),
-        (".boxes.json", {"images": []}, "has no list 'annotations'"),
-        (".boxes.json", GOOD | {"videos": [{}, {}]}, "describes 2 videos: write one file for each"),
-        (".boxes.json", {"images": [{"id": 1}], "annotations": []}, r"images\[0\].frame_id is None"),
-        (".boxes.json", GOOD | {"annotations": [{"image_id": 2}]}, r"annotations\[0\]: images has no id 2"),
-        (".boxes.json", GOOD | {"annotations": [3]}, r"annotations\[0\] is 3"),
-        (
-            ".boxes.json",
-            GOOD | {"annotations": [{"image_id": 1, "bbox": [1, 2, 3], "category_id": 1}]},
-            r"annotations\[0\].bbox is \[1, 2, 3\]: it must be \[left, top, width, height\]",
-        ),
-        (
-            ".boxes.json",
-            GOOD | {"annotations": [{"image_id": 1, "bbox": [1, 2, -3, 4], "category_id": 1}]},
-            r"annotations\[0\]: box .* width and height are at least 0",
-        ),
-        (".boxes.txt", "1,1,2,3\n", "line 1 has 4 values: give frame, track"),
-        (".boxes.txt", "1,1,2,3,4,5\n\n2,1,2,x,4,5\n", "line 3: could not convert"),
-        (".boxes.txt", "0,1,2,3,4,5\n", "line 1: frame 0: MOT counts frames from 1"),
-        (".boxes.txt", "1.5,1,2,3,4,5\n", "line 1: 1.5 is not a whole number"),
-        (".boxes.txt", "1,1,nan,3,4,5\n", "line 1: box .*: coordinates are at most"),
-        (".boxes.txt", "1,99999999,2,3,4,5\n", "line 1: track 99999999: give"),
-    ],
-)
-def test_errors_name_the_place_and_the_remedy(
-    tmp_path: Path, ending: str, content: str | Mapping[str, Any], message: str
-) -> None:
-    path = tmp_path / f"a{ending}"
-    path.write_text(content if isinstance(content, str) else json.dumps(content))
-    with pytest.raises(ValueError, match=message):
-        read(ending, path)
-
-
 def test_files_are_numbered_by_the_end_of_their_names(tmp_path: Path) -> None:
     for name in ("a2_07.txt", ".hidden.txt", "notes.md", "11.TXT"):
         (tmp_path / name).write_text("5 0.5 0.5 2 2\n")
@@ -297,14 +281,6 @@ def test_files_are_numbered_by_the_end_of_their_names(tmp_path: Path) -> None:
     (tmp_path / "frame.txt").write_text("person\n")
     with pytest.raises(ValueError, match=r"frame\.txt: give it a name that ends with the number"):
         read(".boxes/", tmp_path)
-
-
-def test_boxes_of_a_frame_keep_their_order() -> None:
-    boxes = [Box(frame, float(number), 0.0, 1.0, 1.0, number, -1) for number, frame in enumerate((3, 1, 3, 1))]
-    table = BoxTable.of(boxes)
-    assert table.at(1)[1][:, 0].tolist() == [1, 3]
-    assert table.at(3)[1][:, 0].tolist() == [0, 2]
-    assert len(table.at(2)[0]) == 0
 
 
 # --- labels of a view -------------------------------------------------------------------------------------------------
@@ -338,28 +314,21 @@ def test_classes_are_grey_levels_or_palette_indices(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_mask(few, (3, 4)), classes % 2)
 
 
+NOISE = Image.fromarray(np.random.default_rng(0).integers(0, 9, (64, 64), np.uint8))
+
+
 @pytest.mark.parametrize(
-    ("picture", "message"),
+    ("picture", "kept", "message"),
     [
-        (Image.new("RGB", (4, 3)), "is neither 8-bit grey nor a palette"),
-        (Image.new("I;16", (4, 3)), "is neither 8-bit grey nor a palette"),
-        (Image.new("L", (3, 4)), "has 3x4 px: the video has 4x3 px"),
-        (None, "cannot identify"),
+        (Image.new("RGB", (64, 64)), None, "is neither 8-bit grey nor a palette"),
+        (Image.new("I;16", (64, 64)), None, "is neither 8-bit grey nor a palette"),
+        (Image.new("L", (63, 64)), None, "has 63x64 px: the video has 64x64 px"),
+        (NOISE, 4, "cannot identify"),
+        (NOISE, -200, ".*truncated"),
     ],
 )
-def test_other_pictures_are_refused(tmp_path: Path, picture: Image.Image | None, message: str) -> None:
-    path = tmp_path / "12.png"
-    if picture is None:
-        path.write_bytes(b"no picture")
-    else:
-        png(path, picture)
+def test_other_pictures_are_refused(tmp_path: Path, picture: Image.Image, kept: int | None, message: str) -> None:
+    path = png(tmp_path / "12.png", picture)
+    path.write_bytes(path.read_bytes()[:kept])
     with pytest.raises(ValueError, match=rf"^12\.png {message}"):
-        read_mask(path, (3, 4))
-
-
-def test_a_truncated_picture_is_refused(tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    Image.fromarray(np.random.default_rng(0).integers(0, 9, (64, 64), np.uint8)).save(stream, "PNG")
-    (tmp_path / "3.png").write_bytes(stream.getvalue()[:-200])
-    with pytest.raises(ValueError, match=r"^3\.png .*truncated"):
-        read_mask(tmp_path / "3.png", (64, 64))
+        read_mask(path, (64, 64))

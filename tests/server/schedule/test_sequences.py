@@ -100,27 +100,6 @@ def _divided(ends: list[int]) -> bytes:
     return encoded_pieces(parts if ends else pieces((9, Flag.FADE)), max(ends, default=9))
 
 
-@given(st.lists(_runs, max_size=8), st.integers(1, 6), _blocks)
-def test_lookup_by_rank_equals_the_list_between_shot_boundaries(
-    stretches: list[list[tuple[int, int]]], most: int, block: int
-) -> None:
-    spec = StreamSpec(recipe=SMALL, max_sequences_per_video=most, scene="auto")
-    videos, expected = [], []
-    for number, each in enumerate(stretches):
-        ends = list(itertools.accumulate(itertools.chain.from_iterable(each)))
-        runs = tuple(zip(ends[::2], ends[1::2], strict=True))
-        entry = dataclasses.replace(video(f"v{number}", max(ends, default=9)), pieces=_divided(ends))
-        starts = [
-            start
-            for first, end in runs
-            for start in range(first, end - SMALL.frames_needed + 1, SMALL.frames_per_sequence)
-        ]
-        videos.append(entry)
-        expected += [(entry.id, start) for start in starts[:most]]
-    with mock.patch.object(sequences, "_BLOCK", block):
-        assert listed(table(*videos, spec=spec)) == expected
-
-
 @given(
     st.lists(st.tuples(_runs, st.sampled_from((1.0, 24.0, 30_000 / 1001, 60.0, 240.0, math.nan, 1e5))), max_size=8),
     st.floats(0.01, 0.5),
@@ -193,11 +172,6 @@ def test_a_rank_outside_is_refused(rank: int) -> None:
     assert found.count == 3
     with pytest.raises(IndexError, match=f"sequence {rank} of 3"):
         found[rank]
-
-
-def test_an_empty_corpus_has_no_sequence() -> None:
-    found = table()
-    assert (found.count, found.videos, len(found.refusals)) == (0, 0, 0)
 
 
 # --- refusals -------------------------------------------------------------------------------------------------------
@@ -302,13 +276,6 @@ def test_all_that_a_lease_may_take_counts(asked: dict[str, Any], recipe: dict[st
     assert LARGEST_MEMORY_BYTES - MOST_LEASE_BYTES == 1 << 30
 
 
-def test_rows_count() -> None:
-    """WebVid: the top 54 % of 336 rows, which the paper's crop of 128 fits."""
-    assert table(video("a", 201, 336, 596), rows=Rows.parse("top:0.54"), spec=StreamSpec()).count == 1
-    (refusal,) = table(video("a", 201, 336, 596), rows=Rows.parse("top:0.3"), spec=StreamSpec()).refusals
-    assert refusal.reason == "picture 596x100 after rows top:0.3, the crop is 128x128"
-
-
 def test_rows_that_one_picture_does_not_have_reject_only_that_video() -> None:
     found = table(video("low", 100, height_px=10), video("tall", 5, height_px=20), rows=Rows.parse("top:12px"))
     assert listed(found) == [("tall", 0)]
@@ -339,11 +306,6 @@ def test_an_epoch_holds_every_sequence_once() -> None:
     orders = [epoch_order(of, seed, epoch) for seed in (0, 2**64 - 1) for epoch in (0, 2**32 - 1)]
     assert all(sorted(order) == sorted(catalogue_order) for order in orders)
     assert len(set(map(tuple, orders))) == 4
-
-
-def test_without_shuffle_every_epoch_is_in_catalogue_order() -> None:
-    of = schedule(30, 5, 45, shuffle=False)
-    assert epoch_order(of, 5, 0) == epoch_order(of, 6, 9) == sorted(epoch_order(of, 5, 0))
 
 
 def test_substitutes_are_fixed_and_leave_the_order_alone() -> None:

@@ -27,9 +27,7 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.store.cache import Cache, make_cache, piece_frames
-from v2v_server.store.format import RAW
 from v2v_server.store.quota import PARTIAL, QuotaFolder, count_bytes, used_bytes
-from v2v_server.store.store_file import StoreFile
 from v2v_server.worker.process import Clips
 from v2v_server.worker.produce import make_sample
 
@@ -97,21 +95,13 @@ def test_first_a_miss_then_hits(source: Path, folder: Path, changes: dict[str, A
     assert first[0] == "miss"
     assert set(first) <= {"hit", "miss"}
     assert epoch(source, Cache(folder, 1 << 30, 0), 8, spec) == ["hit"] * 8
-    assert used_bytes(folder) == sum(path.stat().st_size for path in pieces(folder))
+    used = sum(path.stat().st_size for path in pieces(folder))
+    assert used_bytes(folder) == used
     assert not list((folder / "partial").iterdir())
-
-
-def test_raw_pieces_of_earlier_releases_are_read(source: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    epoch(source, Cache(folder, 1 << 30, 0), 2)
-    with monkeypatch.context() as earlier:
-        earlier.setattr("v2v_server.store.cache.QUICK", RAW)
-        epoch(source, Cache(folder, 1 << 30, 0), 8)
-    assert epoch(source, Cache(folder, 1 << 30, 0), 8) == ["hit"] * 8
-    found = set()
-    for path in pieces(folder):
-        with StoreFile(path) as stored:
-            found.add(stored.head.packing)
-    assert found == {"zstd", "raw"}
+    (folder / "used").write_bytes(b"nonsense")
+    assert used_bytes(folder) == 0
+    make_cache(folder)  # as each start does
+    assert used_bytes(folder) == used
 
 
 def test_waits_for_other_processes_are_told_and_its_files_are_private(source: Path, folder: Path) -> None:
@@ -132,6 +122,8 @@ def test_siblings_are_read_at_once(source: Path, folder: Path) -> None:
 
 def test_at_its_limit_it_keeps_what_it_has(source: Path, folder: Path) -> None:
     assert set(epoch(source, Cache(folder, 0, 0))) == {"miss: full: 0.00 of 0 GiB"}
+    (said,) = set(epoch(source, Cache(folder, 1 << 30, least_free_bytes=1 << 60)))
+    assert said.startswith("miss: disk full: ")
     assert not pieces(folder)
     epoch(source, Cache(folder, 1 << 30, 0), 2)
     kept = pieces(folder)
@@ -139,11 +131,6 @@ def test_at_its_limit_it_keeps_what_it_has(source: Path, folder: Path) -> None:
     assert said[:2] == ["hit", "hit"]
     assert any("full" in each for each in said)
     assert pieces(folder) == kept
-
-
-def test_a_disk_that_is_nearly_full_is_left_alone(source: Path, folder: Path) -> None:
-    (said,) = set(epoch(source, Cache(folder, 1 << 30, least_free_bytes=1 << 60)))
-    assert said.startswith("miss: disk full: ")
 
 
 def test_a_folder_that_is_gone_is_not_made_again(source: Path, folder: Path) -> None:
@@ -241,21 +228,6 @@ def test_what_a_killed_worker_leaves_is_not_used_and_removed(source: Path, folde
     assert set(epoch(source, cache)) == {"hit"}
 
 
-def test_bytes_are_recounted_at_the_start(source: Path, folder: Path) -> None:
-    epoch(source, Cache(folder, 1 << 30, 0))
-    right = used_bytes(folder)
-    (folder / "used").write_bytes(b"nonsense")
-    assert used_bytes(folder) == 0
-    make_cache(folder)
-    assert used_bytes(folder) == right
-
-
-def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(CorpusError, match=r"--cache .*/file/below: cannot be written to: Not a directory"):
-        make_cache(tmp_path / "file" / "below")
-
-
 def test_pieces_of_large_pictures_are_short() -> None:
     assert [piece_frames(*size) for size in ((181, 596), (1080, 1920), (2160, 3840), (4320, 8192))] == [
         256,
@@ -275,13 +247,10 @@ def test_a_lock_that_is_never_released_costs_no_sample(source: Path, folder: Pat
     assert set(epoch(source, Cache(folder, 1 << 30, 0))) <= {"miss", "hit"}
 
 
-def test_other_users_cannot_open_the_used_file(folder: Path) -> None:
+def test_the_used_file_is_private_and_a_pipe_in_its_place_blocks_nothing(folder: Path) -> None:
     (folder / "used").chmod(0o644)
     make_cache(folder)
     assert (folder / "used").stat().st_mode & 0o777 == 0o600
-
-
-def test_a_pipe_in_place_of_the_used_file_blocks_nothing(folder: Path) -> None:
     (folder / "used").unlink()
     os.mkfifo(folder / "used")
     assert used_bytes(folder) == 0
@@ -316,19 +285,15 @@ def names(quota: QuotaFolder) -> set[str]:
     return {path.name for path in (quota.folder / "ab").iterdir()}
 
 
-def test_what_does_not_fit_is_not_added(quota: QuotaFolder) -> None:
+def test_what_does_not_fit_is_not_added_and_what_is_replaced_counts_once(quota: QuotaFolder) -> None:
     assert add(quota, "a", 60)
     assert not add(quota, "b", 41)
-    assert add(quota, "c", 40)
-    assert names(quota) == {"a", "c"}
-
-
-def test_a_file_that_is_replaced_counts_once(quota: QuotaFolder) -> None:
-    assert add(quota, "a", 60)
     assert add(quota, "a", 40)
     assert quota.used_bytes == 40
+    assert add(quota, "c", 60)
+    assert names(quota) == {"a", "c"}
     quota.remove(quota.folder / "ab" / "a")
-    assert quota.used_bytes == 0
+    assert quota.used_bytes == 60
 
 
 def test_the_oldest_without_a_reader_goes(quota: QuotaFolder) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -19,7 +18,6 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server import motion
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.store_file import StoreFile
 from v2v_server.worker.produce import decode_for, make_sample
 
 ROWS, PLANES = "top:0.9", ("motion",)
@@ -103,18 +101,3 @@ def test_where_nothing_moves_no_margin_is_read_for_sub_steps(tmp_path: Path, flo
     require_equal([found], [expected])
     assert read[0] - 26 <= (8 if flow else 0) < around[0] - 26
     assert read[1] - 32 <= (8 if flow else 0) < around[1] - 32
-
-
-def test_motion_is_added_to_a_store_that_lacks_it(folders: dict[str, Path], tmp_path: Path) -> None:
-    store = Path(shutil.copytree(folders["plain"], tmp_path / "store"))
-    before = (store / "turned.mov").read_bytes()
-    report = run(folders["source"], store, rows=ROWS, planes=PLANES)
-    assert report.complete
-    assert (report.kept, report.looked_at) == (0, 0)
-    after = (store / "turned.mov").read_bytes()
-    assert after == (folders["planes"] / "turned.mov").read_bytes()
-    assert after.startswith(before)
-    assert run(folders["source"], store, rows=ROWS, planes=PLANES).kept == 1
-    assert run(folders["source"], store, rows=ROWS).kept == 1
-    with StoreFile(store / "turned.mov") as stored:
-        assert stored.planes == {"motion"}

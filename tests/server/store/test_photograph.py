@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterator
 from contextlib import closing
@@ -111,10 +110,18 @@ def test_lengths_and_rates_are_checked(seconds: float, rate: float) -> None:
             VideosKind("photographs", rate, seconds)
 
 
-def test_only_photographs_have_a_length() -> None:
-    for kind in ("videos", "sequences"):
-        with pytest.raises(UsageError, match="photographs a rate and a duration"):
-            VideosKind(kind, 0.0, 10.0)
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (("videos", 0.0, 10.0), "photographs a rate and a duration"),
+        (("sequences", 0.0, 10.0), "photographs a rate and a duration"),
+        (("videos", 25.0), r"--videos-kind videos, --rate 25: .*sequences can have a rate"),
+        (("films",), "--videos-kind films, --rate 0: choose one of videos, sequences"),
+    ],
+)
+def test_only_photographs_have_a_length_and_videos_no_rate(settings: tuple[Any, ...], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        VideosKind(*settings)
 
 
 @pytest.mark.parametrize("turned", range(1, 9))
@@ -183,6 +190,9 @@ def test_bad_photographs_are_refused_alone(tmp_path: Path, picture: Grey) -> Non
         with pytest.raises(VideoError, match="Invalid data"):
             still(photos / "spoilt.jpg", catalogue)
         assert still(photos / "behind.jpg", catalogue).shape == picture.shape
+        (photos / "good.jpg").write_bytes(data[:-100])
+        with pytest.raises(VideoError, match="changed"):
+            Photograph(photos / "good.jpg").check(catalogue.videos[1].fingerprint)
 
 
 def test_what_is_no_photograph_is_left_out(tmp_path: Path, picture: Grey) -> None:
@@ -294,33 +304,8 @@ def test_a_large_photograph_takes_the_memory_of_its_crops() -> None:
     assert SequenceTable(large, corpus(*large).rows, spec).count == 3
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_photographs_of_a_bucket_are_as_on_a_disk(folder: Path, samples: list[Sample], tmp_path: Path) -> None:
-    fsspec = pytest.importorskip("fsspec", reason="the extra 'cloud' is not installed")
-    store = fsspec.filesystem("memory")
-    for path in sorted(folder.iterdir()):
-        store.pipe(f"/photos/{path.name}", path.read_bytes())
-    try:
-        options: dict[str, Any] = {"cache_dir": tmp_path, "copies": tmp_path / "copies", "processes": 0}
-        with closing(open_catalogue("memory://photos", kind=PHOTOGRAPHS, **options)) as bucket:
-            assert all(map(same, samples_of(bucket, ROW), samples))
-    finally:
-        store.rm("/photos", recursive=True)
-
-
 def test_a_picture_is_no_video(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(CorpusError, match="is a picture: add --videos-kind photographs"):
         open_catalogue(folder / "b.jpg", cache_dir=tmp_path, processes=0)
     with closing(open_catalogue(folder / "b.jpg", cache_dir=tmp_path, kind=PHOTOGRAPHS, processes=0)) as one:
         assert list(one.videos.ids) == ["b.jpg"]
-
-
-def test_a_stream_of_bytes_is_not_read_to_its_end(tmp_path: Path, picture: Grey) -> None:
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "PNG")
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos/a.png").write_bytes(buffer.getvalue())
-    with opened(tmp_path / "photos") as catalogue:
-        (tmp_path / "photos/a.png").write_bytes(buffer.getvalue()[:-40])
-        with pytest.raises(VideoError, match="changed"):
-            Photograph(tmp_path / "photos/a.png").check(catalogue.videos[0].fingerprint)

@@ -88,10 +88,6 @@ def test_seconds(index: FrameIndex) -> None:
     np.testing.assert_allclose(index.seconds(index.first, len(index)), wanted, rtol=1e-14)
 
 
-def test_seconds_unknown() -> None:
-    assert np.isnan(unseekable(5, (1, 25), 48, 64).seconds(1, 3)).all()
-
-
 @pytest.mark.parametrize(("start", "count"), [(0, 1), (3, 8), (3, 0), (10, 1)])
 def test_ranges_outside(start: int, count: int) -> None:
     index = FrameIndex(3, np.arange(7), np.array([3]), np.array([0]), (1, 25), 48, 64, seekable=True)

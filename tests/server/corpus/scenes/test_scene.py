@@ -42,7 +42,6 @@ from v2v_server.corpus.scenes.scene import (
     firsts_of,
 )  # fmt: skip
 from v2v_server.corpus.scenes.stretches import duplicated, pattern_of, runs_of
-from v2v_server.corpus.videos import SplitVideos, encoded_pieces
 from v2v_server.system.isolate import run_twice
 from v2v_server.video.rows import Rows
 
@@ -58,17 +57,6 @@ def other(frames: int, right_px: int = 1, height: int = 96, width: int = 160) ->
     photo = np.array(data.coffee()[..., 1], np.uint8)  # type: ignore[no-untyped-call]
     columns = (np.arange(frames)[:, None] * right_px + np.arange(width)) % photo.shape[1]
     return photo[100 : 100 + height][:, columns].transpose(1, 0, 2)
-
-
-def test_a_still_clip_neither_moves_nor_changes() -> None:
-    scene = analyse(np.repeat(pan(1, 0), 40, axis=0))
-    values = scene.values(0, 40)
-    assert scene.end == 40
-    assert len(scene.segments) == 3
-    assert not values[:, MOTION].any()
-    assert not values[:, CHANGE].any()
-    assert not values[:, [FLICKER, NOISE]].any()
-    assert scene.shot_boundaries == ()
 
 
 @pytest.mark.parametrize("pace_px", [1, 2, 4])
@@ -117,12 +105,9 @@ def test_noise_and_flicker_have_the_strength_they_were_given() -> None:
     assert analyse(flickering).values(0, 33)[0, FLICKER] == pytest.approx(4.0, abs=0.1)
 
 
-@pytest.mark.parametrize("at", [1, 2, 7, 16, 30, 39])
-def test_a_cut_is_found_where_it_is(at: int) -> None:
-    assert analyse(np.concatenate([pan(at, 2), other(40 - at, 2)])).shot_boundaries == (at,)
-
-
-def test_cuts_in_quick_succession_to_black_and_of_dark_scenes() -> None:
+def test_cuts_are_found_where_they_are_in_quick_succession_to_black_and_of_dark_scenes() -> None:
+    for at in (1, 2, 7, 16, 30, 39):
+        assert analyse(np.concatenate([pan(at, 2), other(40 - at, 2)])).shot_boundaries == (at,)
     parts = [pan(12, 1), other(9), pan(11, 1)[:, ::-1], np.zeros((10, 96, 160), np.uint8), pan(12, 1)]
     assert analyse(np.concatenate(parts)).shot_boundaries == (12, 21, 32, 42)
     dark = np.concatenate([pan(12, 1), other(12)]) // 12
@@ -137,27 +122,17 @@ def test_a_jump_within_a_moving_shot_is_found() -> None:
     assert analyse(np.concatenate([luma[:25], luma[27:]])).shot_boundaries == ()
 
 
-def test_what_appears_in_a_still_picture_and_another_light_are_no_jumps() -> None:
+def test_what_appears_another_light_flashes_flicker_fades_and_motion_are_no_cuts() -> None:
     still = np.repeat(pan(1, 0), 40, axis=0)
     still[20:, 40:72, 60:110] = 200
     lit = pan(40, 1)
     lit[20:] = np.rint(lit[20:] * 0.6 + 20)
-    for luma in (still, lit):
-        assert analyse(luma).shot_boundaries == ()
-
-
-@pytest.mark.parametrize("pace_px", [0, 1, 8, 20])
-def test_motion_is_no_cut(pace_px: int) -> None:
-    assert analyse(pan(60, pace_px)).shot_boundaries == ()
-
-
-def test_flashes_flicker_fades_and_starting_motion_are_no_cuts() -> None:
     flash = pan(40, 1)
     flash[20] = np.clip(flash[20].astype(int) * 2 + 60, 0, 255)
     flicker = (pan(40, 1) * np.where(np.arange(40) % 2, 1.0, 0.8)[:, None, None]).astype(np.uint8)
     fade = (pan(40, 1) * np.linspace(1, 0, 40)[:, None, None]).astype(np.uint8)
     starts = np.concatenate([np.repeat(pan(1, 0), 20, axis=0), pan(21, 3)[1:]])
-    for luma in (flash, flicker, fade, starts):
+    for luma in (still, lit, flash, flicker, fade, starts, *(pan(60, pace_px) for pace_px in (0, 1, 8, 20))):
         assert analyse(luma).shot_boundaries == ()
 
 
@@ -333,24 +308,6 @@ def test_clipped_pieces_say_the_same_of_each_frame(drawn: tuple[int, Pieces], st
     assert by_frame(clip_pieces(whole, 0, start, start + count), start) == all_frames[start : start + count]
 
 
-@given(st.lists(videos()))
-def test_columns_hold_the_pieces_of_the_videos_that_are_divided(drawn: list[tuple[int, Pieces]]) -> None:
-    encoded = [encoded_pieces(each, frames) for frames, each in drawn]
-    for (frames, each), one in zip(drawn, encoded, strict=True):
-        said = set(by_frame(clip_pieces(each, 0, 0, frames), 0))
-        assert bool(one) == (said != {(0, *NO_BARS)} or len(clip_pieces(each, 0, 0, frames)) > 1)
-    split = SplitVideos.of(encoded)
-    assert split.numbers.tolist() == [number for number, one in enumerate(encoded) if one]
-    assert [split.encoded(number) for number in range(len(drawn))] == encoded
-    assert split.firsts().tolist() == [
-        first for frames, each in drawn if encoded_pieces(each, frames)
-        for first in firsts_of(clip_pieces(each, 0, 0, frames), 0).tolist()
-    ]  # fmt: skip
-    part = split.between(1, 3)
-    assert [part.encoded(number) for number in (1, 2)] == [*encoded, b"", b"", b""][1:3]
-    assert part.bounds.dtype == split.bounds.dtype == split.numbers.dtype == np.int32
-
-
 # --- repeats and stretches --------------------------------------------------------------------------------------------
 
 BLOCKS = 100
@@ -371,17 +328,17 @@ def test_one_repeat_in_each_period_is_found_and_named(period: int, data: st.Data
     assert pattern_of(flags) == special.get(period, f"1 of every {period}")
 
 
-def test_motion_that_comes_to_rest_or_begins_is_no_repeat() -> None:
-    resting = [MOVING] * 20 + [0] * 20 + [MOVING] * 20
-    assert not duplicated(resting, BLOCKS).any()
-
-
-def test_a_cut_in_slow_motion_makes_no_repeats() -> None:
-    assert not duplicated(([MOVING] * 10 + [900 * MOVING]) * 6, BLOCKS).any()
-
-
-def test_changes_below_coder_noise_are_no_motion() -> None:
-    assert not duplicated([MOVING // 30, 0] * 30, BLOCKS).any()
+@pytest.mark.parametrize(
+    "changes",
+    [
+        pytest.param([MOVING] * 20 + [0] * 20 + [MOVING] * 20, id="motion comes to rest and begins"),
+        pytest.param(([MOVING] * 10 + [900 * MOVING]) * 6, id="cuts in slow motion"),
+        pytest.param([MOVING // 30, 0] * 30, id="below coder noise"),
+        pytest.param([MOVING] * 29 + [30 * MOVING, 0] + [MOVING] * 29, id="a keyframe that a coder repeats"),
+    ],
+)
+def test_what_looks_like_a_repeat(changes: list[int]) -> None:
+    assert not duplicated(changes, BLOCKS).any()
 
 
 @pytest.mark.parametrize("repeats", [3, 4])
@@ -399,12 +356,6 @@ def test_a_single_repeat_amid_motion_is_found(place: int, change: int, data: st.
     changes[place] = change
     expected = [place] if 4 <= place < 56 else []
     assert np.flatnonzero(duplicated(changes, BLOCKS)).tolist() == expected
-
-
-def test_a_keyframe_that_a_coder_repeats_is_no_repeat() -> None:
-    changes = [MOVING] * 60
-    changes[29:31] = [30 * MOVING, 0]
-    assert not duplicated(changes, BLOCKS).any()
 
 
 @given(st.lists(st.booleans(), max_size=40), st.integers(1, 5), st.integers(0, 3))

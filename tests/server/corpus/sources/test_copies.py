@@ -107,6 +107,9 @@ def test_a_video_is_fetched_once(store: Path) -> None:
     with made.open_local("a.mp4", f"{mark}-content") as path:
         assert path.stat().st_size == SIZE
     assert [each.name for each in (made.copies / PARTIAL).iterdir() if each.suffix != ".lock"] == []
+    found = [path for path in made.copies.rglob("*") if path.is_file()]
+    assert {path.suffix for path in found} >= {".mp4", ".lock"}
+    assert {stat.S_IMODE(path.stat().st_mode) for path in found} == {0o600}, "other users cannot lock a copy"
 
 
 def test_an_object_that_changed_in_the_middle_only_is_fetched_again(store: Path) -> None:
@@ -153,14 +156,6 @@ def test_a_slot_that_another_process_keeps_is_not_waited_for(store: Path, monkey
         with pytest.raises(VideoUnreadable, match="other processes keep all 64 of its slots"):
             made.fetch({"b.mp4": fingerprint(store / "b.mp4")})
     made.fetch({"b.mp4": fingerprint(store / "b.mp4")})
-
-
-def test_other_users_cannot_lock_a_copy(store: Path) -> None:
-    made = copies(store)
-    made.fetch({"a.mp4": fingerprint(store / "a.mp4")})
-    found = [path for path in made.copies.rglob("*") if path.is_file()]
-    assert {path.suffix for path in found} >= {".mp4", ".lock"}
-    assert {stat.S_IMODE(path.stat().st_mode) for path in found} == {0o600}
 
 
 def test_an_object_that_is_gone_or_changed(store: Path) -> None:
@@ -387,9 +382,4 @@ def test_a_list_restricts_it(clips: Path, tmp_path: Path, fetched: list[str]) ->
 def test_a_prepared_corpus_has_to_be_on_a_disk(clips: Path) -> None:
     (clips / "deep" / "v2v-prepared.jsonl").write_text("{}\n", encoding="utf-8")
     with pytest.raises(CorpusError, match="makes it a prepared corpus"), catalogue(clips):
-        pass
-
-
-def test_an_empty_address(clips: Path) -> None:
-    with pytest.raises(CorpusError, match="no video found"), catalogue(clips / "nothing"):
         pass
