@@ -10,8 +10,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
-
 from bench.processes import free_ports
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
 from v2v_client import V2VStreamDataset
@@ -49,22 +47,14 @@ def iterating(address: str) -> Iterator[tuple[Future[list[str]], threading.Event
             go_on.set()
 
 
-def kill(server: LocalServer) -> None:
-    os.kill(server.pid, signal.SIGKILL)
-
-
-@pytest.fixture
-def flags() -> list[str]:
-    """Return flags with an address for two servers in turn: no connection gets its port in between."""
-    return [*SMALL_FLAGS, "--bind", f"tcp://127.0.0.1:{free_ports(1)[0]}"]
-
-
-def test_the_client_goes_on_with_a_restarted_server(clips: Path, flags: list[str]) -> None:
+def test_the_client_goes_on_with_a_restarted_server(clips: Path) -> None:
+    # An address for two servers in turn: no connection gets its port in between.
+    flags = [*SMALL_FLAGS, "--bind", f"tcp://127.0.0.1:{free_ports(1)[0]}"]
     with LocalServer(clips, workers=1, flags=flags) as first:
         address = first.address
         expected = [digest(batch) for batch in epoch_of(address)]
         with iterating(address) as (client, go_on):
-            kill(first)
+            os.kill(first.pid, signal.SIGKILL)
             go_on.set()  # it waits for samples while there is no server
             with LocalServer(clips, workers=2, flags=flags):
                 assert client.result() == expected

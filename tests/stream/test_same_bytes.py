@@ -92,25 +92,3 @@ def test_v2v_simulate_makes_the_same_sample(clips: Path, server: LocalServer, tm
     assert provenance == json.loads(json.dumps(batch.provenance[1].to_dict()))
     assert provenance["id"]["index"] == 7 == batch.indices[1]
     assert (tmp_path / "sample.png").stat().st_size > 1000
-
-
-def test_flow_is_remade_like_everything_else(clips: Path, server: LocalServer) -> None:
-    """All arrays, with flow settings that are not the default; a paused step moves by exactly nothing."""
-    arrays = ("voxels", "frames", "flow", "flow_valid")
-    flow = {"flow_method": "dis-ultrafast", "flow_direction": "backward", "flow_from": 1, "flow_margin_px": 8}
-    recipe = SMALL.replace(pause_probability=0.5)
-    batch = next(iter(V2VStreamDataset(server.address, 3, arrays, recipe, seed=3, **flow)))
-    catalogue = open_catalogue(clips)
-    try:
-        spec = StreamSpec.from_dict({"recipe": recipe, **flow})
-        for row, index in enumerate(batch.indices):
-            sample = remake(catalogue, spec, seed=3, epoch=0, index=index, arrays=arrays)
-            for name in arrays:
-                np.testing.assert_array_equal(batch.arrays[name][row].numpy(), sample.arrays[name])
-            source = sample.provenance.params.source_index(recipe.steps)[[0, 5, 10, 15, 20]]
-            still = np.flatnonzero(source[1:] == source[:-1])
-            assert not sample.arrays["flow"][still].any()
-            assert not sample.arrays["flow"][0].any()
-        assert any(batch.arrays["flow"][row].any() for row in range(3))
-    finally:
-        catalogue.close()
