@@ -63,18 +63,6 @@ def test_the_unit_waits_for_its_bind_address(unit: RawConfigParser) -> None:
     assert unit["Unit"]["Wants"] == "network-online.target"
 
 
-def test_a_container_stops_before_the_server_has_signal_handlers() -> None:
-    assert [service["init"] for service in SERVICES.values()] == [True, True, True]
-    for file in ("Dockerfile", "trainer.Dockerfile"):
-        assert "#   docker run --rm --init " in (DEPLOY / file).read_text()
-
-
-def test_a_mistyped_folder_of_videos_is_not_created() -> None:
-    (videos,) = [volume for volume in SERVICES["v2v-server"]["volumes"] if "VIDEOS" in str(volume)]
-    assert (videos["type"], videos["target"], videos["read_only"]) == ("bind", "/videos", True)
-    assert videos["bind"] == {"create_host_path": False}
-
-
 def test_a_container_has_minimal_rights() -> None:
     """It does not run as root either: both images set a user."""
     for service in SERVICES.values():

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.test_deploy_cluster import KUBERNETES, KUBERNETES_VERSION
+from tests.test_deploy_cluster import KUBERNETES, KUBERNETES_VERSION, build
 from v2v_protocol.errors import KeyRefused
 from v2v_protocol.keys import read_key
 from v2v_server.commands import serve as serve_command
@@ -42,12 +42,7 @@ def test_with_keys_the_manifests_build_and_the_broker_requires_them(
     components: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     validate = pytest.importorskip("kubernetes_validate")
-    shutil.copytree(KUBERNETES, tmp_path / "k")
-    file = tmp_path / "k" / "kustomization.yaml"
-    file.write_text(file.read_text() + yaml.safe_dump({"components": components}))
-    built = subprocess.run(["kubectl", "kustomize", tmp_path / "k"], capture_output=True, text=True, check=False)
-    assert built.returncode == 0, built.stderr
-    made = {(each["kind"], each["metadata"]["name"]): each for each in yaml.safe_load_all(built.stdout)}
+    made = {(each["kind"], each["metadata"]["name"]): each for each in build(components, tmp_path / "k")}
     for kind, document in made.items():
         if kind[0] != "ScaledObject":
             validate.validate(document, KUBERNETES_VERSION, strict=True)

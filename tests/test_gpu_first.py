@@ -29,10 +29,6 @@ FILES = {
 }
 
 
-def test_bash_reads_it() -> None:
-    subprocess.run(["bash", "-n", SCRIPT], check=True)
-
-
 @pytest.mark.parametrize("configuration", ["firenet-cpu", "e2vid"])
 def test_settings_are_known(configuration: str) -> None:
     """Also those that only a run with a GPU uses."""

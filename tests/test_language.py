@@ -45,15 +45,6 @@ def test_packages_use_no_forbidden_words() -> None:
     assert [line for path in checked for line in found(path)] == []
 
 
-def test_pages_hold_no_marks_of_a_merge() -> None:
-    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
-    assert ROOT / "docs" / "accuracy.md" in pages
-    marks = ("<<<<<<<", ">>>>>>>", "|||||||")
-    assert [
-        str(page) for page in pages for line in page.read_text("utf-8").splitlines() if line.startswith(marks)
-    ] == []
-
-
 def public(body: list[ast.stmt], of_class: str = "") -> Iterator[tuple[ast.FunctionDef, str]]:
     """Yield the public functions of a body, each with its docstring; a constructor has that of its class."""
     for node in body:

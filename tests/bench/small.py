@@ -7,10 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.clips import write_panned
-from v2v_protocol.recipe import Recipe
 
-RECIPE = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=40)
-"""Needs 21 frames."""
 FLAGS = ["--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=40"]
 
 

@@ -101,7 +101,6 @@ class FakeServer:
         self.snapshot = 0
         self.workers = "here"
         self.hellos: list[Hello] = []
-        self.goodbyes = 0
         self.wants: list[tuple[int, int]] = []
         self.slots: list[int] = []
         self.arenas: list[str] = []
@@ -220,7 +219,6 @@ class FakeServer:
         if isinstance(message, Hello):
             self._send(identity, encode(self._welcome(identity, message)))
         elif isinstance(message, Goodbye):
-            self.goodbyes += 1
             self._sessions.pop(identity, None)
         elif isinstance(message, Ping):
             self._send(identity, encode(Pong(self.trouble)))

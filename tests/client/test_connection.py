@@ -248,8 +248,9 @@ def test_no_address_or_a_repeated_one_is_refused(given: object) -> None:
 
 
 @pytest.mark.usefixtures("only_mute_is_silent")
+@pytest.mark.parametrize("is_killed", [False, True])
 def test_after_a_broker_falls_silent_every_sample_still_comes_once(
-    servers: tuple[FakeServer, FakeServer],
+    servers: tuple[FakeServer, FakeServer], is_killed: bool
 ) -> None:
     one, other = servers
     stream = dataset([one.address, other.address])
@@ -260,7 +261,10 @@ def test_after_a_broker_falls_silent_every_sample_still_comes_once(
         indices.append(batch.indices)
         if not silenced:
             assert len(other.wants) == asked_before, "only compared until then"
-            one.call(lambda: setattr(one, "mute", True))
+            if is_killed:
+                one.restart(mute=True)
+            else:
+                one.call(lambda: setattr(one, "mute", True))
             silenced = True
     assert indices == whole
     assert len(other.wants) > asked_before

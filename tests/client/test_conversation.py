@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.client.fake_server import SPEC, expected
-from v2v_client.connection import Connection
 from v2v_client.conversation import Conversation, Event, ListeningClock, State
 from v2v_client.options import Patience
 from v2v_client.position import StreamIdentity
@@ -31,7 +30,6 @@ from v2v_protocol.messages import (
     Want,
     Welcome,
     decode,
-    encode,
     encode_sample,
 )
 from v2v_protocol.sample import Provenance, SampleId, SampleParams
@@ -219,46 +217,6 @@ def test_timeouts_must_be_positive(name: str) -> None:
 # --- over queues ------------------------------------------------------------------------------------------------------
 
 
-class Queues:
-    """Link to a server in this thread. Its answers are lost until ``silent_until``; waiting advances the clock."""
-
-    def __init__(self, silent_until: float = 0.0) -> None:
-        self.now = 0.0
-        self.silent_until = silent_until
-        self.connected: list[bool] = []
-        self.answers: list[Frames] = []
-        self.left = 0
-
-    def connect(self, largest_frame_bytes: int, *, again: bool = False) -> None:
-        self.connected.append(again)
-        self.answers.clear()
-
-    def disconnect(self, *, linger_ms: int) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
-
-    def has_reconnected(self) -> bool:
-        return False
-
-    def send(self, frames: Sequence[Any]) -> None:
-        message = decode(frames[0])
-        self.left += isinstance(message, Goodbye)
-        if self.now >= self.silent_until:
-            match message:
-                case Hello():
-                    self.answers.append(encode(WELCOME))
-                case Want():
-                    self.answers += [sample(index) for index in reversed(message.indices)]
-
-    def receive(self, seconds: float) -> Frames | None:
-        if self.answers:
-            return self.answers.pop(0)
-        self.now += seconds
-        return None
-
-
 def sample(index: int) -> Frames:
     arrays = {name: expected(name, 5, 0, index) for name in HELLO.arrays}
     params = SampleParams(0.2, 0.3, 0.0, 0, 0.0, (), 1.0, 0, 0, False, 0.0, (1, 2, 3, 4))
@@ -267,20 +225,6 @@ def sample(index: int) -> Frames:
     return encode_sample(
         epoch=0, index=index, arrays=arrays, provenance=provenance.to_dict(), worker="w", cpu_seconds=0.1
     )
-
-
-@pytest.mark.parametrize(("silent_until", "made_anew"), [(0.0, 0), (25.0, 2)])
-def test_a_connection_works_over_queues(silent_until: float, made_anew: int) -> None:
-    """It needs no socket and no thread, so a silence of 25 s takes no time."""
-    link = Queues(silent_until)
-    connection = Connection("tcp://x:1", HELLO, 0, patience=PATIENCE, clock=lambda: link.now, transport=lambda _: link)
-    connection.open()
-    connection.want(range(7))
-    arrivals = [connection.receive() for _ in range(7)]
-    connection.close()
-    assert sorted(arrival.header.index for arrival in arrivals if arrival is not None) == list(range(7))
-    assert link.connected.count(True) == made_anew
-    assert link.left == 2  # to learn the layout, and at the end
 
 
 def test_waiting_time_is_reported_once_a_second_and_at_the_end() -> None:

@@ -230,17 +230,6 @@ def after(batch: int) -> ResumeState:
     return ALONE.after(BEGINNING, ALONE.plan(STREAM, BEGINNING), batch, None)
 
 
-def test_the_state_after_a_batch_is_where_the_rest_begins() -> None:
-    plan = ALONE.plan(STREAM, BEGINNING)
-    every = [plan.indices(batch) for batch in range(plan.batches)]
-    for batch in range(plan.batches - 1):
-        state = ALONE.after(BEGINNING, plan, batch, quarantine=2)
-        rest = ALONE.plan(STREAM, state)
-        assert [rest.indices(number) for number in range(rest.batches)] == every[batch + 1 :]
-        assert (state.seed, state.epoch, state.quarantine) == (3, 7, 2)
-    assert after(plan.batches - 1) == BEGINNING.at_epoch(8)
-
-
 def test_another_world_size_takes_up_what_no_rank_consumed() -> None:
     taken = HALF.adopt(after(0))
     assert (taken.origin, taken.position, taken.world_size) == (4, 0, 2)
@@ -260,8 +249,12 @@ def test_a_rest_without_a_global_batch_is_skipped_unless_its_epoch_is_named(name
     assert position.start(HALF).place == (8 if named else 9, 0, 0)
 
 
-@pytest.mark.parametrize("here", [None, (0, 2), (1, 3)], ids=str)
-def test_a_share_belongs_to_one_loader_worker(here: tuple[int, int] | None) -> None:
+@pytest.mark.parametrize(
+    ("here", "consumer"),
+    [(None, ALONE), ((0, 2), ALONE), ((1, 3), ALONE), ((1, 2), Consumer(5, 0, 1)), ((1, 2), Consumer(4, 0, 2))],
+    ids=str,
+)
+def test_a_share_belongs_to_one_loader_worker(here: tuple[int, int] | None, consumer: Consumer) -> None:
     state = Iteration(1, BEGINNING, worker=1, workers=2, in_loader=True).after(ALONE, 2, None)
     become_worker(1, 2)
     Position(3, 0).load(state, ALONE)
@@ -269,8 +262,8 @@ def test_a_share_belongs_to_one_loader_worker(here: tuple[int, int] | None) -> N
     if here is not None:
         become_worker(*here)
     Position(3, 0).load(BEGINNING, ALONE)
-    with pytest.raises(UsageError, match="loader worker 1 of 2"):
-        Position(3, 0).load(state, ALONE)
+    with pytest.raises(UsageError, match=r"loader worker 1 of 2 \(batch_size 4, world size 1\)"):
+        Position(3, 0).load(state, consumer)
 
 
 def test_only_the_newest_iteration_affects_the_position() -> None:

@@ -6,7 +6,7 @@ from contextlib import suppress
 from typing import Any
 
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from v2v_client.passes import Iteration
@@ -56,14 +56,18 @@ def test_another_world_size_goes_on_at_a_global_batch_boundary(sequences, world,
     assert sequences - len(both) < other_world * other
 
 
-@given(SEQUENCES, RANKS, BATCH, st.integers(0, 40))
-def test_position_after_a_batch_resumes_at_the_next_one(sequences, world, batch, number):
-    plan = EpochPlan(sequences, world, world - 1, batch)
-    assume(number + 1 < plan.batches)
-    after = Consumer(batch, world - 1, world).after(ResumeState(None, 0, 0, 0, 0, world), plan, number, None)
-    rest = EpochPlan(sequences, world, world - 1, batch, position=after.position)
-    assert rest.indices(0) == plan.indices(number + 1)
-    assert rest.batches == plan.batches - number - 1
+@given(SEQUENCES, RANKS, BATCH)
+def test_the_state_after_a_batch_is_where_the_rest_begins(sequences, world, batch):
+    consumer, stream = Consumer(batch, world - 1, world), StreamIdentity({}, "spec", "catalogue", 1, sequences)
+    plan, state = EpochPlan(sequences, world, world - 1, batch), ResumeState(stream, 3, 7, 0, 0, world)
+    every = [plan.indices(number) for number in range(plan.batches)]
+    for number in range(1, plan.batches):
+        after = consumer.after(state, plan, number - 1, 2)
+        rest = consumer.plan(stream, after)
+        assert [rest.indices(place) for place in range(rest.batches)] == every[number:]
+        assert (after.seed, after.epoch, after.quarantine) == (3, 7, 2)
+    if every:
+        assert consumer.after(state, plan, plan.batches - 1, 2).place == (8, 0, 0)
 
 
 def test_an_epoch_smaller_than_a_global_batch_says_so_with_the_numbers():
@@ -93,10 +97,6 @@ STATE = ResumeState(
 ).to_dict()
 SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary()
 VALUES = st.recursive(SCALARS, lambda inner: st.lists(inner) | st.dictionaries(st.text() | st.integers(), inner))
-
-
-def test_a_state_comes_back() -> None:
-    assert ResumeState.from_dict(STATE).to_dict() == STATE
 
 
 def test_only_a_stream_with_sidecars_pins_them() -> None:

@@ -6,7 +6,6 @@ import json
 import multiprocessing
 import os
 import random
-import tempfile
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -96,12 +95,8 @@ def test_a_trainer_killed_anywhere_repeats_and_skips_nothing(
     server: LocalServer,
     schedule: list[Entry],
     tmp_path: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    monkeypatch: pytest.MonkeyPatch,
     loader_workers: int,
 ) -> None:
-    temporary_files = tmp_path_factory.mktemp("temporary")
-    monkeypatch.setattr(tempfile, "tempdir", str(temporary_files))
     draw = random.Random(loader_workers)
     kills = 0
     # Odd counts strike between a step and its checkpoint, even ones just behind a checkpoint; both, and far apart.
@@ -113,4 +108,3 @@ def test_a_trainer_killed_anywhere_repeats_and_skips_nothing(
     assert _run(server, tmp_path, loader_workers, None)
     assert len(schedule) == EPOCHS * BATCHES_AN_EPOCH * 3
     assert _committed(tmp_path) == schedule
-    assert list(temporary_files.glob("v2v*")) == []

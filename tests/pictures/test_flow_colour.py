@@ -15,17 +15,9 @@ def one(x: float, y: float, largest: float = 1.0) -> tuple[int, ...]:
 
 
 def test_directions_have_their_colours() -> None:
-    assert one(1, 0) == RED
-    red, green, blue = one(0, 1)  # down: yellow
-    assert blue == 0
-    assert min(green, red) > 200
-    red, green, blue = one(-1, 0)  # left: between cyan and blue
-    assert blue == 255
-    assert red == 0
-    red, green, blue = one(0, -1)  # up: violet
-    assert blue == 255
-    assert green == 0
-    assert red > 50
+    """Right is red, down yellow, left between cyan and blue, up violet."""
+    directions = ((1, 0), (0, 1), (-1, 0), (0, -1))
+    assert [one(*each) for each in directions] == [RED, (255, 234, 0), (0, 197, 255), (103, 0, 255)]
 
 
 def test_length_is_saturation_and_longer_is_darker() -> None:

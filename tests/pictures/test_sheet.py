@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -58,9 +57,7 @@ def test_a_single_event_is_visible_at_any_scale() -> None:
 def test_the_least_count_of_int8_does_not_wrap() -> None:
     """|-128| does not fit int8: its colour must not change to that of the other sign."""
     counts = np.full((12, 12), -128, np.int8)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert (draw_events(counts, full_colour([counts])) == DARKER).all()
+    assert (draw_events(counts, full_colour([counts])) == DARKER).all()
 
 
 @given(st.lists(st.integers(-128, 127), min_size=1, max_size=50))
@@ -260,9 +257,8 @@ def test_a_film_begins_with_the_whole_picture() -> None:
 
 
 def test_nothing_at_all_is_drawn_without_a_warning() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        draw_sheet([camera(np.zeros((1, 1, 8, 8), np.float32), flow=np.zeros((1, 2, 8, 8), np.float16))], "t")
+    """Warnings are errors in all tests."""
+    draw_sheet([camera(np.zeros((1, 1, 8, 8), np.float32), flow=np.zeros((1, 2, 8, 8), np.float16))], "t")
 
 
 def test_files_read_back(tmp_path: Path) -> None:

@@ -58,10 +58,6 @@ def test_other_errors_are_not_caught() -> None:
         ended(raised=ZeroDivisionError())
 
 
-def test_unknown_flags_are_reported() -> None:
-    assert ended("--unknown") == 2
-
-
 # --- flags from settings ----------------------------------------------------------------------------------------------
 
 

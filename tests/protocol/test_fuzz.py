@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,7 @@ import pytest
 from bench.chaos.fuzz import fuzz_live
 from tests.clips import write_panned
 from tests.oracles import hostile_frames
-from tests.oracles.hostile_frames import MESSAGE_TYPES, FrameFuzzer, failed, fuzz_decoder
-from v2v_protocol.errors import ProtocolError
+from tests.oracles.hostile_frames import failed, fuzz_decoder
 from v2v_protocol.messages import decode
 
 
@@ -21,19 +19,6 @@ def test_twenty_thousand_frames() -> None:
     assert record["failures"] == []
     assert failed(record) == []
     assert min(record["messages"], record["samples"], record["refused"]) > 200
-
-
-def test_every_type_of_message_is_reached_whole_and_damaged() -> None:
-    fuzzer = FrameFuzzer(random.Random(3))
-    assert {type(decode(fuzzer.true())) for _ in range(500)} == set(MESSAGE_TYPES)
-    for form in (fuzzer.noise, fuzzer.bomb, fuzzer.damaged, fuzzer.replaced):
-        refused = 0
-        for _ in range(300):
-            try:
-                decode(form())
-            except ProtocolError:
-                refused += 1
-        assert refused > 100
 
 
 @pytest.mark.parametrize("wrong", [ValueError("boom"), RecursionError(), "not a message"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import stat
 from pathlib import Path
@@ -56,12 +55,6 @@ def test_a_durable_file_is_flushed_before_it_is_renamed_and_its_folder_after(
     with write_aside_and_rename(path, durable=True) as partial:
         partial.write_text("new")
     assert flushed == [(False, False), (True, True)]
-
-
-def test_records_are_read_back(tmp_path: Path) -> None:
-    records = [{"name": "é", "seconds": 0.1, "kept": None}, {"name": "", "seconds": 2, "kept": True}]
-    write_json(tmp_path / "out.json", records)
-    assert json.loads((tmp_path / "out.json").read_text(encoding="utf-8")) == records
 
 
 def test_a_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:

@@ -102,15 +102,6 @@ def test_a_killed_workers_successor_gets_slots_and_a_consumer_that_leaves_no_mem
         )
 
 
-def test_a_consumer_whose_memory_the_server_cannot_open_gets_messages(clips: Path, server: LocalServer) -> None:
-    reference = [digest(batch) for batch in epoch_of(server.address, seed=5)]
-    before = totals(server.address)
-    assert [digest(batch) for batch in epoch_of(server.address, seed=5, shared_memory=False)] == reference
-    after = totals(server.address)
-    assert after["in_slots"] == before["in_slots"]
-    assert after["samples"] > before["samples"]
-
-
 def test_a_worker_outlasts_a_server_that_is_stopped(clips: Path) -> None:
     """It makes no other connection, so it must not give up this one."""
     with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:

@@ -13,7 +13,7 @@ from tests.clips import write_clip
 from tests.server.worker.test_labels import boxes_text, pictures
 from v2v_client import Batch, V2VDataset, V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_protocol.errors import SampleUnavailable, StateMismatch, UsageError
+from v2v_protocol.errors import SampleUnavailable, UsageError
 
 PLAIN = ("voxels", "frames")
 LABELS = ("boxes", "frames_rgb", "frames_all")
@@ -72,25 +72,6 @@ def test_labels_travel_alike_and_resume(corpus: Path, tmp_path: Path) -> None:
         for index in batches[0].indices:
             sample = dataset[index]
             assert b"".join(sample.arrays[name].tobytes() for name in LABELS) == expected[index]
-    state = batches[0].resume_state
-    (corpus / "b.boxes.json").unlink()
-    with LocalServer(corpus, workers=1, flags=FLAGS) as server:
-        with pytest.raises(
-            SampleUnavailable, match=r"has no boxes: b\.mp4: its sidecar .* is missing.*labels=.optional"
-        ):
-            list(stream())
-        optional = list(stream(labels="optional"))
-        for batch in optional:
-            for row, (index, origin) in enumerate(zip(batch.indices, batch.provenance, strict=True)):
-                assert batch.labelled[row] is (origin.video == "a.mp4")
-                assert batch.labelled[row] or (batch["boxes"][row] == -1).all()
-                assert not batch.labelled[row] or by_index([batch])[index] == expected[index]
-        for batch, bare in zip(optional, plain, strict=True):
-            assert all(torch.equal(batch[name], bare[name]) for name in PLAIN), "labels change no draw"
-        resumed = stream(labels="optional")
-        resumed.load_state_dict(state)
-        with pytest.raises(StateMismatch, match=r"^sidecars: "):
-            list(resumed)
 
 
 def test_the_option_is_checked() -> None:

@@ -11,7 +11,6 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 import pytest
-from torch.utils.data import DataLoader
 from torchdata.stateful_dataloader import StatefulDataLoader
 
 from tests.stream.conftest import SMALL, digest, epoch_of
@@ -51,10 +50,6 @@ def saved_and_loaded(state: Any) -> Any:
     return pickle.loads(pickle.dumps(copy.deepcopy(dict(state))))
 
 
-def plain_loader(stream: V2VStreamDataset, workers: int, method: str | None) -> DataLoader[Batch]:
-    return DataLoader(stream, batch_size=None, num_workers=workers, multiprocessing_context=method)
-
-
 def stateful_loader(stream: V2VStreamDataset, workers: int, method: str | None) -> StatefulDataLoader[Batch]:
     return StatefulDataLoader(stream, batch_size=None, num_workers=workers, multiprocessing_context=method)
 
@@ -67,19 +62,6 @@ def repetition_is_said(workers: int) -> AbstractContextManager[object]:
     if workers:
         return warnings.catch_warnings(action="ignore", category=RepeatedSamplesWarning)
     return pytest.warns(RepeatedSamplesWarning)
-
-
-@pytest.mark.parametrize(("before", "after"), [(0, 2), (2, 0), (2, 1)])
-def test_a_batch_resumes_under_any_number_of_loader_workers(
-    server: LocalServer, plain: list[list[str]], before: int, after: int
-) -> None:
-    """The loader had prefetched more than the trainer used; only what was used counts."""
-    used = take(iter(plain_loader(dataset(server), before, "fork" if before else None)), 3)
-    resumed = dataset(server)
-    resumed.load_state_dict(saved_and_loaded(used[-1].resume_state))
-    loader = plain_loader(resumed, after, "fork" if after else None)
-    assert digests(used) + digests(loader) == plain[0]
-    assert digests(loader) == plain[1]
 
 
 # --- torchdata's StatefulDataLoader -----------------------------------------------------------------------------------

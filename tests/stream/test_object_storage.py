@@ -6,8 +6,6 @@ import logging
 import os
 import re
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
@@ -22,7 +20,6 @@ from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_protocol.errors import UsageError
 
 # Looked for, not imported: the fast tests are collected without them.
 missing = [name for name in ("moto", "s3fs") if find_spec(name) is None]
@@ -82,9 +79,6 @@ class Bucket:
     def go_on(self) -> None:
         host, _, port = self.address.removeprefix("http://").rpartition(":")
         self._server = _server_at(host, int(port))
-
-    def delete(self, id: str) -> None:
-        self.client().delete_object(Bucket="corpus", Key=f"videos/{id}")
 
     def stop(self) -> None:
         logging.getLogger("werkzeug").removeHandler(self._handler)
@@ -150,22 +144,6 @@ def test_the_bytes_are_those_of_the_folder_and_each_video_is_fetched_once(
         assert len(bucket.fetched) == len(ids), "the second epoch fetches nothing"
 
 
-def test_a_deleted_object_is_a_refusal_with_its_reason(bucket: Bucket, tmp_path: Path) -> None:
-    with LocalServer(URL, workers=2, flags=SMALL_FLAGS) as server:
-        forget_copies(tmp_path)
-        bucket.delete("a.mp4")
-        batches = epoch_of(server.address)
-        refusals = {each.video: each.reason for batch in batches for item in batch.provenance for each in item.refusals}
-        assert refusals == {"a.mp4": f"is not in {URL} any more"}
-    shown = subprocess.run(
-        [sys.executable, "-m", "v2v_server.commands.quarantine", "--videos", URL],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert "holds 0 entries" in shown.stdout
-    with LocalServer(URL, workers=0, flags=[*SMALL_FLAGS, "--list-refused"]) as server:
-        assert "6 videos in s3://corpus/videos" in server.last_lines()
-
-
 def test_a_store_that_is_away_condemns_no_video(clips: Path, bucket: Bucket, tmp_path: Path) -> None:
     with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as local:
         reference = digests(local.address, 0)
@@ -177,14 +155,3 @@ def test_a_store_that_is_away_condemns_no_video(clips: Path, bucket: Bucket, tmp
         bucket.go_on()
         assert epoch.result(120) == reference
         assert "passed over" not in all_lines(server)
-
-
-def test_no_credentials_are_one_clear_message(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("AWS_ACCESS_KEY_ID")
-    monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
-    with pytest.raises(UsageError) as raised, LocalServer(URL, workers=1, flags=SMALL_FLAGS):
-        pass
-    said = str(raised.value)
-    assert "access is denied" in said
-    assert "AWS_PROFILE" in said
-    assert said.count("\n") == 0

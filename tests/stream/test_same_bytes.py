@@ -14,12 +14,10 @@ import pytest
 import torch
 
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_workers
-from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.status.client import StatusClient
 from v2v_tools.remake import remake
 
 
@@ -67,42 +65,6 @@ def test_events_in_time_are_the_same_however_they_travel(server: LocalServer, cl
     assert batch.voxels.any()
 
 
-def test_grids_of_a_duration_are_the_same_however_they_travel(server: LocalServer, clips: Path) -> None:
-    """By shared memory, by network, after a resume, and made again; shapes do not depend on the video."""
-    recipe = {"voxels_per_clip": 3, "crop_height_px": 32, "crop_width_px": 40, "voxel_seconds": (0.03, 0.2)}
-    arrays = ("voxels", "frames", "flow")
-
-    def stream(shared: bool) -> V2VStreamDataset:
-        return V2VStreamDataset(
-            server.address, batch_size=3, recipe=recipe, seed=3, arrays=arrays, shared_memory=shared
-        )
-
-    with stream(True) as dataset, stream(False) as other:
-        batches, others = list(dataset), list(other)
-    resumed = stream(True)
-    resumed.load_state_dict(batches[0].resume_state)
-    assert [digest(batch) for batch in others] == [digest(batch) for batch in batches]
-    assert [digest(batch) for batch in resumed] == [digest(batch) for batch in batches[1:]]
-    spec = StreamSpec.from_dict({"recipe": recipe})
-    made = open_catalogue(clips)
-    for row, provenance in enumerate(batches[0].provenance):
-        params = provenance.params
-        again = remake(made, spec, seed=3, epoch=0, index=batches[0].indices[row], arrays=arrays)
-        assert again.provenance == provenance
-        assert all(again.arrays[name].tobytes() == batches[0][name][row].numpy().tobytes() for name in arrays)
-        assert len(params.grid_steps) == 3
-        assert max(abs(lasts - params.voxel_seconds) for lasts in provenance.grid_seconds) <= 0.5 / 25 + 1e-9
-    assert len({sum(provenance.params.grid_steps) for batch in batches for provenance in batch.provenance}) > 2
-
-
-def test_batch_size_changes_no_sample(server: LocalServer) -> None:
-    threes = np.concatenate([batch.voxels.numpy() for batch in epoch_of(server.address, batch_size=3)])
-    fours = np.concatenate([batch.voxels.numpy() for batch in epoch_of(server.address, batch_size=4)])
-    common = min(len(threes), len(fours))
-    assert common >= 20
-    np.testing.assert_array_equal(threes[:common], fours[:common])
-
-
 def test_a_killed_worker_changes_nothing(clips: Path, reference: list[str]) -> None:
     with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
         workers = server_workers(server.pid)
@@ -113,20 +75,6 @@ def test_a_killed_worker_changes_nothing(clips: Path, reference: list[str]) -> N
             if number < 2:
                 os.kill(workers[number].pid, signal.SIGKILL)
         got += [digest(batch) for batch in epoch_of(server.address, epoch=1)]
-    assert got == reference
-
-
-@pytest.mark.slow
-def test_a_stopped_worker_is_replaced(clips: Path, reference: list[str]) -> None:
-    """SIGSTOP: the worker answers no more but does not die; its leases run out and it is killed."""
-    with LocalServer(clips, workers=2, flags=[*SMALL_FLAGS, "--lease-deadline-seconds", "2"]) as server:
-        # Before its hello the server does not miss a worker.
-        with StatusClient(server.address) as client:
-            until(lambda: len(client.get_status()["workers"]) == 2)
-        stopped = server_workers(server.pid)[0]
-        stopped.suspend()
-        got = [digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
-        stopped.wait(timeout=60)
     assert got == reference
 
 
@@ -144,25 +92,3 @@ def test_v2v_simulate_makes_the_same_sample(clips: Path, server: LocalServer, tm
     assert provenance == json.loads(json.dumps(batch.provenance[1].to_dict()))
     assert provenance["id"]["index"] == 7 == batch.indices[1]
     assert (tmp_path / "sample.png").stat().st_size > 1000
-
-
-def test_flow_is_remade_like_everything_else(clips: Path, server: LocalServer) -> None:
-    """All arrays, with flow settings that are not the default; a paused step moves by exactly nothing."""
-    arrays = ("voxels", "frames", "flow", "flow_valid")
-    flow = {"flow_method": "dis-ultrafast", "flow_direction": "backward", "flow_from": 1, "flow_margin_px": 8}
-    recipe = SMALL.replace(pause_probability=0.5)
-    batch = next(iter(V2VStreamDataset(server.address, 3, arrays, recipe, seed=3, **flow)))
-    catalogue = open_catalogue(clips)
-    try:
-        spec = StreamSpec.from_dict({"recipe": recipe, **flow})
-        for row, index in enumerate(batch.indices):
-            sample = remake(catalogue, spec, seed=3, epoch=0, index=index, arrays=arrays)
-            for name in arrays:
-                np.testing.assert_array_equal(batch.arrays[name][row].numpy(), sample.arrays[name])
-            source = sample.provenance.params.source_index(recipe.steps)[[0, 5, 10, 15, 20]]
-            still = np.flatnonzero(source[1:] == source[:-1])
-            assert not sample.arrays["flow"][still].any()
-            assert not sample.arrays["flow"][0].any()
-        assert any(batch.arrays["flow"][row].any() for row in range(3))
-    finally:
-        catalogue.close()

@@ -15,11 +15,10 @@ import psutil
 import pytest
 import zmq
 
-from tests.clips import panned_luma, write_clip
-from tests.stream.conftest import SMALL, SMALL_FLAGS, epoch_of, server_workers
+from tests.stream.conftest import SMALL_FLAGS, epoch_of, server_workers
 from tests.waiting import until
 from v2v_client.local_server import LocalServer
-from v2v_protocol.messages import Denied, Hello, Ping, Pong, Want, Welcome, decode, encode
+from v2v_protocol.messages import Denied, Ping, Pong, decode, encode
 from v2v_server.worker.process import LARGEST_MEMORY_BYTES
 
 
@@ -51,21 +50,6 @@ def test_garbage_on_the_port_does_not_disturb_other_peers(raw: tuple[zmq.Socket[
     assert len(epoch_of(address)) == 8
 
 
-def test_a_refused_want_changes_nothing(raw: tuple[zmq.Socket[bytes], str]) -> None:
-    dealer, _ = raw
-    hello = Hello({"recipe": SMALL.to_dict()}, ("voxels",), 2, 0)
-    welcome = _ask(dealer, *map(bytes, encode(hello)))
-    assert isinstance(welcome, Welcome)
-    too_many = _ask(dealer, *map(bytes, encode(Want(0, tuple(range(welcome.credit + 1))))))
-    assert isinstance(too_many, Denied)
-    assert too_many.code == "credit"
-    outside = _ask(dealer, *map(bytes, encode(Want(0, (welcome.sequences,)))))
-    assert isinstance(outside, Denied)
-    assert outside.code == "range"
-    dealer.send_multipart(encode(Want(0, (0,))))
-    assert len(dealer.recv_multipart()) == 2
-
-
 def test_every_worker_is_under_a_limit_of_memory(server: LocalServer) -> None:
     def limits() -> set[int]:
         return {worker.rlimit(psutil.RLIMIT_DATA)[0] for worker in server_workers(server.pid)}
@@ -91,52 +75,6 @@ def test_a_signal_stops_everything(clips: Path, tmp_path: Path, number: signal.S
     with socket.socket() as probe:
         host, port = address.removeprefix("tcp://").split(":")
         assert probe.connect_ex((host, int(port))) != 0
-
-
-BAD_SURROUNDINGS = [
-    (["--videos", "{clips}/nowhere"], "nowhere: there is no such folder"),
-    (["--videos", "{empty}"], "no video found"),
-    (["--videos", "{clips}", "--set", "crop_width_px=128"], "no video gives a sequence"),
-    (["--videos", "{clips}", "--bind", "tcp://127.0.0.1:{taken}"], "Address already in use"),
-    (["--videos", "{clips}", "--port-file", "{clips}/no/such/port"], "--port-file"),
-]
-
-
-@pytest.mark.parametrize(("arguments", "message"), BAD_SURROUNDINGS)
-def test_a_start_that_cannot_be_ends_with_status_2_and_no_trace(
-    clips: Path, tmp_path: Path, arguments: list[str], message: str
-) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        names = {"clips": clips, "empty": tmp_path, "taken": taken.getsockname()[1]}
-        command = [sys.executable, "-m", "v2v_server", "--bind", "tcp://127.0.0.1:*", *SMALL_FLAGS]
-        command += [part.format(**names) for part in arguments]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 2, done.stderr
-    assert message in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-def test_the_start_says_which_videos_give_nothing_and_what_would_admit_them(clips: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "short"
-    folder.mkdir()
-    write_clip(folder / "long.mp4", panned_luma(60, 48, 64))
-    write_clip(folder / "short.mp4", panned_luma(12, 48, 64))
-    (folder / "noise.mp4").write_bytes(os.urandom(500))
-    port_file = tmp_path / "port"
-    flags = ("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=32")
-    server = _start(folder, "--port-file", str(port_file), "--workers", "0", *flags)
-    try:
-        _wait_for(server, port_file)
-    finally:
-        server.terminate()
-        said = server.communicate(timeout=60)[1]
-    assert "2 videos" in said
-    assert "1 give 2 sequences of 21 frames" in said
-    assert "short.mp4: 12 frames, the recipe needs 21" in said
-    assert "voxels_per_clip at most 2" in said
-    assert "noise.mp4" in said
 
 
 def _start(videos: Path, *flags: str) -> subprocess.Popen[str]:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 from torch.utils.data import DataLoader
 
-from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, server_workers
+from tests.stream.conftest import SMALL
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import UsageError
@@ -58,18 +56,6 @@ def test_no_batch_holds_two_of_a_sequence_and_their_cameras_differ(server: Local
     assert places[0] == places[1] == places[2] != places[3]
     cameras = {(item.params.threshold_pos, item.params.noise_key) for batch in batches for item in batch.provenance}
     assert len(cameras) == len(batches) * BATCH
-
-
-def test_a_killed_worker_changes_nothing(clips: Path, server: LocalServer) -> None:
-    expected = [digest(batch) for batch in dataset(server.address)]
-    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as other:
-        victims = server_workers(other.pid)
-        got: list[str] = []
-        for batch in dataset(other.address):
-            got.append(digest(batch))
-            if victims:
-                os.kill(victims.pop().pid, signal.SIGKILL)
-    assert got == expected
 
 
 def test_a_stream_goes_on_with_a_smaller_batch_and_not_with_a_larger_one(server: LocalServer) -> None:

@@ -36,10 +36,6 @@ GOOD = [
 ]
 
 
-def test_bars_that_are_kept_are_not_mentioned() -> None:
-    assert scaling.missed(GOOD, cores=2) == []
-
-
 @pytest.mark.parametrize(
     ("record", "words"),
     [

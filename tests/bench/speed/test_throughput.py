@@ -56,13 +56,13 @@ def test_ratios_are_medians_of_the_ratios_within_a_turn() -> None:
     assert said == ["exact, source: ratio_to_decode_limit 0.8; the bar is at least 0.9"]
 
 
-def test_a_form_of_a_codec_has_the_bar_of_the_codec() -> None:
-    record = {"label": "exact, dense-tmpfs", "ratio_to_baseline": 24.0, "cpu_ratio_to_baseline": 26.0}
-    said = throughput.missed([record | {"ratio_to_decode_limit": 0.7}])
-    assert said == ["exact, dense-tmpfs: ratio_to_baseline 24; the bar is at least 25"]
-
-
-def test_clips_with_many_keyframes_have_a_bar_of_their_own() -> None:
-    record = {"label": "exact, dense-12", "ratio_to_baseline": 20.0, "cpu_ratio_to_baseline": 19.0}
-    said = throughput.missed([record | {"ratio_to_decode_limit": 0.7}])
-    assert said == ["exact, dense-12: cpu_ratio_to_baseline 19; the bar is at least 20"]
+@pytest.mark.parametrize(
+    ("label", "ratio", "cpu_ratio", "said"),
+    [
+        ("exact, dense-tmpfs", 24.0, 26.0, "ratio_to_baseline 24; the bar is at least 25"),  # that of its codec
+        ("exact, dense-12", 20.0, 19.0, "cpu_ratio_to_baseline 19; the bar is at least 20"),  # many keyframes
+    ],
+)
+def test_a_form_of_clips_has_a_bar_of_its_own(label: str, ratio: float, cpu_ratio: float, said: str) -> None:
+    record = {"label": label, "ratio_to_baseline": ratio, "cpu_ratio_to_baseline": cpu_ratio}
+    assert throughput.missed([record | {"ratio_to_decode_limit": 0.7}]) == [f"{label}: {said}"]
