@@ -79,8 +79,6 @@ def test_another_run_is_not_resumed(server: FakeServer, tmp_path: Path, capsys: 
     trained(tmp_path, server.address, "run", run__steps=1)
     message = refused(tmp_path, server.address, capsys, resume=f"run/{LAST}", optimizer__learning_rate=0.5)
     assert "optimizer.learning_rate: 0.01 -> 0.5" in message
-    message = refused(tmp_path, server.address, capsys, resume=f"run/{LAST}", stream__seed=9)
-    assert "stream.seed: 0 -> 9" in message
 
 
 def test_a_refused_resume_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
