@@ -192,3 +192,10 @@ def test_a_wrong_setting_is_named(tmp_path, setting, message):
 def test_a_wrong_file_is_named(tmp_path, text, message):
     with pytest.raises(UsageError, match=message):
         load_config(written(tmp_path, "c.yaml", text))
+
+
+def test_differences_name_keys_and_both_values():
+    ours = TrainConfig().to_dict()
+    theirs = TrainConfig.from_dict({"optimizer": {"learning_rate": 0.5}}).to_dict()
+    assert differences(ours, ours) == {}
+    assert differences(ours, theirs) == {"optimizer.learning_rate": (1e-4, 0.5)}

@@ -116,15 +116,6 @@ def test_a_larger_batch_does_not_repeat_a_nearly_finished_epoch(tmp_path: Path) 
     assert [record["learning_rate"] for record in readings] == [0.01] * 4 + [0.005] * 2 + [0.0025]
 
 
-def test_a_finished_run_takes_no_more_steps(server: FakeServer, tmp_path: Path) -> None:
-    run = trained(tmp_path, server.address, "run", run__epochs=1)
-    before = load_checkpoint(run / LAST)
-    assert (before.step, before.epoch) == (5, 1)
-    trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__epochs=1)
-    assert same(load_checkpoint(run / LAST).model, before.model)
-    assert len(losses(run)) == 5
-
-
 def test_readings_are_means_over_the_steps_since_the_last(server: FakeServer, whole: Path, tmp_path: Path) -> None:
     run = trained(tmp_path, server.address, "run", run__steps=10, run__log_every=4)
     single, coarse = losses(whole), losses(run)

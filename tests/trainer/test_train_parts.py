@@ -211,16 +211,6 @@ def test_loader_workers_ended_by_the_same_signal_are_not_an_error(error: Excepti
 # --- ranks -----------------------------------------------------------------------------------------------------------
 
 
-def test_one_process_is_a_single_rank() -> None:
-    with ranks("cpu", 60.0) as mine:
-        assert (mine.rank, mine.world_size, mine.first, mine.device.type) == (0, 1, True, "cpu")
-        assert mine.any(True)
-        assert not mine.any(False)
-        assert mine.from_first("address") == "address"
-        assert torch.equal(mine.mean(torch.ones(3)), torch.ones(3))
-        assert mine.gather("a") == ["a"]
-
-
 @pytest.mark.parametrize("error", [None, RuntimeError, KeyboardInterrupt, SystemExit])
 def test_a_rank_with_an_error_does_not_wait_for_the_others(
     monkeypatch: pytest.MonkeyPatch, error: type[BaseException] | None

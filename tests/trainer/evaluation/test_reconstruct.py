@@ -1,4 +1,4 @@
-"""Test running a network over a recording: memory, padding, windows without pictures, files of no network."""
+"""Test running a network over a recording: padding, windows without pictures, files of no network."""
 
 from __future__ import annotations
 
@@ -40,22 +40,6 @@ def test_pieces_equal_one_pass_over_the_sequence(tmp_path: Path, network: VoxelN
         whole = network.forward_sequence(torch.from_numpy(np.stack(grids))[None])[0, :, 0].clamp(0, 1).numpy()
     assert whole.shape == (count, 37, 43)
     np.testing.assert_allclose(np.stack([step.prediction for step in steps]), whole, rtol=0, atol=1e-6)
-
-
-def test_the_memory_is_reset_for_every_sequence(tmp_path: Path) -> None:
-    network = small_e2vid()
-    first = random_recording(tmp_path / "a.h5", seed=1)
-    second = random_recording(tmp_path / "b.h5", seed=2)
-
-    def predictions(path: Path) -> np.ndarray:
-        with Recording(path) as recording:
-            return np.stack(
-                [s.prediction for s in reconstruct(recording, picture_windows(recording), network, VoxelSettings())]
-            )
-
-    alone = predictions(second)
-    predictions(first)
-    np.testing.assert_array_equal(predictions(second), alone)
 
 
 def test_windows_without_a_picture_show_the_latest(tmp_path: Path) -> None:
