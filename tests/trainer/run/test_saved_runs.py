@@ -82,19 +82,25 @@ def test_objects_that_need_code_to_load_are_refused_before_writing(tmp_path: Pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_other_files_are_refused_as_checkpoints(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "no file"),
+        ({"state_dict": {}}, "for weights alone use read_weights"),
+        (
+            {"format": 99, **{field.name: None for field in dataclasses.fields(Checkpoint)}},
+            "format 99, this release reads 2",
+        ),
+        (b"PK\x03\x04 and no more", "or damaged"),
+    ],
+)
+def test_other_files_are_refused_as_checkpoints(tmp_path: Path, content: Any, message: str) -> None:
     path = tmp_path / "a.pt"
-    with pytest.raises(UsageError, match="no file"):
-        load_checkpoint(path)
-    torch.save({"state_dict": small().state_dict()}, path)
-    with pytest.raises(UsageError, match="for weights alone use read_weights"):
-        load_checkpoint(path)
-    save_checkpoint(path, checkpoint())
-    torch.save(torch.load(path, weights_only=True) | {"format": 99}, path)
-    with pytest.raises(UsageError, match="format 99, this release reads 2"):
-        load_checkpoint(path)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(UsageError, match="or damaged"):
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        torch.save(content, path)
+    with pytest.raises(UsageError, match=message):
         load_checkpoint(path)
 
 
