@@ -19,9 +19,7 @@ from trainer.captured import WARM_UP_STEPS, CapturedGradients
 from trainer.config_file import load_config
 from trainer.learner import Learner, build
 from trainer.models.sequence import Guide
-from trainer.run.distributed import Ranks
 from trainer.tasks import Work
-from v2v_protocol.errors import UsageError
 
 STEPS = WARM_UP_STEPS + 3
 
@@ -120,16 +118,17 @@ CASES = [
 
 @pytest.mark.parametrize(("network", "settings", "guide"), CASES)
 def test_a_captured_step_is_the_step(tmp_path: Path, network: str, settings: list[str], guide: float | None) -> None:
-    """Losses, weights, averages and statistics of six different batches: three to warm up, one recorded, all new."""
+    """Losses, weights, averages and statistics of six different batches: three to warm up, one recorded, all new.
+
+    The losses of a step stay as they are when the next is replayed.
+    """
     eager, captured = (learner(tmp_path, network, *settings) for _ in range(2))
     graph = FakeGraph()
     captured = dataclasses.replace(captured, captured=CapturedGradients(captured.gradients, lambda: graph))
-    for step in range(STEPS):
-        expected, found = (each.step(batch(step, guide), step, 0) for each in (eager, captured))
-        assert expected.keys() == found.keys()
-        for name, value in expected.items():
-            torch.testing.assert_close(found[name], value, rtol=1e-5, atol=1e-6, msg=f"{name} at step {step}")
+    losses = [[each.step(batch(step, guide), step, 0) for step in range(STEPS)] for each in (eager, captured)]
     assert (graph.warmed_up, graph.replayed) == (WARM_UP_STEPS, STEPS - WARM_UP_STEPS)
+    for step, (expected, found) in enumerate(zip(*losses, strict=True)):
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6, msg=f"step {step}")
     for name, tensor in eager.network.state_dict().items():
         torch.testing.assert_close(captured.network.state_dict()[name], tensor, rtol=1e-4, atol=1e-5, msg=name)
     for name, tensor in eager.trained.state_dict().items():
@@ -150,18 +149,3 @@ def test_another_shape_or_guide_share_is_recorded_again(tmp_path: Path) -> None:
             gradients(batch(step, share))
     gradients(batch(0, None))
     assert [graph.replayed for graph in graphs] == [2, 2, 0]
-
-
-def test_losses_of_one_step_stay_when_the_next_is_replayed(tmp_path: Path) -> None:
-    gradients = CapturedGradients(learner(tmp_path, "firenet").gradients, FakeGraph)
-    values = [gradients(batch(step, None))["total"] for step in range(STEPS)]
-    assert len({float(value) for value in values}) == STEPS
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_without_a_gpu_or_with_several_ranks_it_is_refused(tmp_path: Path) -> None:
-    config = load_config(configured(tmp_path), ["compute.cuda_graph=true"])
-    with pytest.raises(UsageError, match=r"compute\.cuda_graph = true: PyTorch sees no GPU here"):
-        build(config, ALONE)
-    with pytest.raises(UsageError, match=r"compute\.cuda_graph = true: 2 ranks exchange gradients"):
-        build(config, Ranks(0, 2, torch.device("cuda")))

@@ -11,30 +11,14 @@ import torch
 
 from tests.trainer.training import ALONE, configured
 from trainer.config_file import load_config
-from trainer.learner import Learner, build, obeying_weights
+from trainer.learner import build, obeying_weights
 from trainer.models import FireNet
 from trainer.models.blocks import Loop
 from trainer.run.checkpoint import load_checkpoint, save_checkpoint
+from trainer.run.distributed import Ranks
 from trainer.tasks import Work
 from trainer.weights import SHIPPED, load_network
 from v2v_protocol.errors import UsageError
-
-
-def learner(folder: Path, *, channels_last: bool, fused: bool) -> Learner:
-    """One on the CPU; ``fused`` as if it were a GPU."""
-    config = load_config(configured(folder), [f"compute.channels_last={str(channels_last).lower()}"])
-    built = build(config, ALONE)
-    for group in built.optimizer.param_groups:
-        group["fused"] = fused
-    return built
-
-
-def step(trained: Learner) -> None:
-    voxels = torch.linspace(-3, 3, 2 * 3 * 2 * 16 * 20).sin().reshape(2, 3, 2, 16, 20)
-    prediction, _ = trained.model(voxels)
-    trained.optimizer.zero_grad()
-    (prediction - 0.5).square().mean().backward()
-    trained.optimizer.step()
 
 
 def test_a_training_begins_with_the_shipped_weights() -> None:
@@ -51,18 +35,21 @@ def test_a_training_begins_with_the_shipped_weights() -> None:
 def test_the_optimiser_resumes_in_another_memory_format(
     tmp_path: Path, channels_last: bool, was_fused: bool, fused: bool
 ) -> None:
-    before = learner(tmp_path, channels_last=not channels_last, fused=was_fused)
-    for _ in range(3):
-        step(before)
+    """Fused as on a GPU, on the CPU."""
+    layouts = [f"compute.channels_last={str(each).lower()}" for each in (not channels_last, channels_last)]
+    before, after = (build(load_config(configured(tmp_path), [layout]), ALONE) for layout in layouts)
+    before.optimizer.param_groups[0]["fused"], after.optimizer.param_groups[0]["fused"] = was_fused, fused
+    work = Work(voxels=torch.randint(-3, 4, (2, 3, 2, 16, 20)), truth={"frames": torch.rand(2, 3, 1, 16, 20)})
+    for number in range(3):
+        before.step(work, number, 0)
     save_checkpoint(tmp_path / "last.pt", before.checkpoint(3, None))
-    after = learner(tmp_path, channels_last=channels_last, fused=fused)
     after.restore(load_checkpoint(tmp_path / "last.pt"))
     assert [group["fused"] for group in after.optimizer.param_groups] == [fused]
     for parameter, state in after.optimizer.state.items():
         moments = [state[name] for name in ("exp_avg", "exp_avg_sq", "max_exp_avg_sq")]
         assert {moment.stride() for moment in moments} == {parameter.stride()}
-    step(before)
-    step(after)
+    for each in (before, after):
+        each.step(work, 3, 0)
     for name, tensor in before.network.state_dict().items():
         assert torch.allclose(after.network.state_dict()[name], tensor, rtol=0, atol=1e-5), name
 
@@ -120,9 +107,6 @@ def test_one_compiled_time_step_makes_the_same_step(tmp_path: Path, monkeypatch:
         results.append((values, built.network.state_dict(), built.trained.state_dict()))
     assert any(isinstance(module, Loop) and module._compiled for module in built.network.modules())
     torch.testing.assert_close(results[1], results[0])
-    settings = ["compute.compile=step", "network.name=evflownet", "loss.flow=stream"]
-    with pytest.raises(UsageError, match=r"compute\.compile = step: EVFlowNet has no loop .*; take clip, or none"):
-        build(load_config(configured(tmp_path), settings), ALONE)
 
 
 def test_a_compiled_step_needs_a_new_pytorch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,6 +131,28 @@ def test_dropout_differs_between_ranks_and_steps_and_not_between_runs(tmp_path: 
     assert found[0] == found[3]
 
 
-def test_a_batch_is_split_into_equal_pieces(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"compute\.pieces = 3: give a divisor of stream\.batch_size = 4"):
-        build(load_config(configured(tmp_path), ["compute.pieces=3"]), ALONE)
+@pytest.mark.parametrize(
+    ("settings", "ranks", "message"),
+    [
+        (["compute.pieces=3"], ALONE, r"compute\.pieces = 3: give a divisor of stream\.batch_size = 4"),
+        (
+            ["compute.compile=step", "network.name=evflownet", "loss.flow=stream"],
+            ALONE,
+            r"compute\.compile = step: EVFlowNet has no loop .*; take clip, or none",
+        ),
+        (
+            ["compute.cuda_graph=true"],
+            Ranks(0, 2, torch.device("cuda")),
+            r"compute\.cuda_graph = true: 2 ranks exchange gradients",
+        ),
+        pytest.param(
+            ["compute.cuda_graph=true"],
+            ALONE,
+            r"compute\.cuda_graph = true: PyTorch sees no GPU here",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU"),
+        ),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(tmp_path: Path, settings: list[str], ranks: Ranks, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        build(load_config(configured(tmp_path), settings), ranks)

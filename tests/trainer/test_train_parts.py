@@ -6,7 +6,7 @@ import gc
 import os
 import signal
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 
 import pytest
@@ -103,11 +103,13 @@ def signalling(at: int, *, number: int = signal.SIGINT, then_wait: bool) -> Iter
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_wait_for_data(number: int) -> None:
+def test_a_signal_ends_the_wait_for_data_and_handlers_are_restored(number: int) -> None:
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     with StopRequest() as stop:
         taken = list(stop.until(signalling(3, number=number, then_wait=True)))
     assert taken == [0, 1, 2]
     assert stop.signal == number
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
 
 
 def test_a_signal_within_a_step_lets_it_finish() -> None:
@@ -118,14 +120,6 @@ def test_a_signal_within_a_step_lets_it_finish() -> None:
                 os.kill(os.getpid(), signal.SIGINT)
             finished.append(item)
     assert finished == [0, 1, 2, 3, 4]
-
-
-def test_without_a_signal_all_items_come_and_handlers_are_restored() -> None:
-    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    with StopRequest() as stop:
-        assert list(stop.until(range(5))) == [0, 1, 2, 3, 4]
-        assert not stop.wanted
-    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
 
 
 def test_the_third_signal_takes_effect_immediately() -> None:
@@ -211,25 +205,23 @@ def test_loader_workers_ended_by_the_same_signal_are_not_an_error(error: Excepti
 # --- ranks -----------------------------------------------------------------------------------------------------------
 
 
-def test_one_process_is_a_single_rank() -> None:
-    with ranks("cpu", 60.0) as mine:
-        assert (mine.rank, mine.world_size, mine.first, mine.device.type) == (0, 1, True, "cpu")
-        assert mine.any(True)
-        assert not mine.any(False)
-        assert mine.from_first("address") == "address"
-        assert torch.equal(mine.mean(torch.ones(3)), torch.ones(3))
-        assert mine.gather("a") == ["a"]
+@pytest.fixture
+def at_the_end(monkeypatch: pytest.MonkeyPatch) -> list[Callable[[], None]]:
+    """Make this process the second of two ranks. What is in the list is called when their group is destroyed."""
+    called: list[Callable[[], None]] = []
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setattr("torch.distributed.init_process_group", lambda *_, **__: None)
+    monkeypatch.setattr("torch.distributed.get_rank", lambda: 1)
+    monkeypatch.setattr("torch.distributed.destroy_process_group", lambda: [each() for each in called])
+    return called
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError, KeyboardInterrupt, SystemExit])
 def test_a_rank_with_an_error_does_not_wait_for_the_others(
-    monkeypatch: pytest.MonkeyPatch, error: type[BaseException] | None
+    at_the_end: list[Callable[[], None]], error: type[BaseException] | None
 ) -> None:
-    left = []
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    monkeypatch.setattr("torch.distributed.init_process_group", lambda *_, **__: None)
-    monkeypatch.setattr("torch.distributed.get_rank", lambda: 1)
-    monkeypatch.setattr("torch.distributed.destroy_process_group", lambda: left.append(True))
+    left: list[bool] = []
+    at_the_end.append(lambda: left.append(True))
     with pytest.raises(error) if error else nullcontext(), ranks("cpu", 60.0) as mine:
         assert (mine.rank, mine.world_size) == (1, 2)
         if error:
@@ -237,7 +229,7 @@ def test_a_rank_with_an_error_does_not_wait_for_the_others(
     assert left == ([] if error else [True])
 
 
-def test_the_process_group_is_destroyed_after_training(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_process_group_is_destroyed_after_training(at_the_end: list[Callable[[], None]]) -> None:
     """A model of several ranks knows its group, and lies in a circle of references."""
 
     class Model:
@@ -247,15 +239,12 @@ def test_the_process_group_is_destroyed_after_training(monkeypatch: pytest.Monke
     def trained() -> weakref.ref[Model]:
         return weakref.ref(Model())
 
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    monkeypatch.setattr("torch.distributed.init_process_group", lambda *_, **__: None)
-    monkeypatch.setattr("torch.distributed.get_rank", lambda: 1)
-    known = []
-    monkeypatch.setattr("torch.distributed.destroy_process_group", lambda: known.append(model()))
+    known: list[Model | None] = []
     gc.disable()  # not by chance
     try:
         with ranks("cpu", 60.0):
             model = trained()
+            at_the_end.append(lambda: known.append(model()))
             assert model() is not None
     finally:
         gc.enable()

@@ -182,11 +182,6 @@ def test_a_panic_of_the_decoder_is_reported_as_damage(raised: BaseException, exp
         raise raised
 
 
-def test_a_size_may_be_given_if_the_file_has_none(tmp_path: Path) -> None:
-    done = convert(evt2_without_size(tmp_path), tmp_path / "a.h5", options=ConvertOptions(size=SensorSize(30, 20)))
-    assert done.written.size == SensorSize(30, 20)
-
-
 def test_a_bag_with_several_topics_needs_a_choice(tmp_path: Path) -> None:
     raw_forms.write_bag(tmp_path / "a.bag", scene())
     for options, message in (

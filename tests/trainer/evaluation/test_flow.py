@@ -15,7 +15,7 @@ from trainer.evaluation import paper
 from trainer.evaluation.cli import main
 from trainer.evaluation.flow import HOOD_ROW, FlowRun, FlowScore, evaluate_flow, flow_table
 from trainer.evaluation.voxelise import VoxelSettings
-from trainer.models import ERAFT, EVFlowNet
+from trainer.models import EVFlowNet
 from v2v_protocol.errors import UsageError
 
 HEIGHT, WIDTH = 200, 24
@@ -53,7 +53,7 @@ def constant(x: float, y: float) -> EVFlowNet:
     return network
 
 
-def run(network: EVFlowNet | ERAFT, *, as_published: bool) -> FlowRun:
+def run(network: EVFlowNet, *, as_published: bool) -> FlowRun:
     return FlowRun(network, VoxelSettings(bins=network.bins), as_published=as_published)
 
 
@@ -70,16 +70,6 @@ def test_without_pictures_a_time_range_counts_from_the_first_field(tmp_path: Pat
     assert evaluate_flow(run(constant(0, 0), as_published=False), path, (0.04, 0.11))["zeros"].windows == 1
     with pytest.raises(UsageError, match=r"1 flow fields in the time range .*v2v-convert reads MVSEC's"):
         evaluate_flow(run(constant(0, 0), as_published=False), path, (0.04, 0.06))
-
-
-@pytest.mark.slow
-def test_a_network_that_uses_the_previous_window_has_an_output_for_each(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)
-    path = recording(tmp_path / "a.h5")
-    found = evaluate_flow(run(ERAFT(), as_published=False), path, None)
-    assert found["network"].windows == 3
 
 
 def test_the_command_shows_the_papers_values(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

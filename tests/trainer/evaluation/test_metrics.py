@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +9,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rich.console import Console
 
 from tests.trainer.losses.test_lpips import heads_file, random_metric, torchvision_like
 from tests.trainer.models import numpy_networks
-from trainer.evaluation.config import read_config
+from trainer.evaluation.config import parse_config
 from trainer.evaluation.flow import FLOW_METRICS, FlowScore, flow_table
 from trainer.evaluation.metrics import METRICS, MetricEntry, make_metrics, mse, ssim
 from trainer.evaluation.readers import EventWindow, RecordedImage
@@ -72,30 +70,33 @@ def test_lpips_from_files(tmp_path: Path, net: str) -> None:
     )
 
 
-def test_metrics_that_cannot_be_computed_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"--lpips alex BACKBONE HEADS .*alexnet.*--metrics"):
-        make_metrics(["lpips_alex"], {"squeeze": ("a", "b")})
-    with pytest.raises(UsageError, match=f"give some of {', '.join(METRICS)}"):
-        make_metrics(["psnr"], {})
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("lpips_alex", r"--lpips alex BACKBONE HEADS .*alexnet.*--metrics"),
+        ("psnr", f"give some of {', '.join(METRICS)}"),
+    ],
+)
+def test_metrics_that_cannot_be_computed_are_refused(name: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        make_metrics([name], {"squeeze": ("a", "b")})
+
+
+def test_ssim_needs_a_window() -> None:
     with pytest.raises(UsageError, match="at least 7 x 7"):
         ssim(np.zeros((6, 9)), np.zeros((6, 9)), data_range=1)
 
 
-def test_a_toy_metric_is_one_entry(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_toy_metric_is_one_entry(monkeypatch: pytest.MonkeyPatch) -> None:
     """A configuration may ask for it, and its title is in the table."""
     entry = MetricEntry("MAE", lambda *_: lambda prediction, target: float(abs(prediction - target).mean()))
     monkeypatch.setitem(METRICS, "mae", entry)
-    (tmp_path / "own.yaml").write_text("metrics: [mse, mae]\ndata: [HQF]\n")
-    config = read_config(str(tmp_path / "own.yaml"))
-    assert config.metrics == ("mse", "mae")
+    config = parse_config({"metrics": ["mse", "mae"], "data": ["HQF"]}, "own.yaml")
     prediction, target = pair(9, 11, 1)
     means = {name: metric(prediction, target) for name, metric in make_metrics(config.metrics, {}).items()}
     assert means["mae"] == pytest.approx(np.abs(prediction - target).mean())
-    console = Console(width=120, file=io.StringIO())
-    console.print(table(config.data_sets[0], [SequenceScore("HQF", "still_life", 1, 0, 0, 0, means, means)], ()))
-    printed = console.file.getvalue()
-    assert "MAE" in printed
-    assert f"{means['mae']:.3f}" in printed
+    shown = table(config.data_sets[0], [SequenceScore("HQF", "still_life", 1, 0, 0, 0, means, means)], ())
+    assert "MAE" in [str(column.header) for column in shown.columns]
 
 
 def test_a_toy_metric_of_flow_is_one_entry(monkeypatch: pytest.MonkeyPatch) -> None:

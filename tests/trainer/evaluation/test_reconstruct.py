@@ -1,4 +1,4 @@
-"""Test running a network over a recording: memory, padding, windows without pictures, recognising weight files."""
+"""Test running a network over a recording: padding, windows without pictures, files of no network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from trainer.evaluation.reconstruct import WINDOWS_PER_CALL, _stretch, reconstru
 from trainer.evaluation.voxelise import VoxelSettings, voxel_grid
 from trainer.evaluation.windows import picture_windows, regular_windows
 from trainer.models import E2VID, FireNet, VoxelNetwork
-from trainer.run.checkpoint import Checkpoint, save_checkpoint
 from trainer.weights import load_network
 from v2v_protocol.errors import UsageError
 
@@ -41,22 +40,6 @@ def test_pieces_equal_one_pass_over_the_sequence(tmp_path: Path, network: VoxelN
         whole = network.forward_sequence(torch.from_numpy(np.stack(grids))[None])[0, :, 0].clamp(0, 1).numpy()
     assert whole.shape == (count, 37, 43)
     np.testing.assert_allclose(np.stack([step.prediction for step in steps]), whole, rtol=0, atol=1e-6)
-
-
-def test_the_memory_is_reset_for_every_sequence(tmp_path: Path) -> None:
-    network = small_e2vid()
-    first = random_recording(tmp_path / "a.h5", seed=1)
-    second = random_recording(tmp_path / "b.h5", seed=2)
-
-    def predictions(path: Path) -> np.ndarray:
-        with Recording(path) as recording:
-            return np.stack(
-                [s.prediction for s in reconstruct(recording, picture_windows(recording), network, VoxelSettings())]
-            )
-
-    alone = predictions(second)
-    predictions(first)
-    np.testing.assert_array_equal(predictions(second), alone)
 
 
 def test_windows_without_a_picture_show_the_latest(tmp_path: Path) -> None:
@@ -98,37 +81,21 @@ def test_stretching_maps_each_picture_to_the_whole_range() -> None:
     assert np.isfinite(_stretch(np.ones((1, 4, 4), np.float32), "min-max")).all()
 
 
-def test_networks_are_recognised(tmp_path: Path) -> None:
-    for network, name in ((small_e2vid(norm="batch"), "e2vid"), (FireNet(bins=3, base_channels=4), "firenet")):
-        torch.save(network.state_dict(), tmp_path / "weights.pth")
-        loaded, found = load_network(tmp_path / "weights.pth")
-        assert (found, loaded.bins, loaded.training) == (name, network.bins, False)
-        for key, tensor in network.state_dict().items():
-            assert torch.equal(loaded.state_dict()[key], tensor)
-
-
-def test_own_checkpoints_name_their_network(tmp_path: Path) -> None:
-    network = FireNet(base_channels=4, normalize_voxels=True)
-    config = {"network": {"name": "firenet", "options": {"base_channels": 4, "normalize_voxels": True}, "weights": ""}}
-    save_checkpoint(
-        tmp_path / "last.pt",
-        Checkpoint(0, 0, network.state_dict(), {}, None, None, config),
-    )
-    loaded, name = load_network(tmp_path / "last.pt")
-    assert (name, loaded.normalizes) == ("firenet", True)
-    assert not load_network(tmp_path / "last.pt", options={"normalize_voxels": False})[0].normalizes
-
-
-def test_unknown_networks_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        (None, {}, r"the network is none of e2vid, "),
+        ("unet", {}, "model 'unet': give one of"),
+        ("firenet", {}, "do not fit FireNet"),
+        ("firenet", {"colour": 1}, r"options of firenet: .*colour"),
+    ],
+)
+def test_unknown_networks_are_refused(
+    tmp_path: Path, name: str | None, options: dict[str, object], message: str
+) -> None:
     torch.save({"a": torch.zeros(1)}, tmp_path / "a.pth")
-    with pytest.raises(UsageError, match=r"the network is none of e2vid, "):
-        load_network(tmp_path / "a.pth")
-    with pytest.raises(UsageError, match="model 'unet': give one of"):
-        load_network(tmp_path / "a.pth", name="unet")
-    with pytest.raises(UsageError, match="do not fit FireNet"):
-        load_network(tmp_path / "a.pth", name="firenet")
-    with pytest.raises(UsageError, match=r"options of firenet: .*colour"):
-        load_network(tmp_path / "a.pth", name="firenet", options={"colour": 1})
+    with pytest.raises(UsageError, match=message):
+        load_network(tmp_path / "a.pth", name=name, options=options)
 
 
 def test_equalized_pictures_have_every_grey_value_as_often() -> None:

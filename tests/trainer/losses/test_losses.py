@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
-from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.trainer.models import numpy_networks as oracle
 from trainer.losses.lpips import LPIPS
 from trainer.losses.reconstruction import ReconstructionLoss, l1_loss
 from trainer.losses.temporal import TemporalConsistency
-from trainer.losses.warp import inside, warp
+from trainer.losses.warp import warp
 from v2v_protocol.errors import UsageError
 
 HEIGHT, WIDTH = 20, 24
@@ -46,18 +47,6 @@ def test_warp_equals_the_pixel_oracle_with_a_field_that_leaves_the_picture() -> 
     result = warp(torch.from_numpy(pictures), torch.from_numpy(field)).numpy()
     for index in np.ndindex(2, 3):
         np.testing.assert_allclose(result[index], oracle.warp(pictures[index], field[index[0]]), rtol=0, atol=1e-12)
-
-
-def test_inside_is_where_the_warp_of_ones_is_one() -> None:
-    field = torch.from_numpy(np.random.default_rng(1).uniform(-4, 4, (1, 2, 9, 8)))
-    ones = warp(torch.ones(1, 1, 9, 8, dtype=torch.float64), field)
-    assert torch.equal(inside(field), ones > 1 - 1e-9)
-
-
-def test_gradients_of_the_warp() -> None:
-    picture = torch.rand(1, 1, 4, 5, dtype=torch.float64, requires_grad=True)
-    field = (torch.rand(1, 2, 4, 5, dtype=torch.float64) * 0.4 + 0.3).requires_grad_()
-    assert torch.autograd.gradcheck(warp, (picture, field))
 
 
 def test_autocast_leaves_coordinates_exact() -> None:
@@ -126,22 +115,16 @@ def test_half_rule_of_the_paper_is_half_of_the_full_one() -> None:
     assert half.item() == pytest.approx(full.item() / 2, rel=1e-12)
 
 
-def test_gradients_reach_both_pictures_of_a_pair_and_no_other() -> None:
+def test_gradients_are_finite_and_reach_both_pictures_of_a_pair_and_no_other() -> None:
     target = moving((1, 0), 4)
-    prediction = (target + 0.1 * torch.rand_like(target)).requires_grad_()
+    prediction = target + 0.1 * torch.rand_like(target)
+    prediction[..., :5] = 0  # black in both pictures: there the loss has a corner
+    prediction.requires_grad_()
     TemporalConsistency(first_step=3)(prediction, target, backward_flow((1, 0), 1)).backward()
     assert prediction.grad is not None
     assert prediction.grad.isfinite().all()
     reached = prediction.grad.abs().sum(dim=(0, 2, 3, 4)) > 0
     assert reached.tolist() == [False, False, True, True]
-
-
-def test_gradient_is_finite_for_a_black_prediction() -> None:
-    target = moving((1, 0), 3)
-    prediction = torch.zeros_like(target, requires_grad=True)
-    TemporalConsistency(first_step=1)(prediction, target, backward_flow((1, 0), 2)).backward()
-    assert prediction.grad is not None
-    assert prediction.grad.isfinite().all()
 
 
 def test_temporal_loss_is_float32_under_autocast() -> None:
@@ -164,11 +147,12 @@ def test_temporal_refuses_other_shapes(prediction: tuple[int, ...], flow: tuple[
         TemporalConsistency(first_step=1)(torch.zeros(prediction), torch.zeros(prediction), torch.zeros(flow))
 
 
-def test_temporal_refuses_other_settings() -> None:
-    with pytest.raises(UsageError, match="first_step = 0"):
-        TemporalConsistency(first_step=0)
-    with pytest.raises(UsageError, match="half or full"):
-        TemporalConsistency(rule="quarter")  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("settings", "message"), [({"first_step": 0}, "first_step = 0"), ({"rule": "quarter"}, "half or full")]
+)
+def test_temporal_refuses_other_settings(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        TemporalConsistency(**settings)
 
 
 # L1 and the sum
@@ -206,29 +190,20 @@ def test_the_sum_is_weighted_and_its_terms_are_reported() -> None:
     assert prediction.grad is not None
 
 
-def test_computing_does_not_synchronise_with_the_device() -> None:
-    """Fake tensors have no values: reading one raises."""
-    loss = ReconstructionLoss(
-        lpips=LPIPS("squeeze"), temporal=TemporalConsistency(first_step=1), lpips_weight=1, temporal_weight=1
-    )
-    with FakeTensorMode(allow_non_fake_inputs=True):
-        target = torch.zeros(2, 3, 1, 20, 20)
-        prediction = torch.zeros(2, 3, 1, 20, 20, requires_grad=True)
-        loss(prediction, target, torch.zeros(2, 2, 2, 20, 20))["total"].backward()
-
-
 def test_terms_without_weight_are_absent() -> None:
     terms = ReconstructionLoss()(torch.zeros(1, 2, 1, 4, 4), torch.ones(1, 2, 1, 4, 4))
     assert {name: term.item() for name, term in terms.items()} == {"l1": 1, "total": 1}
 
 
-def test_incomplete_sums_are_refused() -> None:
-    with pytest.raises(UsageError, match="at least one above 0"):
-        ReconstructionLoss(l1_weight=0)
-    with pytest.raises(UsageError, match="LPIPS weight files"):
-        ReconstructionLoss(lpips_weight=1)
-    with pytest.raises(UsageError, match="temporal_weight = 1"):
-        ReconstructionLoss(temporal_weight=1)
-    loss = ReconstructionLoss(temporal=TemporalConsistency(first_step=1), temporal_weight=1)
-    with pytest.raises(UsageError, match="needs the flow"):
-        loss(torch.zeros(1, 2, 1, 4, 4), torch.zeros(1, 2, 1, 4, 4))
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"l1_weight": 0}, "at least one above 0"),
+        ({"lpips_weight": 1}, "LPIPS weight files"),
+        ({"temporal_weight": 1}, "temporal_weight = 1"),
+        ({"temporal_weight": 1, "temporal": TemporalConsistency(first_step=1)}, "needs the flow"),
+    ],
+)
+def test_incomplete_sums_are_refused(parts: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        ReconstructionLoss(**parts)(torch.zeros(1, 2, 1, 4, 4), torch.zeros(1, 2, 1, 4, 4))

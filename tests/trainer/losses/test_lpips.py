@@ -101,21 +101,8 @@ def test_gradients_reach_the_prediction_only(squeeze: LPIPS) -> None:
     assert not any(buffer.requires_grad for buffer in squeeze.buffers())
 
 
-def test_the_gradient_is_that_of_finite_differences() -> None:
-    """This checks the smooth parts; PyTorch computes the gradient of the network itself."""
-    torch.manual_seed(0)
-    features = torch.rand(2, 4, 3, 3, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(unit_length, (features,))
-
-
 def test_dead_features_give_gradient_zero_not_nan() -> None:
     """Where all channels are 0, the published formula gives NaN for every pixel in the receptive field."""
-    dead = torch.zeros(1, 4, 2, 2, requires_grad=True)
-    published = dead / (dead.square().sum(1, keepdim=True).sqrt() + 1e-10)
-    (published.sum()).backward()
-    assert dead.grad is not None
-    assert dead.grad.isnan().all()
-
     metric = LPIPS("squeeze")
     for name, parameter in metric.features.named_parameters():
         if name.endswith("bias"):
@@ -155,12 +142,10 @@ def test_the_smallest_picture_is_stated_correctly(net: str) -> None:
         metric(torch.rand(1, smallest, smallest - 1), torch.rand(1, smallest, smallest - 1))
 
 
-def test_wrong_shapes_are_refused(squeeze: LPIPS) -> None:
-    for first, second in (((1, 20, 20), (2, 1, 20, 20)), ((2, 20, 20), (2, 20, 20))):
-        with pytest.raises(UsageError, match="equal shapes"):
-            squeeze(torch.zeros(first), torch.zeros(second))
-    with pytest.raises(UsageError, match="vgg, alex, squeeze"):
-        LPIPS("resnet")
+@pytest.mark.parametrize(("first", "second"), [((1, 20, 20), (2, 1, 20, 20)), ((2, 20, 20), (2, 20, 20))])
+def test_wrong_shapes_are_refused(squeeze: LPIPS, first: tuple[int, ...], second: tuple[int, ...]) -> None:
+    with pytest.raises(UsageError, match="equal shapes"):
+        squeeze(torch.zeros(first), torch.zeros(second))
 
 
 def torchvision_like(metric: LPIPS) -> dict[str, torch.Tensor]:
@@ -175,18 +160,22 @@ def heads_file(metric: LPIPS) -> dict[str, torch.Tensor]:
     return {f"lin{layer}.model.1.weight": metric.get_buffer(f"head{layer}")[None, :, None, None] for layer in layers}
 
 
-def test_missing_or_wrong_files_say_where_to_get_them(tmp_path: Path, squeeze: LPIPS) -> None:
-    backbone, heads = tmp_path / "backbone.pth", tmp_path / "heads.pth"
-    with pytest.raises(UsageError, match=r"not downloaded automatically.*pytorch.org/models/squeezenet"):
-        LPIPS.from_files("squeeze", backbone, heads)
-    torch.save(torchvision_like(squeeze), backbone)
-    with pytest.raises(UsageError, match=r"not downloaded automatically.*lpips/weights/v0.1/squeeze.pth"):
-        LPIPS.from_files("squeeze", backbone, heads)
-    torch.save(heads_file(LPIPS("alex")), heads)
-    with pytest.raises(UsageError, match=r"of 7 LPIPS weights .*lpips/weights/v0.1/squeeze.pth"):
-        LPIPS.from_files("squeeze", backbone, heads)
-    broken = torchvision_like(squeeze)
-    del broken["features.3.squeeze.bias"]
-    torch.save(broken, backbone)
-    with pytest.raises(UsageError, match=r"first 3.squeeze.bias"):
-        LPIPS.from_files("squeeze", backbone, heads)
+@pytest.mark.parametrize(
+    ("net", "backbone", "heads", "message"),
+    [
+        ("resnet", "", "", "vgg, alex, squeeze"),
+        ("squeeze", "", "squeeze", r"not downloaded automatically.*pytorch.org/models/squeezenet"),
+        ("squeeze", "squeeze", "", r"not downloaded automatically.*lpips/weights/v0.1/squeeze.pth"),
+        ("squeeze", "squeeze", "alex", r"of 7 LPIPS weights .*lpips/weights/v0.1/squeeze.pth"),
+        ("squeeze", "alex", "squeeze", r"first 0.weight.*pytorch.org/models/squeezenet"),
+    ],
+)
+def test_missing_or_wrong_files_say_where_to_get_them(
+    tmp_path: Path, net: str, backbone: str, heads: str, message: str
+) -> None:
+    if backbone:
+        torch.save(torchvision_like(LPIPS(backbone)), tmp_path / "backbone.pth")
+    if heads:
+        torch.save(heads_file(LPIPS(heads)), tmp_path / "heads.pth")
+    with pytest.raises(UsageError, match=message):
+        LPIPS.from_files(net, tmp_path / "backbone.pth", tmp_path / "heads.pth")

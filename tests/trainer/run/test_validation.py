@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -171,6 +172,9 @@ def test_ranks_share_the_recordings_and_have_the_scores_of_one(tmp_path: Path, c
     """Also where there are more ranks than recordings, and where the buffers of the ranks differ."""
     config = two_sets(tmp_path)
     alone = Validation(picture_task(), network(), config, ALONE)(baseline=True)
+    assert list(alone) == [
+        "mse", "correlation_lacking", "constant_grey_mse", "constant_grey_correlation_lacking",
+    ]  # fmt: skip
     networks = [network() for _ in range(count)]
     for number, each in enumerate(networks):
         each.register_buffer("statistics", torch.full((1,), float(number)))
@@ -195,50 +199,30 @@ def test_a_rank_that_is_to_stop_ends_the_validation_of_all(tmp_path: Path, stopp
     assert found == ([{}] * 2 if stopped == 0 else on_ranks(2, config, [network(), network()]))
 
 
-def test_the_blank_is_scored_only_when_it_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    blanks: list[bool] = []
-
-    def mse(prediction: np.ndarray, _target: np.ndarray) -> float:
-        blanks.append(bool(np.ptp(prediction) == 0))
-        return 0.5
-
-    monkeypatch.setattr("trainer.evaluation.metrics.mse", mse)
-    validate = Validation(picture_task(), network(), two_sets(tmp_path), ALONE)
-    assert list(validate(baseline=True)) == [
-        "mse", "correlation_lacking", "constant_grey_mse", "constant_grey_correlation_lacking",
-    ]  # fmt: skip
-    assert sum(blanks) == len(blanks) // 2 > 0
-    blanks.clear()
-    validate()
-    assert blanks
-    assert not any(blanks)
-
-
-def test_what_cannot_be_scored_is_refused_at_once(tmp_path: Path) -> None:
-    random_recording(tmp_path / "a.h5")
-
-    def refused(task: Task, scored: VoxelNetwork, **settings: str) -> str:
-        with pytest.raises(UsageError) as caught:
-            Validation(task, scored, RunConfig(**settings), ALONE)
-        return str(caught.value)
-
-    assert "has 0 flow fields" in refused(flow_task(), constant(0, 0), validate=str(tmp_path))
-    for task, scored in ((flow_task(), constant(0, 0)), (picture_task(), network())):
-        assert "no such file or folder" in refused(task, scored, validate=str(tmp_path / "nowhere"))
-    (tmp_path / "empty").mkdir()
-    assert "has no recordings" in refused(picture_task(), network(), validate=str(tmp_path / "empty"))
-    config = two_sets(tmp_path / "sets")
-    there, named = config.validate, config.validate_config
-    assert "no recording of a/*.h5 (first), b/*.h5 (second) there" in refused(
-        picture_task(), network(), validate=str(tmp_path / "empty"), validate_config=named
-    )
-    assert "run.validate_config: no file absent.yaml" in refused(
-        picture_task(), network(), validate=there, validate_config="absent.yaml"
-    )
-    other = FireNet(bins=3, base_channels=2)
-    two_sets(tmp_path / "sets", voxels={"kind": "discrete", "bins": 5})
-    assert "voxel grids of 5 bins, but the network takes 3" in refused(
-        picture_task(), other, validate=there, validate_config=named
-    )
-    two_sets(tmp_path / "sets", data=[{**DATA_SETS[0], "sequences": {"0": [50, 60]}}])
-    assert "0.h5" in refused(picture_task(), network(), validate=there, validate_config=named)
+@pytest.mark.parametrize(
+    ("task", "validate", "settings", "sets", "message"),
+    [
+        (flow_task, "sets", "", {}, "has 0 flow fields"),
+        (flow_task, "nowhere", "", {}, "no such file or folder"),
+        (picture_task, "nowhere", "", {}, "no such file or folder"),
+        (picture_task, "empty", "", {}, "has no recordings"),
+        (picture_task, "empty", "sets/own.yaml", {}, "no recording of a/*.h5 (first), b/*.h5 (second) there"),
+        (picture_task, "sets", "absent.yaml", {}, "run.validate_config: no file absent.yaml"),
+        (
+            picture_task, "sets", "sets/own.yaml", {"voxels": {"kind": "discrete", "bins": 3}},
+            "voxel grids of 3 bins, but the network takes 5",
+        ),
+        (picture_task, "sets", "sets/own.yaml", {"data": [{**DATA_SETS[0], "sequences": {"0": [50, 60]}}]}, "0.h5"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_scored_is_refused_at_once(
+    tmp_path: Path, task: Callable[[], Task], validate: str, settings: str, sets: dict[str, Any], message: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    Path("empty").mkdir()
+    two_sets(Path("sets"), **sets)
+    random_recording(Path("sets") / "c.h5")
+    scored = constant(0, 0) if task is flow_task else network()
+    with pytest.raises(UsageError, match=re.escape(message)):
+        Validation(task(), scored, RunConfig(validate=validate, validate_config=settings), ALONE)
