@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import os
+import re
 import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -112,6 +117,34 @@ def log_of(server: LocalServer) -> str:
     return os.pread(file, os.fstat(file).st_size, 0).decode(errors="replace")
 
 
+def test_a_cluster_grows_while_a_consumer_waits_and_shrinks_again(clips: Path, cluster: Any) -> None:
+    epochs: list[list[str]] = []
+    flags = [*flags_for(cluster), "--scale-seconds", "6", "--workers", "1:2"]
+    with LocalServer(clips, flags=flags) as server:
+        dataset = V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3)
+
+        def until_there_are(count: int, pause: float) -> None:
+            deadline = time.monotonic() + 300.0
+            while len(workers()) != count and time.monotonic() < deadline:
+                epochs.append([])
+                for batch in dataset:
+                    epochs[-1].append(digest(batch))
+                    time.sleep(pause)
+            assert len(workers()) == count
+
+        until_there_are(1, 0.0)
+        until_there_are(2, 0.0)
+        until_there_are(1, 1.5)  # far from what one can do, on a busy machine too
+        said = log_of(server)
+    changes = [int(found) for found in re.findall(r"workers: (\d+) from now on, because", said)]
+    assert changes[:2] == [2, 1]
+    assert "its leases go to other workers" not in said  # who was sent away left in order
+    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as fixed:
+        for epoch in {0, len(epochs) // 2, len(epochs) - 1}:
+            assert epochs[epoch] == [digest(batch) for batch in epoch_of(fixed.address, epoch=epoch)]
+    assert {len(epoch) for epoch in epochs} == {8}
+
+
 def raylets_of(process: psutil.Process) -> list[int]:
     return [parent.pid for parent in process.parents() if parent.name() == "raylet"]
 
@@ -168,3 +201,57 @@ def test_workers_on_a_cluster_get_a_key_that_is_written_down_nowhere(
     assert holding(session, secret) == []
     (session / "logs" / "planted").write_bytes(b"x" + secret)
     assert holding(session, secret) == ["planted"]
+
+
+def test_ray_train_goes_on_where_a_rank_was_lost(clips: Path, cluster: Any, tmp_path: Path) -> None:
+    pytest.importorskip("ray.train", reason="ray[train] is not installed", exc_type=ImportError)
+    seen = tmp_path / "seen"
+    seen.mkdir()
+    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:
+        # A global batch is two ranks' of two.
+        batches = [batch for epoch in range(2) for batch in epoch_of(server.address, epoch=epoch, batch_size=4)]
+        expected = sorted((batch.epoch, index) for batch in batches for index in batch.indices)
+        running = subprocess.Popen(
+            [
+                sys.executable, "-m", "examples.ray_train", "--connect", server.address, "--storage",
+                str(tmp_path / "storage"), "--seen", str(seen), "--epochs", "2",
+                "--recipe", json.dumps(SMALL.to_dict()),
+            ],
+            env={**os.environ, "RAY_ADDRESS": cluster.address}, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        try:
+            until(lambda: len(notes(seen)) >= 10)
+            rank = next(
+                process for process in psutil.Process().children(recursive=True)
+                if any("TrainWorker" in part for part in process.cmdline())
+            )  # fmt: skip
+            rank.kill()
+            printed, _ = running.communicate(timeout=200)
+        finally:
+            running.kill()
+            running.wait()
+    assert running.returncode == 0, printed
+    trained: dict[tuple[int, int], tuple[int, list[int]]] = {}
+    for rank_number, note in notes(seen):
+        samples = note["epoch"], note["indices"]
+        assert trained.setdefault((rank_number, note["step"]), samples) == samples, "a step came again as another one"
+    assert sorted((epoch, index) for epoch, indices in trained.values() for index in indices) == expected
+    begun: dict[tuple[int, int], int] = {}
+    for rank_number, note in notes(seen):
+        begun.setdefault((rank_number, note["process"]), note["step"])
+    (one, again), (other, other_again) = (
+        [at for (number, _), at in begun.items() if number == each] for each in (0, 1)
+    )
+    assert (one, other) == (1, 1)
+    assert again == other_again > 1, "both ranks were started again, from one checkpoint"
+    assert json.loads(printed.splitlines()[-1])["step"] * 2 == len(trained) == len(batches) * 2
+
+
+def notes(seen: Path) -> list[tuple[int, dict[str, Any]]]:
+    """(rank, what it noted of a step); a line that is being written is none yet."""
+    return [
+        (int(path.stem), json.loads(line))
+        for path in seen.glob("*.jsonl")
+        for line in path.read_text(encoding="utf-8").splitlines(keepends=True)
+        if line.endswith("\n")
+    ]

@@ -81,6 +81,12 @@ def test_hidden_vp8_frames_are_not_counted(tmp_path: Path) -> None:
     np.testing.assert_array_equal(decode_luma(hidden, facts.index, 15, 10).frames, shown[15:25])
 
 
+def test_hidden_vp9_frames_packed_with_shown_ones(tmp_path: Path) -> None:
+    options = {"auto-alt-ref": "1", "lag-in-frames": "16", "b": "60k", "cpu-used": "4"}
+    path = write_clip(tmp_path / "clip.webm", panned_luma(60, 96, 128), codec="libvpx-vp9", options=options, gop=60)
+    assert probe(path).frames == 60
+
+
 @pytest.mark.parametrize(
     ("codec", "packet", "hidden"),
     [

@@ -126,6 +126,20 @@ def test_without_time_stamps_the_index_decides(tmp_path: Path) -> None:
         assert [image.time for image in opened.images] == [1.1, 1.4]
 
 
+def test_pictures_are_listed_without_all_being_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    open_datasets = []
+    repair = Recording._repair_times
+
+    def count_and_repair(self: Recording, times: list[float]) -> list[float]:
+        open_datasets.append(h5py.h5f.get_obj_count(self._file.id, h5py.h5f.OBJ_DATASET))
+        return repair(self, times)
+
+    monkeypatch.setattr(Recording, "_repair_times", count_and_repair)
+    with Recording(random_recording(tmp_path / "a.h5", images=50, events=50)) as opened:
+        assert len(opened.images) == 50
+    assert open_datasets[0] <= 6, "four columns, and at most the picture read last"
+
+
 def test_time_ranges_count_from_the_first_picture(tmp_path: Path) -> None:
     path = random_recording(tmp_path / "a.h5", images=51, period=0.1, events=500)
     with Recording(path) as opened:
