@@ -159,6 +159,13 @@ def test_unexplained_deaths_make_it_run_alone_and_one_more_refuses_it() -> None:
     assert sorted(at.samples()) == [(0, 0), (0, 1), (0, 2), (0, 3)]
 
 
+def test_deaths_count_separately_for_each_candidate() -> None:
+    at = asked(0)
+    candidates = [poisoned(at, Cause.UNEXPLAINED).candidate for _ in range(3 * (ALONE_AFTER + 1))]
+    assert candidates == [number // (ALONE_AFTER + 1) for number in range(len(candidates))]
+    assert len(at.recorded) == 3
+
+
 def test_a_lone_task_whose_video_fails_runs_in_company_again() -> None:
     at = asked(0, 1)
     for _ in range(ALONE_AFTER):
