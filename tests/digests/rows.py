@@ -9,8 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -235,24 +235,16 @@ class Ways:
 
     def _cached(self, row: Row) -> Made:
         """Make the samples twice: the second time each is read from the cache."""
-        with _empty_folder(self.folder / "cache") as folder:
-            make_cache(folder)
+        with tempfile.TemporaryDirectory(dir=self.folder) as folder:
+            make_cache(Path(folder))
             first, again = (
-                samples_of(self.catalogue("videos"), row, Cache(folder, 1 << 30, least_free_bytes=0)) for _ in range(2)
+                samples_of(self.catalogue("videos"), row, Cache(Path(folder), 1 << 30, least_free_bytes=0))
+                for _ in range(2)
             )
         assert all(sample.provenance.decoder.endswith(", from the cache") for sample in again)
         differences = compared(made(first), made(again))
         assert not differences, f"the cache, when it was empty: {differences[0]}"
         return made(again)
-
-
-@contextmanager
-def _empty_folder(folder: Path) -> Iterator[Path]:
-    folder.mkdir()
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder)
 
 
 def samples_of(catalogue: Catalogue, row: Row, cache: Cache | None = None) -> list[Sample]:

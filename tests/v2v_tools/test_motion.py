@@ -14,7 +14,6 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from tests.oracles.decoded import stream_luma
 from v2v_pictures.camera import Camera
-from v2v_protocol.sample import Provenance
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.simulation import simulate
@@ -107,12 +106,13 @@ def test_the_rate_of_noise_is_estimated_to_a_factor_of_two(corpus: Catalogue, si
     assert noise_rate(dataclasses.replace(params, noise_sigma=0.0, effects={"leak_hz": 3.0}), 0.5) == 1.5
 
 
-def _drawn(clip: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *flags: str) -> tuple[list[Provenance], Camera]:
-    seen: list[Provenance] = []
+def _drawn(clip: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *flags: str) -> tuple[list[Camera], Camera]:
+    """Return the cameras and the whole picture of a preview."""
+    seen: list[Camera] = []
     wholes: list[Camera] = []
 
     def keep(shown: list[Camera], title: str, *, moments: int, whole: Camera) -> npt.NDArray[np.uint8]:
-        seen.extend(camera.provenance for camera in shown)
+        seen.extend(shown)
         wholes.append(whole)
         return np.zeros((8, 8, 3), np.uint8)
 
@@ -126,10 +126,21 @@ def _drawn(clip: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *flags: st
 def test_a_seed_that_is_given_is_kept(corpus: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clip = corpus.path("half.mkv")
     seen, whole = _drawn(clip, tmp_path, monkeypatch, "--seed=5", "--seeds=2")
-    assert [provenance.id.seed for provenance in seen] == [5, 6]
+    assert [camera.provenance.id.seed for camera in seen] == [5, 6]
     assert whole.voxels.shape[2:] == (96, 160)
     chosen, _ = _drawn(clip, tmp_path, monkeypatch, "--seeds=2", "--set=threshold=[0.1,0.2]")
-    assert all(provenance.params.crop_left_px > 60 for provenance in chosen)
+    assert all(camera.provenance.params.crop_left_px > 60 for camera in chosen)
+
+
+def test_the_share_of_noise_is_measured(corpus: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    still = np.full((14, 96, 160), 90, np.uint8)
+    write_clip(tmp_path / "still.mkv", still, codec="ffv1", pixel_format="gray")
+    for clip, flags, share in (
+        (corpus.path("half.mkv"), ("--recipe=noise-free", "--set=threshold=0.1"), 0.0),
+        (tmp_path / "still.mkv", ("--seed=0", "--set=noise_sigma=0.3", "--set=pause_probability=0"), 1.0),
+    ):
+        shown, _ = _drawn(clip, tmp_path, monkeypatch, *flags)
+        assert shown[0].noise_share([0, 1, 2]) == share
 
 
 def test_the_start_makes_the_events_of_a_still_clip_and_none_if_it_is_zero(tmp_path: Path) -> None:

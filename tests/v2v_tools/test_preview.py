@@ -9,13 +9,11 @@ from typing import Any
 
 import av
 import numpy as np
-import numpy.typing as npt
 import pytest
 from PIL import Image as Pictures
 
 from tests.clips import panned_luma, write_clip
 from tests.oracles.rendered import rendered_scene
-from v2v_pictures.camera import Camera
 from v2v_pictures.sheet import class_colour
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_tools import preview as command
@@ -168,29 +166,6 @@ def test_many_cameras_and_a_film_show_their_progress(
     assert [line.split(" cameras")[0] for line in cameras] == [f"simulating: {number} of 4" for number in range(1, 5)]
     assert all("a second" in line and "left" in line for line in cameras[1:3])
     assert sum(line.startswith("drawing the film: ") for line in said) == 15
-
-
-def _shares(
-    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: dict[str, object]
-) -> list[float | None]:
-    cameras: list[Camera] = []
-
-    def keep(shown: list[Camera], title: str, *, moments: int, whole: Camera) -> npt.NDArray[np.uint8]:
-        cameras.extend(shown)
-        return np.zeros((8, 8, 3), np.uint8)
-
-    monkeypatch.setattr("v2v_tools.preview.draw_sheet", keep)
-    wanted = [PreviewCamera("a", TINY | recipe, 0)]
-    preview(str(source), tmp_path / "a.png", wanted, {}, title="t", cache_dir=str(tmp_path), with_flow=False)
-    return [camera.noise_share([0, 1, 2]) for camera in cameras]
-
-
-def test_the_share_of_noise_is_measured(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    still = write_clip(tmp_path / "still.mp4", np.full((40, 96, 128), 90, np.uint8))
-    loud = {"noise_sigma": [0.3, 0.3], "pause_probability": 0.0}
-    assert _shares(still, tmp_path, monkeypatch, loud) == [1.0]
-    quiet = {"preset": "noise-free"}
-    assert _shares(clip, tmp_path, monkeypatch, quiet) == [0.0]
 
 
 def _said(source: Path, tmp_path: Path) -> str:

@@ -107,20 +107,6 @@ def test_labels_follow_crop_resize_flip_pauses_and_stride(catalogue: Catalogue, 
         np.testing.assert_allclose([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], [x0, y0, x1, y1], atol=0.6)
 
 
-def test_the_smallest_boxes_are_left_out_and_counted(corpus: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "videos"
-    folder.mkdir()
-    (folder / "a.mp4").symlink_to(corpus / "a.mp4")
-    (folder / "a.boxes.json").write_text(boxes_text((6, 18, 10)))
-    whole = {"crop_height_px": HEIGHT_PX, "crop_width_px": WIDTH_PX, "resize_scale": (1.0, 1.0), "max_boxes": 2}
-    with closing(open_catalogue(folder, processes=0)) as catalogue:
-        sample = made(catalogue, RECIPE.replace(**whole), 0, ("boxes",))
-        assert sample.arrays["boxes"].shape == (5, 2, 7)
-        assert sample.arrays["boxes"][:, :, 5].tolist() == [[2.0, 0.0]] * 5, "the two largest"
-        assert sample.provenance.boxes_dropped == 10
-        assert "boxes_dropped" not in made(catalogue, RECIPE.replace(**whole), 0, ("frames",)).provenance.to_dict()
-
-
 def test_a_toy_label_with_a_cap_needs_no_field_of_its_own(
     corpus: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,39 +140,31 @@ def test_a_toy_label_with_a_cap_needs_no_field_of_its_own(
 
 
 @pytest.mark.parametrize(
-    ("labels", "reason"),
+    ("array", "labels", "reason"),
     [
-        ({}, r"its sidecar \.boxes\.json or \.boxes\.txt or \.boxes/: is missing: add it beside the video"),
-        ({".boxes.json": "{"}, r"its sidecar \.boxes\.json: .*line 1"),
-        ({".boxes.txt": "1,2\n"}, r"its sidecar \.boxes\.txt: line 1 has 2 values"),
-        ({".boxes.json": '{"images": [{"id": 0, "frame_id": 0}], "annotations": []}'}, "has no frame"),
-        ({".boxes.txt": "", ".boxes.json": "{}"}, r"\.boxes\.json or \.boxes\.txt: there are 2: keep one"),
+        ("boxes", {}, r"its sidecar \.boxes\.json or \.boxes\.txt or \.boxes/: is missing: add it beside the video"),
+        ("boxes", {".boxes.json": "{"}, r"its sidecar \.boxes\.json: .*line 1"),
+        ("boxes", {".boxes.txt": "1,2\n"}, r"its sidecar \.boxes\.txt: line 1 has 2 values"),
+        ("boxes", {".boxes.json": '{"images": [{"id": 0, "frame_id": 0}], "annotations": []}'}, "has no frame"),
+        ("boxes", {".boxes.txt": "", ".boxes.json": "{}"}, r"\.boxes\.json or \.boxes\.txt: there are 2: keep one"),
+        ("masks", {".masks/0.png": None}, "has no file of frame"),
     ],
 )
 def test_a_video_without_sound_labels_gives_an_unlabelled_sample(
-    corpus: Path, tmp_path: Path, labels: dict[str, str], reason: str
+    corpus: Path, tmp_path: Path, array: str, labels: dict[str, str | None], reason: str
 ) -> None:
-    folder = tmp_path / "videos"
-    folder.mkdir()
-    (folder / "a.mp4").symlink_to(corpus / "a.mp4")
+    (tmp_path / "a.mp4").symlink_to(corpus / "a.mp4")
     for ending, text in labels.items():
-        (folder / f"a{ending}").write_text(text)
-    with closing(open_catalogue(folder, processes=0)) as catalogue:
-        sample, plain = (made(catalogue, RECIPE, 7, arrays) for arrays in (("frames", "boxes"), ("frames",)))
-    assert np.all(sample.arrays["boxes"] == -1)
+        (tmp_path / f"a{ending}").parent.mkdir(exist_ok=True)
+        if text is None:
+            (tmp_path / f"a{ending}").symlink_to(corpus / "a.masks" / "00000.png")
+        else:
+            (tmp_path / f"a{ending}").write_text(text)
+    with closing(open_catalogue(tmp_path, processes=0)) as catalogue:
+        sample, plain = (made(catalogue, RECIPE, 7, arrays) for arrays in (("frames", array), ("frames",)))
+    assert np.all(sample.arrays[array] == {"boxes": -1, "masks": 255}[array])
     assert not sample.provenance.labelled
     (text,) = sample.provenance.unlabelled.values()
     assert re.search(reason, text)
     assert sample.arrays["frames"].tobytes() == plain.arrays["frames"].tobytes()
     assert (sample.provenance.video, sample.provenance.params) == (plain.provenance.video, plain.provenance.params)
-
-
-def test_a_missing_mask_marks_all_pixels(corpus: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "videos"
-    (folder / "a.masks").mkdir(parents=True)
-    (folder / "a.mp4").symlink_to(corpus / "a.mp4")
-    (folder / "a.masks" / "0.png").symlink_to(corpus / "a.masks" / "00000.png")
-    with closing(open_catalogue(folder, processes=0)) as catalogue:
-        sample = made(catalogue, RECIPE, 7, ("masks",))
-    assert np.all(sample.arrays["masks"] == 255)
-    assert "has no file of frame" in sample.provenance.unlabelled["masks"]

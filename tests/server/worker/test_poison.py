@@ -10,7 +10,7 @@ import pytest
 from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from tests.server.peers import DEADLINE, Peers, peers
 from v2v_protocol.errors import SampleUnavailable, VideoError
-from v2v_protocol.messages import Begun, Denied, ErrorCode, Goodbye, Hello, Lease
+from v2v_protocol.messages import Begun, Goodbye, Lease
 from v2v_protocol.sample import Refusal, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import ALONE_AFTER, Cause
@@ -176,30 +176,6 @@ def test_a_lone_task_whose_video_fails_runs_in_company_again() -> None:
     assert [(lease.indices, lease.candidate) for lease in at.leases[b"w"]] == [((0,), 1), ((1,), 0)]
 
 
-def test_a_lone_task_waits_for_an_empty_worker_and_finds_one_under_load() -> None:
-    at = asked(0, batch_size=20)
-    for _ in range(ALONE_AFTER):
-        poisoned(at, Cause.UNEXPLAINED)
-    at.hello(b"busy", batch_size=20)
-    at.want(*range(40), identity=b"busy")
-    for worker in (b"w1", b"w2"):
-        at.join(worker)
-    # The lone request went first; once it is tried again there is no empty worker any more.
-    at.begin(b"w1")
-    at.die(b"w1", Cause.KILLED)
-    assert all(at.asked_by(lease) == b"busy" for lease in at.leases[b"w2"])
-    turns = 0
-    while not at.samples():
-        turns += 1
-        assert turns < 10
-        for lease in at.leases[b"w2"]:
-            assert at.asked_by(lease) == b"busy" or len(at.leases[b"w2"]) == 1
-        at.begin(b"w2")
-        at.finish(b"w2")
-    at.work_off(b"w2")
-    assert len(at.samples(b"busy")) == 40
-
-
 def test_a_consumer_that_leaves_takes_its_lone_task_along_and_frees_the_worker_kept_for_it() -> None:
     at = asked(0)
     for _ in range(ALONE_AFTER):
@@ -221,22 +197,6 @@ def test_a_consumer_that_leaves_takes_its_lone_task_along_and_frees_the_worker_k
 
 
 # --- the verdict ------------------------------------------------------------------------------------------------------
-
-
-def test_the_verdict_is_written_before_anything_is_sent_under_it() -> None:
-    at = asked(*range(8), batch_size=8)
-    at.join(b"w1")
-    at.join(b"w2")
-    lease = at.begin(b"w1")
-    at.sent.clear()
-    at.finish(b"w2")
-    at.finish(b"w2")
-    at.sent.clear()
-    at.die(b"w1", Cause.CRASHED)
-    at.work_off(b"w2")
-    assert at.sent[0] == ("record", replace(against(lease), snapshot=0))
-    snapshots = {message.quarantine for kind, message in at.sent if isinstance(message, Lease)}
-    assert snapshots == {1}
 
 
 def test_a_spec_that_substitutes_nothing_hears_of_it_after_the_record() -> None:
@@ -359,15 +319,6 @@ def test_a_crash_under_an_older_snapshot_moves_only_that_sample() -> None:
     assert lease.refusals["refusals"][0]["reason"] == "a worker died over it"
     at.work_off()
     assert at.samples() == [(0, 0)]
-
-
-def test_a_snapshot_of_the_future_is_refused() -> None:
-    at = peers(quarantine=Quarantine([in_quarantine()]))
-    (reply,) = at.consumer_says(b"c", Hello({}, ("voxels",), 4, 0, 2))
-    assert isinstance(reply, Denied)
-    assert reply.code == ErrorCode.SPEC
-    assert "snapshot 2 was asked for, this server has 0 .. 1" in reply.text
-    assert len(at.dispatcher.sessions) == 0
 
 
 def test_lines_that_others_wrote_meanwhile_are_taken_up_with_the_own_verdict() -> None:

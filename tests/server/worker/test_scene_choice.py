@@ -48,31 +48,33 @@ def plan(what: Scene, spec: StreamSpec = AUTO, start: int = 0, **changes: Any) -
     )
 
 
-def test_still_slow_moving_and_dark_clips_are_decided_apart() -> None:
-    # A voxel spans five frames: 0.09 px a frame are less than half a pixel, 0.11 more.
-    assert methods(scene(0.0, 1.1)) == ("zero",) * 4
-    assert methods(scene(0.09, 3.0)) == ("dis-ultrafast",) * 4
-    assert methods(scene(0.11, 3.0)) == (LEAN_METHOD,) * 4
-    # 1.1 grey levels over four frames are nothing in daylight, and motion in the dark.
-    assert methods(scene(0.09, 1.1, dark=0.95)) == ("dis-ultrafast",) * 4
-    assert methods(scene(0.11, 0.1, dark=0.95)) == ("zero",) * 4
+LONG = StreamSpec(recipe=RECIPE.replace(voxels_per_clip=2, frames_per_bin=2), scene="auto")
+STRIDED = StreamSpec(recipe=RECIPE.replace(voxels_per_clip=2, frame_stride=2), scene="auto")
 
 
-def test_change_and_motion_grow_with_the_time_between_two_frames() -> None:
-    long = StreamSpec(recipe=RECIPE.replace(voxels_per_clip=2, frames_per_bin=2), scene="auto")
-    assert methods(scene(0.0, 1.1), spec=long) == ("dis-ultrafast",) * 2
-    assert methods(scene(0.09, 3.0), spec=long) == (LEAN_METHOD,) * 2
-    strided = StreamSpec(recipe=RECIPE.replace(voxels_per_clip=2, frame_stride=2), scene="auto")
-    assert methods(scene(0.09, 3.0), spec=strided) == (LEAN_METHOD,) * 2
-
-
-def test_enlarged_pictures_move_more() -> None:
-    assert methods(scene(0.09, 3.0), scale=1.3) == (LEAN_METHOD,) * 4
-
-
-def test_a_pause_takes_its_part_of_the_motion_away() -> None:
-    # Voxel 0 is one long pause; voxel 1 advances by three frames only: 3 x 0.11 < 0.5.
-    assert methods(scene(0.11, 3.0), pauses=((1, 7),)) == ("zero", "dis-ultrafast", LEAN_METHOD, LEAN_METHOD)
+@pytest.mark.parametrize(
+    ("what", "changes", "expected"),
+    [
+        # A voxel spans five frames: 0.09 px a frame are less than half a pixel, 0.11 more.
+        pytest.param(scene(0.0, 1.1), {}, ("zero",) * 4, id="still"),
+        pytest.param(scene(0.09, 3.0), {}, ("dis-ultrafast",) * 4, id="slow"),
+        pytest.param(scene(0.11, 3.0), {}, (LEAN_METHOD,) * 4, id="moving"),
+        # 1.1 grey levels over four frames are nothing in daylight, and motion in the dark.
+        pytest.param(scene(0.09, 1.1, dark=0.95), {}, ("dis-ultrafast",) * 4, id="dark"),
+        pytest.param(scene(0.11, 0.1, dark=0.95), {}, ("zero",) * 4, id="still in the dark"),
+        # Change and motion grow with the time between two frames, and with the picture.
+        pytest.param(scene(0.0, 1.1), {"spec": LONG}, ("dis-ultrafast",) * 2, id="change of a long bin"),
+        pytest.param(scene(0.09, 3.0), {"spec": LONG}, (LEAN_METHOD,) * 2, id="motion of a long bin"),
+        pytest.param(scene(0.09, 3.0), {"spec": STRIDED}, (LEAN_METHOD,) * 2, id="stride"),
+        pytest.param(scene(0.09, 3.0), {"scale": 1.3}, (LEAN_METHOD,) * 4, id="enlarged"),
+        # Voxel 0 is one long pause; voxel 1 advances by three frames only: 3 x 0.11 < 0.5.
+        pytest.param(
+            scene(0.11, 3.0), {"pauses": ((1, 7),)}, ("zero", "dis-ultrafast", LEAN_METHOD, LEAN_METHOD), id="paused"
+        ),
+    ],
+)
+def test_the_method_of_each_voxel(what: Scene, changes: dict[str, Any], expected: tuple[str, ...]) -> None:
+    assert methods(what, **changes) == expected
 
 
 def test_only_the_segments_between_the_frames_count() -> None:
@@ -139,9 +141,8 @@ def test_a_method_that_was_asked_for_is_obeyed() -> None:
     assert made.reason.startswith("still; flow dis-fast-1 as asked; ")
 
 
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_crops_lie_where_the_picture_changes(share: float) -> None:
-    """Of 8 places drawn, those are likely whose tiles change; with a share of 0 each crop stays as drawn."""
+def test_crops_lie_where_the_picture_changes() -> None:
+    """Of 8 places drawn, those are likely whose tiles change."""
     values = np.zeros((4, COLUMNS))
     values[:, CHANGE] = 0.0
     values[2, CHANGE.start + 5] = 30.0  # the second tile of the second row: rows and columns 32 .. 63
@@ -153,20 +154,18 @@ def test_crops_lie_where_the_picture_changes(share: float) -> None:
     drawn = params(crop_top_px=96, crop_left_px=96)
     chosen = [
         choose_crop(
-            drawn, RECIPE, seed=1, epoch=0, index=index, share=share, picture_height_px=SIZE_PX,
+            drawn, RECIPE, seed=1, epoch=0, index=index, share=1.0, picture_height_px=SIZE_PX,
             picture_width_px=SIZE_PX, weigh=weigh,
         )
         for index in range(50)
     ]  # fmt: skip
-    if share:
-        assert np.mean([weigh(each.crop_top_px, each.crop_left_px) > 0 for each in chosen]) > 0.8
-    else:
-        assert all(each == drawn for each in chosen)
+    assert np.mean([weigh(each.crop_top_px, each.crop_left_px) > 0 for each in chosen]) > 0.8
 
 
-def test_crops_stay_as_drawn_where_nothing_changes() -> None:
+@pytest.mark.parametrize(("share", "weight"), [(0.0, 1), (1.0, 0)])
+def test_crops_stay_as_drawn_with_a_share_of_0_and_where_nothing_changes(share: float, weight: int) -> None:
     drawn = params(crop_top_px=7)
     assert drawn == choose_crop(
-        drawn, RECIPE, seed=1, epoch=0, index=0, share=1.0, picture_height_px=SIZE_PX, picture_width_px=SIZE_PX,
-        weigh=lambda top, left: 0,
+        drawn, RECIPE, seed=1, epoch=0, index=0, share=share, picture_height_px=SIZE_PX, picture_width_px=SIZE_PX,
+        weigh=lambda top, left: weight * top,
     )  # fmt: skip

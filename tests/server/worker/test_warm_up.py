@@ -87,13 +87,11 @@ def test_a_confined_process_compiles_in_its_own_memory(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], env=environment, check=True)
 
 
-def test_the_wait_for_a_stuck_process_is_bounded(tmp_path: Path) -> None:
-    with one_compiles(tmp_path, KEY), one_compiles(tmp_path, KEY, longest_wait_seconds=0.0) as is_first:
-        assert is_first
-
-
-def test_what_is_compiled_for_another_processor_is_not_waited_for(tmp_path: Path) -> None:
-    with one_compiles(tmp_path, KEY), one_compiles(tmp_path, "another") as is_first:
+@pytest.mark.parametrize(("key", "longest"), [(KEY, 0.0), ("another", 60.0)], ids=["stuck", "another processor"])
+def test_a_process_that_is_stuck_or_compiles_for_another_processor_is_not_waited_for(
+    tmp_path: Path, key: str, longest: float
+) -> None:
+    with one_compiles(tmp_path, KEY), one_compiles(tmp_path, key, longest_wait_seconds=longest) as is_first:
         assert is_first
 
 

@@ -26,8 +26,6 @@ from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.video.probe import probe
 from v2v_tools.tradeoff import command as tradeoff
 from v2v_tools.tradeoff.measures import (
-    DRAW_ROW,
-    NOISE_ROW,
     Leases,
     compare,
     cpu_seconds,
@@ -47,24 +45,11 @@ def errors(sums: npt.NDArray[Any]) -> tuple[float | None, float | None]:
     return fields["voxel_error_at_0.2"], fields["count_error_at_2"]
 
 
-def test_measures_of_a_known_pair() -> None:
+def test_measures_of_known_pairs() -> None:
     assert errors(compare(voxels(3, -1, 0, 0), voxels(2, -1, 0, -2))) == ((1 + 2) / 5, (4 - 5) / 5)
-
-
-def test_int8_counts_are_not_subtracted_in_int8() -> None:
-    full = np.full((1, 1, 1, 1), 127, np.int8)
-    assert compare(full, -full).tolist() == [254, 127, 127]
-
-
-def test_without_reference_events_no_relative_error_is_named() -> None:
     assert errors(compare(voxels(1, 0), voxels(0, 0))) == (None, None)
-
-
-def test_sums_add_up_like_one_array() -> None:
-    one, other = voxels(3, -1, 0, 5), voxels(2, 0, 0, 5)
-    assert np.array_equal(
-        compare(one[..., :2], other[..., :2]) + compare(one[..., 2:], other[..., 2:]), compare(one, other)
-    )
+    full = np.full((1, 1, 1, 1), 127, np.int8)
+    assert compare(full, -full).tolist() == [254, 127, 127]  # not subtracted in int8
 
 
 COSTS = st.dictionaries(st.text(min_size=1, max_size=3), st.tuples(*[st.integers(0, 4).map(float)] * 3), min_size=1)
@@ -138,11 +123,7 @@ def test_the_choice_is_written_and_a_wish_that_nothing_fulfils_is_status_1(
     assert ServeConfig.load(str(out), {"videos": "clips"}).spec == compared[2].spec
 
 
-def test_a_value_given_twice_is_compared_once() -> None:
-    assert axes(["tolerance=0, 0.01,0"])["tolerance"] == ["0", "0.01"]
-
-
-AXES = ["tolerance=0,0.01", "voxel_seconds=0.1,0.2"]
+AXES = ["tolerance=0, 0.01,0", "voxel_seconds=0.1,0.2"]
 CAMERA_OF_A_USER = StreamSpec(recipe=Recipe(leak_hz=(0.1, 0.2)))
 EVERY = settings([BESIDE, *STORES], CAMERA_OF_A_USER, axes(AXES))
 
@@ -268,18 +249,7 @@ def test_a_short_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert 0 < error["source, substep_px = 1, tolerance = 0.5"] <= 0.5
     assert 0 < error["source, substep_px = 0, tolerance = 0"] < error["beside, substep_px = 0, tolerance = 0"]
     assert error["lossless fast, substep_px = 1, tolerance = 0"] == 0
-    first = by_name["source, K = 1, substep_px = 0, tolerance = 0"]
-    assert first["speed_ratio"] == 1
-    prepared = by_name["beside, K = 1, substep_px = 0, tolerance = 0"]
-    assert prepared["bytes_per_video_second"] / first["bytes_per_video_second"] == pytest.approx(
-        prepared["bytes_ratio"]
-    )
-    scale = {item["way"]: item["voxel_error_at_0.2"] for item in found if item["measure"] == "scale"}
-    assert set(scale) == {NOISE_ROW, DRAW_ROW}
-    assert min(scale.values()) > 0
-    alike = {item["name"]: item for item in found if item["measure"] == "diversity"}
-    assert set(alike) == {"siblings", "batch"}
-    assert 1 <= alike["siblings"]["effective_samples_of_2"] <= alike["siblings"]["effective_samples_of_4"] <= 4
+    assert min(item["voxel_error_at_0.2"] for item in found if item["measure"] == "scale") > 0
     fastest = max((item for item in by_name.values() if not item["voxel_error_at_0.2"]),
                   key=lambda item: item["samples_per_core_second"])  # fmt: skip
     assert f"best: {fastest['name']}" in capsys.readouterr().out
