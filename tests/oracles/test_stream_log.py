@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import pytest
@@ -16,10 +17,12 @@ from tests.oracles.stream_log import (
     Line,
     LogWriter,
     Sighting,
+    Sightings,
     check_order,
     read_log,
     recovery_seconds,
 )
+from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import Refusal
 
 SEQUENCES, BATCH_SIZE = 11, 3
@@ -82,6 +85,21 @@ def test_a_life_that_skips_its_own_numbers_is_found() -> None:
     assert check_order(lines, sequences=SEQUENCES, batch_size=BATCH_SIZE).broken_lives == 1
 
 
+def test_other_bytes_of_the_same_sample_contradict() -> None:
+    seen = Sightings()
+    seen.add("a", batch(0))
+    seen.add("a", batch(0))
+    assert (seen.samples, seen.contradictions) == (6, 0)
+    flipped = dataclasses.replace(batch(0).samples[1], digest="other")
+    seen.add("a", dataclasses.replace(batch(0), samples=(flipped,)))
+    assert seen.contradictions == 1
+    seen.add("b", dataclasses.replace(batch(0), samples=(flipped,)))
+    assert seen.contradictions == 1, "another stream has other bytes"
+    moved = dataclasses.replace(flipped, candidate=1, refusals=(Refusal("v.mp4", None, "crash"),))
+    seen.add("a", dataclasses.replace(batch(0), samples=(moved,)))
+    assert seen.contradictions == 1, "another candidate has other bytes"
+
+
 # --- the file ---------------------------------------------------------------------------------------------------------
 
 
@@ -115,6 +133,15 @@ def test_a_torn_line_counts_as_not_written(tmp_path: Path, cut: int) -> None:
     assert list(read_log(path)) == [*log((0, 2)), LifeLine(2, 0.0)]
 
 
+@pytest.mark.parametrize("text", [b"{}", b"not json", b'{"kind": "batch", "number": 1}'])
+def test_a_damaged_line_is_an_error(tmp_path: Path, text: bytes) -> None:
+    path = tmp_path / "log.jsonl"
+    write(path, log((0, 3)))
+    path.write_bytes(text + b"\n" + path.read_bytes())
+    with pytest.raises(UsageError, match="line 1"):
+        list(read_log(path))
+
+
 # --- recovery ---------------------------------------------------------------------------------------------------------
 
 
@@ -125,6 +152,10 @@ def test_recovery_waits_for_the_last_consumer() -> None:
     assert recovery_seconds(Kill("consumer-kill", 2.0, 0, 2.0), batches) == 1.0, "the next one, not that of the moment"
 
 
-def test_batches_in_hand_and_none_at_all_are_no_recovery() -> None:
+def test_batches_in_hand_do_not_count_as_recovery_of_the_server() -> None:
     assert recovery_seconds(Kill("server-kill", 1.0, None, 4.0), [[1.1, 1.2, 6.0]]) == 5.0
+    assert recovery_seconds(Kill("server-kill", 1.0, None, math.inf), [[1.1, 1.2, 6.0]]) is None
+
+
+def test_who_never_gets_another_batch_has_not_recovered() -> None:
     assert recovery_seconds(Kill("worker-kill", 3.0, None, 3.0), [[4.0], [2.0]]) is None

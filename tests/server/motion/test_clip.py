@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+import os
 import tracemalloc
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.oracles.kinds import disc_over_still, frames_of, pan
+from tests.oracles.kinds import disc_over_still, frames_of, pan, shake
 from tests.oracles.rendered import Errors, counts_of, errors, log_levels, rendered_scene
+from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS
@@ -135,6 +138,54 @@ def test_fast_scenes_gain_and_slow_ones_lose_nothing() -> None:
     assert divided == linear
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["camera", "coffee", "coins"])
+def test_moving_photographs(name: str) -> None:
+    for px in (4.8, 12.0):
+        _, divided = compared(name, px, 160, 1 / HERTZ)
+        assert divided.signed <= 0.10
+        assert divided.split <= 0.30
+    for px, bar in ((2.0, 0.48), (4.0, 0.38), (10.0, 0.50)):
+        _, divided = compared(name, px, 160, 0.01)
+        assert divided.signed <= bar
+    for px in (0.3, 0.8):
+        linear, divided = compared(name, px, 160, 0.01)
+        assert divided.signed <= linear.signed + 0.005
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "bar"),
+    [("parallax", 0.45), ("occlusion", 0.45), ("rotation", 0.35), ("zoom", 0.4), ("plain", 0.45), ("thin", 0.3)],
+)
+def test_other_motion(name: str, bar: float) -> None:
+    linear, divided = compared(name, 6.0, 128, 0.01)
+    assert divided.signed < min(bar, 0.6 * linear.signed)
+
+
+DIGEST = """
+import hashlib
+import numpy as np
+from tests.oracles.rendered import rendered_scene
+from tests.server.motion.test_clip import sub_steps
+for name in ("coins", "parallax", "flicker"):
+    for px in (2.0, 9.0):
+        levels = sub_steps(rendered_scene(name, 72, 88, 30 * px).frames(30, 3))
+        print(hashlib.sha256(levels.grey).hexdigest())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(COMPILE_SECONDS)
+def test_any_processor_makes_the_same_levels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    exec(DIGEST)
+    expected = capsys.readouterr().out.split()
+    monkeypatch.setitem(os.environ, "OPENCV_CPU_DISABLE", "AVX2,FMA3")
+    assert printed_on_a_generic_processor(DIGEST, tmp_path) == expected
+
+
 # --- predicted losses against scenes with exact events ----------------------------------------------------------------
 
 
@@ -154,6 +205,13 @@ def test_the_median_motion_is_right() -> None:
     assert not found.is_slow
 
 
+def test_the_loss_grows_with_motion() -> None:
+    losses = [
+        predict(rendered_scene("camera", 96, 96, px * HERTZ).frames(HERTZ, 4)).loss().likely for px in (1, 2, 4, 8)
+    ]
+    assert losses == sorted(losses)
+
+
 @pytest.mark.parametrize("count", [2, 5])
 def test_a_still_clip_is_slow(count: int) -> None:
     still = np.repeat(rendered_scene("coffee", 48, 48, HERTZ).frames(HERTZ, 1), count, axis=0)
@@ -169,6 +227,13 @@ def test_flicker_and_vibration_cannot_be_followed() -> None:
     assert not predict(lamps).can_be_followed
     shaken = np.stack([np.rint(255 * light(0.05 * rng.random())) for _ in range(6)]).astype(np.uint8)
     found = predict(shaken)
+    assert not found.is_slow
+    assert not found.can_be_followed
+
+
+def test_a_shake_of_two_pixels_at_nine_hertz_is_not_slow() -> None:
+    found = predict(frames_of(shake, "leaves1", 4 * 2 * 9 / HERTZ))
+    assert found.features.unsteady > 0.2
     assert not found.is_slow
     assert not found.can_be_followed
 

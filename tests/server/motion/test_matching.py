@@ -62,9 +62,11 @@ def test_any_pictures_have_bounded_motion(height: int, width: int, kind: str, se
         "cut": np.roll(first, 40, 1),
     }[kind]
     for one, other in ((first, second), (second, first)):
-        found = motion(Pyramid.of(one), Pyramid.of(other))
+        found = without_slow(motion(Pyramid.of(one), Pyramid.of(other)), HALF_PX)
         assert found.shape == (2, -(-height // 4), -(-width // 4))
         assert np.abs(found.astype(int)).max() <= 2 * (max(height, width) + 32) * UNITS_PER_PX
+        squares = (found.astype(int) ** 2).sum(axis=0)
+        assert squares[squares > 0].min(initial=HALF_PX**2) >= HALF_PX**2
 
 
 # --- motion of some cells, as of all ----------------------------------------------------------------------------------
@@ -133,13 +135,15 @@ def made(
     second: npt.NDArray[np.uint8],
     vector: tuple[int, int],
     count: int,
+    *,
+    mirrored: bool = False,
 ) -> Reals:
     height, width = first.shape
     vectors = np.empty((2, -(-height // 4), -(-width // 4)), np.int16)
     vectors[0], vectors[1] = vector
     out = np.empty((count, height, width), np.uint16)
     one, other = padded(np.ascontiguousarray(first)), padded(np.ascontiguousarray(second))
-    between(one, other, vectors, 0, 0, 0, out)
+    between(one, other, vectors, 0, 0, 0, out, mirrored=mirrored)
     return out / PARTS
 
 
@@ -158,6 +162,12 @@ def test_each_pixel_is_what_both_pictures_show_along_the_motion(x: int, y: int, 
         assert abs(pictures[number, row, column] - np.clip(expected, 0, 255)) < slack
 
 
+def test_without_motion_the_light_changes_evenly() -> None:
+    first, second = np.random.default_rng(1).integers(0, 256, (2, 21, 33)).astype(np.uint8)
+    for number, picture in enumerate(made(first, second, (0, 0), 3), 1):
+        np.testing.assert_allclose(picture, first + (second * 1.0 - first) * number / 4, atol=0.6 / PARTS)
+
+
 def test_whole_pixels_are_moved_as_they_are() -> None:
     whole = np.random.default_rng(2).integers(0, 256, (48, 56)).astype(np.uint8)
     pictures = made(whole[4:-4, 4:-4], whole[4:-4, :-8], (4 * UNITS_PER_PX, 0), 3)
@@ -170,3 +180,10 @@ def test_what_enters_the_picture_is_taken_from_the_frame_that_shows_it() -> None
     first, second = whole[:, 16:], whole[:, 8:-8]
     pictures = made(first, second, (8 * UNITS_PER_PX, 0), 1)
     np.testing.assert_array_equal(pictures[0, :, :4], whole[:, 12:16])
+
+
+def test_mirrored_pictures_are_the_others_turned_round() -> None:
+    first, second = np.random.default_rng(4).integers(0, 256, (2, 22, 31)).astype(np.uint8)
+    for vector in ((0, 0), (23, -9)):
+        upright, mirrored = (made(first, second, vector, 2, mirrored=mirrored) for mirrored in (False, True))
+        np.testing.assert_array_equal(mirrored, upright[:, :, ::-1])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,21 @@ def drawn(recipe: Recipe = PAPER, count: int = 1, *, video_id: str = "a.mp4", **
 @pytest.fixture(scope="module")
 def many() -> list[SampleParams]:
     return drawn(count=1500)
+
+
+def test_ranges_and_float32_thresholds(many: list[SampleParams]) -> None:
+    for params in many:
+        small, large = sorted((params.threshold_pos, params.threshold_neg))
+        assert np.float32(0.05) <= small <= 2
+        assert 1 - 1e-6 <= large / small <= 1.5 + 1e-6
+        assert params.threshold_pos == float(np.float32(params.threshold_pos))
+        assert 0 <= params.noise_sigma <= 0.1
+        assert 0 <= params.hot_pixel_count <= 16
+        assert 0 <= params.hot_pixel_sigma <= 10
+        assert (params.scale, params.contrast) == (1.0, 0.0)
+        assert 0 <= params.crop_top_px <= 52
+        assert 0 <= params.crop_left_px <= 468
+        assert all(0 <= word < 2**32 for word in params.noise_key)
 
 
 def test_uniform_moments_and_coins(many: list[SampleParams]) -> None:
@@ -111,6 +128,22 @@ def test_seed_epoch_and_index_each_change_the_draw() -> None:
     assert len(keys) == 4
 
 
+def test_a_setting_of_one_purpose_leaves_the_others_alone() -> None:
+    [paper] = drawn()
+    [other] = drawn(Recipe(pause_probability=0.0, noise_sigma=(0.0, 0.0), contrast_probability=1.0))
+    assert other.contrast > 0
+    for name in (
+        "threshold_pos",
+        "threshold_neg",
+        "hot_pixel_count",
+        "crop_top_px",
+        "crop_left_px",
+        "flip",
+        "noise_key",
+    ):
+        assert getattr(paper, name) == getattr(other, name)
+
+
 def test_thresholds_of_a_video_are_the_same_in_every_epoch() -> None:
     recipe = Recipe(threshold_source="video")
     pairs = {(p.threshold_pos, p.threshold_neg) for p in drawn(recipe, 20) + drawn(recipe, 20, seed=9, epoch=3)}
@@ -124,6 +157,11 @@ def test_thresholds_of_a_video_are_the_same_in_every_epoch() -> None:
     assert (listed.threshold_pos, listed.threshold_neg) == (float(np.float32(0.1)), float(np.float32(0.3)))
 
 
+def test_noise_in_units_of_the_threshold() -> None:
+    [plain], [scaled] = drawn(), drawn(Recipe(noise_scales_with_threshold=True))
+    assert scaled.noise_sigma == plain.noise_sigma * plain.threshold_pos
+
+
 def test_hot_pixel_share_rounds_half_up() -> None:
     for share, count in ((0.5 / 16384, 1), (0.49 / 16384, 0), (1.0, 16384), (0.0, 0)):
         assert drawn(Recipe(hot_pixel_share=(share, share)))[0].hot_pixel_count == count
@@ -135,23 +173,31 @@ EFFECTS: dict[str, Any] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("changes", "moved"),
-    [
-        ({"pause_probability": 0.0}, {"pauses"}),
-        ({"noise_sigma": (0.0, 0.0)}, {"noise_sigma"}),
-        ({"contrast_probability": 1.0}, {"contrast"}),
-        ({"log_eps": (0.01, 0.2)}, {"log_eps"}),
-        (EFFECTS, {"effects"}),
-    ],
-)
-def test_a_setting_moves_its_own_draw_alone(changes: dict[str, Any], moved: set[str]) -> None:
-    plain, other = (dataclasses.asdict(*drawn(recipe)) for recipe in (PAPER, Recipe(**changes)))
-    assert {name for name, value in plain.items() if other[name] != value} == moved
+def test_effects_change_no_other_draw() -> None:
+    plain, other = drawn(count=20), drawn(Recipe(**EFFECTS), 20)
+    assert all(params.effects == {} for params in plain)
+    assert all(params.effects for params in other)
+    assert [dataclasses.replace(params, effects={}) for params in other] == plain
 
 
-def test_a_range_of_log_eps_is_drawn_in_steps() -> None:
-    plain, other = drawn(), drawn(Recipe(log_eps=(0.01, 0.2)), 200)
+@pytest.mark.parametrize("name", EFFECTS)
+def test_one_effect_changes_no_other_effect(name: str) -> None:
+    [base], [changed] = drawn(Recipe(**EFFECTS)), drawn(Recipe(**EFFECTS).replace(**{name: (0.0, 0.0)}))
+    assert {key: value for key, value in base.effects.items() if key != name} == changed.effects
+
+
+def test_effects_are_uniform_in_their_ranges_and_independent() -> None:
+    many = [[params.effects[name] for name in EFFECTS] for params in drawn(Recipe(**EFFECTS), 600)]
+    columns = np.array(many).T
+    for column, (low, high) in zip(columns, EFFECTS.values(), strict=True):
+        assert low <= column.min() <= column.max() <= high
+        assert abs(column.mean() - (low + high) / 2) < 4 * (high - low) / math.sqrt(12 * len(many))
+    assert np.abs(np.corrcoef(columns) - np.eye(len(columns))).max() < 4.5 / math.sqrt(len(many))
+
+
+def test_a_range_of_log_eps_changes_no_other_draw() -> None:
+    plain, other = drawn(count=200), drawn(Recipe(log_eps=(0.01, 0.2)), 200)
+    assert [dataclasses.replace(params, log_eps=None) for params in other] == plain
     values = [params.log_eps or 0.0 for params in other]
     assert (min(values), max(values)) == (pytest.approx(0.01), pytest.approx(0.2))
     assert len(set(values)) == 33  # each needs a table
@@ -195,6 +241,12 @@ GOLDEN = SampleParams(
 )
 
 
+def test_draw_needs_no_compiler() -> None:
+    code = "import sys, v2v_server.simulation.draw; print(sorted({'numba', 'cv2', 'av', 'torch'} & set(sys.modules)))"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
 # --- where the residual of a pixel starts -----------------------------------------------------------------------------
 
 POSITIVE, NEGATIVE = 0.3, 0.2
@@ -236,6 +288,12 @@ def test_each_pixel_starts_between_its_own_thresholds(law: str) -> None:
     still = np.full((6, 40, 40), 90, np.uint8)
     made = simulate(still, threshold_pos=0.2, threshold_mismatch_sigma=0.25, bins=1, start=law)
     assert not made.voxels.any()
+
+
+def test_a_set_residual_wins() -> None:
+    frames = np.array([100, 101, 99], np.uint8)[:, None, None] * np.ones((1, 8, 8), np.uint8)
+    given: dict[str, Any] = {"threshold_pos": 0.2, "bins": 1, "start_residual": 0.19}
+    assert (simulate(frames, start="triangular", **given).voxels == simulate(frames, **given).voxels).all()
 
 
 def test_an_unknown_law_is_refused() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from tests.oracles.noise import mismatch_normals, shot_words, standard_normals, start_uniforms
 from tests.server.simulation import effect_oracle
 from tests.server.simulation.effect_oracle import Camera, Chance
+from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from tests.server.simulation.test_pixel import moving_frames
 from tests.server.simulation.test_times import again
 from v2v_protocol.errors import UsageError
@@ -22,8 +24,8 @@ from v2v_protocol.recipe import LARGEST_NORMAL, Recipe, preset
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation import simulate, simulate_clip
 from v2v_server.simulation.draw import noise_key_of_seed
-from v2v_server.simulation.effects import dead_pixels
-from v2v_server.simulation.intensity import exponential, log_table_float64
+from v2v_server.simulation.effects import dead_pixels, photoreceptor, shot_noise
+from v2v_server.simulation.intensity import exponential, linear_light, log_table_float64
 from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.voxel import rounding_tolerance
 
@@ -106,6 +108,21 @@ def still(level: int, steps: int, height: int = 16, width: int = 16) -> np.ndarr
     return np.broadcast_to(np.uint8(level), (steps + 1, height, width))
 
 
+@pytest.mark.parametrize("mismatch", [0.0, 0.2])
+@pytest.mark.parametrize("refractory", [0.0, 0.001])
+def test_a_leak_of_one_hertz_fires_once_a_second_on_a_still_scene(mismatch: float, refractory: float) -> None:
+    got = simulate(
+        still(90, 5000), threshold_pos=0.2, bins=5000, dtype="float32", frames_per_second=FPS, leak_hz=1.0,
+        threshold_mismatch_sigma=mismatch, refractory_seconds=refractory,
+    ).voxels  # fmt: skip
+    per_pixel = got.sum((0, 1))
+    assert got.min() == 0
+    assert per_pixel.min() >= 190
+    assert per_pixel.max() <= 210
+    # The residual starts around 0 and ends half a threshold above it; a refractory period lengthens every interval.
+    assert per_pixel.mean() == pytest.approx(200 / (1 + refractory) - 0.5, abs=0.2)
+
+
 @pytest.mark.parametrize("refractory", [1e-4, 1e-3, 0.01, 0.039])
 def test_the_refractory_period_stretches_the_time_between_events(refractory: float) -> None:
     """Black to white in a step of 40 ms at constant speed: an event every c / slope + t."""
@@ -129,6 +146,27 @@ def test_dead_pixels_are_dead_and_no_others() -> None:
     expected = plain.reshape(20, -1).copy()
     expected[:, position] = 0
     np.testing.assert_array_equal(got.reshape(20, -1), expected)
+
+
+def test_an_effect_that_can_do_nothing_leaves_every_bit_alone() -> None:
+    """The other kernel, without hot pixels, is the same arithmetic in the same order."""
+    frames = moving_frames(31, 33, 47)
+    for dtype in ("int8", "float32"):
+        plain = simulate(frames, threshold_pos=0.07, threshold_neg=0.1, noise_sigma=0.1, bins=3, dtype=dtype)
+        other = simulate(
+            frames, threshold_pos=0.07, threshold_neg=0.1, noise_sigma=0.1, bins=3, dtype=dtype,
+            frames_per_second=1e6, shot_noise_hz=1e-9,
+        )  # fmt: skip
+        np.testing.assert_array_equal(plain.voxels, other.voxels)
+        assert plain.saturated_bins == other.saturated_bins
+
+
+def test_noise_per_frame_stays_per_frame_where_an_effect_needs_seconds() -> None:
+    recipe = Recipe(voxels_per_clip=2, crop_height_px=16, crop_width_px=16, leak_hz=(1.0, 1.0))
+    params = params_of(effects_of(dead=0.01), noise_sigma=0.1)
+    frames = moving_frames(recipe.frames_needed, 16, 16)
+    clips = [simulate_clip(frames, params, recipe, "int8", np.full(recipe.steps, dt)).voxels for dt in (0.01, 0.5)]
+    np.testing.assert_array_equal(clips[0], clips[1])
 
 
 # --- what leaving one out costs ---------------------------------------------------------------------------------------
@@ -181,6 +219,24 @@ def test_the_exponential() -> None:
     np.testing.assert_allclose(exponential(x), np.exp(x), rtol=2e-15)
 
 
+def test_tables_against_their_equations() -> None:
+    light = linear_light(GAMMA, LOG_EPS)
+    np.testing.assert_allclose(light, (np.arange(256) / 255) ** GAMMA, atol=1e-15)
+    means = shot_noise.shot_means(1000.0, light, np.array([0.01, 0.1]))
+    np.testing.assert_allclose(means[:, [0, 255]], [[5.0, 1.25], [50.0, 12.5]])
+    table = shot_noise.shot_table(means) / 2.0**32
+    for d, level in ((0, 0), (1, 255), (1, 0)):
+        for k in (0, 3, 12, 60):
+            below = sum(math.exp(-means[d, level]) * means[d, level] ** j / math.factorial(j) for j in range(k + 1))
+            expected = 1 - below if k < table.shape[1] else 0.0
+            assert table[d, min(k, table.shape[1] - 1), level] == pytest.approx(expected, abs=3e-10)
+    slow, fast = photoreceptor.low_pass_tables(30.0, light, np.array([0.02]))[0]
+    x = 2 * math.pi * 30.0 * 0.02
+    assert slow[255] == pytest.approx(1 - math.exp(-x))
+    assert fast[255] == pytest.approx(1 - (1 - math.exp(-x)) / x)
+    assert (np.diff(slow) > 0).all()
+
+
 FRAMES = moving_frames(11, 6, 7)
 
 
@@ -215,6 +271,12 @@ def test_a_clip_with_a_timed_effect_needs_its_durations() -> None:
         simulate_clip(FRAMES, params_of({}), recipe.replace(leak_hz=0.0), "int8", np.ones(10))
 
 
+def test_a_dead_pixel_needs_no_clock() -> None:
+    recipe = Recipe(voxels_per_clip=2, crop_height_px=6, crop_width_px=7, dead_pixel_share=(1.0, 1.0))
+    params = params_of(effects_of(dead=1.0))
+    assert not simulate_clip(FRAMES, params, recipe, "int8").voxels.any()
+
+
 # --- the same bytes everywhere ----------------------------------------------------------------------------------------
 
 GOLDEN = {
@@ -235,3 +297,10 @@ def digest(dtype: str) -> str:
 @pytest.mark.parametrize("dtype", sorted(GOLDEN))
 def test_golden_voxels(dtype: Any) -> None:
     assert digest(dtype) == GOLDEN[dtype]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(COMPILE_SECONDS)
+def test_a_generic_processor_gives_the_same_bytes(tmp_path: Path) -> None:
+    code = "from tests.server.simulation.test_effects import digest; print(digest('float32'))"
+    assert printed_on_a_generic_processor(code, tmp_path) == [GOLDEN["float32"]]

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from tests.oracles.noise import shot_words, standard_normals, start_uniforms, words
 from v2v_server.simulation import noise, pixel
+from v2v_server.simulation.effects import dead_pixels
 from v2v_server.simulation.pixel import hot_pixels
 
 KEY = (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344)
@@ -58,9 +59,16 @@ def correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float((a.astype(np.float64) * b).mean() * math.sqrt(a.size))
 
 
-@pytest.mark.parametrize(("steps", "pixels"), [(0, 1), (0, 2), (0, 128), (0, 512), (1, 0), (2, 0), (3, 0), (64, 0)])
-def test_neighbouring_pixels_and_steps_are_independent(normals: np.ndarray, steps: int, pixels: int) -> None:
-    a, b = normals[: len(normals) - steps, : normals.shape[1] - pixels], normals[steps:, pixels:]
+@pytest.mark.parametrize("pixels", [1, 2, 64, 128, 512, 1024])
+def test_neighbouring_pixels_are_independent(normals: np.ndarray, pixels: Any) -> None:
+    a, b = normals[:, :-pixels], normals[:, pixels:]
+    assert abs(correlation(a, b)) < 4.5
+    assert abs(correlation(a**2 - 1, (b**2 - 1) / 2)) < 4.5
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 4, 8, 64])
+def test_neighbouring_steps_are_independent(normals: np.ndarray, steps: Any) -> None:
+    a, b = normals[:-steps], normals[steps:]
     assert abs(correlation(a, b)) < 4.5
     assert abs(correlation(a**2 - 1, (b**2 - 1) / 2)) < 4.5
 
@@ -86,6 +94,13 @@ def test_four_corners_of_pixel_and_pair_are_independent(normals: np.ndarray) -> 
         assert abs(product.mean()) < 5 * product.std() / math.sqrt(product.size)
 
 
+def test_words_of_one_purpose_are_distinct_and_purposes_differ() -> None:
+    place = np.arange(200_000)
+    assert len(np.unique(words(KEY, noise.START, place))) == len(place)
+    agreeing = words(KEY, noise.PIXEL_RADIUS, place) == words(KEY, noise.PIXEL_ANGLE, place)
+    assert np.count_nonzero(agreeing) <= 2
+
+
 @given(st.tuples(*[st.integers(0, 2**32 - 1)] * 4), st.integers(0, 20), st.integers(1, 50))
 def test_the_compiled_words_are_those_of_the_definition(key: noise.NoiseKey, purpose: int, count: int) -> None:
     counters = np.arange(count) * 85_899_345
@@ -102,6 +117,25 @@ def test_start_uniforms_are_uniform() -> None:
     assert u.max() < 1
     counts = np.histogram(u, 50, (0, 1))[0]
     assert ((counts - 4000) ** 2 / 4000).sum() < 49 + 5 * math.sqrt(98)
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 500, 999, 1000])
+def test_hot_pixels_are_distinct_for_every_count(count: Any) -> None:
+    position, normal = hot_pixels(KEY, count, 1000)
+    assert len(position) == len(normal) == count
+    assert (np.diff(position) > 0).all()
+    assert count == 0 or (position[0] >= 0 and position[-1] < 1000)
+
+
+def test_dead_and_hot_pixels_are_chosen_apart() -> None:
+    key = (1, 2, 3, 4)
+    dead = dead_pixels.positions(key, 0.5, 1000)
+    assert len(set(dead.tolist())) == 500
+    assert (np.diff(dead) > 0).all()
+    assert dead_pixels.positions(key, 0.0, 1000).size == 0
+    hot, _ = hot_pixels(key, 500, 1000)
+    # Hypergeometric: 250 in common on average, with a deviation of 7.9.
+    assert abs(len(set(dead.tolist()) & set(hot.tolist())) - 250) < 4 * 7.9
 
 
 def test_shot_words_are_uniform_and_independent() -> None:

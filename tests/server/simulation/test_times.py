@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.oracles.decoded import decode_luma
 from tests.oracles.in_time import ages_of, bilinear_of, counts_of, stacked_histogram, watch
 from tests.oracles.noise import standard_normals, start_uniforms
+from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from tests.server.simulation.test_pixel import moving_frames
+from tests.server.video.test_real_videos import FOLDER as REAL_VIDEOS
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_server.simulation import simulate, simulate_clip, simulate_log
@@ -21,6 +25,7 @@ from v2v_server.simulation.kernels import Voxels, fill, list_events
 from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, rounding_tolerance, timeline
+from v2v_server.video.probe import probe
 
 FPS = 25.0
 ALL = {
@@ -56,7 +61,15 @@ def test_it_counts_the_events_of_the_papers_kernel(
         seed=seed, dtype=dtype, precision=precision,
     )  # fmt: skip
     assert not made.given.needs_general
-    np.testing.assert_array_equal(again(made, *NAMES)["voxels"], made.voxels)
+    found = again(made, *NAMES)
+    np.testing.assert_array_equal(found["voxels"], made.voxels)
+    counts = found["event_counts"].astype(np.int64)
+    assert counts.min() >= 0
+    if not made.saturated_bins:
+        np.testing.assert_array_equal(counts[:, 1] - counts[:, 0], made.voxels)
+        events = made.to_events(1000.0)
+        assert len(events) == counts.sum()
+        np.testing.assert_array_equal(events.voxels(2, 5, 1000.0, dtype), made.voxels)
 
 
 # --- against events one by one ----------------------------------------------------------------------------------------
@@ -132,12 +145,62 @@ def test_kernel_equals_the_oracle(data: Any, grids: int, form: tuple[str, int, s
 # --- arrays against events --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("grids", [0, 2])
-def test_the_published_stacked_histogram_of_the_events_is_the_array(grids: int) -> None:
-    """Its bins reach from the first to the last event. A column beside the picture has one at either end of a grid."""
+def test_shot_noise_has_both_polarities_and_random_times() -> None:
     made = simulate(
-        moving_frames(21, 30, 40, 5), threshold_pos=0.1, bins=10, grids_per_frame=grids, dtype="float32", seed=4
+        np.zeros((501, 8, 8), np.uint8), threshold_pos=0.2, bins=1, frames_per_bin=500, dtype="float32",
+        frames_per_second=FPS, shot_noise_hz=40.0,
+    )  # fmt: skip
+    counts = made.array("event_counts").reshape(2, -1)
+    for each in counts:
+        assert abs(each.mean() - 400) < 4 * 20 / 8
+    events = made.to_events(500e6 / FPS)
+    within = (events.t % 40_000) / 40_000
+    assert abs(within.mean() - 0.5) < 4 / np.sqrt(12 * len(within))
+    assert abs(np.corrcoef(within[:-1], within[1:])[0, 1]) < 0.05 or len(np.unique(events.t)) > 0.9 * len(events) / 2
+
+
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("int16", marks=pytest.mark.slow)])  # another kernel
+@pytest.mark.parametrize("effects", [{}, ALL])
+@pytest.mark.parametrize("grids", [0, 3])
+def test_arrays_and_events_agree(effects: dict[str, float], grids: int, dtype: str) -> None:
+    made = simulate(
+        moving_frames(31, 37, 45, 5), threshold_pos=0.2, threshold_neg=0.25, noise_sigma=0.1, bins=5,
+        grids_per_frame=grids, dtype=dtype, seed=9, **(effects and effects | {"frames_per_second": FPS}),
+    )  # fmt: skip
+    assert made.voxels.shape == ((30 * grids, 5, 37, 45) if grids else (6, 5, 37, 45))
+    counts, bilinear = made.array("event_counts"), made.array("voxels_bilinear").astype(np.float64)
+    assert counts.dtype == dtype
+    assert bilinear.shape == made.voxels.shape
+    np.testing.assert_array_equal(counts[:, 1] - counts[:, 0], made.voxels)
+    # A bin's width apart from edges that do not fall on whole microseconds: 33_333.3.
+    bin_us = 100_000 / 3
+    events = made.to_events(bin_us)
+    np.testing.assert_array_equal(events.voxels(*made.voxels.shape[:2], bin_us), made.voxels)
+    assert len(events) == counts.astype(np.int64).sum()
+    np.testing.assert_allclose(bilinear.sum(axis=1), made.voxels.sum(axis=1), atol=0.05)
+    grid = 2
+    inside = (events.t >= grid * 5 * bin_us) & (events.t < (grid + 1) * 5 * bin_us)
+    here = inside & (events.x == 20) & (events.y == 11)
+    expected = bilinear_of(
+        events.t[here].astype(float), np.where(events.p[here], 1.0, -1.0), grid * 5 * bin_us, (grid + 1) * 5 * bin_us, 5
     )
+    np.testing.assert_allclose(bilinear[grid, :, 11, 20], expected, atol=0.01)
+
+
+def real_frames(name: str, count: int = 21, size: tuple[int, int] = (30, 40)) -> np.ndarray:
+    """Return frames of a part of a real video, [count, *size]."""
+    if not (REAL_VIDEOS / name).is_file():
+        pytest.skip(f"no {name} in {REAL_VIDEOS}; set V2V_TEST_VIDEOS")
+    index = probe(REAL_VIDEOS / name).index
+    return decode_luma(REAL_VIDEOS / name, index.slice(0, count), 0, count, (100, 100, *size)).frames
+
+
+@pytest.mark.parametrize("grids", [0, 2])
+@pytest.mark.parametrize("video", ["", "gopro_hero7_walk.mp4"])
+def test_the_published_stacked_histogram_of_the_events_is_the_array(video: str, grids: int) -> None:
+    """Its bins reach from the first to the last event. A column beside the picture has one at either end of a grid."""
+    frames = real_frames(video) if video else moving_frames(21, 30, 40, 5)
+    made = simulate(frames, threshold_pos=0.1, bins=10, grids_per_frame=grids, dtype="float32", seed=4)
     counts, bin_us = made.array("event_counts"), 5000
     events = made.to_events(bin_us)
     for grid, expected in enumerate(counts):
@@ -197,6 +260,40 @@ def test_what_is_refused(change: dict[str, Any], message: str) -> None:
         simulate(moving_frames(4, 4, 5), threshold_pos=0.2, bins=3).array("counts")
 
 
+DIGEST = """
+import dataclasses, hashlib
+import numpy as np
+from tests.server.simulation.test_pixel import moving_frames
+from tests.server.simulation.test_times import ALL, FPS
+from v2v_server.simulation import simulate
+from v2v_server.simulation.intensity import log_table
+from v2v_server.simulation.kernels import fill
+from v2v_server.simulation.representations import NAMES
+from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments
+
+grey = np.linspace(0, 255 * FINE_STEPS, 80).astype(np.uint16).reshape(2, 5, 8)
+levels = Levels(Moments(np.array([0, 2]), np.array([0.25, 1 / 3])), grey)
+digest = hashlib.sha256()
+for effects in ({}, ALL):
+    for precision in ("float32", "float64"):
+        made = simulate(
+            moving_frames(9, 5, 8, 3), threshold_pos=0.2, noise_sigma=0.1, bins=3, grids_per_frame=2, dtype="float32",
+            seed=5, frames_per_second=FPS, precision=precision, **effects,
+        )
+        for array in fill(dataclasses.replace(made.given, levels=levels), made.real, dict.fromkeys(NAMES))[0].values():
+            digest.update(array.tobytes())
+        digest.update(made.to_events(1000.0).t.tobytes())
+print(digest.hexdigest()[:32])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(COMPILE_SECONDS)
+def test_bytes_do_not_depend_on_the_processor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    exec(DIGEST)
+    assert printed_on_a_generic_processor(DIGEST, tmp_path) == capsys.readouterr().out.split()
+
+
 # --- the time surface -------------------------------------------------------------------------------------------------
 
 NONE = np.inf
@@ -242,7 +339,6 @@ def test_it_is_made_of_the_events_that_are_listed(effects: Any, grids: int, size
     bins = 12 * grids * 3 if grids else 12
     bin_us = 12e6 / FPS / bins
     events, ages = made.to_events(bin_us), surface(made)
-    np.testing.assert_array_equal(events.voxels(*made.voxels.shape[:2], bin_us), made.voxels)
     latest, expected = np.full((2, *size), -np.inf), np.empty((bins, 2, *size))
     bin_of = np.minimum((events.t / bin_us).astype(int), bins - 1)
     for number in range(bins):
@@ -254,10 +350,6 @@ def test_it_is_made_of_the_events_that_are_listed(effects: Any, grids: int, size
     assert (got >= 0).all()
     together = again(made, *NAMES)
     np.testing.assert_array_equal(together["voxels"], made.voxels)
-    counts, bilinear = together["event_counts"], together["voxels_bilinear"].astype(np.float64)
-    np.testing.assert_array_equal(counts[:, 1] - counts[:, 0], made.voxels)
-    assert counts.sum(dtype=np.int64) == len(events)
-    np.testing.assert_allclose(bilinear.sum(axis=1), made.voxels.sum(axis=1), atol=0.05)
     np.testing.assert_array_equal(together["time_surface"], surface(made))
 
 
@@ -291,4 +383,6 @@ def test_a_clip_needs_the_durations_of_its_steps_for_it() -> None:
     out = {"time_surface": np.empty((2, 2, 5, 6, 7), np.float16)}
     with pytest.raises(UsageError, match="step_seconds is missing"):
         simulate_clip(frames, given.params, recipe, "int8", out=out)
-    assert simulate_clip(frames, given.params, recipe, "int8", np.full(10, 0.5), out | {"voxels": None}).voxels.any()
+    timed = simulate_clip(frames, given.params, recipe, "int8", np.full(10, 0.5), out | {"voxels": None})
+    plain = simulate_clip(frames, given.params, recipe, "int8")
+    np.testing.assert_array_equal(timed.voxels, plain.voxels)

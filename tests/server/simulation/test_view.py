@@ -12,7 +12,7 @@ from tests.clips import panned_luma
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.simulation.draw import resized_size
+from v2v_server.simulation.draw import draw, resized_size
 from v2v_server.simulation.view import Window, apply_view, contrast_table, source_window
 
 RECIPE = Recipe(crop_height_px=24, crop_width_px=32)
@@ -49,9 +49,15 @@ def test_the_whole_picture_is_resized_before_the_crop(scale: Any, method: Any) -
 
 @pytest.mark.parametrize("scale", [1.0, 0.7, 1.2])
 def test_flip_mirrors_left_and_right(scale: Any) -> None:
-    mirrored = seen(params(scale=scale, flip=True))
-    np.testing.assert_array_equal(mirrored, seen(params(scale=scale))[:, :, ::-1])
-    assert mirrored.flags.c_contiguous
+    np.testing.assert_array_equal(seen(params(scale=scale, flip=True)), seen(params(scale=scale))[:, :, ::-1])
+
+
+def test_result_is_contiguous_and_a_copy_of_the_right_size() -> None:
+    for view in (params(), params(flip=True), params(scale=0.8), params(contrast=2.0)):
+        got = seen(view)
+        assert got.shape == (3, 24, 32)
+        assert got.dtype == np.uint8
+        assert got.flags.c_contiguous
 
 
 def test_contrast_is_the_stated_formula_rounded_half_up() -> None:
@@ -60,6 +66,17 @@ def test_contrast_is_the_stated_formula_rounded_half_up() -> None:
     np.testing.assert_array_equal(contrast_table(2.0), np.clip(np.floor((level - 127.5) * 2 + 128), 0, 255))
     assert set(contrast_table(2.0**-60)) == {127, 128} or set(contrast_table(2.0**-60)) == {128}
     np.testing.assert_array_equal(seen(params(contrast=3.0)), contrast_table(3.0)[seen(params())])
+
+
+def test_every_drawn_view_fits_its_own_window() -> None:
+    recipe = RECIPE.replace(resize_scale=(0.3, 2.0))
+    for index in range(60):
+        view = draw(
+            recipe, seed=0, epoch=0, index=index, picture_height_px=45, picture_width_px=80, video_id="v"
+        )  # fmt: skip
+        window = source_window(view, recipe, Window(10, 0, 45, 80))
+        bottom, right = window.top_px + window.height_px, window.left_px + window.width_px
+        assert apply_view(PICTURE[:, window.top_px : bottom, window.left_px : right], view, recipe).shape == (3, 24, 32)
 
 
 @pytest.mark.parametrize(("shape", "view"), [((3, 23, 32), params()), ((3, 60, 80), params(scale=0.5, top=7))])

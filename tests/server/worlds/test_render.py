@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 from tests.oracles.known_motion import photograph
 from tests.oracles.worlds import Oracle, event_errors
+from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from v2v_protocol.recipe import PRESETS, Recipe
 from v2v_server.simulation.draw import draw
 from v2v_server.worlds.render import (
@@ -229,6 +231,14 @@ def test_signed_events_are_off_by_at_most_two_percent(period_px: float, px_per_f
     assert abs(found.count) <= 0.02
 
 
+def test_sub_steps_restore_what_a_fast_pattern_loses() -> None:
+    """A period a frame: without them, the frames hardly differ."""
+    coarse, fine = (event_errors(GREY, 8.0, 8.0 * HZ, 0.1, HZ, substep_px) for substep_px in (0.0, 0.5))
+    assert coarse.count < -0.5
+    assert abs(fine.count) < 0.02
+    assert fine.signed <= 0.02
+
+
 # --- the same bytes everywhere ----------------------------------------------------------------------------------------
 
 GOLDEN = {
@@ -240,6 +250,7 @@ GOLDEN = {
 }
 TILTED = {"resize_scale": (0.6, 0.9), "world_tilt": 0.2, "flip_probability": 1.0}
 SEED = 2**64 - 1
+CODE = "from tests.server.worlds.test_render import digests; print(*digests().values())"
 
 
 def digests() -> dict[str, str]:
@@ -269,3 +280,9 @@ def digests() -> dict[str, str]:
 
 def test_pictures_and_truth_keep_their_bytes() -> None:
     assert digests() == GOLDEN
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(COMPILE_SECONDS + 60)
+def test_a_generic_processor_gives_the_same_bytes(tmp_path: Path) -> None:
+    assert printed_on_a_generic_processor(CODE, tmp_path) == list(GOLDEN.values())
