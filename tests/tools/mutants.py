@@ -354,14 +354,16 @@ def main() -> int:
         trees = [Path(folder, str(number)) for number in range(options.jobs)]
         for tree in trees:
             copytree(root, tree, symlinks=True, ignore=ignore_patterns(".git", ".venv*", "out", "__pycache__"))
-            collect = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider"]
-            subprocess.run(
-                collect,
+            collected = subprocess.run(
+                [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider"],
                 cwd=tree,
                 env=os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": ""},
-                stdout=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
                 check=True,
-            )  # writes the bytecode, which each mutant's tests read
+            ).stdout  # and the bytecode, which each mutant's tests read
+        # A name that pytest does not find, or cannot be given, would end its run like a test that fails.
+        existing = set(collected.decode().splitlines())
+        contexts = {place: [name for name in names if name in existing] for place, names in contexts.items()}
         healthy = Stage(list(UNCOMPILED), is_compiled=False)
         if any(mutant.path.startswith(KERNELS) for mutant, _ in todo) and _failure(healthy, trees[0]) != "":
             raise SystemExit(f"a test of UNCOMPILED fails without a mutant, or all take over {TIMEOUT_SECONDS} s")
