@@ -93,6 +93,14 @@ def is_gone(pid: int) -> bool:
 # --- starting and watching --------------------------------------------------------------------------------------------
 
 
+def test_a_host_says_which_workers_go_on(start: Callable[[int, str], Pool]) -> None:
+    made = started(start(2, SLEEPS))
+    ended, going = (slot.place for slot in made._slots)
+    ended.child.process.kill()
+    ended.child.process.wait()
+    assert made._host.wait([ended, going], 0.0) == [going]
+
+
 def test_it_starts_as_many_as_asked_each_with_a_name_of_its_own(start: Callable[[int, str], Pool]) -> None:
     pool = start(2, SLEEPS)
     assert (pool.running, pids_of(pool)) == (0, [])

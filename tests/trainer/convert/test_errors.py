@@ -95,6 +95,11 @@ def bag_with(path: Path, **changes: bytes) -> Path:
     return written(path / "a.bag", bytes(content))
 
 
+def other_packets(path: Path) -> Path:
+    raw_forms.write_bag(path / "a.bag", scene(), packets=True)
+    return written(path / "a.bag", (path / "a.bag").read_bytes().replace(b"evt3", b"evt9"))
+
+
 def short_aedat4(path: Path) -> Path:
     write_aedat4(path / "a.aedat4", scene())
     return cut_short(path / "a.aedat4", 0.03)
@@ -151,6 +156,7 @@ def evt21(path: Path, header: bytes) -> Path:
         (lambda path: cut_short(mvsec(path), 0.6), "fly_data.hdf5 cannot be read as HDF5: .*truncated"),
         (lambda path: mvsec(path, image_raw_ts=None), "fly_data.hdf5 cannot be read as HDF5: .*image_raw_ts"),
         (short_bag, "the bag cannot be read"),
+        (other_packets, r"a packet on /dvs/events is in encoding 'evt9'; supported is one of evt2, evt3"),
         (lambda path: bag_with(path, time=b"\1\1"), r"the bag is damaged and cannot be read: AssertionError\(\)"),
         (lambda path: bag_with(path, conn=b"\x77"), r"the bag is damaged and cannot be read: KeyError\(119\)"),
         (short_aedat4, "cannot be decoded"),

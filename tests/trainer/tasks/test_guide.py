@@ -62,3 +62,11 @@ def test_the_network_sees_the_mixture_in_place_of_its_own_last_picture(share: fl
             torch.testing.assert_close(found[:, step], expected[:, 0], rtol=0, atol=1e-6)
         unguided, _ = network(voxels)
     assert (found - unguided).abs().max() > 1e-4
+
+
+def test_pieces_of_a_batch_are_shown_their_own_pictures(batch: Batch) -> None:
+    work = Reconstruction(ReconstructionSettings(guide_epochs=16), None, CPU, bfloat16=False).prepare(batch, 0)
+    assert work.guide is not None
+    for number, piece in enumerate(work.pieces(2)):
+        assert piece.guide is not None
+        torch.testing.assert_close(piece.guide.pictures, work.guide.pictures[number : number + 1])
