@@ -119,6 +119,12 @@ def test_a_compression_bomb_is_refused() -> None:
         FrameIndex.from_bytes(head + zlib.compress(bytes(10_000_000)))
 
 
+@pytest.mark.parametrize("parts", [(0, 25, 48, 64), (1, 0, 48, 64), (1, 25, 0, 64), (1, 25, 48, 0)])
+def test_no_time_base_or_size_is_refused(parts: tuple[int, int, int, int]) -> None:
+    with pytest.raises(ProtocolError, match=f"time base {parts[0]}/{parts[1]}, {parts[3]}x{parts[2]} px"):
+        FrameIndex.from_bytes(unseekable(5, parts[:2], *parts[2:]).to_bytes())
+
+
 def test_too_many_frames_are_refused() -> None:
     with pytest.raises(ProtocolError, match="limit 100"):
         FrameIndex.from_bytes(unseekable(101, (1, 25), 48, 64).to_bytes(), most_frames=100)
