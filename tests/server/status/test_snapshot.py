@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.server.named_corpus import SMALL_SPEC
@@ -186,7 +186,7 @@ def test_a_reconnect_continues_the_row_and_a_later_run_begins_one(at: Peers, ser
     assert later.served == 0
 
 
-@settings(max_examples=50, deadline=None)
+@pytest.mark.slow
 @given(
     epochs=st.lists(
         st.tuples(
@@ -212,8 +212,7 @@ def test_rows_add_up_to_the_totals(epochs: list[tuple[bytes, int, float, bool]])
             at.work_off()
         if leaves:
             at.consumer_says(identity, Goodbye(0.1 * batches))
-        at.now += pause
-        service.publisher.tick(at.now)
+        service.pass_seconds(pause)
         totals = list(at.dispatcher.sessions.totals())
         assert len({each.number for each in totals}) == len(totals)
         assert sum(each.served for each in totals) == at.dispatcher.counters.samples
