@@ -15,7 +15,6 @@ from tests.tools.statements import statements_of
 from tests.tools.trace import trace
 
 ROOT = Path(__file__).parents[1]
-CORE = ("v2v_protocol", "v2v_server", "v2v_tools", "v2v_client", "v2v_pictures", "v2v_recordings")
 # (statements, files that are not empty)
 LIMITS = {
     "v2v_protocol": (2276, 21),
@@ -26,7 +25,7 @@ LIMITS = {
     "v2v_recordings": (996, 10),
     "trainer": (4350, 57),
     "bench": (3420, 39),
-    "tests": (32608, 332),
+    "tests": (32614, 332),
 }
 WAY_FILES, WAY_RETURNS = 68, 251
 """Files that one sample visits, and returns to an earlier one; 89 and 258 at commit 419dc2ec. Measured 62 and 237 to

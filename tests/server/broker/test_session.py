@@ -8,7 +8,7 @@ from typing import cast
 
 import hypothesis.strategies as st
 import pytest
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from v2v_protocol.liveness import Liveness
@@ -83,7 +83,7 @@ def test_what_is_in_flight_outlives_a_hello() -> None:
     assert sessions.next_request() is None
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 20, 133, 400])
+@given(st.integers(1, 400))
 def test_all_consumers_that_do_not_read_share_one_limit(count: int) -> None:
     """Each may hold one sample, and the next ones as long as all of them hold less than the limit."""
     everyone = [session(b"%d" % number, credit=400) for number in range(count)]
@@ -120,6 +120,15 @@ def test_nothing_comes_back_to_a_session_that_is_gone_or_was_opened_again() -> N
     assert not sessions.mark_answered(request, 1.0)
     assert sessions.next_request() is None
     assert len(sessions) == 1
+
+
+def test_the_silent_are_idle() -> None:
+    a, b = session(b"a", last_heard=0.0), session(b"b", last_heard=100.0)
+    sessions = opened(a, b)
+    assert sessions.idle(599.5) == []
+    assert sessions.idle(600.0) == [b"a"]
+    b.liveness.mark_heard(0.0)
+    assert sorted(sessions.idle(601.0)) == [b"a", b"b"]
 
 
 # --- sharing ----------------------------------------------------------------------------------------------------------

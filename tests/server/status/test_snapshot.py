@@ -220,7 +220,7 @@ def test_rows_add_up_to_the_totals(epochs: list[tuple[bytes, int, float, bool]])
         for row in service.view().consumers:
             assert 0.0 <= row.waiting_share <= 1.0
             assert 0.0 <= row.epoch_share <= 1.0
-            # Two in half a second, and two more in a window that begins just before them, of at least a second.
+            # Two in half a second: w seconds hold at most 2 w + 1 such pairs, so 4 + 2 / w, and w is at least 1.
             assert 0.0 <= row.samples_per_second <= 4.0 + 2.0 + 1e-6
 
 
