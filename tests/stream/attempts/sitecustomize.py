@@ -10,6 +10,7 @@ import json
 import os
 import socket
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -66,10 +67,11 @@ def _install(attempts: dict) -> None:
             thread = threading.Thread(target=lambda: inside.update(_attempts(Path(attempts["home"]), attempts["pid"])))
             thread.start()
             thread.join()
-            filters = {
-                Path(f"/proc/self/task/{each}/status").read_text().partition("Seccomp_filters:")[2].split()[0]
-                for each in os.listdir("/proc/self/task")
-            }
+            filters = set()
+            for task in Path("/proc/self/task").iterdir():
+                # A thread that was joined may still be listed, and gone a moment later.
+                with suppress(FileNotFoundError, ProcessLookupError):
+                    filters.add((task / "status").read_text().partition("Seccomp_filters:")[2].split()[0])
             found |= {"threads": threads[0], "filters": sorted(filters), "in a thread": inside == found}
             os.write(report, json.dumps(found).encode() + b"\n")
         return sample_message(*arguments, **named)
