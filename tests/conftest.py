@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import socket
 import subprocess
@@ -61,6 +62,12 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         with open(__file__, "rb") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             config.add_cleanup(subprocess.Popen(_WARM_UP, pass_fds=[lock.fileno()]).wait)
+
+
+def pytest_collection_finish() -> None:
+    """Exclude all modules and collected tests from Python's garbage collections, which some tests ask for often."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

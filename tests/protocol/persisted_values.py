@@ -6,6 +6,7 @@ import dataclasses
 import math
 import os
 import typing
+from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, get_args, get_origin
@@ -35,11 +36,13 @@ _SCALARS: dict[Any, st.SearchStrategy[Any]] = {
 }
 
 
+@cache
 def hints_of(cls: Any) -> dict[str, Any]:
     hints = typing.get_type_hints(cls, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
+@cache
 def values_of(kind: Any) -> st.SearchStrategy[Any]:
     """Values of a type that a field may have."""
     origin, parts = get_origin(kind), get_args(kind)

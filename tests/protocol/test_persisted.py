@@ -12,7 +12,7 @@ from typing import Any
 
 import msgpack
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from tests.protocol.persisted_values import PLAIN, fits, hints_of, values_of
@@ -109,6 +109,7 @@ def _holds_record(hint: Any) -> bool:
 
 
 @each_class
+@settings(max_examples=10)  # names of fields, not their values
 @given(st.data())
 def test_fields_that_are_missing_or_unknown(cls: Any, data: st.DataObject) -> None:
     """A field with a default may be missing, as in records of earlier releases; no other, and none may be added."""
@@ -126,6 +127,7 @@ def test_fields_that_are_missing_or_unknown(cls: Any, data: st.DataObject) -> No
 
 
 @each_class
+@settings(max_examples=20)
 @given(PLAIN)
 def test_what_is_no_record_is_refused(cls: Any, value: Any) -> None:
     assume(not isinstance(value, dict))

@@ -12,10 +12,16 @@ import numpy.typing as npt
 from v2v_server.simulation import noise
 from v2v_server.simulation.precision import Real
 
-_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+_OPTIONS: dict[str, Any] = {
+    "nogil": True, "error_model": "numpy", "_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True
+}  # fmt: skip
 compiled: Any = numba.njit(**_OPTIONS)
-"""Decorator of a compiled function without reference counting, which every view of an array would cost. The function
-cannot create arrays; the caller provides all memory."""
+"""Decorator of a compiled function that only compiled functions call.
+
+It has no reference counting, which every view of an array would cost: it cannot create arrays, and the caller provides
+all memory. It has no entry for Python either, which a third of the kernel's time to compile went into. Calling it from
+Python ends the process; its ``py_func`` is the function in Python.
+"""
 hook: Any = numba.njit(forceinline=True, **_OPTIONS)
 """The same for an effect's functions, which are inlined into the kernel."""
 
