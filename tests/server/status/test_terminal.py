@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zmq
 from rich.console import Console
 
 from tests.clips import panned_luma, write_clip
@@ -24,8 +26,11 @@ from tests.server.peers import Peers, peers
 from tests.server.status.services import Published, published
 from tests.waiting import until
 from v2v_client.local_server import LocalServer
+from v2v_protocol.errors import ProtocolError
+from v2v_protocol.messages import Status, encode
 from v2v_server.broker.state import Counters
 from v2v_server.commands.top import main
+from v2v_server.status.client import StatusClient
 from v2v_server.status.snapshot import StatusFields
 from v2v_server.status.terminal import StatusView, draw, format_shutdown_summary, line
 from v2v_server.system.log import Log
@@ -226,6 +231,19 @@ def test_the_sentence_is_shown_names_are_text_many_are_counted_and_an_old_state_
 def test_an_absent_server_is_an_error(capsys: pytest.CaptureFixture[str], unused_port: int) -> None:
     assert main(["--connect", f"tcp://127.0.0.1:{unused_port}", "--once", "--timeout-seconds", "0.2"]) == 1
     assert "no answer for 0.2 s; is v2v-serve running there?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("text", "why"), [
+    (b"no", "that is not JSON"), (b"[]", "without a version"), (b'{"version": "1"}', "without a version"),
+])  # fmt: skip
+def test_a_status_that_cannot_be_read_is_refused(text: bytes, why: str) -> None:
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as server, ThreadPoolExecutor(1) as thread:
+        address = f"tcp://127.0.0.1:{server.bind_to_random_port('tcp://127.0.0.1')}"
+        with StatusClient(address) as client:
+            answer = thread.submit(client.get_status, 60.0)
+            server.send_multipart([server.recv_multipart()[0], *encode(Status(text))])
+            with pytest.raises(ProtocolError, match=f"^{address} sent a status {why}$"):
+                answer.result()
 
 
 @pytest.mark.slow

@@ -102,6 +102,19 @@ def test_the_recipe_is_one_that_a_server_accepts(tmp_path: Path) -> None:
     assert path.read_text().startswith("# Camera of recording.h5, fitted by v2v-fit")
 
 
+def test_dead_pixels_are_silent_among_active_neighbours() -> None:
+    side, dead = 40, np.arange(41, 800, 31)  # in the upper half: nothing in the lower one fires
+    fires = np.arange(side**2) < side**2 // 2
+    fires[dead] = False
+    place = np.tile(np.flatnonzero(fires), 30)
+    at, rising = np.arange(len(place)), np.ones(len(place), np.bool_)
+    grey = np.full((2, side, side), 100, np.uint8)
+    made = recorded(side, side, at, place, rising, grey, np.array([0, len(place)]), light=LIGHT)
+    found = estimators.dead_pixels(made, made.blocks())
+    assert found.value == len(dead) / 800
+    assert found.low <= found.value <= found.high < 0.1
+
+
 def test_noise_is_that_of_pixels_whose_neighbours_are_quiet_too() -> None:
     """Half of the sensor sees motion too dark for a grey level: its pixels fire together."""
     rng, side, seconds, hz = np.random.default_rng(2), 40, 4, 4.0
