@@ -14,7 +14,9 @@ def _is_docstring(node: ast.stmt) -> bool:
 
 def statements_of(source: str) -> int:
     """Count the statements of one module's source, without docstrings, those below a constant or field included."""
-    nodes = ast.walk(ast.parse(source))
+    nodes: list[ast.AST] = [ast.parse(source)]
+    for node in nodes:  # an expression holds no statement
+        nodes += (child for child in ast.iter_child_nodes(node) if not isinstance(child, ast.expr))
     return sum(isinstance(node, ast.stmt) and not _is_docstring(node) for node in nodes)
 
 

@@ -69,6 +69,7 @@ def test_every_network_resumes_exactly(
 ) -> None:  # fmt: skip
     """Dropout and batch norm included."""
     monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)  # the other ten say nothing new
+    monkeypatch.setattr("trainer.models.etnet.ENCODER_LAYERS", 1)  # nor do two more layers
     settings: dict[str, Any] = {
         "network": {"name": name, "options": options}, "loss": loss, "stream": {"batch_size": 2},
         "optimizer": {"learning_rate": 1e-3},
@@ -225,9 +226,12 @@ def test_too_large_a_batch_is_reported_with_its_numbers(tmp_path: Path, capsys: 
 
 
 def test_loader_workers_change_nothing(server: FakeServer, whole: Path, tmp_path: Path) -> None:
-    run = trained(tmp_path, server.address, "run", run__steps=7, stream__loader_workers=1)
-    assert losses(run) == losses(whole)[:7]
-    trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=12, stream__loader_workers=1)
+    """A run begins without one, goes on with one into the next epoch, and ends without one."""
+    run = trained(tmp_path, server.address, "run", run__steps=3)
+    for steps, workers in ((7, 1), (12, 0)):
+        trained(
+            tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=steps, stream__loader_workers=workers
+        )
     assert losses(run) == losses(whole)
 
 

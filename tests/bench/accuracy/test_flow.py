@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import itertools
 
+import pytest
+
 from bench.accuracy.flow import LENGTHS_PX, beside_worlds
 
 
+@pytest.mark.slow
 def test_no_flow_at_all_is_wrong_by_the_length_of_the_exact_flow() -> None:
     records = {record["where"]: record for record in beside_worlds(("zero",), 3)}
     assert abs(sum(record["share"] for record in records.values()) - 1.0) < 1e-6

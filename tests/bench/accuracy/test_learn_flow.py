@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from bench.accuracy.learn_flow import ESTIMATED, EXACT, MARGIN_PX, SETTINGS, SIDE_PX, arms, judge, learn
@@ -39,6 +40,7 @@ def test_the_arms_differ_in_nothing_but_the_flow() -> None:
     assert abs(float(down.median())) < 0.1
 
 
+@pytest.mark.slow
 def test_equal_flow_makes_equal_networks() -> None:
     for right_px in (0, 3):
         [(steps, networks)] = learn((batch(seed, right_px) for seed in range(9)), CONFIG, (3,))

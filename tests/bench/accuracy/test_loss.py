@@ -9,6 +9,7 @@ import pytest
 from bench.accuracy.loss import is_inside, measure, scenes, summary
 
 
+@pytest.mark.slow
 def test_shapes_lie_in_their_intervals() -> None:
     records = list(scenes("held out", "plain shapes"))
     assert all(is_inside(record, name) for record in records for name in ("linear", "divided"))
