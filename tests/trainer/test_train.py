@@ -229,9 +229,7 @@ def test_loader_workers_change_nothing(server: FakeServer, whole: Path, tmp_path
     """A run begins without one, goes on with one into the next epoch, and ends without one."""
     run = trained(tmp_path, server.address, "run", run__steps=3)
     for steps, workers in ((7, 1), (12, 0)):
-        trained(
-            tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=steps, stream__loader_workers=workers
-        )
+        trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=steps, stream__loader_workers=workers)
     assert losses(run) == losses(whole)
 
 
