@@ -86,8 +86,12 @@ def faults(path: Path, array: re.Pattern[str]) -> Iterator[str]:
 
 
 def test_public_docstrings_give_shapes_and_errors() -> None:
-    sources_of_aliases = [text for path in sources() if ALIAS.search(text := path.read_text("utf-8"))]
-    aliases = {name for text in sources_of_aliases for name in shapeless_aliases(ast.parse(text).body)}
+    aliases = {
+        name
+        for path in sources()
+        if ALIAS.search(path.read_text("utf-8"))
+        for name in shapeless_aliases(ast.parse(path.read_text("utf-8")).body)
+    }
     array = re.compile("|".join((ARRAY.pattern, *(rf"\b{name}\b" for name in aliases))))
     checked = [path for path in sources() if path.relative_to(ROOT).parts[0] != "examples"]
     assert [fault for path in checked for fault in faults(path, array)] == []

@@ -194,8 +194,13 @@ def test_bash_completes_flags_and_commands(capsys: pytest.CaptureFixture[str], m
     script = run_v2v("completion", "bash", capsys=capsys, monkeypatch=monkeypatch)[1]
 
     def bash(asked: str) -> str:
-        command = ["bash", "-c", f"{script}\n{asked}"]
-        return subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False).stdout
+        return subprocess.run(
+            ["bash", "-c", f"{script}\n{asked}"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+        ).stdout
 
     registered = bash("complete -p")
     for name in ("v2v", *(f"v2v-{each}" for each in programs.COMMANDS)):

@@ -174,16 +174,18 @@ def refuse(name: str, value: Any) -> str:
 
 NO_NUMBER = (math.nan, math.inf, -math.inf, True, "a tenth", "nan", None, 10**400, 1j, b"1")
 NO_PAIR = ([], [1.0], [1.0, 1.0, 1.0], [math.nan, 1.0], [0.5, True], [[1.0], 1.0], {1.0: 2.0})
-OF_ANOTHER_KIND: list[tuple[list[str], tuple[Any, ...]]] = [
-    (NUMBERS + RANGES, NO_NUMBER),
-    (RANGES, NO_PAIR),
-    (WHOLE, (1.0, True, "1", None, [1], np.int64(1))),
-    (FLAGS, (0, 1, "true", None)),
-    (WORDS, ("", "samples", None, 1, True)),
-]
 
 
-@pytest.mark.parametrize(("names", "values"), OF_ANOTHER_KIND)
+@pytest.mark.parametrize(
+    ("names", "values"),
+    [
+        (NUMBERS + RANGES, NO_NUMBER),
+        (RANGES, NO_PAIR),
+        (WHOLE, (1.0, True, "1", None, [1], np.int64(1))),
+        (FLAGS, (0, 1, "true", None)),
+        (WORDS, ("", "samples", None, 1, True)),
+    ],
+)
 def test_a_value_of_another_kind_is_refused(names: list[str], values: tuple[Any, ...]) -> None:
     for name, value in itertools.product(names, values):
         refuse(name, value)

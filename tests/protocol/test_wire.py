@@ -96,9 +96,11 @@ _values = st.recursive(
 @pytest.mark.parametrize("depth", [1, 15, 16, 17, 200, 990, 1020, 1024, 200_000])
 def test_nesting(depth: int) -> None:
     """Depths that the decoder takes, but that no repr() survives."""
-    before = V + b"\xa1t", b"\x82\xa1t\xa4ping\xa1v", b"\x83\xa1t\xa4ping" + V[1:] + b"\xa1x", b""
-    for start, opening in itertools.product(before, (b"\x91", b"\x81\xa1a", b"\x81\x91", b"\x92\x01")):
-        message_or_refusal(start + opening * depth + b"\x90")
+    for before, opening in itertools.product(
+        (V + b"\xa1t", b"\x82\xa1t\xa4ping\xa1v", b"\x83\xa1t\xa4ping" + V[1:] + b"\xa1x", b""),
+        (b"\x91", b"\x81\xa1a", b"\x81\x91", b"\x92\x01"),
+    ):
+        message_or_refusal(before + opening * depth + b"\x90")
 
 
 def test_a_field_nested_too_deeply_is_refused_before_anybody_looks_at_it() -> None:

@@ -210,18 +210,14 @@ def test_flow_is_scored_and_drawn_as_well(server: FakeServer, tmp_path: Path) ->
     assert (run / "previews" / "step-0000002-0.png").is_file()
 
 
-def test_a_preview_shows_no_more_samples_than_an_epoch_has(tmp_path: Path) -> None:
+def test_an_epoch_of_one_sample_limits_previews_and_batches(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with FakeServer(sequences=1) as server:
+        told = refused(tmp_path, server.address, capsys, run__preview_every=1, stream__batch_size=4)
         run = trained(
             tmp_path, server.address, "run", run__steps=1, run__preview_every=1, run__judge_samples=2,
             stream__batch_size=1,
         )  # fmt: skip
     assert [path.name for path in (run / "previews").glob("*.png")] == ["step-0000001-0.png"]
-
-
-def test_too_large_a_batch_is_reported_with_its_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with FakeServer(sequences=1) as server:
-        told = refused(tmp_path, server.address, capsys, run__preview_every=1, stream__batch_size=4)
     assert "no global batch of 1 x 4 = 4 samples" in told
 
 

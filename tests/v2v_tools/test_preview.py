@@ -27,9 +27,13 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_clip(tmp_path_factory.mktemp("clips") / "gliding.mp4", panned_luma(40, 96, 128))
 
 
-def test_each_kind_of_file_is_what_its_name_says(clip: Path, tmp_path: Path) -> None:
-    two = [PreviewCamera("a", TINY, 0), PreviewCamera("b", TINY, 1)]
-    for kind, wanted in (("png", two), ("mp4", two[:1]), ("gif", two[:1]), ("html", two[:1])):
+def test_each_kind_of_file_is_what_its_name_says_and_progress_is_shown(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("v2v_protocol.progress.LOG_SECONDS", 0.0)
+    three = [PreviewCamera(str(seed), TINY, seed) for seed in range(3)]
+    for kind, wanted in (("png", three[:2]), ("gif", three[:1]), ("html", three[:1]), ("mp4", three)):
+        capsys.readouterr()
         preview(
             str(clip), tmp_path / f"preview.{kind}", wanted, {}, title="t", cache_dir=str(tmp_path),
             with_flow=kind == "png", say=lambda line: None,
@@ -41,6 +45,11 @@ def test_each_kind_of_file_is_what_its_name_says(clip: Path, tmp_path: Path) -> 
     with av.open(io.BytesIO((tmp_path / "preview.mp4").read_bytes())) as film:
         assert len(list(film.decode(video=0))) == 2 * 2
     assert "data:image/png;base64," in (tmp_path / "preview.html").read_text()
+    said = capsys.readouterr().err.splitlines()
+    cameras = [line for line in said if line.startswith("simulating: ")]
+    assert [line.split(" cameras")[0] for line in cameras] == [f"simulating: {number} of 3" for number in range(1, 4)]
+    assert re.search("a second.* left", cameras[1])
+    assert sum(line.startswith("drawing the film: ") for line in said) == 2 * 2
 
 
 def test_a_single_video_is_shown_with_the_boxes_beside_it(clip: Path, tmp_path: Path) -> None:
@@ -153,20 +162,6 @@ def test_recipes_of_other_sizes_are_not_compared(clip: Path, tmp_path: Path) -> 
     assert not list(tmp_path.glob("p.*"))
     preview(str(clip), tmp_path / "p.png", clips, {}, **more)
     assert (tmp_path / "p.png").exists()
-
-
-def test_many_cameras_and_a_film_show_their_progress(
-    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("v2v_protocol.progress.LOG_SECONDS", 0.0)
-    wanted = [PreviewCamera(str(seed), TINY, seed) for seed in range(3)]
-    preview(str(clip), tmp_path / "p.mp4", wanted, {}, title="t", cache_dir=str(tmp_path), with_flow=False)
-    said = capsys.readouterr().err.splitlines()
-    cameras = [line for line in said if line.startswith("simulating: ")]
-    assert [line.split(" cameras")[0] for line in cameras] == [f"simulating: {number} of 3" for number in range(1, 4)]
-    assert "a second" in cameras[1]
-    assert "left" in cameras[1]
-    assert sum(line.startswith("drawing the film: ") for line in said) == 2 * 2
 
 
 def _said(source: Path, tmp_path: Path) -> str:

@@ -1,11 +1,14 @@
-"""Learning flow from exact flow and from DIS's: both networks see the same, but for the flow."""
+"""Flow methods beside the exact flow of worlds, and networks that learn from either and see the same otherwise."""
 
 from __future__ import annotations
+
+import itertools
 
 import numpy as np
 import pytest
 import torch
 
+from bench.accuracy.flow import LENGTHS_PX, beside_worlds
 from bench.accuracy.learn_flow import ESTIMATED, EXACT, MARGIN_PX, SETTINGS, SIDE_PX, arms, judge, learn
 from tests.oracles.known_motion import photograph
 from trainer.config_file import load_config
@@ -27,6 +30,15 @@ def batch(seed: int, right_px: int) -> Batch:
         "flow_valid": torch.ones((2, 1, 1, WIDE_PX, WIDE_PX), dtype=torch.uint8),
     }
     return Batch(arrays, (0, 1), 0, (), {}, 0.0, 0.0, 2, CONFIG.stream.resolved_recipe)
+
+
+@pytest.mark.slow
+def test_no_flow_at_all_is_wrong_by_the_length_of_the_exact_flow() -> None:
+    records = {record["where"]: record for record in beside_worlds(("zero",), 3)}
+    assert abs(sum(record["share"] for record in records.values()) - 1.0) < 1e-6
+    for low, high in itertools.pairwise(LENGTHS_PX[1:]):
+        record = records.get(f"{low:g} to {high:g} px")
+        assert record is None or low <= record["error_median_px"] < high
 
 
 def test_the_arms_differ_in_nothing_but_the_flow() -> None:

@@ -28,8 +28,7 @@ FORGETFUL = ("evflownet",)
 
 @pytest.fixture(params=[pytest.param(name, marks=[pytest.mark.slow] if name == "eraft" else []) for name in NETWORKS])
 def name(request: pytest.FixtureRequest) -> str:
-    chosen: str = request.param
-    return chosen
+    return str(request.param)
 
 
 @pytest.fixture(autouse=True)

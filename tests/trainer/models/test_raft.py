@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -54,23 +53,19 @@ def in_the_authors_layout(state: dict[str, Tensor], size: str) -> dict[str, Tens
     return renamed
 
 
-@cache
-def formula_state(size: str) -> dict[str, Tensor]:
-    return formula_weights(RAFT(size).state_dict())
-
-
-def saved(folder: Path, size: str, authors: bool = False) -> Path:
-    state = formula_state(size)
+def saved(folder: Path, size: str) -> Path:
     path = folder / f"{size}.pth"
-    torch.save(in_the_authors_layout(state, size) if authors else state, path)
+    torch.save(formula_weights(RAFT(size).state_dict()), path)
     return path
 
 
 @pytest.mark.parametrize("size", sorted(RAFT_SIZES))
 def test_agrees_with_torchvision_in_both_layouts(size: str, tmp_path: Path) -> None:
-    estimate, authors = (RaftFlow(size, saved(tmp_path, size, layout)) for layout in (False, True))
-    state = authors._network.state_dict()
-    assert all(torch.equal(state[name], tensor) for name, tensor in estimate._network.state_dict().items())
+    estimate = RaftFlow(size, saved(tmp_path, size))
+    state = estimate._network.state_dict()
+    torch.save(in_the_authors_layout(state, size), tmp_path / "authors.pth")
+    authors = RaftFlow(size, tmp_path / "authors.pth")._network.state_dict()
+    assert all(torch.equal(authors[name], tensor) for name, tensor in state.items())
     flow = estimate(*pictures())
     assert flow.shape == (2, 2, HEIGHT, WIDTH)
     recorded = RECORDED[f"{size}_formula"]
@@ -130,7 +125,7 @@ def test_bfloat16_stays_near() -> None:
 def test_unsuitable_weights_are_refused_with_a_source(tmp_path: Path, size: str, content: object, message: str) -> None:
     """A dict is added to the entries of the small network."""
     if isinstance(content, dict):
-        content = formula_state("small") | content
+        content = formula_weights(RAFT("small").state_dict()) | content
     if content is not None:
         torch.save(content, tmp_path / "a.pth")
     with pytest.raises(UsageError, match=message):

@@ -56,20 +56,12 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @cache
 def lpips_files(folder: Path, net: str) -> dict[str, str]:
     """Write the files of a network of LPIPS; return the settings that name them."""
-    torch.manual_seed(5)
     backbone, heads = folder / net, folder / f"{net}-heads"
     torch.save({f"features.{key}": value for key, value in LPIPS(net).features.state_dict().items()}, backbone)
-    channels = enumerate(BACKBONES[net].channels)
-    torch.save({f"lin{i}.model.1.weight": torch.rand(1, c, 1, 1) / c for i, c in channels}, heads)
+    torch.save(
+        {f"lin{i}.model.1.weight": torch.rand(1, c, 1, 1) / c for i, c in enumerate(BACKBONES[net].channels)}, heads
+    )
     return {"loss.lpips_backbone": str(backbone), "loss.lpips_heads": str(heads)}
-
-
-@cache
-def raft_file(folder: Path, size: str) -> str:
-    torch.manual_seed(5)
-    path = folder / f"raft-{size}"
-    torch.save(RAFT(size).state_dict(), path)
-    return str(path)
 
 
 def side_px(config: TrainConfig) -> int:
@@ -78,6 +70,7 @@ def side_px(config: TrainConfig) -> int:
 
 def reduced(name: str, weights: Path) -> TrainConfig:
     """The configuration with a small network, few small voxel grids, and files that are there."""
+    torch.manual_seed(5)
     config = load_config(name)
     side = side_px(config)
     recipe = {"voxels_per_clip": 3, "bins": 2, "crop_height_px": side, "crop_width_px": side}
@@ -91,7 +84,8 @@ def reduced(name: str, weights: Path) -> TrainConfig:
     if getattr(loss, "lpips_weight", 0):
         settings |= lpips_files(weights, loss.lpips_network)
     if getattr(loss, "raft_weights", ""):
-        settings["loss.raft_weights"] = raft_file(weights, loss.raft_size)
+        settings["loss.raft_weights"] = str(weights / f"raft-{loss.raft_size}")
+        torch.save(RAFT(loss.raft_size).state_dict(), settings["loss.raft_weights"])
     if getattr(loss, "temporal_weight", 0):
         settings["loss.temporal_first_step"] = min(2, loss.temporal_first_step)
     return load_config(name, [f"{key}={value!r}" for key, value in settings.items()])
