@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.tools.statements import nodes_of
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = (
     "v2v_protocol",
@@ -70,7 +72,7 @@ FLOORS = (
 def imported_modules(source: str) -> set[str]:
     """Return the full names of all imports anywhere in a module: statements, and import_module("...") calls."""
     names: set[str] = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes_of(source, expressions="import_module" in source or "__import__" in source):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -113,13 +115,10 @@ from . import o
     assert imported_modules(source) == {"a.b", "c", "e.f", "i", "j", "l.m", "n", "."}
 
 
-@pytest.mark.parametrize("path", modules("v2v_protocol"), ids=lambda path: path.name)
-def test_the_protocol_needs_only_light_packages(path: Path) -> None:
-    may = PROTOCOL_MAY | {"safe_yaml.py": {"yaml"}, "progress.py": {"rich"}, "command.py": {"shtab"}}.get(
-        path.name, set()
-    )
-    may = may | {"zmq"} if path.parent.name == "link" else may
-    assert imported(path) - may == set()
+def test_the_protocol_needs_only_light_packages() -> None:
+    more = {"safe_yaml.py": {"yaml"}, "progress.py": {"rich"}, "command.py": {"shtab"}, "link": {"zmq"}}
+    for path in modules("v2v_protocol"):
+        assert imported(path) - PROTOCOL_MAY - more.get(path.name, set()) - more.get(path.parent.name, set()) == set()
 
 
 def test_at_most_four_files_import_the_transport() -> None:
@@ -207,7 +206,7 @@ def test_what_a_fresh_interpreter_loads(module: str, without: tuple[str, ...]) -
 def test_no_two_classes_constants_or_aliases_have_one_name() -> None:
     """But for what the files of one seam have in common, and what has the same definition: every effect has its
     ``Tables``, every plane its ``PLANE``."""
-    found: dict[str, dict[str, str]] = {}
+    found: dict[str, dict[str, ast.expr]] = {}
     for package in (
         "v2v_protocol",
         "v2v_pictures",
@@ -220,24 +219,25 @@ def test_no_two_classes_constants_or_aliases_have_one_name() -> None:
         for path in modules(package):
             if {"effects", "planes"} & set(path.parts):
                 continue
-            tree = ast.parse(path.read_text(encoding="utf-8"))
-            classes = {item.name: str(path) for item in ast.walk(tree) if isinstance(item, ast.ClassDef)}
-            for name, definition in (classes | constants(tree)).items():
+            nodes = nodes_of(path.read_text("utf-8"))
+            classes = {item.name: ast.Constant(str(path)) for item in nodes if isinstance(item, ast.ClassDef)}
+            for name, definition in (constants(nodes[0]) | classes).items():
                 if name[0].isupper():
                     found.setdefault(name, {})[str(path.relative_to(ROOT))] = definition
     del found["LOOKED_FOR"]  # of each kind of pixels
-    assert {name: list(used) for name, used in found.items() if len(set(used.values())) > 1} == {}
+    several = {name: used for name, used in found.items() if len(used) > 1}
+    assert {name: list(used) for name, used in several.items() if len(set(map(ast.unparse, used.values()))) > 1} == {}
 
 
-def constants(tree: ast.Module) -> dict[str, str]:
+def constants(module: ast.AST) -> dict[str, ast.expr]:
     """Return the definition of each constant and alias of a module."""
-    found: dict[str, str] = {}
-    for node in tree.body:
+    found: dict[str, ast.expr] = {}
+    for node in ast.iter_child_nodes(module):
         if isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
             for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
                 several = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
                 pairs = zip(target.elts, node.value.elts, strict=True) if several else [(target, node.value)]
                 for place, value in pairs:
                     names = (item for item in ast.walk(place) if isinstance(item, ast.Name))
-                    found |= {item.id: ast.unparse(value) for item in names if isinstance(item.ctx, ast.Store)}
+                    found |= {item.id: value for item in names if isinstance(item.ctx, ast.Store)}
     return found

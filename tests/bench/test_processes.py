@@ -43,7 +43,5 @@ def test_too_little_is_refused() -> None:
 
 
 def test_a_process_that_is_gone_has_no_memory() -> None:
-    here = rss_mib(os.getpid())
-    assert here is not None
-    assert here > 10.0
+    assert (rss_mib(os.getpid()) or 0.0) > 10.0
     assert rss_mib(2**22 + 1) is None

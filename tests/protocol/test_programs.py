@@ -188,44 +188,31 @@ def test_one_door_lists_all_commands_and_runs_them(
     assert "did you mean 'serve'" in said
 
 
-@pytest.fixture(scope="module")
-def completion() -> str:
-    """The script of bash."""
+def test_bash_completes_flags_and_commands(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("shtab")
-    command = [
-        sys.executable,
-        "-c",
-        "import v2v_protocol.programs as p; raise SystemExit(p.v2v())",
-        "completion",
-        "bash",
-    ]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    monkeypatch.setenv(programs.COMPLETION, "")
+    script = run_v2v("completion", "bash", capsys=capsys, monkeypatch=monkeypatch)[1]
 
+    def bash(asked: str) -> str:
+        return subprocess.run(
+            ["bash", "-c", f"{script}\n{asked}"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+        ).stdout
 
-def test_shells_complete_the_flags(completion: str) -> None:
-    registered = subprocess.run(
-        ["bash", "-c", f"{completion}\ncomplete -p"], capture_output=True, text=True, check=True
-    ).stdout
+    registered = bash("complete -p")
     for name in ("v2v", *(f"v2v-{each}" for each in programs.COMMANDS)):
         assert re.search(rf" {name}$", registered, re.M), name
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
+    for words, expected in (
         ("v2v pre", {"prepare", "preview"}),
         ("v2v preview --see", {"--seed", "--seeds"}),
         ("v2v prepare --size fa", {"fast"}),
         ("v2v nothing --see", set()),
-    ],
-)
-def test_bash_completes_commands_after_v2v(words: str, expected: set[str], completion: str) -> None:
-    given = words.split()
-    asked = (
-        f"{completion}\nCOMP_WORDS=({words}) COMP_CWORD={len(given) - 1}\n_v2v\nprintf '%s\\n' \"${{COMPREPLY[@]}}\""
-    )
-    done = subprocess.run(["bash", "-c", asked], capture_output=True, text=True, check=False)
-    assert (set(done.stdout.split()), done.stderr) == (expected, "")
+    ):
+        said = bash(f"COMP_WORDS=({words}) COMP_CWORD={words.count(' ')}\n_v2v\nprintf '%s\\n' \"${{COMPREPLY[@]}}\"")
+        assert set(said.split()) == expected, words
 
 
 def test_completion_leaves_out_commands_that_are_not_installed(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import re
 from typing import Any
@@ -173,39 +174,34 @@ def refuse(name: str, value: Any) -> str:
 
 NO_NUMBER = (math.nan, math.inf, -math.inf, True, "a tenth", "nan", None, 10**400, 1j, b"1")
 NO_PAIR = ([], [1.0], [1.0, 1.0, 1.0], [math.nan, 1.0], [0.5, True], [[1.0], 1.0], {1.0: 2.0})
-OF_ANOTHER_KIND: list[tuple[list[str], tuple[Any, ...]]] = [
-    (NUMBERS + RANGES, NO_NUMBER),
-    (RANGES, NO_PAIR),
-    (WHOLE, (1.0, True, "1", None, [1], np.int64(1))),
-    (FLAGS, (0, 1, "true", None)),
-    (WORDS, ("", "samples", None, 1, True)),
-]
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [(name, value) for names, values in OF_ANOTHER_KIND for name in names for value in values]
+    ("names", "values"),
+    [
+        (NUMBERS + RANGES, NO_NUMBER),
+        (RANGES, NO_PAIR),
+        (WHOLE, (1.0, True, "1", None, [1], np.int64(1))),
+        (FLAGS, (0, 1, "true", None)),
+        (WORDS, ("", "samples", None, 1, True)),
+    ],
 )
-def test_a_value_of_another_kind_is_refused(name: str, value: Any) -> None:
-    refuse(name, value)
+def test_a_value_of_another_kind_is_refused(names: list[str], values: tuple[Any, ...]) -> None:
+    for name, value in itertools.product(names, values):
+        refuse(name, value)
 
 
-@pytest.mark.parametrize("name", RANGES)
-def test_a_range_is_given_lowest_first(name: str) -> None:
-    setting = settings_of(Recipe)[name]
-    assert "lowest value comes first" in refuse(name, [setting.high, max(setting.low, setting.high / 2)])
+def test_every_number_has_a_limit_on_both_sides() -> None:
+    for name, extreme in itertools.product(WHOLE + NUMBERS + RANGES, (-(10**12), 10**12)):
+        assert settings_of(Recipe)[name].expected in refuse(name, extreme if name in WHOLE else float(extreme))
 
 
-@pytest.mark.parametrize("name", WHOLE + NUMBERS + RANGES)
-def test_every_number_has_a_limit_on_both_sides(name: str) -> None:
-    kind = int if name in WHOLE else float
-    for extreme in (-(10**12), 10**12):
-        assert settings_of(Recipe)[name].expected in refuse(name, kind(extreme))
-
-
-@pytest.mark.parametrize("name", RANGES)
-def test_both_ends_of_a_range_are_limited(name: str) -> None:
-    assert "[1.0, 1000000000000.0]: give one number, or a pair" in refuse(name, [1.0, 10.0**12])
-    assert "[-1000000000000.0, 1.0]: give one number, or a pair" in refuse(name, [-(10.0**12), 1.0])
+def test_a_range_is_given_lowest_first_and_both_ends_are_limited() -> None:
+    for name in RANGES:
+        setting = settings_of(Recipe)[name]
+        assert "lowest value comes first" in refuse(name, [setting.high, max(setting.low, setting.high / 2)])
+        assert "[1.0, 1000000000000.0]: give one number, or a pair" in refuse(name, [1.0, 10.0**12])
+        assert "[-1000000000000.0, 1.0]: give one number, or a pair" in refuse(name, [-(10.0**12), 1.0])
 
 
 def test_the_frames_of_a_sample_are_limited() -> None:

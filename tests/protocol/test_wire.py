@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -35,8 +36,6 @@ from v2v_protocol.sample import Form
 
 V = b"\x82\xa1v" + bytes([PROTOCOL_VERSION])
 """A message of two fields begins, with its version."""
-
-by_name = pytest.mark.parametrize("cls", MESSAGES, ids=lambda cls: cls.__name__)
 
 
 def plain(message: Any) -> dict[str, Any]:
@@ -94,11 +93,13 @@ _values = st.recursive(
 )
 
 
-@pytest.mark.parametrize("opening", [b"\x91", b"\x81\xa1a", b"\x81\x91", b"\x92\x01"])
 @pytest.mark.parametrize("depth", [1, 15, 16, 17, 200, 990, 1020, 1024, 200_000])
-def test_nesting(opening: bytes, depth: int) -> None:
+def test_nesting(depth: int) -> None:
     """Depths that the decoder takes, but that no repr() survives."""
-    for before in (V + b"\xa1t", b"\x82\xa1t\xa4ping\xa1v", b"\x83\xa1t\xa4ping" + V[1:] + b"\xa1x", b""):
+    for before, opening in itertools.product(
+        (V + b"\xa1t", b"\x82\xa1t\xa4ping\xa1v", b"\x83\xa1t\xa4ping" + V[1:] + b"\xa1x", b""),
+        (b"\x91", b"\x81\xa1a", b"\x81\x91", b"\x92\x01"),
+    ):
         message_or_refusal(before + opening * depth + b"\x90")
 
 
@@ -136,12 +137,12 @@ def test_a_map_nested_too_deeply_is_refused(opening: bytes, depth: int) -> None:
 # --- form -------------------------------------------------------------------------------------------------------------
 
 
-@by_name
 @pytest.mark.parametrize(
     "version", [0, 1, PROTOCOL_VERSION + 1, -1, 2**64 - 1, float(PROTOCOL_VERSION), True, "2", None, [2], {"v": 2}]
 )
-def test_other_versions_are_refused_with_both_numbers(cls: type[Any], version: Any) -> None:
-    refuse(plain(example(cls)) | {"v": version}, VersionMismatch, f"this side version {PROTOCOL_VERSION}")
+def test_other_versions_are_refused_with_both_numbers(version: Any) -> None:
+    for cls in MESSAGES:
+        refuse(plain(example(cls)) | {"v": version}, VersionMismatch, f"this side version {PROTOCOL_VERSION}")
 
 
 @pytest.mark.parametrize("name", ["Ping", "", "sample-header", None, 1, ["ping"], {"t": "ping"}, b"ping"])

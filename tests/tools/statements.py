@@ -12,10 +12,17 @@ def _is_docstring(node: ast.stmt) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
+def nodes_of(source: str, *, expressions: bool = False) -> list[ast.AST]:
+    """Return the nodes of a module, without or with its expressions: most nodes, in which there is no statement."""
+    nodes: list[ast.AST] = [ast.parse(source)]
+    for node in nodes:
+        nodes += (child for child in ast.iter_child_nodes(node) if expressions or not isinstance(child, ast.expr))
+    return nodes
+
+
 def statements_of(source: str) -> int:
     """Count the statements of one module's source, without docstrings, those below a constant or field included."""
-    nodes = ast.walk(ast.parse(source))
-    return sum(isinstance(node, ast.stmt) and not _is_docstring(node) for node in nodes)
+    return sum(isinstance(node, ast.stmt) and not _is_docstring(node) for node in nodes_of(source))
 
 
 def statements_under(folder: Path) -> int:

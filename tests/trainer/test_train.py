@@ -69,6 +69,7 @@ def test_every_network_resumes_exactly(
 ) -> None:  # fmt: skip
     """Dropout and batch norm included."""
     monkeypatch.setattr("trainer.models.eraft.UPDATES", 2)  # the other ten say nothing new
+    monkeypatch.setattr("trainer.models.etnet.ENCODER_LAYERS", 1)  # nor do two more layers
     settings: dict[str, Any] = {
         "network": {"name": name, "options": options}, "loss": loss, "stream": {"batch_size": 2},
         "optimizer": {"learning_rate": 1e-3},
@@ -209,25 +210,22 @@ def test_flow_is_scored_and_drawn_as_well(server: FakeServer, tmp_path: Path) ->
     assert (run / "previews" / "step-0000002-0.png").is_file()
 
 
-def test_a_preview_shows_no_more_samples_than_an_epoch_has(tmp_path: Path) -> None:
+def test_an_epoch_of_one_sample_limits_previews_and_batches(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with FakeServer(sequences=1) as server:
+        told = refused(tmp_path, server.address, capsys, run__preview_every=1, stream__batch_size=4)
         run = trained(
             tmp_path, server.address, "run", run__steps=1, run__preview_every=1, run__judge_samples=2,
             stream__batch_size=1,
         )  # fmt: skip
     assert [path.name for path in (run / "previews").glob("*.png")] == ["step-0000001-0.png"]
-
-
-def test_too_large_a_batch_is_reported_with_its_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with FakeServer(sequences=1) as server:
-        told = refused(tmp_path, server.address, capsys, run__preview_every=1, stream__batch_size=4)
     assert "no global batch of 1 x 4 = 4 samples" in told
 
 
 def test_loader_workers_change_nothing(server: FakeServer, whole: Path, tmp_path: Path) -> None:
-    run = trained(tmp_path, server.address, "run", run__steps=7, stream__loader_workers=1)
-    assert losses(run) == losses(whole)[:7]
-    trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=12, stream__loader_workers=1)
+    """A run begins without one, goes on with one into the next epoch, and ends without one."""
+    run = trained(tmp_path, server.address, "run", run__steps=3)
+    for steps, workers in ((7, 1), (12, 0)):
+        trained(tmp_path, server.address, "run", resume=f"run/{LAST}", run__steps=steps, stream__loader_workers=workers)
     assert losses(run) == losses(whole)
 
 

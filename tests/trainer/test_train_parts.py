@@ -11,7 +11,7 @@ from contextlib import nullcontext
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.client.fake_server import SPEC, FakeServer
@@ -62,6 +62,7 @@ def test_the_started_server_is_announced_before_it_is_ready(
 # --- the averaged network ---------------------------------------------------------------------------------------------
 
 
+@settings(max_examples=25)  # a linear recurrence
 @given(st.lists(st.floats(-10, 10, width=32), min_size=1, max_size=30), st.floats(0, 0.999))
 def test_the_average_is_the_recurrence_of_its_docstring(values: list[float], decay: float) -> None:
     network = FireNet(bins=1, base_channels=1)

@@ -220,7 +220,7 @@ def test_defects_of_pictures_are_said_with_what_can_be_done(tmp_path: Path, caps
     ):
         assert each in said
     assert "no problems found" not in said
-    status, said = told(capsys, *flags, "--rows", "0.1:0.8")
+    status, said = told(capsys, "--videos", str(tmp_path / "boxed.mp4"), *flags[2:], "--rows", "0.1:0.8")
     assert "have bars at the sides of the picture (boxed.mp4: 100% of the frames have bars: left 10 px" in said
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
-import faery
 import h5py
 import numpy as np
 import pytest
@@ -42,6 +41,8 @@ def read(path: Path) -> EventList:
             assert "linear in time" in file.attrs["note"]
             x, y, t, p = (file[f"events/{name}"][:] for name in "xytp")
             return EventList(x, y, t + file["t_offset"][()], p > 0, int(file.attrs["width"]), int(file.attrs["height"]))
+    import faery  # as every process of a run of all tests imports this module
+
     stream = faery.events_stream_from_file(path)
     table = stream.to_array()
     return EventList(table["x"], table["y"], table["t"].astype(np.int64), table["on"], *stream.dimensions())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from bench.accuracy.false_events import between, compared, sequences
 from tests.clips import panned_luma
@@ -12,12 +13,14 @@ from v2v_server.corpus.scenes.scene import COLUMNS, Scene
 FILM = panned_luma(40, 80, 96)
 
 
+@pytest.mark.slow
 def test_a_clean_clip_has_no_false_event() -> None:
     events, false, wanted, missing = compared(FILM[:16], between(FILM, np.arange(16.0))).tolist()
     assert events == wanted > 1000
     assert false == missing == 0
 
 
+@pytest.mark.slow
 def test_a_repeated_frame_moves_its_events_to_the_next_step() -> None:
     """Light only rises, so nothing cancels in a step of twice the length."""
     rising = np.broadcast_to(40 + 9 * np.arange(16)[:, None, None] + np.arange(32), (16, 24, 32)).astype(np.uint8)

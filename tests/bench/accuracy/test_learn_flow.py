@@ -1,10 +1,14 @@
-"""Learning flow from exact flow and from DIS's: both networks see the same, but for the flow."""
+"""Flow methods beside the exact flow of worlds, and networks that learn from either and see the same otherwise."""
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
+import pytest
 import torch
 
+from bench.accuracy.flow import LENGTHS_PX, beside_worlds
 from bench.accuracy.learn_flow import ESTIMATED, EXACT, MARGIN_PX, SETTINGS, SIDE_PX, arms, judge, learn
 from tests.oracles.known_motion import photograph
 from trainer.config_file import load_config
@@ -28,6 +32,15 @@ def batch(seed: int, right_px: int) -> Batch:
     return Batch(arrays, (0, 1), 0, (), {}, 0.0, 0.0, 2, CONFIG.stream.resolved_recipe)
 
 
+@pytest.mark.slow
+def test_no_flow_at_all_is_wrong_by_the_length_of_the_exact_flow() -> None:
+    records = {record["where"]: record for record in beside_worlds(("zero",), 3)}
+    assert abs(sum(record["share"] for record in records.values()) - 1.0) < 1e-6
+    for low, high in itertools.pairwise(LENGTHS_PX[1:]):
+        record = records.get(f"{low:g} to {high:g} px")
+        assert record is None or low <= record["error_median_px"] < high
+
+
 def test_the_arms_differ_in_nothing_but_the_flow() -> None:
     given, inner = batch(0, right_px=3), slice(MARGIN_PX, MARGIN_PX + SIDE_PX)
     exact, estimated = (arms(given)[arm].arrays for arm in (EXACT, ESTIMATED))
@@ -39,6 +52,7 @@ def test_the_arms_differ_in_nothing_but_the_flow() -> None:
     assert abs(float(down.median())) < 0.1
 
 
+@pytest.mark.slow
 def test_equal_flow_makes_equal_networks() -> None:
     for right_px in (0, 3):
         [(steps, networks)] = learn((batch(seed, right_px) for seed in range(9)), CONFIG, (3,))

@@ -6,15 +6,7 @@ import argparse
 
 import pytest
 
-from bench.accuracy.loss import is_inside, measure, scenes, summary
-
-
-def test_shapes_lie_in_their_intervals() -> None:
-    records = list(scenes("held out", "plain shapes"))
-    assert all(is_inside(record, name) for record in records for name in ("linear", "divided"))
-    found = summary("held out", records)
-    assert found["scenes"] == len(records) == 4
-    assert found["rms_linear"] < 0.12
+from bench.accuracy.loss import measure
 
 
 @pytest.mark.slow

@@ -48,6 +48,7 @@ def test_an_event_at_an_edge_belongs_to_the_bin_that_ends_there() -> None:
     assert bin_events(events, np.array([1.0, 2.0]), 1).ravel().tolist() == [1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", analytic_scenes(), ids=lambda scene: scene.name)
 def test_scenes_hold_the_events_of_a_very_fine_simulation(scene: Any) -> None:
     edges = np.linspace(0.0, 1.0, 26)
@@ -86,6 +87,7 @@ def test_errors_by_hand() -> None:
     assert found["differing_bins_ppm"] == 250_000
 
 
+@pytest.mark.slow
 def test_all_frames_of_a_film_give_the_events_of_all_frames() -> None:
     frames = np.rint(moved_photograph("coffee", 49, 40, 50, 0.3) * 255).astype(np.uint8)
     for threshold in (0.1, 0.5):
@@ -98,6 +100,7 @@ def test_all_frames_of_a_film_give_the_events_of_all_frames() -> None:
         assert 0 < fewer["voxel_error"] < 0.5
 
 
+@pytest.mark.slow
 def test_signed_sums_of_few_frames_are_off_by_one_at_most() -> None:
     # Both sides have a residual below one threshold and have seen the same change: no frame rate can lose more.
     frames = np.rint(moved_photograph("camera", 97, 40, 50, 2.0) * 255).astype(np.uint8)
@@ -106,6 +109,7 @@ def test_signed_sums_of_few_frames_are_off_by_one_at_most() -> None:
     assert np.abs(np.cumsum(few, axis=0, dtype=np.int64) - np.cumsum(true, axis=0)).max() == 1
 
 
+@pytest.mark.slow
 def test_analytic_records_hold_their_bar() -> None:
     records = list(physics.analytic())
     assert physics.missed(records) == []

@@ -106,6 +106,7 @@ def test_a_recording_is_like_itself_and_not_like_its_mirror() -> None:
     assert (empty["correlation"], empty["missed"], empty["invented"]) == (0.0, 1.0, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light", ["linear", "2.2", "srgb"])
 def test_the_equations_agree_with_the_kernel(light: str) -> None:
     made = given(light)
@@ -113,6 +114,7 @@ def test_the_equations_agree_with_the_kernel(light: str) -> None:
     assert exact["correlation"] > 0.8
 
 
+@pytest.mark.slow
 def test_the_threshold_of_the_camera_is_found_and_bars_are_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -321,9 +321,9 @@ def test_connections_with_a_session_make_no_room(
 
 CONNECT_MANY = f"""
 import resource, socket, sys
-resource.setrlimit(resource.RLIMIT_NOFILE, (6000, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+resource.setrlimit(resource.RLIMIT_NOFILE, (2000, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
 held = []
-for _ in range(5000):
+for _ in range(1500):
     held.append(socket.create_connection(("127.0.0.1", int(sys.argv[1])), 60.0))
     held[-1].sendall({GREETING + READY!r})
 print("connected", flush=True)
@@ -331,12 +331,12 @@ sys.stdin.read()
 """
 
 
-def test_five_thousand_connections_with_few_descriptors_do_not_stop_a_newcomer(
+def test_many_connections_with_few_descriptors_do_not_stop_a_newcomer(
     serve: Callable[..., Sockets], consumer: Callable[..., zmq.Socket[bytes]]
 ) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     few = len(os.listdir("/proc/self/fd")) + 1100  # other tests may have left some open
-    if hard < few + 5000:
+    if hard < few + 1500:
         pytest.skip("the system allows fewer connections")
     resource.setrlimit(resource.RLIMIT_NOFILE, (few, hard))
     try:

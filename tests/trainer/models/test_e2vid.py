@@ -14,8 +14,8 @@ from v2v_protocol.errors import UsageError
 
 
 def test_equals_the_numpy_network() -> None:
-    """The network has its full size; the input is two clips of two steps with sides that need padding."""
-    model = E2VID()
+    """The network has its full depth; the input is two clips of two steps with sides that need padding."""
+    model = E2VID(base_channels=8)
     weights = oracle.random_weights(model, seed=1)
     voxels = counts((2, 2, 5, 13, 18))
     expected = np.stack([oracle.e2vid(clip.astype(np.float64), weights) for clip in voxels])

@@ -28,8 +28,7 @@ FORGETFUL = ("evflownet",)
 
 @pytest.fixture(params=[pytest.param(name, marks=[pytest.mark.slow] if name == "eraft" else []) for name in NETWORKS])
 def name(request: pytest.FixtureRequest) -> str:
-    chosen: str = request.param
-    return chosen
+    return str(request.param)
 
 
 @pytest.fixture(autouse=True)
@@ -65,7 +64,8 @@ OF_15_BINS = {f"{net}.conv1.weight": [64, 15, 7, 7] for net in ("fnet", "cnet")}
 def test_published_files_are_recognised_and_load_strictly(
     tmp_path: Path, name: str, changed: dict[str, list[int]], parameters: int, buffers: int | None
 ) -> None:
-    state = {key: torch.full(shape, 0.01) for key, shape in (PUBLISHED[name] | changed).items()}
+    # Each tensor is one stored number.
+    state = {key: torch.tensor(0.01).expand(shape) for key, shape in (PUBLISHED[name] | changed).items()}
     state = {key: value.long() if key.endswith("num_batches_tracked") else value for key, value in state.items()}
     torch.save({"state_dict": {f"module.{key}": value for key, value in state.items()}, "epoch": 9}, tmp_path / "a.pth")
     network, found = load_network(tmp_path / "a.pth")

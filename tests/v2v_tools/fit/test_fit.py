@@ -36,15 +36,13 @@ IGNORING = TrueCamera(0.23, 0.21, shot_noise_hz=3.0, refractory_seconds=1e-3, lo
 SLOW = TrueCamera(0.25, 0.21, 0.12, 0.4, 0.6, 0.0, 60.0, log_eps=0.01)
 
 
-@lru_cache(maxsize=1)
-def film() -> Film:
-    return rendered_film("coffee", 48, 64, 70.0, moving=1.0)
+film = lru_cache(maxsize=3)(rendered_film)
 
 
 def recording_of(
     camera: TrueCamera, film_seen: Film | None = None, frames: npt.NDArray[np.uint8] | None = None
 ) -> Recorded:
-    made = record(film_seen or film(), camera, 1)
+    made = record(film_seen or film("coffee", 48, 64, 70.0, moving=1.0), camera, 1)
     shown = made["frames"] if frames is None else frames
     height, width = shown.shape[1:]
     place = made["y"].astype(np.int64) * width + made["x"]
@@ -137,7 +135,7 @@ def test_noise_is_that_of_pixels_whose_neighbours_are_quiet_too() -> None:
 )  # fmt: skip
 def test_thresholds_and_low_pass_come_back_from_events_and_frames(camera: TrueCamera, late: int) -> None:
     """The low-pass is slower in the dark, frames are as late everywhere."""
-    seen = rendered_film("camera", 48, 64, 70.0, moving=0.8, still=0.0)
+    seen = film("camera", 48, 64, 70.0, moving=0.8, still=0.0)
     shown = np.minimum(np.arange(0, len(seen.grey), 8) + late, len(seen.grey) - 1)
     made = recording_of(camera, seen, np.rint(255 * seen.grey[shown]).astype(np.uint8))
     found = Regression(increments_of(made, camera.refractory_seconds, 33_333.0), made.blocks())
@@ -214,7 +212,7 @@ def test_intervals_that_the_scene_ends_do_not_pass_for_a_refractory_period() -> 
 
 
 def test_a_recording_in_files_is_the_recording_in_memory(tmp_path: Path) -> None:
-    made = record(rendered_film("coins", 20, 24, 60.0, moving=0.2), FAST, 1)
+    made = record(film("coins", 20, 24, 60.0, moving=0.2, still=0.1), FAST, 1)
     write_ijrr(tmp_path, made)
     read, direct = read_recording(tmp_path), recorded(
         20, 24, made["t"], made["y"].astype(np.int64) * 24 + made["x"], made["p"], made["frames"], made["frame_us"]
@@ -272,7 +270,8 @@ def test_tiles_of_a_large_sensor_stay_within_the_limit(height: int, width: int) 
     assert np.isin(chosen_pixels(height, width, len(pixels) // 2), pixels).all()
 
 
-@settings(max_examples=8, deadline=None)
+@pytest.mark.slow  # of an oracle of a bench
+@settings(max_examples=8)
 @given(st.integers(-9, 9), st.sampled_from(["linear", "2.2", "srgb"]))
 def test_the_offset_of_the_frames_is_found(offset_ms: int, name: str) -> None:
     """Gratings of any speed: the events have exact times, and the frames are seen later than they say."""
@@ -298,17 +297,17 @@ def test_the_offset_of_the_frames_is_found(offset_ms: int, name: str) -> None:
 
 
 def test_frames_of_unknown_light_are_refused(tmp_path: Path) -> None:
-    made = recording_of(FAST, rendered_film("coins", 20, 24, 60.0, moving=0.2))
+    write_ijrr(tmp_path, record(film("coins", 20, 24, 60.0, moving=0.2, still=0.1), FAST, 1))
+    made = read_recording(tmp_path)
     with pytest.raises(UsageError, match=r"does not state the light of its frames.*--light linear"):
         fit(dataclasses.replace(made, light=None))
-    write_ijrr(tmp_path, record(rendered_film("coins", 20, 24, 60.0, moving=0.2), FAST, 1))
-    assert read_recording(tmp_path).light == Light.parse("linear")  # IJRR is of a DAVIS
+    assert made.light == Light.parse("linear")  # IJRR is of a DAVIS
     assert read_recording(tmp_path, ConvertOptions(light=LIGHT)).light == LIGHT
 
 
 def test_a_camera_of_linear_frames_has_the_thresholds_of_the_same_light() -> None:
     """The same scene, once gamma-coded and once linear: the fit takes each for what it is."""
-    coded = recording_of(FAST, rendered_film("camera", 48, 64, 70.0, moving=0.8, still=0.0))
+    coded = recording_of(FAST, film("camera", 48, 64, 70.0, moving=0.8, still=0.0))
     linear = np.rint(255.0 * LIGHT.of(np.arange(256.0))).astype(np.uint8)[coded.frames]
     others = [coded, dataclasses.replace(coded, frames=linear, light=Light.parse("linear"))]
     found = [Regression(increments_of(each, 5e-4, 33_333.0), each.blocks()) for each in others]
