@@ -8,7 +8,8 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from pathlib import Path
 from typing import Any
 
 import numba.core.dispatcher
@@ -62,6 +63,17 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         with open(__file__, "rb") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             config.add_cleanup(subprocess.Popen(_WARM_UP, pass_fds=[lock.fileno()]).wait)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Let one process of a run collect first: the others find its compiled files."""
+    with (Path(__file__).parent / "__init__.py").open("rb") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            fcntl.flock(lock, fcntl.LOCK_SH)
+        return (yield)
 
 
 def pytest_collection_finish() -> None:
