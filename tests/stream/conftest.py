@@ -56,9 +56,10 @@ def clips(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="package")
-def server(clips: Path) -> Iterator[LocalServer]:
-    """A server over these clips for tests that leave it as it is."""
-    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as running:
+def server(request: pytest.FixtureRequest, clips: Path) -> Iterator[LocalServer]:
+    """A server over these clips for tests that leave it as it is. Of network faults, one worker shows all."""
+    workers = 1 if request.node.name.endswith("faults") else 2
+    with LocalServer(clips, workers=workers, flags=SMALL_FLAGS) as running:
         yield running
 
 
@@ -82,9 +83,9 @@ def _no_process_left() -> Iterator[None]:
     """
     before = set(psutil.Process().children(recursive=True))
     yield
-    after = psutil.Process().children(recursive=True)
-    servers = {process.pid for process in before if "v2v_server" in _command(process)}
-    left = [process for process in after if process not in before and _parent(process) not in servers]
+    left = [process for process in psutil.Process().children(recursive=True) if process not in before]
+    workers = tuple(f"{process.pid} " for process in before)
+    left = [process for process in left if not _command(process).startswith(workers)]
     left = [process for process in left if "resource_tracker" not in _command(process)]
     _, alive = psutil.wait_procs(left, timeout=60)
     for process in alive:
@@ -99,17 +100,11 @@ def server_workers(pid: int) -> list[psutil.Process]:
 
 
 def _command(process: psutil.Process) -> str:
+    """The id of its parent, and its command line."""
     try:
-        return " ".join(process.cmdline())
+        return f"{process.ppid()} {' '.join(process.cmdline())}"
     except (psutil.NoSuchProcess, psutil.ZombieProcess):
         return ""
-
-
-def _parent(process: psutil.Process) -> int | None:
-    try:
-        return process.ppid()
-    except psutil.NoSuchProcess:
-        return None
 
 
 def digest(batch: Batch) -> str:

@@ -1,7 +1,5 @@
 """Do the jobs of commands called in this process here; programs that tests start use other processes."""
 
-from __future__ import annotations
-
 import pytest
 
 from v2v_server.commands import prepare
