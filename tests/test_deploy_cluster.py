@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -30,10 +31,11 @@ BATCH = DEPLOY / "slurm" / "train.sbatch"
 GPU_FIRST = DEPLOY.parent / "examples" / "gpu_first.sh"
 
 
-def documents(folder: Path = KUBERNETES) -> list[dict[str, Any]]:
+@cache
+def documents() -> list[dict[str, Any]]:
     """Of all files that the kustomization names."""
-    names = yaml.safe_load((folder / "kustomization.yaml").read_text())["resources"]
-    return [document for name in names for document in yaml.safe_load_all((folder / name).read_text())]
+    names = yaml.safe_load((KUBERNETES / "kustomization.yaml").read_text())["resources"]
+    return [document for name in names for document in yaml.safe_load_all((KUBERNETES / name).read_text())]
 
 
 def named(kind: str, name: str) -> dict[str, Any]:

@@ -88,12 +88,17 @@ OUTPUTS = [
 """Outputs that would destroy an input, or cannot be written: refused before the work."""
 
 
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return write_clip(tmp_path_factory.mktemp("clip") / "a.mp4", panned_luma(30, 64, 64)).read_bytes()
+
+
 @pytest.fixture
-def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def desk(clip: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a clip under several names, a corpus, labels, and files of other kinds."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path / "cache"))
-    write_clip(tmp_path / "a.mp4", panned_luma(30, 64, 64))
+    (tmp_path / "a.mp4").write_bytes(clip)
     (tmp_path / "link.mp4").symlink_to("a.mp4")
     (tmp_path / "hard.mp4").hardlink_to("a.mp4")
     for folder in ("clips", "b.masks", "run", "locked"):

@@ -4,7 +4,6 @@ reports that it could not write it."""
 from __future__ import annotations
 
 import fcntl
-import gc
 import mmap
 import os
 from pathlib import Path
@@ -141,11 +140,9 @@ def test_its_size_cannot_be_changed(arena: Arena) -> None:
 
 def test_a_worker_keeps_no_descriptor_of_an_arena_and_opens_none_of_a_dead_consumer(arena: Arena) -> None:
     of_dead = Arena(LAYOUT, ROWS).slot(0)
-    gc.collect()
     before = set(os.listdir("/proc/self/fd"))
     assert write(arena.slot(0), 1)
     assert not write(of_dead, 1)
-    gc.collect()
     assert set(os.listdir("/proc/self/fd")) == before
     assert ArenaName.parse(arena.slot(0).arena).token not in Path("/proc/self/maps").read_text()
 

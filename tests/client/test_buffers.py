@@ -1,4 +1,3 @@
-import gc
 import os
 from contextlib import contextmanager
 
@@ -46,7 +45,6 @@ def test_referenced_memory_is_not_reused(hold):
     assert address(other) != first
     other[:] = 9
     del held
-    gc.collect()
     again = buffers.arrays()["voxels"]
     assert address(again) == first, "the last user is gone, yet the memory did not come back"
     assert (again == 7).all(), "memory in use was written to"
@@ -57,7 +55,6 @@ def test_at_most_the_stated_memory_is_kept():
     arrays = [buffers.arrays()["voxels"] for _ in range(5)]
     addresses = {address(array) for array in arrays}
     del arrays
-    gc.collect()
     kept = [buffers.arrays()["voxels"] for _ in range(2)]
     assert {address(array) for array in kept} <= addresses
     assert len(buffers._free) == 0
@@ -120,11 +117,9 @@ def test_an_arena_with_a_referenced_batch_is_not_reused(hold):
     name, whole = arena_of(memory), filled(memory)
     held = hold(whole["voxels"].reshape(4, 6))
     del memory, whole
-    gc.collect()
     others = [buffers.take(shared=True) for _ in range(3)]
     assert name not in map(arena_of, others)
     del held
-    gc.collect()
     assert arena_of(buffers.take(shared=True)) == name
 
 
@@ -133,7 +128,6 @@ def test_an_arena_with_an_incomplete_batch_is_not_reused():
     memory = buffers.take(shared=True)
     name = arena_of(memory)
     del memory
-    gc.collect()
     assert arena_of(buffers.take(shared=True)) != name
 
 
@@ -173,7 +167,6 @@ def test_an_arena_in_use_during_a_fork_is_not_reused():
     with forked(still_there):
         mine.clear()
         del memory
-        gc.collect()
         for _ in range(3):
             memory = buffers.take(shared=True)
             assert arena_of(memory) != name
@@ -188,7 +181,6 @@ def test_a_forked_process_does_not_reuse_its_parents_arenas():
     name = arena_of(memory)
     filled(memory)
     del memory
-    gc.collect()
 
     def uses_another():
         assert arena_of(buffers.take(shared=True)) != name

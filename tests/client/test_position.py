@@ -96,7 +96,11 @@ STATE = ResumeState(
     StreamIdentity({"recipe": {"gamma": 2.2}}, "s" * 64, "c" * 64, 1, 100), 3, 1, 0, 40, 2, LoaderShare(0, 2, 4, 5), 7
 ).to_dict()
 SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary()
-VALUES = st.recursive(SCALARS, lambda inner: st.lists(inner) | st.dictionaries(st.text() | st.integers(), inner))
+VALUES = st.recursive(
+    SCALARS,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text() | st.integers(), inner, max_size=3),
+    max_leaves=4,  # small ones have every shape, and larger ones take most of the time
+)
 
 
 def test_only_a_stream_with_sidecars_pins_them() -> None:
@@ -110,7 +114,10 @@ def test_only_a_stream_with_sidecars_pins_them() -> None:
         other.require_same(one, ours="the state", theirs="the server")
 
 
-@given(st.dictionaries(st.sampled_from([*STATE, "more"]), VALUES), st.sets(st.sampled_from(list(STATE))))
+@given(
+    st.dictionaries(st.sampled_from([*STATE, "more"]), VALUES, max_size=2),
+    st.sets(st.sampled_from(list(STATE)), max_size=2),
+)
 def test_a_hostile_state_is_taken_or_refused_in_words(changed: dict[str, Any], missing: set[str]) -> None:
     state = {name: value for name, value in (STATE | changed).items() if name not in missing}
     with suppress(UsageError):

@@ -157,7 +157,7 @@ def test_an_index_is_taken_over_or_replaced_with_a_note(fixture: Path, monkeypat
     probed: list[str] = []
     probe = refresh.probe_files
     monkeypatch.setattr(refresh, "probe_files", lambda root, ids, *rest: probed.extend(ids) or probe(root, ids, *rest))
-    with closing(open_catalogue(fixture / "videos", rows=Rows.parse(ROWS), cache_dir=cache)) as catalogue:
+    with closing(open_catalogue(fixture / "videos", rows=Rows.parse(ROWS), cache_dir=cache, processes=0)) as catalogue:
         assert [video.id for video in catalogue.videos] == ["a.mp4", "b.webm"]
         if version == SCHEMA_VERSION:
             assert probed == []

@@ -19,7 +19,7 @@ from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 
 FORK = multiprocessing.get_context("fork")
-EPOCHS = 3
+EPOCHS = 2
 BATCHES_AN_EPOCH = 8
 
 Entry = tuple[int, int, str]
@@ -100,7 +100,7 @@ def test_a_trainer_killed_anywhere_repeats_and_skips_nothing(
     draw = random.Random(loader_workers)
     kills = 0
     # Odd counts strike between a step and its checkpoint, even ones just behind a checkpoint; both, and far apart.
-    for kill_after in (1, 2, *(draw.randint(3, 16) for _ in range(4))):
+    for kill_after in (1, 2, *(draw.randint(3, 10) for _ in range(4))):
         if _run(server, tmp_path, loader_workers, kill_after):
             break
         kills += 1

@@ -158,15 +158,15 @@ def _require_it_goes_on(source: Path, out: Path, cache: Path) -> None:
     for record in kept:
         with StoreFile(out / record.id) as stored:
             assert stored.is_whole
-    with closing(open_catalogue(source, cache_dir=cache)) as catalogue:
-        report = prepare(catalogue, out)
+    with closing(open_catalogue(source, cache_dir=cache, processes=0)) as catalogue:
+        report = prepare(catalogue, out, processes=0)
     assert report.complete
     assert report.kept >= len(kept)  # a file that was finished before its line could be written counts too
 
 
 def test_preparing_files_that_cannot_be_written(source: Path, tmp_path: Path, cache: Path) -> None:
     out = tmp_path / "out"
-    open_catalogue(source, cache_dir=cache).close()
+    open_catalogue(source, cache_dir=cache, processes=0).close()
     done = subprocess.run(_limited(8192, *_preparing(source, out, cache)), capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "0 of 5 videos prepared" in done.stdout

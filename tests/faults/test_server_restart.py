@@ -10,8 +10,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
+import psutil
+
 from bench.processes import free_ports
-from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
+from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_workers
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_client.options import Patience
@@ -54,8 +56,10 @@ def test_the_client_goes_on_with_a_restarted_server(clips: Path) -> None:
         address = first.address
         expected = [digest(batch) for batch in epoch_of(address)]
         with iterating(address) as (client, go_on):
+            workers = server_workers(first.pid)
             os.kill(first.pid, signal.SIGKILL)
             go_on.set()  # it waits for samples while there is no server
-            with LocalServer(clips, workers=2, flags=flags):
+            with LocalServer(clips, workers=1, flags=flags):
                 assert client.result() == expected
+            assert not psutil.wait_procs(workers, timeout=60)[1]
     assert len(expected) > 2 * BATCHES_BEFORE

@@ -10,11 +10,13 @@ from typing import Any
 
 import psutil
 import pytest
+from torch.utils.data import DataLoader
 
 from tests.clips import damaged, panned_luma, write_clip
-from v2v_client import Batch, V2VStreamDataset
+from v2v_client import Batch, V2VDataset, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.recipe import Recipe
+from v2v_server.corpus.catalogue import open_catalogue
 
 SMALL = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=40)
 """Needs 21 frames; everything else as in the paper."""
@@ -49,13 +51,15 @@ def clips(compiled: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ):
         luma = panned_luma(frames, 48, 64, step=(1 + number % 2, 1 + number % 3))
         write_clip(folder / name, luma, **options)  # type: ignore[arg-type]
+    open_catalogue(folder, processes=0).close()  # a server that finds no index starts processes that probe
     return folder
 
 
 @pytest.fixture(scope="package")
-def server(clips: Path) -> Iterator[LocalServer]:
-    """A server over these clips for tests that leave it as it is."""
-    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as running:
+def server(request: pytest.FixtureRequest, clips: Path) -> Iterator[LocalServer]:
+    """A server over these clips for tests that leave it as it is. Of network faults, one worker shows all."""
+    workers = 1 if request.node.name.endswith("faults") else 2
+    with LocalServer(clips, workers=workers, flags=SMALL_FLAGS) as running:
         yield running
 
 
@@ -67,15 +71,21 @@ def clips_with_a_broken_one(compiled: None, tmp_path_factory: pytest.TempPathFac
         write_clip(folder / f"good{number}.mp4", panned_luma(64, step=(1, 1 + number)), gop=16)
     write_clip(aside / "whole.mp4", panned_luma(126), gop=126)
     damaged(aside / "whole.mp4", folder / "broken.mp4", 50)
+    open_catalogue(folder, processes=0).close()
     return folder
 
 
 @pytest.fixture(autouse=True)
 def _no_process_left() -> Iterator[None]:
-    """Check that each process that a test started has ended; kill the others, so that the next test starts without."""
+    """Check that each process that a test started has ended; kill the others, so that the next test starts without.
+
+    A server that more than one test uses may have new workers.
+    """
     before = set(psutil.Process().children(recursive=True))
     yield
     left = [process for process in psutil.Process().children(recursive=True) if process not in before]
+    workers = tuple(f"{process.pid} " for process in before)
+    left = [process for process in left if not _command(process).startswith(workers)]
     left = [process for process in left if "resource_tracker" not in _command(process)]
     _, alive = psutil.wait_procs(left, timeout=60)
     for process in alive:
@@ -90,8 +100,9 @@ def server_workers(pid: int) -> list[psutil.Process]:
 
 
 def _command(process: psutil.Process) -> str:
+    """The id of its parent, and its command line."""
     try:
-        return " ".join(process.cmdline())
+        return f"{process.ppid()} {' '.join(process.cmdline())}"
     except (psutil.NoSuchProcess, psutil.ZombieProcess):
         return ""
 
@@ -126,3 +137,13 @@ def epoch_of(
         compress=compress,
     )
     return list(dataset)
+
+
+def made_here(videos: Path, *epochs: int) -> list[Batch]:
+    """All batches of these epochs under SMALL, made in this process."""
+    dataset = V2VDataset(videos, recipe=SMALL, seed=3)
+    batches = []
+    for epoch in epochs:
+        dataset.set_epoch(epoch)
+        batches += DataLoader(dataset, batch_size=3, drop_last=True)
+    return batches

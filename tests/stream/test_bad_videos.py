@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
+from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, made_here
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import SampleUnavailable
@@ -21,9 +21,8 @@ def one_worker(clips_with_a_broken_one: Path) -> Iterator[LocalServer]:
 
 
 def test_the_next_candidate_is_served_and_marked(clips_with_a_broken_one: Path, one_worker: LocalServer) -> None:
-    with LocalServer(clips_with_a_broken_one, workers=2, flags=SMALL_FLAGS) as server:
-        batches = [batch for epoch in range(4) for batch in epoch_of(server.address, epoch=epoch)]
-    again = [batch for epoch in range(4) for batch in epoch_of(one_worker.address, epoch=epoch)]
+    batches = [batch for epoch in range(2) for batch in epoch_of(one_worker.address, epoch=epoch)]
+    again = made_here(clips_with_a_broken_one, 0, 1)
     refusals = [refusal for batch in batches for item in batch.provenance for refusal in item.refusals]
     assert refusals
     assert {refusal.video for refusal in refusals} == {"broken.mp4"}

@@ -10,13 +10,15 @@ import os
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
 
-from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_workers
+from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, made_here, server_workers
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
@@ -46,26 +48,43 @@ def open_files(pid: int) -> Counter[str]:
     return Counter(names)
 
 
-@pytest.mark.parametrize("flags", [(), ("--share-gib", "1"), ("--worker-bind", "tcp://127.0.0.1:*")])
-def test_a_worker_reads_files_and_nothing_else(
-    monkeypatch: pytest.MonkeyPatch, clips: Path, tmp_path: Path, flags: tuple[str, ...]
-) -> None:
-    home, report = tmp_path / "home", tmp_path / "report"
-    home.mkdir()
-    (home / "notes").write_bytes(b"before")
-    report.touch()
-    with subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"]) as other:
-        monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(ATTEMPTS), os.environ.get("PYTHONPATH")))))
-        monkeypatch.setenv("V2V_ATTEMPTS", json.dumps({"report": str(report), "home": str(home), "pid": other.pid}))
-        try:
-            with LocalServer(clips, workers=2, flags=[*SMALL_FLAGS, *flags]) as server:
-                assert len(epoch_of(server.address)) == 8
-                seen = totals(server.address)
-                assert len(server_workers(server.pid)) == 2
-        finally:
-            other.kill()
-    assert seen["in_slots"] == seen["samples"] > 0
-    lines = [json.loads(line) for line in report.read_text().splitlines()]
+@contextmanager
+def attempting(clips: Path, folder: Path, *flags: str) -> Iterator[tuple[LocalServer, Path]]:
+    """A server of one worker, and the folder with what its worker attempts."""
+    (folder / "notes").write_bytes(b"before")
+    (folder / "report").touch()
+    with subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"]) as other, ExitStack() as stack:
+        stack.callback(other.kill)
+        given = {"report": str(folder / "report"), "home": str(folder), "pid": other.pid}
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(ATTEMPTS), os.environ.get("PYTHONPATH")))))
+            patch.setenv("V2V_ATTEMPTS", json.dumps(given))
+            server = stack.enter_context(LocalServer(clips, workers=1, flags=[*SMALL_FLAGS, *flags]))
+        yield server, folder
+
+
+@pytest.fixture(scope="module")
+def alone(clips: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LocalServer, Path]]:
+    with attempting(clips, tmp_path_factory.mktemp("attempts")) as running:
+        yield running
+
+
+def test_a_worker_reads_files_and_nothing_else(alone: tuple[LocalServer, Path]) -> None:
+    require_confined(*alone)
+
+
+def test_nor_does_one_that_shares_samples_and_connects_by_tcp(clips: Path, tmp_path: Path) -> None:
+    with attempting(clips, tmp_path, "--share-gib", "1", "--worker-bind", "tcp://127.0.0.1:*") as running:
+        require_confined(*running)
+
+
+def require_confined(server: LocalServer, folder: Path) -> None:
+    earlier = totals(server.address)
+    assert len(epoch_of(server.address)) == 8
+    assert len(server_workers(server.pid)) == 1
+    later = totals(server.address)
+    assert later["in_slots"] - earlier["in_slots"] == later["samples"] - earlier["samples"] > 0
+    lines = [json.loads(line) for line in (folder / "report").read_text().splitlines()]
     assert lines
     for found in lines:
         assert found.pop("threads") == 1  # when the files were closed, so it holds for all later ones
@@ -73,46 +92,49 @@ def test_a_worker_reads_files_and_nothing_else(
         assert found.pop("in a thread") is True
         assert found.pop("read") == "done"
         assert [name for name, gave in found.items() if gave not in ("EPERM", "EACCES")] == []
-    assert (home / "notes").read_bytes() == b"before"
+    assert (folder / "notes").read_bytes() == b"before"
 
 
-def test_a_killed_workers_successor_gets_slots_and_a_consumer_that_leaves_no_memory(clips: Path) -> None:
-    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:
-        reference = [digest(batch) for batch in epoch_of(server.address)]
-        (worker,) = server_workers(server.pid)
-        before = open_files(server.pid)
-        worker.kill()
-        until(lambda: [each.pid for each in server_workers(server.pid)] not in ([], [worker.pid]))
-        earlier = totals(server.address)
-        assert [digest(batch) for batch in epoch_of(server.address)] == reference
-        later = totals(server.address)
-        assert later["in_slots"] - earlier["in_slots"] == later["samples"] - earlier["samples"] >= len(reference)
-        gc.collect()
-        until(lambda: open_files(server.pid)["/memfd"] == before["/memfd"])
-        (successor,) = server_workers(server.pid)
-        until(
-            lambda: (
-                not [
-                    each
-                    for process in (psutil.Process(server.pid), successor)
-                    for each in Path(f"/proc/{process.pid}/fd").iterdir()
-                    if "v2v-" in os.readlink(each) and "logbook" not in os.readlink(each)
-                ]
-            )
+def test_a_killed_workers_successor_gets_slots_and_a_consumer_that_leaves_no_memory(
+    clips: Path, alone: tuple[LocalServer, Path]
+) -> None:
+    server, _ = alone
+    reference = [digest(batch) for batch in made_here(clips, 0)]
+    assert [digest(batch) for batch in epoch_of(server.address)] == reference
+    (worker,) = server_workers(server.pid)
+    before = open_files(server.pid)
+    worker.kill()
+    until(lambda: [each.pid for each in server_workers(server.pid)] not in ([], [worker.pid]))
+    earlier = totals(server.address)
+    assert [digest(batch) for batch in epoch_of(server.address)] == reference
+    later = totals(server.address)
+    assert later["in_slots"] - earlier["in_slots"] == later["samples"] - earlier["samples"] >= len(reference)
+    gc.collect()
+    until(lambda: open_files(server.pid)["/memfd"] == before["/memfd"])
+    (successor,) = server_workers(server.pid)
+    until(
+        lambda: (
+            not [
+                each
+                for process in (psutil.Process(server.pid), successor)
+                for each in Path(f"/proc/{process.pid}/fd").iterdir()
+                if "v2v-" in os.readlink(each) and "logbook" not in os.readlink(each)
+            ]
         )
+    )
 
 
-def test_a_worker_outlasts_a_server_that_is_stopped(clips: Path) -> None:
+def test_a_worker_outlasts_a_server_that_is_stopped(alone: tuple[LocalServer, Path]) -> None:
     """It makes no other connection, so it must not give up this one."""
-    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:
-        iterator = iter(V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, timeout_seconds=120.0))
-        next(iterator)
-        (worker,) = server_workers(server.pid)
-        psutil.Process(server.pid).suspend()
-        try:
-            with pytest.raises(psutil.TimeoutExpired):
-                worker.wait(13.0)  # longer than the silence after which a worker elsewhere connects again
-        finally:
-            psutil.Process(server.pid).resume()
-        assert len(list(iterator)) == 7
-        assert [each.pid for each in server_workers(server.pid)] == [worker.pid]
+    server, _ = alone
+    iterator = iter(V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, timeout_seconds=120.0))
+    next(iterator)
+    (worker,) = server_workers(server.pid)
+    psutil.Process(server.pid).suspend()
+    try:
+        with pytest.raises(psutil.TimeoutExpired):
+            worker.wait(13.0)  # longer than the silence after which a worker elsewhere connects again
+    finally:
+        psutil.Process(server.pid).resume()
+    assert len(list(iterator)) == 7
+    assert [each.pid for each in server_workers(server.pid)] == [worker.pid]

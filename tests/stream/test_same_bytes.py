@@ -5,31 +5,29 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_workers
+from tests.stream.conftest import SMALL, digest, epoch_of, made_here, server_workers
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_tools.remake import remake
+from v2v_tools.simulate import main as simulate
 
 
 @pytest.fixture(scope="module")
 def reference(clips: Path) -> list[str]:
-    """Digests of the batches of two epochs, made by one worker."""
-    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as server:
-        return [digest(batch) for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
+    """Digests of the batches of two epochs, made without a server."""
+    return [digest(batch) for batch in made_here(clips, 0, 1)]
 
 
 @pytest.mark.parametrize(("shared", "compress"), [(True, False), (False, False), (False, True), (True, True)])
-def test_another_number_of_workers_and_the_way_samples_travel_change_nothing(
+def test_workers_and_the_way_samples_travel_change_nothing(
     server: LocalServer, reference: list[str], shared: bool, compress: bool
 ) -> None:
     got = [
@@ -65,25 +63,24 @@ def test_events_in_time_are_the_same_however_they_travel(server: LocalServer, cl
     assert batch.voxels.any()
 
 
-def test_a_killed_worker_changes_nothing(clips: Path, reference: list[str]) -> None:
-    with LocalServer(clips, workers=2, flags=SMALL_FLAGS) as server:
-        workers = server_workers(server.pid)
-        assert len(workers) == 2
-        got = []
-        for number, batch in enumerate(V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3)):
-            got.append(digest(batch))
-            if number < 2:
-                os.kill(workers[number].pid, signal.SIGKILL)
-        got += [digest(batch) for batch in epoch_of(server.address, epoch=1)]
+def test_a_killed_worker_changes_nothing(server: LocalServer, reference: list[str]) -> None:
+    workers = server_workers(server.pid)
+    assert len(workers) == 2
+    got = []
+    for number, batch in enumerate(V2VStreamDataset(server.address, batch_size=3, recipe=SMALL, seed=3)):
+        got.append(digest(batch))
+        if number < 2:
+            os.kill(workers[number].pid, signal.SIGKILL)
+    got += [digest(batch) for batch in epoch_of(server.address, epoch=1)]
     assert got == reference
 
 
 def test_v2v_simulate_makes_the_same_sample(clips: Path, server: LocalServer, tmp_path: Path) -> None:
     recipe = tmp_path / "small.yaml"
     recipe.write_text("preset: paper\nvoxels_per_clip: 4\ncrop_height_px: 32\n", encoding="utf-8")
-    command = [sys.executable, "-m", "v2v_tools.simulate", str(clips), "--recipe", str(recipe)]
-    command += ["--set", "crop_width_px=40", "--seed", "3", "--index", "7", "--out", str(tmp_path / "sample.npz")]
-    subprocess.run([*command, "--picture", str(tmp_path / "sample.png")], check=True, capture_output=True)
+    command = [str(clips), "--recipe", str(recipe), "--set", "crop_width_px=40", "--seed", "3", "--index", "7"]
+    command += ["--out", str(tmp_path / "sample.npz"), "--picture", str(tmp_path / "sample.png")]
+    assert simulate(command) == 0
     batch = epoch_of(server.address)[2]
     with np.load(tmp_path / "sample.npz") as sample:
         np.testing.assert_array_equal(sample["voxels"], batch.voxels[1].numpy())

@@ -115,7 +115,7 @@ def test_the_stream_is_what_is_remade_and_a_server_with_scenes_serves_both(scene
     flags = (*SMALL_FLAGS, "--set", "pause_probability=0", "--scene", "auto", "--no-shuffle")
     flags = (*flags, "--still-share", "1", "--moving-share", "0.5")
     spec = dataclasses.replace(AUTO, moving_share=0.5)
-    with LocalServer(scenes, workers=2, flags=flags) as server:
+    with LocalServer(scenes, workers=1, flags=flags) as server:
         stream = V2VStreamDataset(server.address, batch_size=4, arrays=ARRAYS, seed=3)
         count = 0
         for batch in stream:

@@ -6,9 +6,6 @@ import os
 import random
 import signal
 import socket
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -22,32 +19,26 @@ from v2v_protocol.messages import Denied, Ping, Pong, decode, encode
 from v2v_server.worker.process import LARGEST_MEMORY_BYTES
 
 
-@pytest.fixture
-def raw(server: LocalServer) -> Iterator[tuple[zmq.Socket[bytes], str]]:
-    """A bare socket on a running server, and its address."""
-    with zmq.Context() as context, context.socket(zmq.DEALER) as dealer:
-        dealer.setsockopt(zmq.LINGER, 0)
-        dealer.setsockopt(zmq.RCVTIMEO, 60_000)
-        dealer.connect(server.address)
-        yield dealer, server.address
-
-
 def _ask(dealer: zmq.Socket[bytes], *frames: bytes) -> object:
     dealer.send_multipart(frames)
     return decode(dealer.recv_multipart()[0])
 
 
-def test_garbage_on_the_port_does_not_disturb_other_peers(raw: tuple[zmq.Socket[bytes], str]) -> None:
-    dealer, address = raw
-    host, port = address.removeprefix("tcp://").split(":")
+def test_garbage_on_the_port_does_not_disturb_other_peers(server: LocalServer) -> None:
+    host, port = server.address.removeprefix("tcp://").split(":")
     with socket.create_connection((host, int(port))) as plain:
         plain.sendall(os.urandom(4096))
-    for frames in ([b""], [b"\xc1" * 50], [random.Random(0).randbytes(1000)], [b"a", b"b", b"c"], [encode(Pong())[0]]):
-        answer = _ask(dealer, *map(bytes, frames))
-        assert isinstance(answer, Denied)
-        assert answer.code == "malformed"
-    assert _ask(dealer, bytes(encode(Ping())[0])) == Pong()
-    assert len(epoch_of(address)) == 8
+    malformed = ([b""], [b"\xc1" * 50], [random.Random(0).randbytes(1000)], [b"a", b"b", b"c"], [encode(Pong())[0]])
+    with zmq.Context() as context, context.socket(zmq.DEALER) as dealer:
+        dealer.setsockopt(zmq.LINGER, 0)
+        dealer.setsockopt(zmq.RCVTIMEO, 60_000)
+        dealer.connect(server.address)
+        for frames in malformed:
+            answer = _ask(dealer, *map(bytes, frames))
+            assert isinstance(answer, Denied)
+            assert answer.code == "malformed"
+        assert _ask(dealer, bytes(encode(Ping())[0])) == Pong()
+    assert len(epoch_of(server.address)) == 8
 
 
 def test_every_worker_is_under_a_limit_of_memory(server: LocalServer) -> None:
@@ -57,42 +48,14 @@ def test_every_worker_is_under_a_limit_of_memory(server: LocalServer) -> None:
     until(lambda: limits() == {LARGEST_MEMORY_BYTES})
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_a_signal_stops_everything(clips: Path, tmp_path: Path, number: signal.Signals) -> None:
-    port_file = tmp_path / "port"
-    server = _start(clips, "--port-file", str(port_file), *SMALL_FLAGS)
-    try:
-        _wait_for(server, port_file)
-        address = port_file.read_text(encoding="utf-8").strip()
-        workers = server_workers(server.pid)
-        assert len(workers) == 2
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_everything(clips: Path, number: signal.Signals) -> None:
+    with LocalServer(clips, workers=1, flags=SMALL_FLAGS) as running:
+        server, workers = psutil.Process(running.pid), server_workers(running.pid)
+        assert len(workers) == 1
         server.send_signal(number)
-        assert server.wait(timeout=60) == (-number if number == signal.SIGKILL else 0)
-    finally:
-        _end(server)
-    assert not psutil.wait_procs(workers, timeout=60)[1]
-    assert port_file.exists() == (number == signal.SIGKILL)
-    with socket.socket() as probe:
-        host, port = address.removeprefix("tcp://").split(":")
-        assert probe.connect_ex((host, int(port))) != 0
-
-
-def _start(videos: Path, *flags: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "v2v_server", "--videos", str(videos), "--workers", "2"]
-    return subprocess.Popen(
-        [*command, "--bind", "tcp://127.0.0.1:*", *flags],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def _wait_for(server: subprocess.Popen[str], port_file: Path) -> None:
-    until(lambda: port_file.exists() or server.poll() is not None)
-    assert server.poll() is None, server.stderr.read() if server.stderr else ""
-
-
-def _end(server: subprocess.Popen[str]) -> None:
-    if server.poll() is None:
-        server.kill()
-    server.communicate(timeout=60)
+        assert server.wait(60) == 0
+        assert not psutil.wait_procs(workers, timeout=60)[1]
+        with socket.socket() as probe:
+            host, port = running.address.removeprefix("tcp://").split(":")
+            assert probe.connect_ex((host, int(port))) != 0

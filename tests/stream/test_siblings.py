@@ -35,8 +35,13 @@ def achieved(batches: list[Batch]) -> float:
     return sum(map(len, batches)) / sum(batch.decodes for batch in batches)
 
 
-def test_samples_are_those_that_are_made_alone(clips: Path, server: LocalServer) -> None:
-    batches = list(dataset(server.address))
+@pytest.fixture(scope="module")
+def batches(server: LocalServer) -> list[Batch]:
+    """Of one epoch."""
+    return list(dataset(server.address))
+
+
+def test_samples_are_those_that_are_made_alone(clips: Path, batches: list[Batch]) -> None:
     spec = StreamSpec(recipe=SMALL, samples_per_decode=VIEWS, sibling_spacing=BATCH)
     assert len(batches) == 25 // BATCH * VIEWS
     assert achieved(batches) > VIEWS - 1
@@ -49,8 +54,7 @@ def test_samples_are_those_that_are_made_alone(clips: Path, server: LocalServer)
             assert batch.provenance[row] == alone.provenance
 
 
-def test_no_batch_holds_two_of_a_sequence_and_their_cameras_differ(server: LocalServer) -> None:
-    batches = list(dataset(server.address))
+def test_no_batch_holds_two_of_a_sequence_and_their_cameras_differ(batches: list[Batch]) -> None:
     places = [{(item.video, item.start_frame) for item in batch.provenance} for batch in batches]
     assert all(len(each) == BATCH for each in places)
     assert places[0] == places[1] == places[2] != places[3]
@@ -58,13 +62,14 @@ def test_no_batch_holds_two_of_a_sequence_and_their_cameras_differ(server: Local
     assert len(cameras) == len(batches) * BATCH
 
 
-def test_a_stream_goes_on_with_a_smaller_batch_and_not_with_a_larger_one(server: LocalServer) -> None:
-    whole = list(dataset(server.address))
-    state = whole[2].resume_state
+def test_a_stream_goes_on_with_a_smaller_batch_and_not_with_a_larger_one(
+    server: LocalServer, batches: list[Batch]
+) -> None:
+    state = batches[2].resume_state
     smaller = dataset(server.address, batch_size=1)
     smaller.load_state_dict(state)
     rows = [batch.voxels[0].numpy() for batch in smaller]
-    np.testing.assert_array_equal(np.stack(rows), np.concatenate([batch.voxels.numpy() for batch in whole[3:]]))
+    np.testing.assert_array_equal(np.stack(rows), np.concatenate([batch.voxels.numpy() for batch in batches[3:]]))
     larger = dataset(server.address, batch_size=4)
     larger.load_state_dict(state)
     with pytest.raises(UsageError, match="sibling_spacing = 3: samples of one decode would come in one global batch"):

@@ -64,6 +64,8 @@ def test_every_line_of_a_run_is_an_object(tmp_path: Path) -> None:
         until((tmp_path / "port").exists)
         server.terminate()
         lines = server.communicate()[0].splitlines()
+    assert server.returncode == 0
+    assert not (tmp_path / "port").exists()
     texts = [json.loads(line)["text"] for line in lines]
     for said in ("have endings", "short.mp4: 5 frames", "damaged.mp4: ", "page: http", "ready: ", "the end"):
         assert [text for text in texts if said in text], said

@@ -8,13 +8,12 @@ import os
 import re
 import shutil
 from contextlib import closing, suppress
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from tests.clips import damaged, panned_luma, write_clip
 from tests.oracles.decoded import decode_luma
@@ -129,14 +128,13 @@ def two(source: Path, tmp_path: Path) -> Path:
     return tmp_path / "source"
 
 
-@pytest.mark.parametrize("crash", [0, 2])
-def test_a_video_that_cannot_be_written_fails_alone(two: Path, tmp_path: Path, crash: int) -> None:
+def test_a_video_that_cannot_be_written_fails_alone(two: Path, tmp_path: Path) -> None:
     """Where the file should be, there is a folder."""
     run(two, tmp_path / "out")
     (tmp_path / "out" / "x.mp4").unlink()
     (tmp_path / "out" / "x.mp4").mkdir()
     (tmp_path / "out" / "x.mp4" / "in the way").touch()
-    report = run(two, tmp_path / "out", processes=crash)
+    report = run(two, tmp_path / "out")
     assert [video.id for video in report.failed] == ["x.mp4"]
     assert [video.id for video in report.prepared] == ["y.mp4"]
 
@@ -277,19 +275,13 @@ def test_a_manifest_that_makes_no_sense(prepared: tuple[Path, Report], tmp_path:
         (tmp_path / MANIFEST_NAME).write_text(text)
         with pytest.raises(CorpusError, match=complaint):
             read_manifest(tmp_path)
-    fields = st.sampled_from([*json.loads(header), *video])
-    values = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.lists(st.integers()) | st.just({})
-
-    @given(st.integers(1, 2), fields, values)
-    @settings(max_examples=300, suppress_health_check=[HealthCheck.differing_executors])
-    def any_value_is_taken_or_refused_in_words(line: int, field: str, value: object) -> None:
+    values = (None, True, 0, -1, 1 << 70, 0.5, float("nan"), float("inf"), "", "\0\ud800/..", [], [1], {})
+    for line, field, value in product((0, 1), json.loads(header) | video, values):
         written = [json.loads(header), dict(video)]
-        written[line - 1][field] = value
+        written[line][field] = value
         (tmp_path / MANIFEST_NAME).write_text("".join(json.dumps(each) + "\n" for each in written))
-        with suppress(CorpusError):
+        with suppress(CorpusError):  # any value is taken or refused in words
             read_manifest(tmp_path)
-
-    any_value_is_taken_or_refused_in_words()
     (tmp_path / MANIFEST_NAME).write_text(f"{header}\n{lines[0]}\n{lines[1][:20]}")
     assert list(read_manifest(tmp_path).videos) == [video["id"]]
 

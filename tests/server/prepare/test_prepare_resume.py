@@ -20,7 +20,7 @@ import numpy as np
 import psutil
 import pytest
 
-from tests.clips import damaged, panned_luma, write_clip
+from tests.clips import damaged, panned_luma, write_clip, write_panned
 from tests.server.prepare.test_prepare import opened, run, stored_whole, whole
 from tests.server.prepare.test_prepare_isolate import children
 from tests.waiting import until
@@ -36,12 +36,17 @@ from v2v_server.video.fingerprint import fingerprint
 _KILLED_SECONDS = 60.0
 
 
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_panned(tmp_path_factory.mktemp("clips"), 4, 24)
+    write_clip(folder / "sub" / "4.mp4", panned_luma(30))
+    return folder
+
+
 @pytest.fixture
-def source(tmp_path: Path) -> Path:
-    for number in range(4):
-        write_clip(tmp_path / "source" / f"{number}.mp4", panned_luma(24, step=(1, number)))
-    write_clip(tmp_path / "source" / "sub" / "4.mp4", panned_luma(30))
-    return tmp_path / "source"
+def source(clips: Path, tmp_path: Path) -> Path:
+    """Five clips that a test may change."""
+    return Path(shutil.copytree(clips, tmp_path / "source"))
 
 
 @pytest.fixture

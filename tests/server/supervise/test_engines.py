@@ -43,17 +43,16 @@ def test_half_a_label_is_none(label: str) -> None:
     assert ServeConfig(**RAY | {"ray_label": "corpus=clips"}).ray_labels == {"corpus": "clips"}
 
 
-def test_a_server_whose_workers_are_here_loads_no_ray() -> None:
-    program = "import sys, v2v_server.serve\nsys.exit('ray' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
-
-
-def test_where_no_cluster_is_it_says_what_to_start(unused_port: int) -> None:
+def test_ray_is_loaded_by_its_host_only_which_says_what_to_start_where_no_cluster_is(unused_port: int) -> None:
     pytest.importorskip("ray", reason="the extra 'ray' is not installed")
     # In a process of its own: importing Ray changes warnings, signal handlers and more.
     address = f"127.0.0.1:{unused_port}"
-    program = f"from v2v_server.supervise.ray_host import RayHost\nRayHost('videos', 'w', address='{address}')"
+    program = (
+        "import sys, v2v_server.serve\nprint('ray' in sys.modules)\n"
+        f"from v2v_server.supervise.ray_host import RayHost\nRayHost('videos', 'w', address='{address}')"
+    )
     done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True)
+    assert done.stdout == "False\n"
     assert f"UsageError: --ray-address {address}: " in done.stderr
     assert "ray start --head" in done.stderr
 

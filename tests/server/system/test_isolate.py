@@ -76,7 +76,7 @@ def half(number: int) -> float | None:
 
 
 def test_nothing_is_a_result_too_and_a_whole_number_a_float_where_one_is_meant() -> None:
-    found = dict(run_isolated(half, range(4), 2, lambda job: 60.0))
+    found = dict(run_isolated(half, range(4), 1, lambda job: 60.0))
     assert found == {0: 0.0, 1: None, 2: 1.0, 3: None}
     assert (type(found[0]), type(found[2])) == (float, float)
 
