@@ -327,7 +327,8 @@ class Interleaving(RuleBasedStateMachine):
 
 
 TestInterleaving = Interleaving.TestCase
-TestInterleaving.settings = settings(max_examples=60, stateful_step_count=50, deadline=None)
+# Few: the long walks below take the same rules much further. These explain a failure by its shortest example.
+TestInterleaving.settings = settings(max_examples=25, stateful_step_count=50, deadline=None)
 
 
 class OfSiblings(Interleaving):
@@ -337,7 +338,7 @@ class OfSiblings(Interleaving):
 
 
 TestInterleavingOfSiblings = OfSiblings.TestCase
-TestInterleavingOfSiblings.settings = settings(max_examples=40, stateful_step_count=50, deadline=None)
+TestInterleavingOfSiblings.settings = settings(max_examples=20, stateful_step_count=50, deadline=None)
 
 
 class WithSlots(Interleaving):
@@ -433,7 +434,7 @@ class WithSlots(Interleaving):
 
 
 TestInterleavingWithSlots = WithSlots.TestCase
-TestInterleavingWithSlots.settings = settings(max_examples=60, stateful_step_count=50, deadline=None)
+TestInterleavingWithSlots.settings = settings(max_examples=30, stateful_step_count=50, deadline=None)
 
 
 # --- long walks -------------------------------------------------------------------------------------------------------
