@@ -524,7 +524,9 @@ def test_pictures_of_a_track_that_begins_late(small_first: bool, tmp_path: Path)
     """A broadcast changes the number (PID) of its track: a demuxer does not see the second one."""
     parts = []
     for number, (frames, pid) in enumerate([(20, 256), (45, 512)][:: 1 if small_first else -1]):
-        plain = write_clip(tmp_path / f"{number}.mp4", panned_luma(frames, 240, 320), options={"crf": "4", "preset": "ultrafast"})
+        plain = write_clip(
+            tmp_path / f"{number}.mp4", panned_luma(frames, 240, 320), options={"crf": "4", "preset": "ultrafast"}
+        )
         parts.append(remuxed(plain, tmp_path / f"{number}.ts", mpegts_start_pid=str(pid)).read_bytes())
     path = tmp_path / "changes.ts"
     path.write_bytes(b"".join(parts))
