@@ -32,7 +32,7 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def catalogue(corpus: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Catalogue]:
-    taken_in = open_catalogue(corpus, cache_dir=tmp_path_factory.mktemp("cache"))
+    taken_in = open_catalogue(corpus, cache_dir=tmp_path_factory.mktemp("cache"), processes=0)
     yield taken_in
     taken_in.close()
 
