@@ -304,7 +304,7 @@ class AnyOrder(RuleBasedStateMachine):
 
 
 TestAnyOrder = AnyOrder.TestCase
-TestAnyOrder.settings = settings(max_examples=40, stateful_step_count=50, deadline=None)
+TestAnyOrder.settings = settings(max_examples=25, stateful_step_count=50, deadline=None)
 
 
 def walk(seed: int) -> Counter[str]:

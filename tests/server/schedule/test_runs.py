@@ -35,7 +35,7 @@ def video(name: str, frames: int, parts: Pieces | None = None) -> VideoEntry:
 
 
 def starts(table: SequenceTable) -> list[tuple[str, int]]:
-    return [(table[rank].video.id, table[rank].start_frame) for rank in range(table.count)]
+    return [(found.video.id, found.start_frame) for found in map(table.__getitem__, range(table.count))]
 
 
 def expected(parts: Pieces, frames: int, spec: StreamSpec) -> list[int]:

@@ -36,9 +36,8 @@ SPEC = StreamSpec(recipe=Recipe(voxels_per_clip=4, bins=5, crop_height_px=24, cr
 
 
 @pytest.fixture(autouse=True)
-def small_pieces(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("v2v_server.store.cache.piece_frames", lambda rows, width_px: 16)
-    monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path / "index"))
 
 
 @pytest.fixture(scope="module")

@@ -121,7 +121,7 @@ def test_the_whole_clip_is_the_independent_reference(clip: Clip) -> None:
     assert whole.bit_exact == by_standard
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_cuts_of_one_pass_equal_sequential_decoding(clip: Clip, data: st.DataObject) -> None:
     start, stride = data.draw(st.integers(0, FRAMES - 1)), data.draw(st.integers(1, 4))
