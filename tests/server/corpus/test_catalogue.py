@@ -373,9 +373,6 @@ def test_a_file_that_kills_its_reader_costs_only_itself(corpus: Path) -> None:
 def test_a_file_is_not_blamed_for_a_process_killed_from_outside(corpus: Path) -> None:
     (record,) = probe_files(Folder(corpus), ["a.mp4"], 1, killed_once)
     assert (record.id, record.problem) == ("a.mp4", None)
-
-
-def test_a_file_is_not_condemned_for_what_an_installation_did(corpus: Path) -> None:
     (record,) = probe_files(Folder(corpus), ["a.mp4"], 1, always_killed)
     assert "twice (signal SIGKILL), which says nothing of the file" in (record.problem or "")
     assert record.size_bytes == -1  # which no file has: the next start tries again

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from tests.pieces import pieces, shots
@@ -128,6 +128,7 @@ def test_a_share_of_the_quiet_sequences_is_served(share: float) -> None:
     assert abs(np.count_nonzero(found < 16_000) - share * 800) <= 50
 
 
+@settings(max_examples=50)
 @given(divided(), st.floats(0, 1), st.floats(0, 1))
 def test_shares_are_nested(parts: Pieces, one: float, other: float) -> None:
     """A larger share serves all sequences of a smaller one, as far as max_sequences_per_video reaches."""
