@@ -430,7 +430,7 @@ class WithSlots(Interleaving):
 
 
 TestInterleavingWithSlots = WithSlots.TestCase
-TestInterleavingWithSlots.settings = settings(max_examples=30, stateful_step_count=50, deadline=None)
+TestInterleavingWithSlots.settings = settings(max_examples=40, stateful_step_count=50, deadline=None)
 
 
 # --- long walks -------------------------------------------------------------------------------------------------------

@@ -62,7 +62,7 @@ def test_an_empty_domain_is_refused() -> None:
         Permutation(0, 0, 0)
 
 
-@pytest.mark.parametrize("n", [7, 40, 100])
+@pytest.mark.parametrize("n", [7, 40])
 @pytest.mark.parametrize("index", [0, 1, 6])
 def test_every_place_is_equally_likely(n: int, index: int) -> None:
     draws = 60 * n

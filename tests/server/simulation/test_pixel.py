@@ -144,12 +144,11 @@ def test_saturation_in_some_blocks_equals_the_definition(
     dtype: Any, limit: Any, gamma: Any, greys: Any, frames_per_bin: Any, precision: Any
 ) -> None:
     """Counts of -1, 0, 1 and 2 beyond the limit, up and down; in the second of three blocks and the narrow last one."""
-    width, steps = 2 * pixel.PIXELS_A_BLOCK + 21, 4 * frames_per_bin
+    block, width, steps = pixel.PIXELS_A_BLOCK, 2 * pixel.PIXELS_A_BLOCK + 21, 4 * frames_per_bin
     table = (log_table if precision == "float32" else log_table_float64)(gamma, 1e-3)
     threshold = float(np.ptp(table)) / (limit + 3)
     frames = np.zeros((steps + 1, 1, width), np.uint8)
-    places = [width - 1, pixel.PIXELS_A_BLOCK, pixel.PIXELS_A_BLOCK + 17, width - 6]
-    frames[frames_per_bin : 3 * frames_per_bin, 0, places] = greys
+    frames[frames_per_bin : 3 * frames_per_bin, 0, [width - 1, block, block + 17, width - 6]] = greys
     got = simulate(
         frames, threshold_pos=threshold, bins=2, frames_per_bin=frames_per_bin, seed=1, dtype=dtype,
         precision=precision, gamma=gamma,
@@ -162,7 +161,7 @@ def test_saturation_in_some_blocks_equals_the_definition(
     np.testing.assert_array_equal(got.voxels.reshape(expected.shape), expected)
     assert got.saturated_bins == saturated > 0
     assert (expected.max(), expected.min()) == (limit, -limit)
-    assert np.abs(expected[:, : pixel.PIXELS_A_BLOCK]).max() < limit
+    assert np.abs(expected[:, :block]).max() < limit
 
 
 GOLDEN = {
