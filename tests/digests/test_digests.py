@@ -29,7 +29,10 @@ SAME_BYTES = {"on_bad_video"}
 @pytest.fixture(scope="module")
 def ways(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ways]:
     opened = Ways(tmp_path_factory.mktemp("digests"))
-    yield opened
+    with pytest.MonkeyPatch.context() as patch:
+        # Several pieces of the cache for most samples, and none of a whole video.
+        patch.setattr("v2v_server.store.cache.piece_frames", lambda rows, width_px: 16)
+        yield opened
     opened.close()
 
 

@@ -149,7 +149,7 @@ def exact_multiples() -> Finding:
         if height < 6.9:
             offsets = np.linspace(-6.9, -height, 200)
             ramp = offsets + height * np.arange(steps + 1)[:, None] / steps
-            got = simulate_log(ramp[:, None], threshold_pos=threshold, start_residual=0.0, bins=steps, dtype="int16")
+            got = simulate_log(ramp[:, None], threshold_pos=threshold, start_residual=0.0, bins=steps, dtype="float32")
             wrong += int(np.count_nonzero(got.voxels.sum(axis=(0, 1)) != count))
             tried += offsets.size
     return Finding(wrong, 0.0, "float32", f"{tried} ramps")
@@ -248,18 +248,22 @@ def denormals() -> Finding:
     return balanced(Camera(0.05, 0.06, noise_sigma=1e-310, hot_pixel_count=2, hot_pixel_sigma=1e-40), tiny)
 
 
-def dtype_limits() -> Finding:
+def dtype_limits(precision: str, **limits: float) -> Finding:
     """Count bins that are neither exact nor clipped to the limit of their type and counted."""
-    wrong = 0
-    for dtype, limit in (("int8", 127), ("int16", 32767), ("float32", math.inf)):
-        for height in (0.5, 126.5, 127.5, 128.5, 255.5, 256.5, 32766.5, 32767.5, 32768.5, 65536.5, 1e6 + 0.5):
-            level = np.array([0.0, height, 0.0, -height, 0.0])[:, None, None]
-            got = simulate_log(level, threshold_pos=1.0, bins=4, start_residual=0.0, dtype=dtype)
+    wrong, contrast = 0, float(np.ptp(log_table_float64(2.2, 1e-3)))
+    frames = np.array([0, 255, 0, 255, 0], np.uint8)[:, None, None]
+    largest = 65536.5 if precision == "float32" else 1e6 + 0.5
+    for dtype, limit in limits.items():
+        for height in (0.5, 126.5, 127.5, 128.5, 255.5, 256.5, 32766.5, 32767.5, 32768.5, largest):
+            threshold = contrast / height
+            # A quarter of a threshold is left above each whole number of them, up and down.
+            got = simulate(
+                frames, threshold_pos=threshold, bins=4, start_residual=-threshold / 4, dtype=dtype, precision=precision
+            )
             whole = math.floor(height)
-            expected = np.clip([whole, -whole, -whole, whole], -limit, limit)
-            # What is left of a step, half a threshold, makes the way back to zero one event the less.
+            expected = np.clip([whole, -whole, whole, -whole], -limit, limit)
             wrong += int((got.voxels.ravel() != expected).sum()) + (got.saturated_bins != 4 * (whole > limit))
-    return Finding(wrong, 0.0)
+    return Finding(wrong, 0.0, precision)
 
 
 def seeds() -> Finding:
@@ -346,7 +350,10 @@ def divided_rows() -> list[Row]:
         return Finding(*in_time.excess_along_motion(px))
 
     quantity = "more than a threshold left, log units"
-    made = [Row(name, "counted", quantity, partial(check, setting)) for name, setting in asked.items()]
+    made = [  # slow: in float64, another compiled kernel
+        Row(name, "counted", quantity, partial(check, setting), slow=setting[0] < 1e-3)
+        for name, setting in asked.items()
+    ]
     for px in (0.0, 500.0, -2048.0):  # the last is the largest that is stored
         name = f"motion of {px:g} px a frame"
         made.append(Row(name, "counted", quantity, partial(check_motion, px)))
@@ -399,7 +406,11 @@ def rows() -> list[Row]:
         Row("NaN and infinity", "refused", "calls not refused", not_numbers),
         Row("NaN and infinity in a recipe", "refused", "calls not refused", not_numbers_in_a_recipe),
         Row("denormal numbers", "counted", error, denormals),
-        Row("limits of int8, int16, float32", "counted", wrong, dtype_limits),
+        Row("limits of int8, int16, float32", "counted", wrong,
+            lambda: dtype_limits("float32", int8=127, int16=32767, float32=math.inf)),
+        Row("limit of float32 in float64", "counted", wrong, lambda: dtype_limits("float64", float32=math.inf)),
+        Row("limits of int8 and int16 in float64", "counted", wrong,
+            lambda: dtype_limits("float64", int8=127, int16=32767), slow=True),  # other compiled kernels
         Row("seeds 0 and 2^64 - 1", "counted", "violations", seeds),
         Row("correlation of noise", "counted", "standard errors", noise_correlation),
         Row("more than float64 can count", "refused", "calls not refused", beyond_float64),

@@ -35,7 +35,7 @@ def test_a_still_scene_has_the_rates_of_the_equations() -> None:
 
 @pytest.mark.parametrize("ignores", [False, True], ids=["obeys", "ignores"])
 def test_a_steady_ramp_fires_by_threshold_and_refractory_period(ignores: bool) -> None:
-    side, threshold, period, hz = 24, 0.05, 2e-3, 6.0
+    side, threshold, period, hz = 16, 0.05, 2e-3, 6.0
     light = np.exp(np.linspace(-3.0, -0.5, 241))
     film = Film(np.broadcast_to(light[:, None, None] ** (1 / 2.2), (241, side, side)), 240)
     quiet = TrueCamera(threshold, 0.2, refractory_seconds=period, log_eps=1e-9)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -32,16 +32,13 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def catalogue(corpus: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Catalogue]:
-    taken_in = open_catalogue(corpus, cache_dir=tmp_path_factory.mktemp("cache"))
+    taken_in = open_catalogue(corpus, cache_dir=tmp_path_factory.mktemp("cache"), processes=0)
     yield taken_in
     taken_in.close()
 
 
-Flip = Callable[[int, np.ndarray], None]
-
-
-def lines(catalogue: Catalogue, asked: Profile, flip: Flip = lambda index, voxels: None) -> list[Line]:
-    """Return a log without faults; ``flip`` may change the bytes of a sample before they are logged."""
+def lines(catalogue: Catalogue, asked: Profile, flipped: int = -1) -> list[Line]:
+    """Return a log without faults, apart from a byte of the sample ``flipped``."""
     found: list[Line] = [LifeLine(0, 0.0)]
     for number in range(BATCHES):
         epoch, place = divmod(number, 11 // asked.batch_size)
@@ -49,7 +46,8 @@ def lines(catalogue: Catalogue, asked: Profile, flip: Flip = lambda index, voxel
         for index in range(place * asked.batch_size, (place + 1) * asked.batch_size):
             made = remake(catalogue, asked.stream_spec, seed=asked.seed, epoch=epoch, index=index)
             arrays = {name: np.array(array) for name, array in made.arrays.items()}
-            flip(index, arrays["voxels"])
+            if index == flipped:
+                arrays["voxels"].view(np.uint8).reshape(-1)[1234] ^= 1
             samples.append(sighting(arrays, made.provenance))
         found.append(BatchLine(number, epoch, float(number), 0.0, tuple(samples)))
     return found
@@ -85,11 +83,7 @@ def test_an_honest_log_passes(catalogue: Catalogue, honest: list[Line]) -> None:
 
 
 def test_a_planted_flipped_byte_is_caught(catalogue: Catalogue) -> None:
-    def flip(index: int, voxels: np.ndarray) -> None:
-        if index == 6:
-            voxels.view(np.uint8).reshape(-1)[1234] ^= 1
-
-    flipped = [line for line in lines(catalogue, ASKED, flip) if not isinstance(line, BatchLine) or line.epoch == 0]
+    flipped = [line for line in lines(catalogue, ASKED, 6) if not isinstance(line, BatchLine) or line.epoch == 0]
     assert faults(verdict(catalogue, (ASKED, flipped))) == (0, 0, 1)
 
 

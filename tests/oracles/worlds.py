@@ -9,6 +9,7 @@ prints how far the events of a moving pattern are from its exact crossings.
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +38,7 @@ class Oracle:
 
     def __init__(self, world: World, grey: npt.NDArray[np.unsignedinteger]) -> None:
         self.world, self.size = world, grey.shape[::-1]
+        self._pose = cache(self._pose_at)
         self.levels = [np.floor(grey * (4095 / np.iinfo(grey.dtype).max) + 0.5)]
         while min(self.levels[-1].shape) > 2:
             level = np.pad(self.levels[-1], [(0, side % 2) for side in self.levels[-1].shape], "edge")
@@ -66,7 +68,7 @@ class Oracle:
         share = 1.0 - np.tensordot(tilt, e, 1)
         return np.where(share > 0.0, e / share, np.nan) + middle
 
-    def _pose(self, seconds: float, number: int) -> tuple[Reals, Reals, Reals, Reals, Reals]:
+    def _pose_at(self, seconds: float, number: int) -> tuple[Reals, Reals, Reals, Reals, Reals]:
         """Return o, z R / scale, the shake, the tilt and c, each with axes to broadcast."""
         world, layer = self.world, self.world.layers[number]
         top, left, height, width = world.crop

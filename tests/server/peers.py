@@ -6,6 +6,7 @@ import json
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 from tests.server.named_corpus import SMALL_SPEC, corpus, video
@@ -56,9 +57,15 @@ def sample_frames(epoch: int, index: int, seed: int = 0) -> list[Buffer]:
     return frames_of(array_layout(SMALL_SPEC.recipe, "int8", ("voxels",)), epoch, index, seed)
 
 
+@cache
+def spec_of(encoded: bytes) -> StreamSpec:
+    """Decode a spec; a test repeats few of them often."""
+    return StreamSpec.from_dict(json.loads(encoded))
+
+
 def answer_to(lease: Lease, *, in_slot: bool = False, cpu_seconds: float = 0.1, decoded: bool = True) -> list[Buffer]:
     """What an honest worker sends behind its Result."""
-    spec = StreamSpec.from_dict(json.loads(lease.spec))
+    spec = spec_of(lease.spec)
     layout = array_layout(spec.recipe, spec.voxel_dtype, lease.arrays)
     frames = frames_of(
         layout, lease.epoch, lease.indices[0], lease.seed, lease.slot, cpu_seconds, lease.quarantine, decoded

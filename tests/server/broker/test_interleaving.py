@@ -326,18 +326,15 @@ class Interleaving(RuleBasedStateMachine):
         assert set(self.at.dispatcher.leases.durations) <= set(self.owed)
 
 
-TestInterleaving = Interleaving.TestCase
-TestInterleaving.settings = settings(max_examples=60, stateful_step_count=50, deadline=None)
-
-
 class OfSiblings(Interleaving):
     """The same with two samples of each decode, neighbours but one."""
 
     spec = {"samples_per_decode": 2, "sibling_spacing": 2}  # noqa: RUF012
 
 
+# Few: the long walks below take the same rules much further. These explain a failure by its shortest example.
 TestInterleavingOfSiblings = OfSiblings.TestCase
-TestInterleavingOfSiblings.settings = settings(max_examples=40, stateful_step_count=50, deadline=None)
+TestInterleavingOfSiblings.settings = settings(max_examples=20, stateful_step_count=50, deadline=None)
 
 
 class WithSlots(Interleaving):
@@ -433,7 +430,7 @@ class WithSlots(Interleaving):
 
 
 TestInterleavingWithSlots = WithSlots.TestCase
-TestInterleavingWithSlots.settings = settings(max_examples=60, stateful_step_count=50, deadline=None)
+TestInterleavingWithSlots.settings = settings(max_examples=40, stateful_step_count=50, deadline=None)
 
 
 # --- long walks -------------------------------------------------------------------------------------------------------

@@ -175,7 +175,7 @@ class Sharing(WithSlots):
 
 
 TestInterleavingOfSharing = Sharing.TestCase
-TestInterleavingOfSharing.settings = settings(max_examples=30, stateful_step_count=40, deadline=None)
+TestInterleavingOfSharing.settings = settings(max_examples=20, stateful_step_count=40, deadline=None)
 
 
 def test_long_walks_with_sharing_keep_the_promise() -> None:

@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.server.named_corpus import corpus, video
@@ -54,6 +54,7 @@ def test_siblings_come_in_different_batches_of_one_consumer_within_k_of_its_batc
         assert numbers == list(range(numbers[0], numbers[0] + views))
 
 
+@settings(max_examples=50)  # views and spacing are 48 cases
 @given(views=st.integers(1, 4), spacing=st.integers(1, 12), seed=st.integers(0, 2**64 - 1), epoch=st.integers(0, 9))
 def test_every_sequence_that_is_not_dropped_comes_once_for_each_view(
     views: int, spacing: int, seed: int, epoch: int

@@ -272,7 +272,7 @@ cameras = st.builds(
 )  # fmt: skip
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(camera=cameras, margin=st.sampled_from([None, 0, 7, 500]), backward=st.booleans())
 def test_flow_lies_on_the_pixels_of_the_view(
     camera: tuple[Recipe, SampleParams], margin: int | None, backward: bool

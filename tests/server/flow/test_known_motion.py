@@ -4,17 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pytest
 
-from tests.oracles.known_motion import Scene, photograph, scenes
+from tests.oracles.known_motion import photograph, scenes
 from v2v_server.flow import consistent
-
-TEXTURES = {name: photograph(name) for name in ("coffee", "camera", "chelsea")}
-
-
-@pytest.fixture(scope="module")
-def made() -> list[Scene]:
-    return scenes(TEXTURES, 100, 160)
 
 
 def brought(picture: np.ndarray, field: np.ndarray) -> np.ndarray:
@@ -23,8 +15,8 @@ def brought(picture: np.ndarray, field: np.ndarray) -> np.ndarray:
     return cv2.remap(picture, x + field[..., 0], y + field[..., 1], cv2.INTER_CUBIC)
 
 
-def test_following_the_flow_finds_the_same_picture(made: list[Scene]) -> None:
-    for scene in made:
+def test_following_the_flow_finds_the_same_picture() -> None:
+    for scene in scenes({"coffee": photograph("coffee")}, 100, 160):
         seen = consistent(scene.forward, scene.backward) & ~scene.boundary
         assert seen.mean() > 0.4, scene.name
         for field, source, target in (

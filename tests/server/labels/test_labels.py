@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -73,6 +73,7 @@ def read(ending: str, path: Path) -> BoxTable:
     return READERS[ending](path, PICTURE_PX)
 
 
+@settings(max_examples=50)
 @given(boxes=st.lists(box, max_size=12))
 def test_all_formats_give_the_same_boxes(tmp_path_factory: pytest.TempPathFactory, boxes: Boxes) -> None:
     folder = tmp_path_factory.mktemp("labels")

@@ -25,7 +25,7 @@ def chi_square(counts: np.ndarray) -> float:
     return float((((counts - expected) ** 2 / expected).sum() - freedom) / np.sqrt(2 * freedom))
 
 
-@given(st.integers(1, 2000) | st.sampled_from((255, 256, 257, 1023, 1024, 1025, 4096, 4097)), seeds, epochs)
+@given(st.integers(1, 500) | st.sampled_from((255, 256, 257, 1023, 1024, 1025, 4096, 4097)), seeds, epochs)
 @settings(max_examples=60)
 def test_bijection(n: int, seed: int, epoch: int) -> None:
     assert sorted(order(n, seed, epoch)) == list(range(n))
@@ -62,7 +62,7 @@ def test_an_empty_domain_is_refused() -> None:
         Permutation(0, 0, 0)
 
 
-@pytest.mark.parametrize("n", [7, 40, 100])
+@pytest.mark.parametrize("n", [7, 40])
 @pytest.mark.parametrize("index", [0, 1, 6])
 def test_every_place_is_equally_likely(n: int, index: int) -> None:
     draws = 60 * n

@@ -18,8 +18,9 @@ from tests.oracles import noise
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.recipe import PRESETS, STARTS, Recipe, preset
 from v2v_protocol.sample import SampleParams
-from v2v_server.simulation.clip import simulate, simulate_log
+from v2v_server.simulation.clip import simulate
 from v2v_server.simulation.draw import admits, draw, noise_key_of_seed, resized_size, smallest_scale
+from v2v_server.simulation.intensity import log_table_float64
 
 PAPER = Recipe()
 
@@ -250,7 +251,7 @@ def test_draw_needs_no_compiler() -> None:
 # --- where the residual of a pixel starts -----------------------------------------------------------------------------
 
 POSITIVE, NEGATIVE = 0.3, 0.2
-STEP = 1e-3
+ROUNDING = 2e-5
 Reals = npt.NDArray[np.float64]
 
 
@@ -268,19 +269,22 @@ def residuals(law: str, uniform: Reals) -> Reals:
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("law", STARTS)
 def test_both_kernels_start_where_the_law_says(law: str, precision: str) -> None:
+    """All grey levels, one by one: the first event puts the start between two levels below the threshold."""
     pixels = 700  # more than a block
-    ramp = np.arange(501.0)[:, None, None] * STEP * np.ones((1, 1, pixels))
-    made = simulate_log(
+    ramp = np.arange(256, dtype=np.uint8)[:, None, None] * np.ones((1, 1, pixels), np.uint8)
+    made = simulate(
         ramp, threshold_pos=POSITIVE, threshold_neg=NEGATIVE, bins=1, seed=5, precision=precision, start=law,
-        dtype="float32",
+        dtype="float32", gamma=1.0, log_eps=1.0,
     )  # fmt: skip
     expected = residuals(law, noise.start_uniforms(noise_key_of_seed(5), pixels).astype(np.float64))
+    risen = log_table_float64(1.0, 1.0) - log_table_float64(1.0, 1.0)[0]
     # The general kernel computes the law by the same functions in float64, in one more compiled form.
     general = [made.array("event_counts")[:, 1, 0, 0]] if precision == "float32" else []
     for rising in (made.voxels[:, 0, 0], *general):
         assert (rising > 0).any(axis=0).all()
-        found = POSITIVE - STEP * (np.argmax(rising > 0, axis=0) + 1)
-        assert np.abs(found - expected + STEP / 2).max() < 0.52 * STEP
+        first = np.argmax(rising > 0, axis=0)
+        assert (expected < POSITIVE - risen[first] + ROUNDING).all()
+        assert (expected >= POSITIVE - risen[first + 1] - ROUNDING).all()
 
 
 @pytest.mark.parametrize("law", STARTS)

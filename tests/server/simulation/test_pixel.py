@@ -21,9 +21,9 @@ from tests.server.simulation import oracle, reference
 from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_server.simulation import pixel, simulate_clip, simulate_log
+from v2v_server.simulation import pixel, simulate, simulate_clip, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
-from v2v_server.simulation.intensity import log_table
+from v2v_server.simulation.intensity import log_table, log_table_float64
 from v2v_server.simulation.pixel import hot_pixels
 from v2v_server.simulation.voxel import rounding_tolerance
 
@@ -116,7 +116,8 @@ def test_look_up_is_indexing_and_writes_nothing_else(real: Any) -> None:
         assert np.isnan(levels[width:]).all()
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+# Float64 is other kernels to compile, here and below.
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("height", "width"), [(16, 32), (31, 33), (1, 1), (1, 513), (1, 1025), (32, 48)])
 def test_log_frames_of_any_size_and_precision_equal_the_definition(precision: Any, height: Any, width: Any) -> None:
     steps = 15
@@ -133,31 +134,34 @@ def test_log_frames_of_any_size_and_precision_equal_the_definition(precision: An
     np.testing.assert_array_equal(got.voxels.reshape(steps, -1), expected)
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("frames_per_bin", [1, 3])
-@pytest.mark.parametrize(("dtype", "limit"), [("int8", 127), ("int16", 32767)])
+@pytest.mark.parametrize(
+    ("dtype", "limit", "gamma", "greys"),
+    [("int8", 127, 2.2, (231, 237, 243, 249)), ("int16", 32767, 0.02, (244, 247, 250, 252))],
+)
 def test_saturation_in_some_blocks_equals_the_definition(
-    dtype: Any, limit: Any, frames_per_bin: Any, precision: Any
+    dtype: Any, limit: Any, gamma: Any, greys: Any, frames_per_bin: Any, precision: Any
 ) -> None:
-    """Counts just below, at and beyond the limit; in the second of three blocks and in the narrow last one only."""
-    width, steps, threshold = 2 * pixel.PIXELS_A_BLOCK + 21, 4 * frames_per_bin, 2.0**-4
-    level = np.zeros((steps + 1, width))
-    for place, beyond in ((pixel.PIXELS_A_BLOCK, 0), (pixel.PIXELS_A_BLOCK + 17, 1), (width - 6, 2), (width - 1, -1)):
-        jump = (limit + beyond) * threshold
-        level[frames_per_bin : 2 * frames_per_bin, place] = jump
-        level[3 * frames_per_bin :, place] = -jump
-    got = simulate_log(
-        level[:, None, :], threshold_pos=threshold, threshold_neg=2 * threshold, start_residual=None, bins=2,
-        frames_per_bin=frames_per_bin, seed=1, dtype=dtype, precision=precision,
+    """Counts of -1, 0, 1 and 2 beyond the limit, up and down; in the second of three blocks and the narrow last one."""
+    block, width, steps = pixel.PIXELS_A_BLOCK, 2 * pixel.PIXELS_A_BLOCK + 21, 4 * frames_per_bin
+    table = (log_table if precision == "float32" else log_table_float64)(gamma, 1e-3)
+    threshold = float(np.ptp(table)) / (limit + 3)
+    frames = np.zeros((steps + 1, 1, width), np.uint8)
+    frames[frames_per_bin : 3 * frames_per_bin, 0, [width - 1, block, block + 17, width - 6]] = greys
+    got = simulate(
+        frames, threshold_pos=threshold, bins=2, frames_per_bin=frames_per_bin, seed=1, dtype=dtype,
+        precision=precision, gamma=gamma,
     )  # fmt: skip
     expected, saturated = reference.simulate(
-        level.astype(precision), noise_key_of_seed(1), threshold_pos=threshold, threshold_neg=2 * threshold,
+        table[frames[:, 0]], noise_key_of_seed(1), threshold_pos=threshold, threshold_neg=threshold,
         noise_scale=None, hot_count=0, hot_sigma=0.0, hot_scale=np.ones(steps), frames_per_bin=frames_per_bin,
         dtype=dtype,
     )  # fmt: skip
     np.testing.assert_array_equal(got.voxels.reshape(expected.shape), expected)
     assert got.saturated_bins == saturated > 0
-    assert np.abs(expected[:, : pixel.PIXELS_A_BLOCK]).max() < limit
+    assert (expected.max(), expected.min()) == (limit, -limit)
+    assert np.abs(expected[:, :block]).max() < limit
 
 
 GOLDEN = {

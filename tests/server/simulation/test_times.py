@@ -19,7 +19,7 @@ from tests.server.simulation.test_pixel import moving_frames
 from tests.server.video.test_real_videos import FOLDER as REAL_VIDEOS
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
-from v2v_server.simulation import simulate, simulate_clip, simulate_log
+from v2v_server.simulation import simulate, simulate_clip
 from v2v_server.simulation.intensity import log_table
 from v2v_server.simulation.kernels import Voxels, fill, list_events
 from v2v_server.simulation.pixel import hot_pixels
@@ -27,6 +27,7 @@ from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.voxel import FINE_STEPS, Levels, Moments, rounding_tolerance, timeline
 from v2v_server.video.probe import probe
 
+SLOW = pytest.mark.slow  # another kernel to compile
 FPS = 25.0
 ALL = {
     "threshold_mismatch_sigma": 0.15, "shot_noise_hz": 20.0, "leak_hz": 3.0, "refractory_seconds": 0.005,
@@ -42,19 +43,21 @@ def again(made: Voxels, *names: str, precision: Any = None, **changes: Any) -> d
 # --- against the paper's kernel ---------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
+@pytest.mark.parametrize(
+    ("dtype", "precision"),
+    [("int8", "float32"), ("float32", "float32"), pytest.param("float32", "float64", marks=SLOW)],
+)
+@settings(max_examples=15, deadline=None)
 @given(
     size=st.sampled_from([(1, 1), (6, 8), (1, 513), (31, 33)]),
     noise_sigma=st.sampled_from([0.0, 0.1]),
     hot_count=st.integers(0, 1),
     start_residual=st.none() | st.floats(-0.2, 0.2),
-    form=st.sampled_from([("int8", "float32"), ("float32", "float32"), ("float32", "float64")]),
     seed=st.integers(0, 2**64 - 1),
 )
 def test_it_counts_the_events_of_the_papers_kernel(
-    size: Any, noise_sigma: float, hot_count: int, start_residual: float | None, form: tuple[str, str], seed: int
+    dtype: str, precision: str, size: Any, noise_sigma: float, hot_count: int, start_residual: float | None, seed: int
 ) -> None:
-    dtype, precision = form
     made = simulate(
         moving_frames(21, *size, seed=seed % 256), threshold_pos=0.2, threshold_neg=0.25, noise_sigma=noise_sigma,
         hot_pixel_count=hot_count, hot_pixel_sigma=2.0, start_residual=start_residual, bins=5, frames_per_bin=2,
@@ -75,15 +78,14 @@ def test_it_counts_the_events_of_the_papers_kernel(
 # --- against events one by one ----------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
-@given(
-    data=st.data(), grids=st.integers(1, 4),
-    # Each is another kernel to compile: the table of digests compiles the last, too.
-    form=st.sampled_from([("float32", 8, "float32"), ("float64", 8, "float32"), ("float32", 12, "int8")]),
-)  # fmt: skip
-def test_kernel_equals_the_oracle(data: Any, grids: int, form: tuple[str, int, str]) -> None:
+@pytest.mark.parametrize(
+    ("precision", "bits", "dtype"),  # the table of digests compiles both
+    [("float32", 8, "float32"), ("float32", 12, "int8"), pytest.param("float64", 8, "float32", marks=SLOW)],
+)
+@settings(max_examples=15, deadline=None)
+@given(data=st.data(), grids=st.integers(1, 4))
+def test_kernel_equals_the_oracle(data: Any, grids: int, precision: str, bits: int, dtype: str) -> None:
     """Noise, hot drift, intermediate levels and a refractory period; bins that do not meet the intermediate levels."""
-    precision, bits, dtype = form
     seed, bins, steps, pixels = data.draw(st.integers(0, 2**32)), 3, 6, 24
     random = np.random.default_rng(seed)
     effects = {"refractory_seconds": 0.006} if data.draw(st.booleans()) else {}
@@ -159,7 +161,7 @@ def test_shot_noise_has_both_polarities_and_random_times() -> None:
     assert abs(np.corrcoef(within[:-1], within[1:])[0, 1]) < 0.05 or len(np.unique(events.t)) > 0.9 * len(events) / 2
 
 
-@pytest.mark.parametrize("dtype", ["float32", pytest.param("int16", marks=pytest.mark.slow)])  # another kernel
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("int16", marks=SLOW)])
 @pytest.mark.parametrize("effects", [{}, ALL])
 @pytest.mark.parametrize("grids", [0, 3])
 def test_arrays_and_events_agree(effects: dict[str, float], grids: int, dtype: str) -> None:
@@ -304,7 +306,7 @@ def surface(made: Voxels, **changes: Any) -> np.ndarray:
     return np.asarray(again(made, "time_surface", **changes)["time_surface"], np.float64)
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=SLOW)])
 def test_a_pixel_with_known_crossings(precision: str) -> None:
     """It rises by 1 in 2 s from half a threshold: events every 0.4 s from 0.2 s on; it rests; it falls as fast."""
     frames = np.array([0, 255, 255, 0], np.uint8)[:, None, None]  # log intensities would take another kernel
@@ -318,9 +320,8 @@ def test_a_pixel_with_known_crossings(precision: str) -> None:
 
 
 def test_uneven_steps_last_as_long_as_they_do() -> None:
-    made = simulate_log(
-        np.array([0.0, 0.3, 0.3, 0.3])[:, None, None], threshold_pos=0.2, start_residual=0.0, bins=3, dtype="float32"
-    )
+    frames = np.array([0, 255, 255, 255], np.uint8)[:, None, None]
+    made = simulate(frames, threshold_pos=CONTRAST / 1.5, start_residual=0.0, bins=3, dtype="float32")
     ages = surface(made, step_seconds=np.array([0.3, 1.0, 0.05]))
     np.testing.assert_allclose(ages[0, 1].ravel(), [0.1, 1.1, 1.15], atol=1e-6)
 

@@ -21,7 +21,7 @@ from tests.clips import damaged, panned_luma, write_clip
 from tests.oracles.leases import open_leases, whole_sample
 from tests.server.prepare.test_lossless_served import require_equal
 from v2v_protocol.errors import CorpusError, VideoChanged, VideoError
-from v2v_protocol.messages import Lease
+from v2v_protocol.messages import Lease, encode
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
@@ -36,9 +36,8 @@ SPEC = StreamSpec(recipe=Recipe(voxels_per_clip=4, bins=5, crop_height_px=24, cr
 
 
 @pytest.fixture(autouse=True)
-def small_pieces(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("v2v_server.store.cache.piece_frames", lambda rows, width_px: 16)
-    monkeypatch.setenv("V2V_CACHE_DIR", str(tmp_path / "index"))
 
 
 @pytest.fixture(scope="module")
@@ -209,14 +208,15 @@ def test_what_a_killed_worker_leaves_is_not_used_and_removed(source: Path, folde
     """Killed in the middle of a piece: the file is there, under a name that is never read."""
     program = (
         "import os, signal, sys\nfrom pathlib import Path\nimport v2v_server.store.cache as cache\n"
-        "from v2v_server.store.store_file import StoreWriter\n"
-        "from tests.server.store.test_cache import leases_of, Clips, Folder\n"
+        "from v2v_protocol.messages import decode\nfrom v2v_server.corpus.sources.folder import Folder\n"
+        "from v2v_server.store.store_file import StoreWriter\nfrom v2v_server.worker.process import Clips\n"
         "cache.piece_frames = lambda rows, width: 16\n"
         "StoreWriter.close = lambda self, **more: os.kill(os.getpid(), signal.SIGKILL)\n"
-        "(root, lease), = leases_of(Path(sys.argv[1]), 1)\n"
-        "Clips(Folder(root), cache.Cache(Path(sys.argv[2]), 1 << 30, 0)).take(lease)\n"
+        "clips = Clips(Folder(Path(sys.argv[1])), cache.Cache(Path(sys.argv[2]), 1 << 30, 0))\n"
+        "clips.take(decode(bytes.fromhex(sys.argv[3])))\n"
     )
-    done = subprocess.run([sys.executable, "-c", program, str(source), str(folder)], check=False)
+    ((root, lease),) = leases_of(source, 1)
+    done = subprocess.run([sys.executable, "-c", program, root, folder, bytes(encode(lease)[0]).hex()], check=False)
     assert done.returncode == -9
     assert len(list((folder / "partial").iterdir())) == 1
     assert not pieces(folder)

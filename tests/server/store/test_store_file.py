@@ -103,7 +103,7 @@ def reads_right_or_refuses(path: Path, luma: npt.NDArray[np.uint8]) -> bool:
     return True
 
 
-@settings(in_folder, max_examples=300)
+@settings(in_folder, max_examples=200)
 @given(st.sampled_from(["a bit", "the end", "a stretch"]), st.data())
 def test_any_damage_is_found(
     tmp_path: Path, sound: tuple[Path, npt.NDArray[np.uint8]], damaged: str, data: st.DataObject

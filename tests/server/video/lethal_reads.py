@@ -33,11 +33,6 @@ def always_killed(source: VideoSource, id: str) -> IndexRow:
     return probe_file(source, id)
 
 
-def always_exits(source: VideoSource, id: str) -> IndexRow:
-    """Ends with a status over every file, as over a module that is not installed."""
-    os._exit(3)
-
-
 def waiting(source: VideoSource, id: str) -> IndexRow:
     """Waits for ever over files of that name, as over storage that does not answer."""
     if "waiting" in id:

@@ -13,7 +13,7 @@ from v2v_protocol.errors import ProtocolError, UsageError
 from v2v_server.video.frame_index import NO_TIMESTAMP, FrameIndex, unseekable
 from v2v_server.video.picture import Orientation
 
-steps = st.lists(st.integers(1, 2**40), min_size=1, max_size=60)
+steps = st.lists(st.integers(1, 2**40), min_size=1, max_size=25)
 
 
 @st.composite

@@ -13,6 +13,7 @@ from tests.oracles.decoded import decode_luma
 from v2v_server.video.probe import probe
 
 
+@pytest.mark.slow  # of the benches
 def test_form_and_ping_pong(tmp_path: Path) -> None:
     source = write_clip(tmp_path / "source.mp4", panned_luma(8, 240, 320, step=(0, 6)))
     (clip,) = webvid_like([source], tmp_path / "out", gop=12, frames=30, clips=1)

@@ -77,7 +77,7 @@ def made(catalogue: Catalogue, recipe: Recipe, seed: int, arrays: tuple[str, ...
     return Remaker(catalogue, StreamSpec(recipe=recipe), arrays).sample(seed, 0, 0)
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32))
 def test_labels_follow_crop_resize_flip_pauses_and_stride(catalogue: Catalogue, seed: int) -> None:
     sample = made(catalogue, RECIPE, seed, ("voxels", "frames", "boxes", "masks"))
