@@ -394,7 +394,7 @@ def test_the_registry_forgets_removed_workers() -> None:
         max_size=100,
     )
 )
-@settings(max_examples=120)
+@settings(max_examples=300)
 def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int, int]]) -> None:
     """The table looks only at workers whose load has changed: none is ever forgotten, nor kept in mind twice."""
     table, out = Table(), []
