@@ -24,7 +24,7 @@ VIDEOS = ("my.mp4", "VIDEO", "bigbuckbunny.mp4")
 FOLDERS = ("smaller", "DIR", "CLIPS", "CORPUS", "webvid10k", "my-videos", "clips")
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob("docs/guides/*.md"))]
 SMALLER = {
-    "v2v-preview": ["--seeds", "1"],
+    "v2v-preview": ["--seeds", "1", "--set", "voxels_per_clip=4"],
     "v2v-serve": ["--workers", "1", "--bind", "tcp://127.0.0.1:*", "--port-file", "port"],
     "v2v-train": ["--workers", "1", "--set", "stream.batch_size=1"],
     "v2v-prepare": ["--workers", "1"],

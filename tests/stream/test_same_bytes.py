@@ -9,14 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from tests.stream.conftest import SMALL, digest, epoch_of, made_here, server_workers
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.catalogue import open_catalogue
-from v2v_tools.remake import remake
 from v2v_tools.simulate import main as simulate
 
 
@@ -37,30 +33,6 @@ def test_workers_and_the_way_samples_travel_change_nothing(
     ]
     assert got == reference
     assert len(reference) == len(set(reference))
-
-
-def test_events_in_time_are_the_same_however_they_travel(server: LocalServer, clips: Path) -> None:
-    """All arrays made of events, and grids within a step, by shared memory, by network, and made again."""
-    recipe = {"preset": "davis346", "voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}
-    recipe |= {"grids_per_frame": 2, "bins": 3}
-    arrays = ("voxels", "event_counts", "voxels_bilinear", "time_surface", "frames")
-    got = []
-    for shared in (True, False):
-        with V2VStreamDataset(
-            server.address, batch_size=3, recipe=recipe, seed=3, arrays=arrays, shared_memory=shared
-        ) as dataset:
-            batch = next(iter(dataset))
-            got.append(digest(batch))
-            frame_grids = batch.frame_grids.tolist()
-    assert got[0] == got[1]
-    spec = StreamSpec.from_dict({"recipe": recipe})
-    assert frame_grids == list(spec.recipe.frame_grids)
-    again = remake(open_catalogue(clips), spec, seed=3, epoch=0, index=batch.indices[0], arrays=arrays)
-    for name in arrays:
-        assert batch[name][0].numpy().tobytes() == again.arrays[name].tobytes()
-    counts = batch["event_counts"].int()
-    assert torch.equal(counts[:, :, 1] - counts[:, :, 0], batch.voxels.int())
-    assert batch.voxels.any()
 
 
 def test_a_killed_worker_changes_nothing(server: LocalServer, reference: list[str]) -> None:
