@@ -98,7 +98,7 @@ def test_pieces_of_a_batch_make_the_same_step(tmp_path: Path, longest: float) ->
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")  # torch.compile looks at all of it
 def test_one_compiled_time_step_makes_the_same_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
     voxels, frames = torch.randint(-3, 4, (4, 3, 2, 16, 20)), torch.rand(4, 3, 1, 16, 20)
     results = []
     for compiled in ("none", "step"):
