@@ -76,6 +76,9 @@ def test_every_name_on_the_lists_is_one_of_ffmpegs() -> None:
 def test_a_picture_with_too_many_pixels_is_refused_before_it_is_decoded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("v2v_server.video.probe.LARGEST_INDEXED_SIDE_PX", 63)
+    with pytest.raises(VideoError, match="of 64x48 px are larger than 63 px a side"):
+        probe(write_clip(tmp_path / "wide.mkv", panned_luma(3)))
     assert source.LARGEST_PICTURE_PX == 8192 * 8192
     monkeypatch.setattr(source, "LARGEST_PICTURE_PX", 64 * 48 - 1)
     with pytest.raises(VideoError, match="64x48 px is larger than 3071 pixels"):

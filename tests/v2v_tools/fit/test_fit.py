@@ -105,9 +105,8 @@ def test_dead_pixels_are_silent_among_active_neighbours() -> None:
     fires = np.arange(side**2) < side**2 // 2
     fires[dead] = False
     place = np.tile(np.flatnonzero(fires), 30)
-    at, rising = np.arange(len(place)), np.ones(len(place), np.bool_)
-    grey = np.full((2, side, side), 100, np.uint8)
-    made = recorded(side, side, at, place, rising, grey, np.array([0, len(place)]), light=LIGHT)
+    frames = np.full((2, side, side), 100, np.uint8), np.array([0, len(place)])
+    made = recorded(side, side, np.arange(len(place)), place, place >= 0, *frames, light=LIGHT)
     found = estimators.dead_pixels(made, made.blocks())
     assert found.value == len(dead) / 800
     assert found.low <= found.value <= found.high < 0.1
