@@ -225,8 +225,11 @@ def test_no_two_classes_constants_or_aliases_have_one_name() -> None:
                 if name[0].isupper():
                     found.setdefault(name, {})[str(path.relative_to(ROOT))] = definition
     del found["LOOKED_FOR"]  # of each kind of pixels
-    several = {name: used for name, used in found.items() if len(used) > 1}
-    assert {name: list(used) for name, used in several.items() if len(set(map(ast.unparse, used.values()))) > 1} == {}
+    assert {
+        name: list(used)
+        for name, used in found.items()
+        if len(used) > 1 and len(set(map(ast.unparse, used.values()))) > 1
+    } == {}
 
 
 def constants(module: ast.AST) -> dict[str, ast.expr]:

@@ -83,10 +83,11 @@ def _no_process_left() -> Iterator[None]:
     """
     before = set(psutil.Process().children(recursive=True))
     yield
-    left = [process for process in psutil.Process().children(recursive=True) if process not in before]
-    workers = tuple(f"{process.pid} " for process in before)
-    left = [process for process in left if not _command(process).startswith(workers)]
-    left = [process for process in left if "resource_tracker" not in _command(process)]
+    started = {each: _described(each) for each in set(psutil.Process().children(recursive=True)) - before}
+    of_servers = tuple(f"{process.pid} " for process in before)
+    left = [
+        each for each, text in started.items() if not text.startswith(of_servers) and "resource_tracker" not in text
+    ]
     _, alive = psutil.wait_procs(left, timeout=60)
     for process in alive:
         with suppress(psutil.NoSuchProcess):
@@ -96,11 +97,11 @@ def _no_process_left() -> Iterator[None]:
 
 def server_workers(pid: int) -> list[psutil.Process]:
     """The worker processes of a server (it has other helpers, which come and go)."""
-    return [child for child in psutil.Process(pid).children() if "v2v_server.commands.worker" in _command(child)]
+    return [child for child in psutil.Process(pid).children() if "v2v_server.commands.worker" in _described(child)]
 
 
-def _command(process: psutil.Process) -> str:
-    """The id of its parent, and its command line."""
+def _described(process: psutil.Process) -> str:
+    """Return the id of its parent and its command line; "" if it has ended."""
     try:
         return f"{process.ppid()} {' '.join(process.cmdline())}"
     except (psutil.NoSuchProcess, psutil.ZombieProcess):

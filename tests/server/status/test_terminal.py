@@ -238,11 +238,11 @@ def test_an_absent_server_is_an_error(capsys: pytest.CaptureFixture[str], unused
 ])  # fmt: skip
 def test_a_status_that_cannot_be_read_is_refused(text: bytes, why: str) -> None:
     with zmq.Context() as context, context.socket(zmq.ROUTER) as server, ThreadPoolExecutor(1) as thread:
-        address = f"tcp://127.0.0.1:{server.bind_to_random_port('tcp://127.0.0.1')}"
-        with StatusClient(address) as client:
+        port = server.bind_to_random_port("tcp://127.0.0.1")
+        with StatusClient(f"tcp://127.0.0.1:{port}") as client:
             answer = thread.submit(client.get_status, 60.0)
             server.send_multipart([server.recv_multipart()[0], *encode(Status(text))])
-            with pytest.raises(ProtocolError, match=f"^{address} sent a status {why}$"):
+            with pytest.raises(ProtocolError, match=f":{port} sent a status {why}$"):
                 answer.result()
 
 

@@ -102,11 +102,9 @@ def test_the_recipe_is_one_that_a_server_accepts(tmp_path: Path) -> None:
 
 def test_dead_pixels_are_silent_among_active_neighbours() -> None:
     side, dead = 40, np.arange(41, 800, 31)  # in the upper half: nothing in the lower one fires
-    fires = np.arange(side**2) < side**2 // 2
-    fires[dead] = False
-    place = np.tile(np.flatnonzero(fires), 30)
-    frames = np.full((2, side, side), 100, np.uint8), np.array([0, len(place)])
-    made = recorded(side, side, np.arange(len(place)), place, place >= 0, *frames, light=LIGHT)
+    place = np.tile(np.setdiff1d(np.arange(800), dead), 30)
+    frames, frame_us = np.full((2, side, side), 100, np.uint8), np.array([0, len(place)])
+    made = recorded(side, side, np.arange(len(place)), place, place >= 0, frames, frame_us, light=LIGHT)
     found = estimators.dead_pixels(made, made.blocks())
     assert found.value == len(dead) / 800
     assert found.low <= found.value <= found.high < 0.1

@@ -19,8 +19,8 @@ compiled: Any = numba.njit(**_OPTIONS)
 """Decorator of a compiled function that only compiled functions call.
 
 It has no reference counting, which every view of an array would cost: it cannot create arrays, and the caller provides
-all memory. It has no entry for Python either, which a third of the kernel's time to compile went into. Calling it from
-Python ends the process; its ``py_func`` is the function in Python.
+all memory. It has no entry for Python either, because these took a third of the time to compile the kernel. Calling it
+from Python ends the process; call its ``py_func`` there, which must call no other such function.
 """
 hook: Any = numba.njit(forceinline=True, **_OPTIONS)
 """The same for an effect's functions, which are inlined into the kernel."""
