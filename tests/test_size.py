@@ -1,6 +1,6 @@
-"""The size of the house, which may only shrink: lower a limit when a change allows it.
+"""The size of three parts of the house, as a guard: each may hold 3 % more statements than it did when it was counted.
 
-An issue that may add says by how much. Statements are counted by AST, docstrings apart; empty files do not count.
+Statements are counted by AST, docstrings apart.
 """
 
 from __future__ import annotations
@@ -15,35 +15,25 @@ from tests.tools.statements import statements_of
 from tests.tools.trace import trace
 
 ROOT = Path(__file__).parents[1]
-# (statements, files that are not empty)
-LIMITS = {
-    "v2v_protocol": (2276, 21),
-    "v2v_server": (14797, 115),
-    "v2v_tools": (2272, 22),
-    "v2v_client": (2018, 17),
-    "v2v_pictures": (780, 8),
-    "v2v_recordings": (996, 10),
-    "trainer": (4350, 57),
-    "bench": (3420, 39),
-    "tests": (32609, 331),
+PARTS = {
+    "service": (19091, ("v2v_protocol", "v2v_server", "v2v_client")),
+    "workshop": (4048, ("v2v_tools", "v2v_recordings", "v2v_pictures")),
+    "trainer": (4350, ("trainer",)),
 }
+"""Statements at commit d9d79e82, and the packages that they count."""
+AIR = 1.03
 WAY_FILES, WAY_RETURNS = 68, 251
 """Files that one sample visits, and returns to an earlier one; 89 and 258 at commit 419dc2ec. Measured 62 and 237 to
 242; a busy host adds pings and waits."""
 
 
-def size_of(package: str) -> tuple[int, int]:
-    """Return statements and files of a package."""
-    counts = [statements_of(path.read_text("utf-8")) for path in (ROOT / package).rglob("*.py")]
-    return sum(counts), sum(count > 0 for count in counts)
-
-
-@pytest.mark.parametrize("package", LIMITS)
-def test_no_package_grows(package: str) -> None:
-    statements, files = size_of(package)
-    most_statements, most_files = LIMITS[package]
-    assert statements <= most_statements, f"{package} has {statements} statements, the limit is {most_statements}"
-    assert files <= most_files, f"{package} has {files} files, the limit is {most_files}"
+@pytest.mark.parametrize("part", PARTS)
+def test_no_part_grows_beyond_its_air(part: str) -> None:
+    counted, packages = PARTS[part]
+    paths = [path for package in packages for path in (ROOT / package).rglob("*.py")]
+    statements = sum(statements_of(path.read_text("utf-8")) for path in paths)
+    limit = int(counted * AIR)
+    assert statements <= limit, f"{part} ({', '.join(packages)}) has {statements} statements, the limit is {limit}"
 
 
 @pytest.mark.slow
