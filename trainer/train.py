@@ -32,7 +32,7 @@ def _parser() -> Parser:
     parser = Parser(
         "v2v-train", "CONFIG.yaml [flags]",
         "Train a network on the stream. Without an address it starts its own server. Ctrl-C and SIGTERM end the run "
-        "after the current step and save it; the third signal ends it at once.",
+        "after the current step and save it; a second signal ends it at once (under torchrun a third).",
         [
             "v2v-train e2vid --videos webvid10k/ --workers 8 --out runs/e2vid",
             "v2v-train my.yaml --connect tcp://127.0.0.1:5555 --set optimizer.learning_rate=1e-4",

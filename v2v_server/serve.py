@@ -99,8 +99,11 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
     return catalogue
 
 
-def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debug: bool = False) -> None:
+def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debug: bool = False) -> int:
     """Run a server until SIGINT or SIGTERM.
+
+    Returns:
+        the number of the signal; 0 if its parent has ended.
 
     Args:
         standbys: see :func:`v2v_server.supervise.pool.make_pool`.
@@ -166,7 +169,7 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
         worker_flags += catalogue.source.worker_flags()
         stop = threading.Event()
         sockets.has_session = dispatcher.has_session
-        opened.enter_context(stop_on_signals(stop))
+        signals = opened.enter_context(stop_on_signals(stop))
         pool = make_pool(config, catalogue.source, label, worker_flags, keys, standbys)
         opened.callback(catalogue.close)
         server = Server(config, catalogue, dispatcher, sockets, pool, quarantine_file, page=page, log=log)
@@ -181,6 +184,7 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
             log.say(f"page: {page.url}")
         while not stop.is_set() and config.parent_pid in (0, os.getppid()):
             server.turn(_TURN_SECONDS)
+    return signals[0] if signals else 0
 
 
 class Server:
@@ -479,19 +483,23 @@ class Clock:
 
 
 @contextlib.contextmanager
-def stop_on_signals(stop: threading.Event) -> Iterator[None]:
-    """Set ``stop`` at the first SIGINT or SIGTERM; a second signal has its usual effect."""
+def stop_on_signals(stop: threading.Event) -> Iterator[list[int]]:
+    """Set ``stop`` at the first SIGINT or SIGTERM, and yield a list that then holds its number; a second signal ends
+    the process at once.
+    """
+    signals: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def on_signal(number: int, frame: object) -> None:
-        for each, handler in before.items():
-            signal.signal(each, handler)
+        for each in before:
+            signal.signal(each, signal.SIG_DFL)
+        signals.append(number)
         stop.set()
 
     for number in before:
         signal.signal(number, on_signal)
     try:
-        yield
+        yield signals
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

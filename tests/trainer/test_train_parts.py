@@ -123,11 +123,20 @@ def test_a_signal_within_a_step_lets_it_finish() -> None:
     assert finished == [0, 1, 2, 3, 4]
 
 
-def test_the_third_signal_takes_effect_immediately() -> None:
+@pytest.mark.parametrize("launched", [False, True])
+def test_the_second_signal_takes_effect_immediately_and_the_third_under_torchrun(
+    launched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
+    if launched:
+        monkeypatch.setenv("TORCHELASTIC_RUN_ID", "run")
+    signals = []
+
     def steps() -> None:
         with StopRequest() as stop:
             for _ in stop.until(range(10)):
-                for _ in range(3):
+                for number in range(3):
+                    signals.append(number)
                     os.kill(os.getpid(), signal.SIGINT)
 
     # Its default action would end this process, so Python's own stands in for it.
@@ -135,6 +144,7 @@ def test_the_third_signal_takes_effect_immediately() -> None:
         patch.setattr(signal, "SIG_DFL", signal.default_int_handler)
         with pytest.raises(KeyboardInterrupt):
             steps()
+    assert len(signals) == 2 + launched
 
 
 def test_any_rank_stops_all_ranks_before_the_next_step() -> None:

@@ -6,6 +6,7 @@ The signal handler only sets a flag, so a step is never interrupted. While the l
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -16,8 +17,9 @@ from v2v_protocol.errors import V2VError
 
 _Item = TypeVar("_Item")
 
-_PATIENT_SIGNALS = 2
-"""torchrun forwards the Ctrl-C that its processes already had from the terminal, so two signals may be one Ctrl-C."""
+_LAUNCHED = "TORCHELASTIC_RUN_ID"
+"""Variable of the environment that torchrun sets. It forwards the Ctrl-C that its processes already had from the
+terminal, so two signals may be one Ctrl-C."""
 
 
 class _StopWaiting(BaseException):
@@ -27,7 +29,7 @@ class _StopWaiting(BaseException):
 class StopRequest:
     """A request to end the run, from ``with`` on (in the main thread).
 
-    The third signal ends the process as if there were no handler.
+    The second signal ends the process as if there were no handler; under torchrun the third one does.
 
     Args:
         seconds: end after this time; 0: no limit.
@@ -41,7 +43,7 @@ class StopRequest:
     def __init__(self, seconds: float = 0.0, agree: Callable[[bool], bool] = bool) -> None:
         self.signal = 0
         self.failure: V2VError | None = None
-        self._count = 0
+        self._left = 2 if _LAUNCHED in os.environ else 1
         self._waiting = False
         self._agree = agree
         self._deadline = time.monotonic() + seconds if seconds else None
@@ -56,8 +58,8 @@ class StopRequest:
 
     def _handle(self, number: int, _frame: FrameType | None) -> None:
         self.signal = self.signal or number
-        self._count += 1
-        if self._count > _PATIENT_SIGNALS:
+        self._left -= 1
+        if self._left < 0:
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
         if self._waiting:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2v_protocol.command import Parser, run_command
+from v2v_protocol.command import INTERRUPTED, Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting
 from v2v_protocol.write_aside import check_output
@@ -26,6 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "v2v-serve --videos clips/ --recipe davis346 --set voxels_per_clip=20 --set 'threshold=[0.2,0.4]'",
             "v2v-serve --config serve.yaml",
         ],
+        "Exit status: 0 ended by SIGTERM, 130 by Ctrl-C; a second signal ends it at once, without a summary.",
     )  # fmt: skip
     parser.add_settings(ServeConfig)
     add_spec(parser)
@@ -33,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_command(parser, report_errors(_run), argv, failures=(V2VError,), interrupted="")
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> int:
     flags = {name: getattr(arguments, name) for name in SERVE_KEYS}
     # Without --recipe, --set changes fields of the file's recipe.
     recipe = asked_recipe(arguments)
@@ -49,7 +51,7 @@ def _run(arguments: argparse.Namespace) -> None:
     with start_ahead(config) as standbys:
         from v2v_server.serve import serve  # takes as long as the imports of a worker, which run meanwhile
 
-        serve(config, standbys, arguments.debug)
+        return INTERRUPTED if serve(config, standbys, arguments.debug) == signal.SIGINT else 0
 
 
 if __name__ == "__main__":

@@ -74,14 +74,14 @@ class Log:
             write(sys.stderr, printable(text) + "\n")
 
 
-def report_errors(run: Callable[[Namespace], None]) -> Callable[[Namespace], None]:
+def report_errors(run: Callable[[Namespace], int | None]) -> Callable[[Namespace], int | None]:
     """Return a command's function that writes an error as a JSON line, instead of the plain text for people, if its
     ``--log-format`` is ``json``.
     """
 
-    def run_and_report(arguments: Namespace) -> None:
+    def run_and_report(arguments: Namespace) -> int | None:
         try:
-            run(arguments)
+            return run(arguments)
         except V2VError as error:
             if arguments.log_format == "json":
                 Log(is_json=True).say(" ".join(str(error).split()), "error")

@@ -162,6 +162,8 @@ class WorkerConversation:
         self._unsent_since = 0.0
         self._may_wait = False  # the latest of them may wait for its sibling's
         self._stopping = False
+        self.has_server = False
+        """Whether the server has answered within the last interval between pings."""
 
     def stop(self) -> None:
         """Finish the current sample, return the other leases, and leave."""
@@ -184,6 +186,7 @@ class WorkerConversation:
         actions: list[WorkerAction] = []
         if messages:
             self._restart_silence(now)
+            self.has_server = True
             for frame in messages:
                 actions += self._handle(frame)
         else:
@@ -282,6 +285,7 @@ class WorkerConversation:
     def _handle_silence(self, now: float) -> list[WorkerAction]:
         actions: list[WorkerAction] = []
         if self._silence.ping_due(now):
+            self.has_server = False
             if self._silence.silence(now) >= _RECONNECT_SECONDS:
                 actions += [Reconnect(), self._say_hello()]
             else:

@@ -394,7 +394,8 @@ class Worker:
                     self._do(action)
                 actions = self._take(step)
         finally:
-            self._link.disconnect(linger_ms=_LINGER_MS)
+            # Without a server there is no message worth waiting for.
+            self._link.disconnect(linger_ms=_LINGER_MS if self._conversation.has_server else 0)
             self._link.close()
 
     def _do(self, action: WorkerAction) -> None:

@@ -227,6 +227,17 @@ def test_a_silent_server_is_greeted_over_a_new_connection() -> None:
     assert (talk.hears(), talk.connections) == ([Ping()], 2)
 
 
+def test_a_message_is_waited_for_only_if_a_server_was_there_lately() -> None:
+    talk = Talk()
+    found = [talk.conversation.has_server]
+    for message in (Pong(), None, Pong()):
+        talk.now += 5.0
+        talk.hears(*([] if message is None else [message]))
+        found.append(talk.conversation.has_server)
+    assert found == [False, True, False, True]
+    assert at_work(1, 2).conversation.has_server
+
+
 def test_the_time_that_a_sample_takes_is_no_silence() -> None:
     talk = at_work(1, is_watched=False)
     talk.makes(1, seconds=1000.0)
