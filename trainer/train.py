@@ -23,6 +23,7 @@ from trainer.run.reporting import CONFIGURATION
 from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.programs import counted
 from v2v_protocol.recipe import Recipe
 
 SIGNAL_STATUS = 128
@@ -101,7 +102,9 @@ def serving(stream: StreamConfig, recipe: Recipe, mine: Ranks) -> Iterator[str]:
         yield address
         return
     # The server's output is not shown, and cataloguing a new corpus takes a while.
-    print(f"starting a server: {stream.videos}, rows {stream.rows}, {stream.workers} workers", file=sys.stderr)
+    print(
+        f"starting a server: {stream.videos}, rows {stream.rows}, {counted(stream.workers, 'worker')}", file=sys.stderr
+    )
     with ExitStack() as stack:
         try:
             server = LocalServer(stream.videos, workers=stream.workers, flags=flags_of(stream, recipe))

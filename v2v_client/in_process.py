@@ -22,6 +22,7 @@ from v2v_client.batch import Batch, Drawn, draw_samples
 from v2v_client.options import Labels, check_labels, require_arguments, require_labels
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
+from v2v_protocol.programs import counted
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample, html_table
 from v2v_protocol.settings import require_whole
@@ -137,7 +138,7 @@ class V2VDataset(Dataset[Sample]):
         self.epoch = epoch
 
     def __repr__(self) -> str:
-        return f"V2VDataset({self._videos!r}, {self._length} samples, seed {self.seed}, epoch {self.epoch})"
+        return f"V2VDataset({self._videos!r}, {counted(self._length, 'sample')}, seed {self.seed}, epoch {self.epoch})"
 
     def _repr_html_(self) -> str:
         recipe = self.spec.recipe
@@ -155,7 +156,7 @@ class V2VDataset(Dataset[Sample]):
     def _place(self, index: int) -> int:
         place = index + self._length if index < 0 else index
         if not 0 <= place < self._length:
-            raise IndexError(f"index {index}: the epoch has {self._length} samples")
+            raise IndexError(f"index {index}: the epoch has {counted(self._length, 'sample')}")
         return place
 
     def _open(self) -> Any:

@@ -23,6 +23,7 @@ from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer, server_flags
 from v2v_protocol.command import INTERRUPTED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
+from v2v_protocol.programs import counted
 from v2v_protocol.progress import Progress
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS
@@ -290,7 +291,8 @@ def run(arguments: argparse.Namespace) -> int:
         flags = server_flags(recipe, vars(arguments), *(("--rows", arguments.rows) if arguments.rows else ()))
     for workers in (None,) if arguments.connect else arguments.workers or (1, 2):
         local = None if workers is None else LocalServer(arguments.videos, workers=workers, flags=flags)
-        with local or nullcontext() as server, Progress(arguments.connect or f"{workers} workers", "%") as progress:
+        title = arguments.connect if workers is None else counted(workers, "worker")
+        with local or nullcontext() as server, Progress(title, "%") as progress:
             address = arguments.connect if server is None else server.address
             dataset = _dataset(arguments, address)
             results.append(

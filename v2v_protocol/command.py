@@ -16,9 +16,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Never
 
-from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION, __version__
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_protocol.programs import COMPLETION, open_standard_streams, show
+from v2v_protocol.programs import COMPLETION, open_standard_streams, show, version_of
 from v2v_protocol.settings import Setting, nearest, settings_of
 from v2v_protocol.write_aside import check_output
 
@@ -199,11 +198,6 @@ def _complete(parser: argparse.ArgumentParser, shell: str) -> int:
             action.complete = shtab.FILE  # type: ignore[attr-defined]
     print(shtab.complete(parser, shell))
     return 0
-
-
-def version_of(name: str) -> str:
-    """Return the version line of a command: versions of the program, the protocol and the numerics."""
-    return f"{name} {__version__} (protocol {PROTOCOL_VERSION}, numerics {NUMERICS_VERSION})"
 
 
 def flag_of(name: str) -> str:

@@ -15,6 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TextIO
 
+from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION, __version__
 from v2v_protocol.settings import nearest
 
 _OURS = frozenset({"v2v_protocol", "v2v_server", "v2v_tools", "v2v_client", "trainer"})
@@ -67,6 +68,20 @@ def printable(text: str) -> str:
         return text
     text = _STEERING.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
     return os.fsencode(text).decode("utf-8", "backslashreplace")
+
+
+def counted(number: int, noun: str, nouns: str = "") -> str:
+    """Return a number with its noun: "1 video", "2 videos".
+
+    Args:
+        nouns: the plural, and the verb if ``noun`` has one; by default the noun with an s.
+    """
+    return f"{number} {noun if number == 1 else nouns or f'{noun}s'}"
+
+
+def version_of(name: str) -> str:
+    """Return the version line of a command: versions of the program, the protocol and the numerics."""
+    return f"{name} {__version__} (protocol {PROTOCOL_VERSION}, numerics {NUMERICS_VERSION})"
 
 
 def show(text: str, stream: TextIO | None = None) -> None:
@@ -149,6 +164,9 @@ def v2v() -> int | None:
         return 2 if failed else 0
     if name in ("-h", "--help"):
         print(_USAGE)
+        return 0
+    if name == "--version":
+        print(version_of("v2v"))
         return 0
     print(f"v2v: unknown command {name!r}{nearest(name, COMMANDS)}; v2v --help lists the commands", file=sys.stderr)
     return 2

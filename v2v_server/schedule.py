@@ -41,6 +41,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.programs import counted
 from v2v_protocol.recipe import LARGEST_SCALE, MOST_STEPS_PER_GRID, Recipe
 from v2v_protocol.sample import Refusal, RefusalKind
 from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
@@ -584,27 +585,28 @@ def corpus_summary(
     """
     span, lines = sequence_span(catalogue, spec.recipe)
     lines = [
-        f"{len(catalogue.videos)} videos in {catalogue.source}: {table.videos} give {table.count} sequences of "
-        f"{span} (at most {spec.max_sequences_per_video} a video), rows {catalogue.rows}",
+        f"{counted(len(catalogue.videos), 'video')} in {catalogue.source}, {table.videos} of use: "
+        f"{counted(table.count, 'sequence')} of {span} (at most {spec.max_sequences_per_video} a video), "
+        f"rows {catalogue.rows}",
         *lines,
     ]
     if spec.scene != "off":
         split = 0 if catalogue.videos.split is None else len(catalogue.videos.split)
         lines.append(
-            f"scene {spec.scene}: {split} videos have shot boundaries or empty parts; {table.spoilt} sequences are "
-            "left out or moved"
+            f"scene {spec.scene}: {counted(split, 'video has', 'videos have')} shot boundaries or empty parts; "
+            f"{counted(table.spoilt, 'sequence is', 'sequences are')} left out or moved"
         )
         if long := int(np.count_nonzero(catalogue.videos.frames > MOST_ANALYSED_FRAMES)):
             lines.append(
-                f"{long} videos are longer than the {MOST_ANALYSED_FRAMES} frames that are analysed: later frames are "
-                "served only of videos without defects; split long videos to use all of them"
+                f"{counted(long, 'video is', 'videos are')} longer than the {MOST_ANALYSED_FRAMES} frames that are "
+                "analysed: later frames are served only of videos without defects; split long videos to use all of them"
             )
     if refusals := table.refusals:
-        lines.append(f"{len(refusals)} videos give none under the server's own recipe:")
+        lines.append(f"{counted(len(refusals), 'video gives', 'videos give')} none under the server's own recipe:")
         lines += _listed(refusals, list_refused)
         lines += _shorter_clips(table)
     if catalogue.refusals:
-        lines.append(f"{len(catalogue.refusals)} files cannot be used at all:")
+        lines.append(f"{counted(len(catalogue.refusals), 'file')} cannot be used at all:")
         lines += _listed(catalogue.refusals, list_refused)
     return lines
 

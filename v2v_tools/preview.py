@@ -24,6 +24,7 @@ from v2v_pictures.film import FRAMES_PER_SECOND, draw_film
 from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import CorpusError, UsageError, V2VError
+from v2v_protocol.programs import counted
 from v2v_protocol.progress import Progress
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, sidecar_endings
@@ -142,7 +143,7 @@ def preview(
     if not kind.is_rendered:
         say(describe_loss(loss, defects))
     write_file(out, _content(out.suffix.lower(), whole, cameras, title, moments))
-    say(f"{out}: {len(cameras)} camera{'s' if len(cameras) > 1 else ''}")
+    say(f"{out}: {counted(len(cameras), 'camera')}")
 
 
 def _check_sizes(cameras: Sequence[Camera], kind: str) -> None:

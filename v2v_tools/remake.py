@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, VideoError, VideoUnreadable
 from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
+from v2v_protocol.programs import counted
 from v2v_protocol.progress import Progress
 from v2v_protocol.sample import DEFAULT_ARRAYS, Refusal, RefusalKind, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
@@ -91,7 +92,7 @@ class Remaker:
         catalogue, spec = self._catalogue, self._spec
         SampleId(spec.digest, catalogue.facts.digest_under(spec.scene), 0, seed, epoch, index)
         if index >= self.count:
-            raise UsageError(f"index {index}: the epoch has {self.count} samples, 0 .. {self.count - 1}")
+            raise UsageError(f"index {index}: the epoch has {counted(self.count, 'sample')}, 0 .. {self.count - 1}")
         request = Request(b"", epoch, index, snapshot=self._snapshot)
         most = MOST_CANDIDATES if spec.on_bad_video == "substitute" else 1
         while request.candidate < most:

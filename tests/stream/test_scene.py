@@ -83,7 +83,7 @@ def test_a_start_says_how_many_videos_are_longer_than_what_is_analysed(
 ) -> None:
     monkeypatch.setattr("v2v_server.schedule.MOST_ANALYSED_FRAMES", 42)
     said = corpus_summary(catalogue, AUTO, SequenceTable(catalogue.videos, catalogue.rows, AUTO))
-    assert any(line.startswith("1 videos are longer than the 42 frames that are analysed") for line in said)
+    assert any(line.startswith("1 video is longer than the 42 frames that are analysed") for line in said)
 
 
 def test_no_sequence_holds_the_cut_or_shows_nothing(catalogue: Catalogue) -> None:

@@ -78,7 +78,7 @@ def test_a_corpus_is_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str
         "2 files cannot be used: broken.mp4",
         "cut.mp4: is truncated: ",
         "voxels_per_clip=2 admits",
-        "1 samples an epoch",
+        "1 sample an epoch",
         "1 of 1 sidecars .boxes.txt can be read: 2 frames have labels, 3 boxes",
     ):
         assert each in said
@@ -187,7 +187,7 @@ def test_how_videos_are_stored_is_said_where_it_matters(tmp_path: Path, capsys: 
     flags = ["--videos", str(tmp_path), "--cache-dir", str(tmp_path), "--recipe", str(tmp_path / "recipe.yaml")]
     status, said = told(capsys, *flags)
     assert status == 0
-    assert "1 videos have no time stamps that name their frames (raw.h264)" in said
+    assert "1 video has no time stamps that name their frames (raw.h264)" in said
     assert "run v2v-prepare once" in said
 
 
@@ -228,7 +228,7 @@ def test_the_loss_of_fast_motion_is_predicted(tmp_path: Path, capsys: pytest.Cap
     write_clip(tmp_path / "slow.mp4", panned_luma(21, 140, 160, step=(0, 0)))
     flags = ["--videos", str(tmp_path), "--cache-dir", str(tmp_path)]
     _, said = told(capsys, *flags)
-    assert re.search(r"\nok    motion        0 px .*substep_px would change little; .* middle of 1 videos\n", said)
+    assert re.search(r"\nok    motion        0 px .*substep_px would change little; .* middle of 1 video\n", said)
     write_clip(tmp_path / "fast.mp4", panned_luma(21, 140, 160, step=(3, 4)))
     _, said = told(capsys, *flags)
     assert re.search(r"\nnote  motion        fast motion: 5.* px a frame .* lost between frames, .* 2 videos\n", said)

@@ -233,6 +233,8 @@ class RecordingWriter:
             sensor_resolution=(size.height, size.width),
             num_events=self._events,
             num_imgs=len(self._picture_times),
+            t0=float(ts[0]),
+            duration=seconds,
             data_source=self._source,
             start_ns=self._origin_ns,
         )

@@ -1,6 +1,6 @@
 """Run `v2v-eval`.
 
-Exit status: 0 all existing recordings were evaluated, 2 wrong usage or input, 130 interrupted.
+Exit status: 0 all existing recordings were evaluated, 1 some could not be, 2 wrong usage or input, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import argparse
 import contextlib
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,8 +18,8 @@ from rich.console import Console
 
 from trainer.convert.conversion import in_layout
 from trainer.evaluation.config import EvaluationConfig, folder_config, read_config, shipped
-from trainer.evaluation.evaluate import Advance, Drawing, Run, check_data_set, evaluate_data_set, find_recordings
-from trainer.evaluation.flow import FlowRun, evaluate_flow, flow_records, flow_table
+from trainer.evaluation.evaluate import Advance, Drawing, Run, check_recording, evaluate_sequence, find_recordings
+from trainer.evaluation.flow import FlowRun, FlowScore, evaluate_flow, flow_records, flow_table
 from trainer.evaluation.metrics import METRICS, make_metrics
 from trainer.evaluation.readers import VIDEO_GAMMA
 from trainer.evaluation.reconstruct import Stretch
@@ -27,7 +27,7 @@ from trainer.evaluation.score import SequenceScore
 from trainer.evaluation.tables import records, table, write_frames
 from trainer.evaluation.voxelise import Kind, Span, VoxelSettings
 from trainer.weights import SHIPPED, load_network
-from v2v_protocol.command import JSON, Parser, run_command
+from v2v_protocol.command import FAILED, JSON, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
@@ -65,6 +65,7 @@ def _parser() -> Parser:
             "v2v-eval paper-discrete --weights runs/e2vid/last.pt --data recordings/",
             "v2v-eval --data own.h5 --out pictures/ --video",
         ],
+        "Exit status: 0 all recordings were evaluated, 1 some could not be and are named, 2 wrong usage or input.",
     )  # fmt: skip
     what, how, out = parser.group("What"), parser.group("How"), parser.group("Output")
     what.add_argument(
@@ -156,12 +157,20 @@ def _evaluate(arguments: argparse.Namespace, data: Path, config: EvaluationConfi
     run, model = _prepare(arguments, config)
     if run.network.task == "flow":
         return _run_flow(arguments, data, config, run, model)
-    lights = set[str]().union(*(check_data_set(run, data, data_set) for data_set in config.data_sets))
+    lights: set[str] = set()
     scores: dict[str, list[SequenceScore]] = {}
+    unscored = Unscored()
+    found = [(data_set, path) for data_set in config.data_sets for path in find_recordings(data, data_set).values()]
+    for data_set, path in found:  # a wrong one is named before the others are evaluated, which may take hours
+        with unscored.noting(path):
+            lights.add(check_recording(run, path, data_set))
     try:
         with Progress("evaluating", "windows") as progress:
-            for data_set in config.data_sets:
-                for score in evaluate_data_set(run, data, data_set, _advance(progress)):
+            for data_set, path in found:
+                if path in unscored.reasons:
+                    continue
+                with unscored.noting(path):
+                    score = evaluate_sequence(run, path, data_set, _advance(progress))
                     scores.setdefault(data_set.name, []).append(score)
     except KeyboardInterrupt:
         if scores:
@@ -169,6 +178,7 @@ def _evaluate(arguments: argparse.Namespace, data: Path, config: EvaluationConfi
             _print(config, scores)
         raise
     if not scores:
+        unscored.fail()
         wanted = ", ".join(f"{data_set.folder}/*.h5 ({data_set.name})" for data_set in config.data_sets)
         raise UsageError(f"--data {data} holds no sequence of {wanted}; create the files with v2v-convert")
     _print(config, scores)
@@ -192,7 +202,7 @@ def _evaluate(arguments: argparse.Namespace, data: Path, config: EvaluationConfi
             "light": "as stored" if run.light is None else run.light.name,
         }
         write_json(arguments.json, records(scores, settings))
-    return 0
+    return unscored.status
 
 
 def _of_light(run: Run, lights: set[str]) -> str:
@@ -212,23 +222,55 @@ def _run_flow(arguments: argparse.Namespace, data: Path, config: EvaluationConfi
     flow_run = FlowRun(run.network, run.voxels, run.device, run.as_published, run.drawing.folder, run.size)
     settings = {"model": model, "weights": str(arguments.weights), "as_published": run.as_published}
     written: list[dict[str, object]] = []
+    unscored = Unscored()
     console = Console() if Console().is_terminal else Console(width=LEAST_WIDTH)
     for data_set in config.data_sets:
         found = find_recordings(data, data_set)
         with Progress("evaluating", "windows") as progress:
-            scores = {
-                sequence: evaluate_flow(
-                    flow_run, path, data_set.time_ranges[sequence] if run.use_time_ranges else None, _advance(progress)
-                )
-                for sequence, path in found.items()
-            }
+            scores: dict[str, dict[str, FlowScore]] = {}
+            for sequence, path in found.items():
+                time_range = data_set.time_ranges[sequence] if run.use_time_ranges else None
+                with unscored.noting(path):
+                    scores[sequence] = evaluate_flow(flow_run, path, time_range, _advance(progress))
         console.print(flow_table(data_set.name, scores, config.paper))
         written += flow_records(data_set.name, scores, settings)
     if not written:
+        unscored.fail()
         raise UsageError(f"--data {data} holds no sequence of {', '.join(each.name for each in config.data_sets)}")
     if arguments.json is not None:
         write_json(arguments.json, written)
-    return 0
+    return unscored.status
+
+
+class Unscored:
+    """The recordings that cannot be scored; the others are.
+
+    Attributes:
+        reasons: why, by file.
+    """
+
+    def __init__(self) -> None:
+        self.reasons: dict[Path, UsageError] = {}
+
+    @contextlib.contextmanager
+    def noting(self, path: Path) -> Iterator[None]:
+        """Keep an error of the body as the reason of a recording, and name it on standard error."""
+        try:
+            yield
+        except UsageError as error:
+            self.reasons[path] = error
+            show(f"v2v-eval: not scored: {' '.join(str(error).split())}", sys.stderr)
+
+    def fail(self) -> None:
+        """Raise the first reason, if there is one: no recording was scored."""
+        for reason in self.reasons.values():
+            reason.is_reported = True
+            raise reason
+
+    @property
+    def status(self) -> int:
+        """The exit status of a command that has scored others."""
+        return FAILED if self.reasons else 0
 
 
 def _prepare(arguments: argparse.Namespace, config: EvaluationConfig) -> tuple[Run, str]:
@@ -297,7 +339,7 @@ def _print(config: EvaluationConfig, scores: dict[str, list[SequenceScore]]) -> 
         console = Console(width=LEAST_WIDTH)
     for data_set in config.data_sets:
         if data_set.name not in scores:
-            console.print(f"{data_set.name}: 0 of {len(data_set.time_ranges)} sequences found", markup=False)
+            console.print(f"{data_set.name}: 0 of {len(data_set.time_ranges)} sequences scored", markup=False)
             continue
         console.print(table(data_set, scores[data_set.name], config.paper))
         for score in scores[data_set.name]:

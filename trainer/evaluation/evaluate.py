@@ -103,20 +103,12 @@ def find_recordings(data: Path, data_set: DataSet) -> dict[str, Path]:
     return found
 
 
-def check_data_set(run: Run, data: Path, data_set: DataSet) -> set[str]:
-    """Check all existing recordings, so that a bad one is reported before the others are evaluated.
-
-    Returns:
-        the lights of pictures that they state; "" of one that states none.
+def check_recording(run: Run, path: Path, data_set: DataSet) -> str:
+    """Check that a recording can be evaluated; return the light of pictures that it states, "" if it states none.
 
     Raises:
         UsageError: see :class:`Recording`.
     """
-    return {check_recording(run, path, data_set) for path in find_recordings(data, data_set).values()}
-
-
-def check_recording(run: Run, path: Path, data_set: DataSet) -> str:
-    """Check that a recording can be evaluated; return the light that it states, raise as :func:`check_data_set`."""
     with Recording(path, as_published=run.as_published, size=run.size) as recording:
         _windows(run, recording, data_set)
         return recording.stated_light
@@ -134,22 +126,14 @@ def _windows(run: Run, recording: Recording, data_set: DataSet) -> list[EventWin
     return picture_windows(recording, time_range, pictures=run.window_pictures, later=later)
 
 
-def evaluate_data_set(
-    run: Run, data: Path, data_set: DataSet, advance: Advance = lambda _sequence, _done, _total: None
-) -> Iterator[SequenceScore]:
-    """Evaluate the existing sequences and yield their scores one by one.
+def evaluate_sequence(
+    run: Run, path: Path, data_set: DataSet, advance: Advance = lambda _sequence, _done, _total: None
+) -> SequenceScore:
+    """Score one recording, and draw it if requested.
 
     Raises:
         UsageError: see :class:`Recording` and :func:`reconstruct`.
     """
-    for path in find_recordings(data, data_set).values():
-        yield evaluate_sequence(run, path, data_set, advance)
-
-
-def evaluate_sequence(
-    run: Run, path: Path, data_set: DataSet, advance: Advance = lambda _sequence, _done, _total: None
-) -> SequenceScore:
-    """Score one recording, and draw it if requested."""
     with Recording(path, as_published=run.as_published, size=run.size, light=run.light) as recording, ieee_products():
         windows = _windows(run, recording, data_set)
         scorer = SequenceScorer(run.metrics, run.score_blank)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import CorpusError, UsageError, V2VError
-from v2v_protocol.programs import show
+from v2v_protocol.programs import counted, show
 from v2v_protocol.progress import Progress, format_duration
 from v2v_protocol.spec import SCENES
 from v2v_server.config import ServeConfig
@@ -80,7 +80,7 @@ def _run(arguments: argparse.Namespace) -> None:
             catalogue = _catalogue_all(arguments, probed)
     if shard is None:
         lines = _of_all(catalogue)
-    for line in [*lines, f"probed {probed.files} files in {format_duration(time.monotonic() - begun)}"]:
+    for line in [*lines, f"probed {counted(probed.files, 'file')} in {format_duration(time.monotonic() - begun)}"]:
         show(line)
 
 
@@ -151,9 +151,9 @@ class _Probed:
 
 def _of_all(catalogue: Catalogue) -> list[str]:
     with closing(catalogue):
-        lines = [*catalogue.notes, f"{catalogue.source}: {len(catalogue.videos)} videos can be used"]
+        lines = [*catalogue.notes, f"{catalogue.source}: {counted(len(catalogue.videos), 'video')} can be used"]
         if catalogue.refusals:
-            lines.append(f"{len(catalogue.refusals)} files cannot be used:")
+            lines.append(f"{counted(len(catalogue.refusals), 'file')} cannot be used:")
             lines += [f"  {refusal}" for refusal in catalogue.refusals[:_SHOWN]]
             if len(catalogue.refusals) > _SHOWN:
                 lines.append(f"  ... and {len(catalogue.refusals) - _SHOWN} more: v2v-serve --list-refused lists all")

@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged
 from v2v_protocol.messages import Lease
+from v2v_protocol.programs import counted
 from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
@@ -570,32 +571,40 @@ def _snapshot(
         reasons = {id: manifest.videos[id].problem or "its file is missing or changed" for id in absent}
         notes = [
             *notes,
-            f"{len(absent)} videos have no prepared file, so others stand in for them{format_problems(reasons)}",
+            f"{counted(len(absent), 'video has', 'videos have')} no prepared file, so others stand in for them"
+            f"{format_problems(reasons)}",
         ]
     if len(woven := np.flatnonzero(videos.interlaced)):
         first = videos[int(woven[0])].id
         notes = [
             *notes,
-            f"{len(woven)} videos are interlaced ({first}): their frames are served as they are stored, two fields "
-            "taken at different times woven together, so that what moves is combed and makes false events. Deinterlace "
-            "such videos once (ffmpeg -i IN -vf bwdif=send_field OUT), or leave them out",
+            f"{counted(len(woven), 'video is', 'videos are')} interlaced ({first}): the frames are served as they are "
+            "stored, two fields taken at different times woven together, so that what moves is combed and makes "
+            "false events. Deinterlace such videos once (ffmpeg -i IN -vf bwdif=send_field OUT), or leave them out",
         ]
     if remarks := {videos.ids[at]: videos.remark[at] for at in np.flatnonzero(videos.remark).tolist()}:
         notes = [
             *notes,
-            f"{len(remarks)} videos are served in part, or with wrong grey levels{format_problems(remarks)}",
+            f"{counted(len(remarks), 'video is', 'videos are')} served in part, or with wrong grey levels"
+            f"{format_problems(remarks)}",
         ]
     if corpus.left_out:
         notes = [*notes, corpus.left_out]
     if shorter:
-        notes = [*notes, f"{len(shorter)} videos are shorter than the list states: {shorter[0]}"]
+        notes = [
+            *notes,
+            f"{counted(len(shorter), 'video is', 'videos are')} shorter than the list states: {shorter[0]}",
+        ]
     digest = videos.digest(corpus.rows)
     scene_digest, unknown = None, set(absent)
     if scenes is not None:
         split, scene_digest = scenes.read(store, table, unknown, digest)
         videos = Videos(table, thresholds, split)
         if died := sorted(unknown - absent):
-            notes = [*notes, f"{len(died)} videos crash the decoder that analyses their scenes: {died[0]}"]
+            notes = [
+                *notes,
+                f"{counted(len(died), 'video crashes', 'videos crash')} the decoder that analyses scenes: {died[0]}",
+            ]
     marks = {} if source.kind.is_rendered else dict(zip(videos.ids, videos.fingerprints, strict=True))
     endings = sidecar_endings(tuple(ARRAYS))
     sidecars, said = collect_sidecars(source, store, marks, videos.shape, endings, processes, notice)

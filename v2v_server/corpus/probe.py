@@ -28,7 +28,7 @@ import xxhash
 
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
 from v2v_protocol.persisted import Persisted
-from v2v_protocol.programs import printable
+from v2v_protocol.programs import counted, printable
 from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_ANALYSED_FRAMES, PIECE, Scene
 from v2v_server.corpus.sources.prepared import Manifest
@@ -248,7 +248,7 @@ class SceneCollection:
         """
         missing = np.flatnonzero((table.summaries.lengths == 0) & (table.problem == np.array(None))).tolist()
         if missing and store.has_other_versions(self.kind.name, _ENDING):
-            notice(f"analysing {len(missing)} videos again: this release finds more in pictures than earlier ones")
+            notice(f"analysing {counted(len(missing), 'video')} again: this release finds more than earlier ones")
         with closing(self._found(store, source, table, missing, processes)) as found:
             for batch in batches(found, len(missing), progress):
                 store.put_figures(self.kind, (figures(*each) for each in batch))

@@ -14,7 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from v2v_protocol.programs import printable
+from v2v_protocol.programs import counted, printable
 from v2v_protocol.progress import format_duration
 from v2v_server.status.snapshot import StatusFields, events, meanings_at
 from v2v_server.system.log import GIB, Log, write
@@ -47,7 +47,7 @@ def figures(status: StatusFields) -> str:
         f"consumers {status['consumer_count']}",
         f"queue {status['queue']}",
         f"faults {totals['faults']}",
-        f"total {totals['samples']} samples",
+        f"total {counted(totals['samples'], 'sample')}",
         *events(status),
     ]
     return "  ".join(filter(None, parts))
@@ -73,8 +73,8 @@ def format_shutdown_summary(status: StatusFields) -> list[str]:
     clips = f", from {totals['decodes']} decoded clips" if totals["decodes"] < totals["samples"] else ""
     happened = events(status)
     lines = [
-        f"in total {totals['samples']} samples ({totals['batches']:.1f} batches, {totals['bytes'] / GIB:.2f} GiB"
-        f"{clips}) in {format_duration(seconds)}: {rate:.2f} samples/s",
+        f"in total {counted(totals['samples'], 'sample')} ({totals['batches']:.1f} batches, "
+        f"{totals['bytes'] / GIB:.2f} GiB{clips}) in {format_duration(seconds)}: {rate:.2f} samples/s",
         f"faults {totals['faults']}" + (f"; {', '.join(happened)}" if happened else ""),
     ]
     busy = totals["decode_seconds"] + totals["simulate_seconds"] + totals["handover_seconds"]
@@ -131,7 +131,7 @@ def consumers_table(count: int, consumers: Sequence[StatusFields]) -> Table:
         consumers: the rows to draw.
     """
     table = _table(
-        f"{count} consumers",
+        counted(count, "consumer"),
         *("name", "state", "epoch", "", "position", "left", "batches/s", "waits", "in work + queued"),
     )
     for each in _shown(table, consumers):
@@ -151,7 +151,8 @@ def consumers_table(count: int, consumers: Sequence[StatusFields]) -> Table:
 
 def _workers(status: StatusFields) -> Table:
     table = _table(
-        f"{status['worker_count']} workers", *("name", "host", "state", "clip", "busy", "cores", "GiB", "restarts")
+        counted(status["worker_count"], "worker"),
+        *("name", "host", "state", "clip", "busy", "cores", "GiB", "restarts"),
     )
     for each in _shown(table, status["workers"]):
         table.add_row(

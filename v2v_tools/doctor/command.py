@@ -24,9 +24,9 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from v2v_protocol.command import FAILED, Parser, run_command, version_of
+from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_protocol.programs import show
+from v2v_protocol.programs import show, version_of
 from v2v_server.store.pixels import PIXEL_KINDS, VideosKind
 from v2v_server.system.process import control_groups, usable_cores
 from v2v_server.system.sandbox import can_confine

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError, V2VError
+from v2v_protocol.programs import counted
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
@@ -63,9 +64,9 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
     found = catalogue.videos
     codecs = Counter(video.codec for video in found)
     kinds = ", ".join(f"{count} {codec}" for codec, count in codecs.most_common())
-    yield "ok", "corpus", f"{len(found)} videos: {kinds}; {int(found.frames.sum())} frames that decode", ""
+    yield "ok", "corpus", f"{counted(len(found), 'video')}: {kinds}; {int(found.frames.sum())} frames that decode", ""
     if catalogue.refusals:
-        text = f"{len(catalogue.refusals)} files cannot be used: {name_all(catalogue.refusals)}"
+        text = f"{counted(len(catalogue.refusals), 'file')} cannot be used: {name_all(catalogue.refusals)}"
         change = "they are skipped: repair them, or leave them out of --videos"
         if any(os.strerror(errno.EACCES) in refusal.reason for refusal in catalogue.refusals):
             change += "; where permission is denied, let this user read the file and its folders (chmod, chown)"
@@ -89,7 +90,12 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
         change = _remedy(table.longest_clips, spec.recipe.voxels_per_clip)
         why = name_all(table.refusals)
         level = "note" if table.count else "bad"
-        yield level, "corpus", f"{useless} videos give no sequence of the recipe {recipe}: {why}", change
+        yield (
+            level,
+            "corpus",
+            f"{counted(useless, 'video gives', 'videos give')} no sequence of the recipe {recipe}: {why}",
+            change,
+        )
     if not table.count:
         return
     remaker = Remaker(catalogue, spec, DEFAULT_ARRAYS)
@@ -100,10 +106,10 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
     except V2VError as error:
         yield "bad", "corpus", f"a sample could not be made: {error}", "run v2v-simulate on that video"
         return
-    text = f"{table.count} samples an epoch; one took {time.perf_counter() - began:.2f} s on one core"
+    text = f"{counted(table.count, 'sample')} an epoch; one took {time.perf_counter() - began:.2f} s on one core"
     yield "ok", "corpus", text, ""
     yield (
-        "ok", "start", f"{describe_start(np.asarray(starts))}; {min(4, remaker.count)} samples",
+        "ok", "start", f"{describe_start(np.asarray(starts))}; {counted(min(4, remaker.count), 'sample')}",
         "" if spec.recipe.start == "triangular" else "start: triangular begins as a running camera does",
     )  # fmt: skip
 
@@ -130,11 +136,11 @@ def _how_videos_are_stored(catalogue: Catalogue) -> Iterator[Line]:
     if catalogue.prepared is not None or catalogue.source.kind.has_parts:
         return
     ids = [video.id for video in islice(catalogue.videos, _VIDEOS_OPENED)]
-    counted = [id for id in ids if not catalogue.frame_index(id).seekable]
-    if counted:
+    unnamed = [id for id in ids if not catalogue.frame_index(id).seekable]
+    if unnamed:
         text = (
-            f"{len(counted)} videos have no time stamps that name their frames ({name_all(counted)}): every clip of "
-            "them is decoded from the beginning of its file"
+            f"{counted(len(unnamed), 'video has', 'videos have')} no time stamps that name their frames "
+            f"({name_all(unnamed)}): every clip of them is decoded from the beginning of its file"
         )
         yield "note", "corpus", text, "run v2v-prepare once: all frames of a prepared corpus are quick to read"
 

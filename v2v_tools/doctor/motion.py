@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, replace
 
 from v2v_protocol.errors import V2VError
+from v2v_protocol.programs import counted
 from v2v_protocol.progress import Progress
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import Defect, Excerpt, examine, hides_motion, spread_excerpts
@@ -51,7 +52,7 @@ def look_at_motion(
     if total.can_be_followed and not total.uncovers:
         change += "; so does substep_px: 1 in the spec, for processor time"
     loss = describe_loss(total, [each for id in found for each in defects.get(id, ())])
-    text = f"{loss}; {_FRAMES} frames in the middle of {len(found)} videos"
+    text = f"{loss}; {_FRAMES} frames in the middle of {counted(len(found), 'video')}"
     yield ("ok", "motion", text.removeprefix("motion: "), "") if total.is_slow else ("note", "motion", text, change)
 
 

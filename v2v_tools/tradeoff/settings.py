@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.errors import CorpusError, UsageError
-from v2v_protocol.programs import show
+from v2v_protocol.programs import counted, show
 from v2v_protocol.safe_yaml import format_yaml, parse_yaml
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
@@ -171,7 +171,7 @@ def open_forms(
                 made[name] = opened(_link(beside, chosen, folder / BESIDE), rows)
                 _require_alike(source, made[name], beside)
             elif name in STORES:
-                show(f"preparing {len(source.videos)} clips as {name}", sys.stderr)
+                show(f"preparing {counted(len(source.videos), 'clip')} as {name}", sys.stderr)
                 into, planes = folder / STORES[name], planes_for(setting.spec for setting in compared)
                 if failed := prepare(source, into, STORES[name], processes=0, planes=planes).failed:
                     raise CorpusError(f"{failed[0].id} could not be prepared as {name}: {failed[0].problem}")

@@ -276,7 +276,7 @@ def test_lists(corpus: Path, opener: Opener) -> None:
     assert ids(by_source) == ["a.mp4", "sub/b.mp4"]
     assert [(video.threshold_pos, video.threshold_neg) for video in by_source.videos] == [(None, None), (0.2, 0.3)]
     assert [refusal.video for refusal in by_source.refusals] == ["gone.mp4"]
-    assert by_source.notes == ("1 videos are shorter than the list states: sub/b.mp4 has 30 frames, not 99",)
+    assert by_source.notes == ("1 video is shorter than the list states: sub/b.mp4 has 30 frames, not 99",)
     # The part that the list leaves out stays in the index.
     opener(corpus)
     opener(listed)
@@ -288,7 +288,7 @@ def test_interlaced_videos_are_said_at_each_start(corpus: Path, opener: Opener) 
     for catalogue in (opener(corpus), opener(corpus)):
         assert len(catalogue.videos) == 4
         (note,) = catalogue.notes
-        assert note.startswith("1 videos are interlaced (fields.mp4): their frames are served as they are stored")
+        assert note.startswith("1 video is interlaced (fields.mp4): the frames are served as they are stored")
     assert opener.probed == [4, 0]
 
 

@@ -24,7 +24,7 @@ def lines(catalogue: Catalogue, spec: StreamSpec = SMALL_SPEC) -> list[str]:
 
 def test_a_corpus_without_trouble_is_one_line() -> None:
     assert lines(corpus(video("a.mp4"), video("b.mp4", frames=9), rows="top:0.75")) == [
-        "2 videos in /corpus: 2 give 12 sequences of 5 frames (at most 10 a video), rows top:0.75"
+        "2 videos in /corpus, 2 of use: 12 sequences of 5 frames (at most 10 a video), rows top:0.75"
     ]
 
 
@@ -51,7 +51,7 @@ def test_the_duration_of_grids_is_the_one_that_is_made(seconds: tuple[float, flo
 
 def test_refusals_name_reason_and_remedy() -> None:
     said = lines(corpus(video("a.mp4"), video("short.mp4", frames=4), video("small.mp4", height_px=5)))
-    assert said[0].startswith("3 videos in /corpus: 1 give 10 sequences")
+    assert said[0].startswith("3 videos in /corpus, 1 of use: 10 sequences")
     assert said[1:] == [
         "2 videos give none under the server's own recipe:",
         "  short.mp4: 4 frames, the recipe needs 5; would admit it: voxels_per_clip at most 1",
@@ -80,7 +80,7 @@ def test_files_that_cannot_be_used_are_named() -> None:
     problems = tuple(Refusal(f"p{number}.mp4", None, "has no video track") for number in range(7))
     named = NamedCorpus((video("a.mp4"),), Rows(), problems, Path("/elsewhere"))
     said = lines(named)  # type: ignore[arg-type]
-    assert said[0].startswith("1 videos in /elsewhere: 1 give 10 sequences")
+    assert said[0].startswith("1 video in /elsewhere, 1 of use: 10 sequences")
     assert said[1:] == [
         "7 files cannot be used at all:",
         *(f"  p{number}.mp4: has no video track" for number in range(5)),

@@ -149,7 +149,7 @@ def test_a_terminal_shows_a_few_lines_in_the_place_of_the_previous_ones(at: Peer
     view.show(0.6, service.status())
     second = out.getvalue().removeprefix(first)
     assert second.startswith(f"\x1b[{first.count(chr(10))}F\x1b[J")
-    assert "1 consumers" in second
+    assert "1 consumer" in second
     assert "1/50" in second
     view.interrupt()
     assert out.getvalue().endswith(f"\x1b[{second.count(chr(10))}F\x1b[J")
@@ -219,8 +219,8 @@ def test_the_sentence_is_shown_names_are_text_many_are_counted_and_an_old_state_
     text = drawn(state, "no answer for 10 s")
     assert state["waiting"]["sentence"] in text
     assert state["waiting"]["sentence"] in line(state)
-    assert "1 consumers" in text
-    assert "1 workers" in text
+    assert "1 consumer" in text
+    assert "1 worker" in text
     assert "and 70 more" in text
     assert "no answer for 10 s" in text
     assert "[red]x[/red]" in text

@@ -23,6 +23,7 @@ from trainer.evaluation import evaluate as evaluate_module
 from trainer.evaluation.readers import Recording
 from trainer.evaluation.reconstruct import Step
 from trainer.models import FireNet
+from v2v_protocol.errors import UsageError
 from v2v_recordings.items import ConvertOptions, Light, Picture
 from v2v_recordings.reading import read_items
 
@@ -84,7 +85,7 @@ def test_an_interrupt_prints_the_completed_scores(
             raise KeyboardInterrupt
         return one_by_one(run, path, *rest)
 
-    monkeypatch.setattr(evaluate_module, "evaluate_sequence", until_the_second)
+    monkeypatch.setattr(cli, "evaluate_sequence", until_the_second)
     assert cli.main(["--weights", str(weights), "--data", str(tmp_path / "own")]) == 130
     shown = capsys.readouterr()
     assert "scores of the completed sequences" in shown.err
@@ -205,7 +206,7 @@ def test_data_sets_of_the_paper(tmp_path: Path, weights: Path, capsys: pytest.Ca
     assert "mean of 2 of 7" in printed
     assert "paper: E2VID WebVid10K" in printed
     assert "0.562" in printed
-    assert "EVAID: 0 of 11 sequences found" in printed
+    assert "EVAID: 0 of 11 sequences scored" in printed
     assert sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.png")) == [
         "HQF/desk.png",
         "IJRR/office_zigzag.png",
@@ -268,6 +269,35 @@ def test_mistakes_end_with_status_2(
     assert message in capsys.readouterr().err
 
 
+def test_recordings_that_cannot_be_scored_are_named_before_the_others_are_scored(
+    tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One is shorter than its time range, one is no recording, and one fails while it is scored."""
+    random_recording(tmp_path / "hqf" / "desk.h5")
+    random_recording(tmp_path / "hqf" / "still_life.h5")
+    random_recording(tmp_path / "ijrr" / "slider_depth.h5")
+    (tmp_path / "ijrr" / "office_zigzag.h5").write_bytes(b"no recording")
+    one_by_one, named = evaluate_module.evaluate_sequence, []
+
+    def but_the_second(run: Any, path: Path, *rest: Any) -> Any:
+        named.append(capsys.readouterr().err)
+        if path.stem == "still_life":
+            raise UsageError(f"{path}: not finite")
+        return one_by_one(run, path, *rest)
+
+    monkeypatch.setattr(cli, "evaluate_sequence", but_the_second)
+    given = ["paper-discrete", "--weights", str(weights), "--data", str(tmp_path), "--metrics", "mse"]
+    assert cli.main([*given, "--json", str(tmp_path / "scores.json")]) == 1
+    assert [("slider_depth.h5 lasts" in each, "office_zigzag.h5" in each) for each in named] == [
+        (True, True),
+        (False, False),
+    ]
+    assert "v2v-eval: not scored: " in (last := capsys.readouterr().err)
+    assert "still_life.h5: not finite" in last
+    scored = json.loads((tmp_path / "scores.json").read_text(encoding="utf-8"))
+    assert [each["sequence"] for each in scored] == ["desk", None]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -275,7 +305,7 @@ def test_mistakes_end_with_status_2(
         (("--cuts", "none", "--json", "{data}/none/a.json"), "none/a.json: there is no folder"),
     ],
 )
-def test_bad_recordings_are_refused_before_any_evaluation(
+def test_nothing_is_evaluated_if_no_recording_or_no_output_can_be(
     tmp_path: Path,
     weights: Path,
     arguments: tuple[str, ...],
@@ -283,7 +313,6 @@ def test_bad_recordings_are_refused_before_any_evaluation(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    random_recording(tmp_path / "hqf" / "desk.h5")
     random_recording(tmp_path / "ijrr" / "slider_depth.h5")  # shorter than its time range
     evaluated = []
 

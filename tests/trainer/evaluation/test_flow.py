@@ -81,6 +81,10 @@ def test_the_command_shows_the_papers_values(tmp_path: Path, capsys: pytest.Capt
     shown = capsys.readouterr().out
     stated = paper.FLOW["Zeros"]["indoor_flying1"]
     assert f"{stated['aee_dense']:.3f}" in shown
+    (tmp_path / "data" / "mvsec" / "indoor_flying2.h5").write_bytes(b"no recording")
+    assert main(["mvsec-flow", *arguments]) == 1
+    assert "not scored: " in (named := capsys.readouterr().err)
+    assert "indoor_flying2.h5" in named
     records = json.loads((tmp_path / "a.json").read_text())
     assert [record["predictor"] for record in records] == ["network", "zeros"]
     assert records[0]["aee_dense"] == records[1]["aee_dense"]

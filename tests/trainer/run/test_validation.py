@@ -19,7 +19,7 @@ from tests.trainer.evaluation.test_flow import constant, recording, run
 from tests.trainer.training import ALONE
 from trainer.config import RunConfig
 from trainer.evaluation.config import parse_config
-from trainer.evaluation.evaluate import Run, evaluate_data_set
+from trainer.evaluation.evaluate import Run, evaluate_sequence, find_recordings
 from trainer.evaluation.flow import evaluate_flow
 from trainer.evaluation.metrics import make_metrics
 from trainer.evaluation.voxelise import VoxelSettings
@@ -142,7 +142,7 @@ def test_data_sets_weigh_the_same_whatever_their_sizes(tmp_path: Path) -> None:
     scores = Validation(picture_task(), network(), config, ALONE)()
     evaluation = Run(network(), VoxelSettings(bins=5), make_metrics(["mse", "correlation"], {}))
     means = [
-        [score.means for score in evaluate_data_set(evaluation, tmp_path, data_set)]
+        [evaluate_sequence(evaluation, path, data_set).means for path in find_recordings(tmp_path, data_set).values()]
         for data_set in parse_config({"data": DATA_SETS}, "").data_sets
     ]
     assert [len(each) for each in means] == [2, 1]

@@ -15,6 +15,7 @@ import numpy as np
 
 from v2v_protocol.errors import V2VError
 from v2v_protocol.persisted import Persisted
+from v2v_protocol.programs import counted
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
@@ -228,7 +229,7 @@ def look_at_pictures(
     results = sorted(looked, key=lambda each: each.excerpt.id)
     found, sequences = [each for each in results if each.frames], _sequences_of(results, frames_needed)
     text = f"looked at {len(found)} of {len(catalogue.videos)} videos, at most {SECONDS_OF_EACH} s and "
-    text += f"{_MOST_FRAMES} frames of each: {len(sequences)} sequences"
+    text += f"{_MOST_FRAMES} frames of each: {counted(len(sequences), 'sequence')}"
     if failed := [f"{each.excerpt.id}: {each.problem}" for each in results if not each.frames]:
         text += f"; {len(failed)} more did not decode ({name_all(failed)})"
     yield "ok", "pictures", text, ""
@@ -294,7 +295,8 @@ def check_in_background(
         ]
         if shares:
             say(
-                f"pictures: of {len(sequences)} sequences of {len(results)} videos, {', '.join(shares)}: "
+                f"pictures: of {counted(len(sequences), 'sequence')} of {counted(len(results), 'video')}, "
+                f"{', '.join(shares)}: "
                 "--scene auto leaves these out; v2v-doctor --videos names the videos"
             )
 
