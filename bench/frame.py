@@ -13,9 +13,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from v2v_protocol.command import JSON, Parser
+from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
-from v2v_protocol.write_aside import write_aside_and_rename, write_json
+from v2v_protocol.write_aside import JSON, write_aside_and_rename, write_json
 from v2v_tools.tradeoff.report import format_table
 
 if TYPE_CHECKING:

@@ -21,14 +21,14 @@ from rich.table import Table
 
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.local_server import LocalServer, server_flags
-from v2v_protocol.command import INTERRUPTED, JSON, Parser, run_command
+from v2v_protocol.command import INTERRUPTED, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.programs import counted
 from v2v_protocol.progress import Progress
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_changes, recipe_setting, spec_fields
-from v2v_protocol.write_aside import write_json
+from v2v_protocol.write_aside import JSON, write_json
 
 _RSS_EVERY_SECONDS = 0.5
 _LEAST_WIDTH = 110

@@ -19,15 +19,13 @@ from typing import Any, Never
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import COMPLETION, open_standard_streams, show, version_of
 from v2v_protocol.settings import Setting, nearest, settings_of
-from v2v_protocol.write_aside import check_output
+from v2v_protocol.write_aside import JSON, check_output
 
 FAILED = 1
 WRONG_USAGE = 2
 INTERRUPTED = 128 + signal.SIGINT
 _LONGEST_CHOICE = 30
 _HELP_WIDTH = 100
-JSON = (".json",)
-"""Endings of ``--json FILE``."""
 _GENERAL = "General"
 _FILES = ("FILE", "DIR", "VIDEO", "SRC", "DST", "PATH", "CONFIG", "RECORDING")
 """Words in the placeholder of an argument that names a file or folder."""

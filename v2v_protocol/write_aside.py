@@ -13,6 +13,8 @@ from v2v_protocol.errors import UsageError
 
 _LISTS = frozenset({".txt", ".csv", ".lst"})
 """Endings of files that may name the videos beside them."""
+JSON = (".json",)
+"""Endings of ``--json FILE``. Another name will do, unless a file of that name exists that is not JSON."""
 _STREAMS = frozenset({"/dev", "/dev/fd"})
 """Folders whose files, such as /dev/stdout, are written in place."""
 
@@ -98,7 +100,7 @@ def check_output(
             raise UsageError(f"{named}: it is a folder; give the name of a file")
         if _is_stream(path):
             return
-        if path.suffix.lower() not in endings:
+        if path.suffix.lower() not in endings and (endings != JSON or _is_other_than_json(path)):
             raise UsageError(f"{named}: unknown ending; give a name that ends in {', '.join(endings)}")
         if not path.parent.is_dir():
             raise UsageError(f"{named}: there is no folder {path.parent}; create it first")
@@ -134,6 +136,14 @@ def _input_reason(path: Path, inputs: Iterable[str | os.PathLike[str]]) -> str:
             if any(name != path.name for name in alike):
                 return f"it exists, beside other {path.suffix} files, in {folder}, which this command reads"
     return ""
+
+
+def _is_other_than_json(path: Path) -> bool:
+    """Return whether there is such a file, with something in it that does not begin as JSON records do."""
+    if not path.exists():
+        return False
+    with path.open("rb") as file:
+        return file.read(1) not in b"[{"
 
 
 def _is_stream(path: Path) -> bool:

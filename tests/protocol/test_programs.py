@@ -175,6 +175,11 @@ def run_v2v(*given: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest
     return status, said.out, said.err
 
 
+def test_one_of_a_thing_is_no_plural() -> None:
+    assert [programs.counted(number, "video") for number in (0, 1, 2)] == ["0 videos", "1 video", "2 videos"]
+    assert [programs.counted(number, "box is", "boxes are") for number in (1, 3)] == ["1 box is", "3 boxes are"]
+
+
 def test_one_door_lists_all_commands_and_runs_them(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,6 +187,7 @@ def test_one_door_lists_all_commands_and_runs_them(
     assert status == 0
     assert {f"v2v-{name}" for name in programs.COMMANDS} == set(SCRIPTS)
     assert all(re.search(rf"^  {name} +\w", listed, re.M) for name in programs.COMMANDS)
+    assert run_v2v("--version", capsys=capsys, monkeypatch=monkeypatch)[1] == f"{programs.version_of('v2v')}\n"
     assert run_v2v("serve", "--version", capsys=capsys, monkeypatch=monkeypatch)[1].startswith("v2v-serve ")
     status, _, said = run_v2v("serv", capsys=capsys, monkeypatch=monkeypatch)
     assert status == 2

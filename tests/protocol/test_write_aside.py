@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.write_aside import write_aside_and_rename, write_json
+from v2v_protocol.write_aside import JSON, check_output, write_aside_and_rename, write_json
 
 
 @pytest.mark.parametrize("durable", [False, True])
@@ -55,6 +55,16 @@ def test_a_durable_file_is_flushed_before_it_is_renamed_and_its_folder_after(
     with write_aside_and_rename(path, durable=True) as partial:
         partial.write_text("new")
     assert flushed == [(False, False), (True, True)]
+
+
+def test_records_may_have_any_name_and_replace_records_only(tmp_path: Path) -> None:
+    file = tmp_path / "scores"
+    check_output("--json", file, JSON)
+    write_json(file, [{"mse": 1.0}])
+    check_output("--json", file, JSON)
+    (tmp_path / "a.mp4").write_bytes(b"\0\0\0 ftyp")
+    with pytest.raises(UsageError, match=r"a\.mp4: unknown ending; give a name that ends in \.json"):
+        check_output("--json", tmp_path / "a.mp4", JSON)
 
 
 def test_a_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:

@@ -12,10 +12,10 @@ from pathlib import Path
 
 from trainer.convert.conversion import Converted, convert, default_name
 from trainer.evaluation import layout
-from v2v_protocol.command import JSON, Parser, run_command
+from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.progress import Progress
-from v2v_protocol.write_aside import write_json
+from v2v_protocol.write_aside import JSON, write_json
 from v2v_recordings import items
 from v2v_recordings.reading import FORMS
 

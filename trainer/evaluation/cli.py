@@ -27,11 +27,11 @@ from trainer.evaluation.score import SequenceScore
 from trainer.evaluation.tables import records, table, write_frames
 from trainer.evaluation.voxelise import Kind, Span, VoxelSettings
 from trainer.weights import SHIPPED, load_network
-from v2v_protocol.command import FAILED, JSON, Parser, run_command
+from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
-from v2v_protocol.write_aside import write_json
+from v2v_protocol.write_aside import JSON, write_json
 from v2v_recordings.items import ConvertOptions, Light, SensorSize
 
 OF_PICTURES = (

@@ -14,12 +14,12 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from v2v_protocol.command import FAILED, JSON, Parser, run_command
+from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec import SCENES
-from v2v_protocol.write_aside import write_json
+from v2v_protocol.write_aside import JSON, write_json
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.sources.source import LIST_SUFFIXES

@@ -13,10 +13,10 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 
-from v2v_protocol.command import JSON, Parser, run_command
+from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.programs import show
-from v2v_protocol.write_aside import write_json
+from v2v_protocol.write_aside import JSON, write_json
 from v2v_server.corpus.sources.source import SourceOptions, open_source
 from v2v_server.quarantine import Quarantine, clearing, quarantine_path, read_quarantine, write_entry
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import cv2
 
-from v2v_protocol.command import FAILED, JSON, Parser, run_command
+from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError
 from v2v_protocol.programs import show
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_recipe, recipe_setting
-from v2v_protocol.write_aside import write_file, write_json
+from v2v_protocol.write_aside import JSON, write_file, write_json
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.simulation.precision import warm_up
 from v2v_server.system.process import keep_freed_memory

@@ -57,6 +57,8 @@ def test_pictures_are_paired_and_late_events_sorted_whatever_the_chunks(
     with h5py.File(path) as file:
         origin = file.attrs["start_ns"]
         np.testing.assert_allclose(file["events/ts"][:] * 1e9 + origin, times, rtol=0, atol=1e-3)
+        assert file.attrs["t0"] * 1e9 + origin == pytest.approx(min(times), abs=1e-3)
+        assert file.attrs["duration"] * 1e9 == pytest.approx(max(times) - min(times), abs=1e-3)
         paired = [
             (round(image.attrs["timestamp"] * 1e9) + origin, image.attrs["event_idx"])
             for image in file["images"].values()
