@@ -18,10 +18,17 @@ Modules:
     loadtest      the load test; local_server: a server as a subprocess
 """
 
-from v2v_client.batch import Batch
-from v2v_client.dataset import V2VStreamDataset
-from v2v_client.in_process import V2VDataset
-from v2v_client.options import Patience
+from v2v_protocol.programs import name_extra
+
+try:
+    from v2v_client.batch import Batch
+    from v2v_client.dataset import V2VStreamDataset
+    from v2v_client.in_process import V2VDataset
+    from v2v_client.options import Patience
+except ModuleNotFoundError as error:
+    if (missing := error.name or "").startswith("v2v_"):
+        raise
+    raise ModuleNotFoundError(name_extra("v2v_client", missing, "client"), name=missing) from error
 from v2v_protocol.arena import keep_freed_memory
 from v2v_protocol.errors import (
     NoWorkers,

@@ -22,7 +22,7 @@ from v2v_client.batch import Batch, Drawn, draw_samples
 from v2v_client.options import Labels, check_labels, require_arguments, require_labels
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
-from v2v_protocol.programs import counted
+from v2v_protocol.programs import counted, name_extra
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample, html_table
 from v2v_protocol.settings import require_whole
@@ -165,10 +165,8 @@ class V2VDataset(Dataset[Sample]):
             try:
                 remake = importlib.import_module("v2v_tools.remake")
             except ModuleNotFoundError as error:
-                raise UsageError(
-                    f"V2VDataset makes samples in this process, which needs the package {error.name}: pip install "
-                    "'.[server]' in a checkout"
-                ) from error
+                needs = "V2VDataset, which makes samples in this process,"
+                raise UsageError(name_extra(needs, error.name or "", "server")) from error
             kind = remake.VideosKind(*self._kind)
             self._maker = remake.open_remaker(
                 self._videos, **self._source, kind=kind, spec=self.spec, arrays=self._arrays

@@ -79,6 +79,20 @@ def counted(number: int, noun: str, nouns: str = "") -> str:
     return f"{number} {noun if number == 1 else nouns or f'{noun}s'}"
 
 
+def name_extra(needs: str, package: str, extra: str) -> str:
+    """Return a message that names the missing package and how to install it.
+
+    Args:
+        needs: what needs it.
+        package: name of the module that could not be imported.
+        extra: extra of the distribution that brings it.
+    """
+    return (
+        f"{needs} needs the Python package {package.partition('.')[0]}, which is not installed; the extra '{extra}' "
+        f"brings it: pip install '.[{extra}]' in a checkout of v2v-stream"
+    )
+
+
 def version_of(name: str) -> str:
     """Return the version line of a command: versions of the program, the protocol and the numerics."""
     return f"{name} {__version__} (protocol {PROTOCOL_VERSION}, numerics {NUMERICS_VERSION})"
@@ -115,11 +129,7 @@ def _run(name: str) -> int | None:
             raise
         if os.environ.get(COMPLETION):
             return None  # a shell completes the commands that are installed
-        print(
-            f"v2v-{name}: needs the Python package {package}, which is not installed; the extra '{extra}' brings it: "
-            f"pip install '.[{extra}]' in a checkout of v2v-stream",
-            file=sys.stderr,
-        )
+        print(name_extra(f"v2v-{name}:", package, extra), file=sys.stderr)
         return 2
     return status
 

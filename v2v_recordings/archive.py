@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.programs import name_extra
 from v2v_recordings.items import SensorSize
 
 ZIPS = (".zip", ".npz")
@@ -158,9 +159,7 @@ def package(name: str, what: str) -> Any:
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
-        raise UsageError(
-            f"{what} needs the package {name.partition('.')[0]}: pip install '.[convert]' in a checkout of v2v-stream"
-        ) from error
+        raise UsageError(name_extra(what, name, "convert")) from error
 
 
 def holds(path: Path, check: Callable[[Archive], Any], suffix: str = ".zip") -> bool:

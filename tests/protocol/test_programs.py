@@ -67,6 +67,48 @@ def test_a_missing_package_is_named(
     assert "pip install '.[convert]'" in line
 
 
+WITHOUT = """
+import sys
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {packages}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Missing())
+"""
+"""A program that begins with some packages missing."""
+
+
+def without(packages: set[str], then: str) -> subprocess.CompletedProcess[str]:
+    code = WITHOUT.format(packages=packages) + then
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("package", ["torch", "zmq"])
+def test_the_client_without_its_packages_names_the_extra(package: str) -> None:
+    done = without({package}, "import v2v_client")
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == (
+        f"ModuleNotFoundError: v2v_client needs the Python package {package}, which is not installed; the extra "
+        "'client' brings it: pip install '.[client]' in a checkout of v2v-stream"
+    )
+
+
+def test_recordings_are_converted_with_the_packages_of_their_extra(tmp_path: Path) -> None:
+    """Of all packages of other extras none is needed, PyTorch above all."""
+    extras = PROJECT["optional-dependencies"]
+    modules = {"opencv-contrib-python-headless": "cv2", "pyyaml": "yaml", "pyzmq": "zmq", "pillow": "PIL"}
+    modules["scikit-image"] = "skimage"
+    named = {each: {re.match(r"[\w-]+", text)[0] for text in extras[each]} for each in ("server", "trainer", "convert")}  # type: ignore[index]
+    others = {modules.get(name, name) for name in named["server"] | named["trainer"] | {"torch"}}
+    missing = others - {modules.get(name, name) for name in named["convert"]} - {"v2v-stream"}
+    assert {"torch", "scipy", "av", "yaml", "numba"} <= missing
+    (tmp_path / "events.txt").write_text("".join(f"{0.001 * n:.6f} {n % 9} {n % 7} {n % 2}\n" for n in range(2000)))
+    run = "from trainer.convert.cli import main; sys.exit(main(['events.txt', '--out', 'a.h5']))"
+    code = f"import os; os.chdir({str(tmp_path)!r}); {run}"
+    done = without(missing, code)
+    assert (done.returncode, (tmp_path / "a.h5").is_file()) == (0, True), done.stderr
+
+
 def test_no_decoder_is_installed_that_does_not_tell_damage() -> None:
     (bound,) = [text for text in PROJECT["optional-dependencies"]["server"] if text.startswith("av")]
     # PyAV 18 carries FFmpeg 8.1.2, with the fixes of 2026; what a later one delivers has not been looked at.

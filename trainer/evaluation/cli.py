@@ -262,7 +262,11 @@ class Unscored:
             show(f"v2v-eval: not scored: {' '.join(str(error).split())}", sys.stderr)
 
     def fail(self) -> None:
-        """Raise the first reason, if there is one: no recording was scored."""
+        """Fail with the first reason, if there is one: no recording was scored.
+
+        Raises:
+            UsageError: that reason.
+        """
         for reason in self.reasons.values():
             reason.is_reported = True
             raise reason

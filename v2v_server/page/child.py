@@ -17,7 +17,7 @@ import sys
 from importlib.util import find_spec
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.programs import environment
+from v2v_protocol.programs import environment, name_extra
 
 _PACKAGES = ("starlette", "uvicorn", "prometheus_client")
 _FIRST_PAUSE_SECONDS, _LONGEST_PAUSE_SECONDS = 1.0, 60.0
@@ -44,10 +44,7 @@ class PageProcess:
     ) -> None:
         missing = [name for name in _PACKAGES if find_spec(name) is None]
         if missing:
-            raise UsageError(
-                f"--page needs the Python package {missing[0]}, which is not installed; the extra 'page' brings it: "
-                "pip install '.[server,page]' in a checkout of v2v-stream"
-            )
+            raise UsageError(name_extra("--page", missing[0], "page"))
         self._socket = _listening(host, port)
         self._flags = ["--names", names, "--log-format", log_format, *["--insecure"] * is_insecure]
         self._address = ""

@@ -25,6 +25,7 @@ from typing import Any, Protocol, TypeVar
 import psutil
 
 from v2v_protocol.errors import UsageError, WorkerCrashLoop
+from v2v_protocol.programs import name_extra
 from v2v_server.broker.leases import Cause, Loss, Stall
 from v2v_server.config import ENGINES, ServeConfig
 from v2v_server.corpus.sources.source import VideoSource
@@ -424,8 +425,7 @@ def make_pool(
         if error.name != name:
             raise
         raise UsageError(
-            f"--engine {name} needs the Python package {name}, which is not installed; the extra '{name}' brings it: "
-            f"pip install '.[server,{name}]' in a checkout of v2v-stream, here and on every node of the cluster"
+            f"{name_extra(f'--engine {name}', name, name)}, here and on every node of the cluster"
         ) from error
     key = None if keys is None or name == "local" else keys.lend(f"{name}-{label}", "worker")
     return Pool(engine.make_host(config, source.name, label, flags, key, standbys), label)
