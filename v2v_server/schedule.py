@@ -470,10 +470,14 @@ def _unsuited(video: VideoEntry, reason: str, remedy: str) -> Refusal:
 def _too_short(video: VideoEntry, recipe: Recipe) -> Refusal:
     most = _longest_clip(video.frames, int(recipe.steps_at(video.frames_per_second)), recipe)
     shorter = "shorter voxel_seconds" if recipe.is_timed else "fewer bins, frames_per_bin"
-    remedy = f"voxels_per_clip at most {most}" if most else f"{shorter} or frame_stride, no lead_voxels"
+    remedy = _shorter(most) if most else f"{shorter} or frame_stride, no lead_voxels"
     if video.frames < 2:
         remedy = "none: a voxel grid needs two frames"
     return _unsuited(video, f"{video.frames} frames, {_needs(video, recipe)}", remedy)
+
+
+def _shorter(most: int) -> str:
+    return f"voxels_per_clip at most {most} (--set voxels_per_clip={most})"
 
 
 def _needs(video: VideoEntry, recipe: Recipe) -> str:
@@ -500,7 +504,7 @@ def _all_cut(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal:
     if longest < needed:
         most = _longest_clip(longest, int(recipe.steps_at(video.frames_per_second)), recipe)
         reason = f"at most {longest} frames in a row without a defect, {_needs(video, recipe)}"
-        return _unsuited(video, reason, f"voxels_per_clip at most {most}, or scene off" if most else "scene off")
+        return _unsuited(video, reason, f"{_shorter(most)}, or scene off" if most else "scene off")
     for sides in runs.sides[runs.frames >= needed].tolist():
         if (refusal := _too_small(video, rows, recipe, Sides(*sides))) is not None:
             return refusal

@@ -116,6 +116,8 @@ def preview(
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir, kind=kind)
     cameras: list[Camera] = []
     loss, started, notes = Prediction(), np.zeros(2), dict[str, list[str]]()
+    for note in catalogue.notes:
+        say(note)
     try:
         first = _fitted_stream(catalogue, spec, wanted[0].recipe)
         wholes = WholePictures(catalogue, first)
@@ -226,8 +228,7 @@ def _camera(
     arrays = ("voxels", "frames", *(("flow",) if with_flow else ()), *labels)
     made = Remaker(catalogue, stream, arrays).made(wanted.seed, 0, 0)
     provenance = made.sample.provenance
-    remark = f"{provenance.video} {provenance.remark}" if provenance.remark else ""
-    for note in filter(None, (remark, _signal_note(catalogue, provenance, stream.recipe))):
+    if note := _signal_note(catalogue, provenance, stream.recipe):
         notes.setdefault(note, []).append(title)
     whole = _whole_picture(catalogue, provenance, stream.recipe)
     camera = Camera.of(made.sample.arrays, provenance, title, stream.recipe, whole)

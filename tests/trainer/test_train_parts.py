@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import os
 import signal
@@ -24,7 +25,9 @@ from trainer.run.distributed import ranks
 from trainer.run.interruption import StopRequest
 from trainer.run.reporting import _planned_steps
 from trainer.tasks import Asked
+from trainer.tasks.task import liveliest
 from trainer.train import serving
+from v2v_client import V2VStreamDataset
 from v2v_protocol.errors import ServerLost, StateMismatch, UsageError, V2VError, WorkerCrashLoop
 from v2v_protocol.recipe import Recipe
 
@@ -88,6 +91,17 @@ def test_the_rate_warms_up_decays_by_epoch_and_may_end_as_a_cosine() -> None:
     by_step = [learning_rate(cosine, RunConfig(epochs=4, steps=8), step, 0) for step in (0, 2, 4, 6, 8)]
     assert by_epoch == pytest.approx([0.1, 0.1 * (0.5 + 0.125**0.5), 0.05, 0.1 * (0.5 - 0.125**0.5), 0], abs=1e-9)
     assert by_step == pytest.approx(by_epoch, abs=1e-9)
+
+
+@pytest.mark.parametrize(("count", "chosen"), [(1, [2]), (2, [0, 2]), (9, [0, 1, 2])])
+def test_films_are_of_the_samples_that_move_most(count: int, chosen: list[int]) -> None:
+    with FakeServer() as server:
+        batch = next(iter(V2VStreamDataset(server.address, batch_size=3, recipe=SPEC.recipe)))
+    moving = torch.zeros(3, 4, 1, 8, 8, dtype=torch.uint8)
+    moving[0, 2], moving[2, 1] = 100, 200
+    noise = torch.randint(-9, 9, (3, 4, 5, 8, 8), dtype=torch.int8)  # events of noise are no motion
+    assert liveliest(dataclasses.replace(batch, arrays={"voxels": noise, "frames": moving}), count) == chosen
+    assert liveliest(dataclasses.replace(batch, arrays={"voxels": noise}), count) == [0, 1, 2][:count]
 
 
 # --- a clean end ------------------------------------------------------------------------------------------------------

@@ -80,6 +80,16 @@ def test_a_video_too_short_or_too_small_is_shown_all_the_same_and_said(clip: Pat
     assert said[-1] == f"{tmp_path / 'p.png'}: 1 camera"
 
 
+def test_what_a_server_says_of_a_video_is_said(tmp_path: Path) -> None:
+    write_clip(tmp_path / "fields.mp4", panned_luma(60, 64, 64), options={"x264-params": "interlaced=1"})
+    recipe = {"crop_height_px": 48, "crop_width_px": 48, "voxels_per_clip": 4}
+    said: list[str] = []
+    preview(
+        str(tmp_path / "fields.mp4"), tmp_path / "a.png", [PreviewCamera("", recipe, 0)], {}, title="", say=said.append
+    )
+    assert said[0].startswith("1 video is interlaced (fields.mp4): the frames are served as they are stored")
+
+
 def test_a_video_of_one_frame_is_refused(tmp_path: Path) -> None:
     still = write_clip(tmp_path / "still.mp4", panned_luma(1, 64, 64))
     with pytest.raises(CorpusError, match=r"still\.mp4"):

@@ -167,15 +167,27 @@ class Task(abc.ABC):
     @torch.no_grad()
     @ieee_products()
     def judge(self, network: VoxelNetwork, batch: Batch, films: int) -> tuple[dict[str, float], list[Image]]:
-        """Return the losses of a network on a held-out batch, and films of its first ``films`` samples."""
+        """Return the losses of a network on a held-out batch, and films of the ``films`` samples that move most."""
         training = network.training
         network.eval()
         work = self.prepare(batch, None)
         prediction: Tensor = network(work.voxels)[0]
         losses = {name: float(value) for name, value in self.losses(prediction, work).items()}
         network.train(training)
-        shown = range(min(films, len(prediction)))
+        shown = liveliest(batch, films)
         return losses, [self.film(work.voxels, prediction.float(), work, sample) for sample in shown]
+
+
+def liveliest(batch: Batch, count: int) -> list[int]:
+    """Return the samples of a batch in whose frames most changes, in order: a still crop shows nothing.
+
+    Args:
+        count: number of samples wanted; there are fewer if the batch has fewer. Without frames they are the first.
+    """
+    if "frames" not in batch.arrays:
+        return list(range(min(count, len(batch.indices))))
+    changes = batch.arrays["frames"].float().diff(dim=1).abs().mean(dim=(1, 2, 3, 4))
+    return sorted(changes.argsort(descending=True, stable=True)[:count].tolist())
 
 
 def required_file(settings: Any, key: str, why: str, origin: str) -> str | Path:

@@ -17,7 +17,8 @@ VIDEO_SUFFIXES = frozenset({
     ".mp4", ".mpeg", ".mpg", ".mts", ".mxf", ".obu", ".ogv", ".ts", ".vob", ".webm", ".wmv", ".y4m",
 })  # fmt: skip
 LOOKED_FOR = (
-    f"{' '.join(sorted(VIDEO_SUFFIXES))}; with --videos-kind sequences, folders of numbered pictures are videos"
+    f"{' '.join(sorted(VIDEO_SUFFIXES))}; with --videos-kind sequences, folders of numbered pictures are videos, and "
+    "with --videos-kind photographs, each picture is a scene that moves"
 )
 
 

@@ -97,7 +97,10 @@ def test_what_can_be_done_about_a_video_is_said() -> None:
               video("still", 61, pieces((61, Flag.STILL))))  # fmt: skip
     table = SequenceTable(videos, Rows(), StreamSpec(recipe=RECIPE, scene="auto", still_share=0.0))
     assert [(refusal.reason, refusal.remedy) for refusal in table.refusals] == [
-        ("at most 20 frames in a row without a defect, the recipe needs 21", "voxels_per_clip at most 3, or scene off"),
+        (
+            "at most 20 frames in a row without a defect, the recipe needs 21",
+            "voxels_per_clip at most 3 (--set voxels_per_clip=3), or scene off",
+        ),
         (
             "picture 64x24 after rows full and without its bars, the crop is 32x32",
             "resize_scale up to 1.334, or a smaller crop",

@@ -137,7 +137,12 @@ def test_grids_of_a_duration_have_as_many_frames_as_the_rate_of_their_video_says
     [
         (math.nan, 100, "its frame rate is unknown, and voxel_seconds needs it", "voxel_seconds 0"),
         (10_000.0, 10**6, r"a voxel grid of 10 s spans 100000 steps at 10000 frames/s, the limit is 1024", "shorter"),
-        (30.0, 500, r"500 frames, the recipe needs 601 at 30 frames/s", "voxels_per_clip at most 1"),
+        (
+            30.0,
+            500,
+            r"500 frames, the recipe needs 601 at 30 frames/s",
+            "voxels_per_clip at most 1 (--set voxels_per_clip=1)",
+        ),
         (30.0, 200, r"200 frames, the recipe needs 601 at 30 frames/s", "shorter voxel_seconds or frame_stride"),
     ],
 )
@@ -193,7 +198,7 @@ def test_the_remedy_for_a_short_video_admits_it(frames: int, voxels: int, bins: 
         return
     assert refusals[0].video == "short"
     assert refusals[0].reason == f"{frames} frames, the recipe needs {recipe.frames_needed}"
-    if match := re.fullmatch(r"voxels_per_clip at most (\d+)", refusals[0].remedy):
+    if match := re.fullmatch(r"voxels_per_clip at most (\d+) \(--set voxels_per_clip=\1\)", refusals[0].remedy):
         most = int(match[1])
         assert 1 <= most < voxels
         assert table(video("short", frames), spec=StreamSpec(recipe=recipe.replace(voxels_per_clip=most))).count == 1

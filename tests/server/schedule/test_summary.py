@@ -54,7 +54,8 @@ def test_refusals_name_reason_and_remedy() -> None:
     assert said[0].startswith("3 videos in /corpus, 1 of use: 10 sequences")
     assert said[1:] == [
         "2 videos give none under the server's own recipe:",
-        "  short.mp4: 4 frames, the recipe needs 5; would admit it: voxels_per_clip at most 1",
+        "  short.mp4: 4 frames, the recipe needs 5; would admit it: voxels_per_clip at most 1 "
+        "(--set voxels_per_clip=1)",
         "  small.mp4: picture 16x5 after rows full, the crop is 8x8; "
         "would admit it: resize_scale up to 1.6, or a smaller crop",
         "  The longest clip that fits has 1 voxel grids. Shorter clips: --set voxels_per_clip=1 admits 1 of them",
