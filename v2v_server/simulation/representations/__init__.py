@@ -99,7 +99,9 @@ def new_memory(name: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def fill_array(array: npt.NDArray[Any], memory: npt.NDArray[Any]) -> int:
-    """Fill an array, [T, ..., H, W] or [T, ...], from the memory that the kernel wrote; return how many values were clipped."""
+    """Fill an array, [T, ..., H, W] or [T, ...], from the memory that the kernel wrote; return how many values were
+    clipped.
+    """
     if array.dtype != np.float16:
         return 0
     within = np.clip(memory, -_LARGEST_FLOAT16, _LARGEST_FLOAT16)
