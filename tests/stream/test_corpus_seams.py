@@ -195,7 +195,7 @@ assert {each.video for batch in batches for each in batch.provenance} == {"toys/
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The files with both additions, which an import prefers to those of the packages, and two clips."""
     tmp_path = tmp_path_factory.mktemp("tree")
-    for name in ("v2v_server/worker", "v2v_server/corpus/sources", "v2v_protocol"):
+    for name in ("v2v_server/worker/arrays", "v2v_server/corpus/sources", "v2v_protocol"):
         (tmp_path / name).mkdir(parents=True)
     for name, *_ in (*DEPTH_LINES, SOURCE_LINE):
         shutil.copy(ROOT / name, tmp_path / name)
