@@ -20,7 +20,9 @@ from tests.client.fake_server import FakeServer, expected
 from tests.clips import panned_luma, write_clip
 from v2v_client import V2VStreamDataset
 from v2v_protocol import sample
-from v2v_server.worker import arrays
+from v2v_protocol.sample import ArrayForm
+from v2v_server.simulation.representations import NAMES
+from v2v_server.worker.arrays.context import ARRAY_BUILDERS
 
 ROOT = Path(__file__).parents[1]
 
@@ -61,20 +63,25 @@ EFFECT_LINES = (
 )  # fmt: skip
 
 ARRAY = '''
-"""Depth, of a world in which what is brighter is nearer."""
+"""Depth, of a world in which what is brighter is nearer; and an array that takes from the simulation what it wants."""
 
-from v2v_server.worker.arrays import makes
+from v2v_server.worker.arrays.context import makes
 
 
 @makes("depth")
 def depth(context, out):
     out[:, 0] = 255.0 - context.view[context.source[context.target_steps]]
+
+
+@makes("listed")
+def listed(context, out):
+    out[0] = len(context.simulated.to_events(1e3).t)
 '''
 ARRAY_LINES = (
-    ("v2v_protocol/sample.py", '    "flow_valid": lambda',
-     '    "depth": lambda recipe, _: ("float32", (recipe.voxels_per_clip, 1, *recipe.crop_px)),\n'),
-    ("v2v_server/worker/produce.py", "from v2v_server.worker.arrays import",
-     "import v2v_server.worker.depth  # noqa: F401\n"),
+    ("v2v_protocol/sample.py", '    "flow_valid": ArrayForm(',
+     '    "depth": ArrayForm(lambda recipe, _: ("float32", (recipe.voxels_per_clip, 1, *recipe.crop_px))),\n'
+     '    "listed": ArrayForm(lambda recipe, _: ("float32", (1,)), Needs(events=True)),\n'),
+    ("v2v_server/worker/arrays/__init__.py", '    "flow",', '    "depth",\n'),
 )  # fmt: skip
 
 REPRESENTATION = '''
@@ -90,11 +97,30 @@ def end(fired, counts):
             fired[counts.grid, counts.bin, counts.first + i] = counts.on[i] + counts.off[i] > 0
     return 0
 '''
+ACTIVITY = '''
+"""Events of each voxel grid, of all pixels together: [grids]."""
+
+from v2v_server.simulation.effects.state import hook
+
+
+def prepare(memory, given, segments, real):
+    memory[:] = 0
+    return memory
+
+
+@hook
+def end(activity, counts):
+    if len(activity) > 0:
+        for i in range(counts.last - counts.first):
+            activity[counts.grid] += counts.on[i] + counts.off[i]
+    return 0
+'''
 REPRESENTATION_LINES = (
     (
         "v2v_protocol/sample.py",
-        '    "time_surface": OfEvents(',
-        '    "fired": OfEvents(lambda dtype, *shape: (dtype, shape)),\n',
+        '    "time_surface": of_events(',
+        '    "fired": of_events(lambda dtype, *shape: (dtype, shape)),\n'
+        '    "activity": of_events(lambda dtype, grids, *_: ("float32", (grids,))),\n',
     ),
 )
 
@@ -139,6 +165,17 @@ assert np.array_equal(tolerated.arrays["voxels"], off.arrays["voxels"])
 counts, fired = tolerated.arrays["event_counts"], tolerated.arrays["fired"]
 assert np.array_equal(fired, counts.any(axis=1))
 assert 0 < fired.mean() < 1
+# An array without pixels, and one that simulates on its own, alone and beside one that needs seconds.
+plain = StreamSpec(recipe=Recipe(**small))
+counted = np.abs(off.arrays["voxels"].astype(int)).sum((1, 2, 3))
+for arrays in (("activity",), ("listed",), ("voxels", "listed"), ("activity", "time_surface", "listed", "voxels")):
+    sample = remake(catalogue, plain, seed=1, epoch=0, index=0, arrays=arrays)
+    if "activity" in arrays:
+        assert sample.arrays["activity"].tolist() == counted.tolist()
+    if "listed" in arrays:
+        assert sample.arrays["listed"] == counted.sum()
+    if "voxels" in arrays:
+        assert np.array_equal(sample.arrays["voxels"], off.arrays["voxels"])
 json.dump({"off": off.provenance.to_dict()["params"], "on": on.provenance.to_dict()["params"]}, sys.stdout)
 """
 
@@ -157,9 +194,10 @@ def test_a_toy_effect_array_and_representation_are_a_file_and_a_line_or_two(tmp_
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "v2v_server/simulation/effects/event_loss.py").write_text(EFFECT)
     add(tmp_path, EFFECT_LINES)
-    (tmp_path / "v2v_server/worker/depth.py").write_text(ARRAY)
+    (tmp_path / "v2v_server/worker/arrays/depth.py").write_text(ARRAY)
     add(tmp_path, ARRAY_LINES)
-    (tmp_path / "v2v_server/simulation/representations/fired.py").write_text(REPRESENTATION)
+    for name, text in (("fired", REPRESENTATION), ("activity", ACTIVITY)):
+        (tmp_path / f"v2v_server/simulation/representations/{name}.py").write_text(text)
     add(tmp_path, REPRESENTATION_LINES)
     clips = tmp_path / "clips"
     clips.mkdir()
@@ -177,7 +215,8 @@ def test_a_toy_effect_array_and_representation_are_a_file_and_a_line_or_two(tmp_
 
 def test_a_toy_array_reaches_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its layout is checked on the wire, and it lies in the batch beside the others."""
-    monkeypatch.setitem(sample.ARRAYS, "depth", lambda recipe, _: ("float32", (recipe.voxels_per_clip, 1, 4, 6)))
+    form = ArrayForm(lambda recipe, _: ("float32", (recipe.voxels_per_clip, 1, 4, 6)))
+    monkeypatch.setitem(sample.ARRAYS, "depth", form)
     with FakeServer(sequences=8) as server:
         dataset = V2VStreamDataset(server.address, batch_size=4, arrays=("voxels", "depth"), seed=5)
         batches = list(dataset)
@@ -189,7 +228,8 @@ def test_a_toy_array_reaches_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_array_that_can_be_requested_is_made() -> None:
-    assert arrays.ARRAY_BUILDERS.keys() == sample.ARRAYS.keys()
+    assert ARRAY_BUILDERS.keys() | set(NAMES) == sample.ARRAYS.keys()
+    assert not ARRAY_BUILDERS.keys() & set(NAMES)
 
 
 def test_every_seam_of_the_page_has_a_toy() -> None:

@@ -21,7 +21,7 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import ARRAYS, Provenance, empty_value, html_table
+from v2v_protocol.sample import ARRAYS, Provenance, html_table
 from v2v_protocol.settings import nearest
 
 _SHOWN = 3
@@ -186,7 +186,7 @@ class Batch(Drawn):
             UsageError: the dataset did not request this array.
         """
         label = self._array(name)
-        counts = (label != empty_value(name)).any(-1).sum(-1).tolist()
+        counts = (label != ARRAYS[name].empty).any(-1).sum(-1).tolist()
         return [[frame[:count] for frame, count in zip(*clip, strict=True)] for clip in zip(label, counts, strict=True)]
 
     @property

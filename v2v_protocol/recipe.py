@@ -467,6 +467,11 @@ class Recipe(Persisted):
         return tuple(end * grids - 1 for end in range(self.first_frame, self.spans + 1))
 
     @property
+    def delivered_frames(self) -> int:
+        """Frames of a sample that arrays have: T + lead_frames."""
+        return self.voxels_per_clip + self.lead_frames
+
+    @property
     def spans(self) -> int:
         """Spans from one delivered frame to the next in a sample, lead voxel included."""
         return self.voxels_per_clip + self.lead_voxels

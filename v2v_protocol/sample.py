@@ -6,7 +6,9 @@ import html
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from functools import reduce
+from operator import or_
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -66,85 +68,117 @@ Coordinates are continuous: pixel (row, column) covers column <= x < column + 1 
 are whole numbers; a box without a track has -1. Rows without a box hold -1 in all columns."""
 TRACK_COLUMNS = ("x", "y", "visible")
 """Columns of the array ``tracks``: the place in px of the crop, as for boxes, and 1 where the point is seen, else 0."""
-ArrayForm: TypeAlias = Callable[[Recipe, str], tuple[str, tuple[int, ...]]]
+ArrayShape: TypeAlias = tuple[str, tuple[int, ...]]
+"""dtype and shape of an array of one sample."""
+EventShape: TypeAlias = Callable[[str, int, int, int, int], ArrayShape]
+"""dtype and shape, by the spec's ``voxel_dtype``, the number of voxel grids, the bins of a grid, and height and width
+of the picture."""
+
+
+Seconds: TypeAlias = Literal["", "if known", "must"]
+EstimatedFlow: TypeAlias = Literal["", "estimated", "checked"]
+"""Words of :class:`Needs`; each asks for more than the one before."""
 
 
 @dataclass(frozen=True, slots=True)
-class OfEvents:
-    """The form of an array that is made of the clip's events (``v2v_server/simulation/representations/``).
+class Needs:
+    """What an array is made from, beside the frames.
 
     Attributes:
-        form: dtype and shape of one sample, by the spec's ``voxel_dtype``, the number of voxel grids, the bins of a
-            grid, and height and width of the picture.
-        in_seconds: whether it needs the time between frames, even if the recipe does not.
-        empty: value of the whole array in a sample whose video has no known frame rate, if it needs one.
+        events: the clip is simulated before the array is made.
+        seconds: the time between frames. "if known": a sample of a video without a known frame rate has an empty array,
+            and says so; "must": such a video gives no sample.
+        levels: the levels between frames, where the spec has sub-steps; a simulation always has them.
+        flow: optical flow, "estimated" or also "checked" for where it is reliable.
+        colour: the colour of the delivered frames.
+        sidecars: endings of the sidecars that it can be made from, files or folders beside the video: ".boxes.json" for
+            ``clip.boxes.json`` beside ``clip.mp4``; with a slash at its end for a folder. One of them is enough.
     """
 
-    form: Callable[[str, int, int, int, int], tuple[str, tuple[int, ...]]]
-    in_seconds: bool = False
+    events: bool = False
+    seconds: Seconds = ""
+    levels: bool = False
+    flow: EstimatedFlow = ""
+    colour: bool = False
+    sidecars: tuple[str, ...] = ()
+
+    def __or__(self, other: Needs) -> Needs:
+        """Return what both need together."""
+        return Needs(
+            self.events or other.events,
+            max(self.seconds, other.seconds, key=get_args(Seconds).index),
+            self.levels or other.levels,
+            max(self.flow, other.flow, key=get_args(EstimatedFlow).index),
+            self.colour or other.colour,
+            tuple(sorted({*self.sidecars, *other.sidecars})),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayForm:
+    """An array that a consumer may request.
+
+    Attributes:
+        shape: dtype and shape for one sample, by the recipe and the spec's ``voxel_dtype``.
+        needs: what it is made from.
+        empty: value of the whole array in a sample for which it cannot be made.
+        of_events: dtype and shape of a representation (``v2v_server/simulation/representations/``), which the kernel
+            makes; None for all other arrays.
+    """
+
+    shape: Callable[[Recipe, str], ArrayShape]
+    needs: Needs = Needs()
     empty: float = 0
-
-    def __call__(self, recipe: Recipe, voxel_dtype: str) -> tuple[str, tuple[int, ...]]:
-        return self.form(voxel_dtype, recipe.voxel_grids, recipe.bins, *recipe.crop_px)
+    of_events: EventShape | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class FromSidecar:
-    """The form of an array that is made from a sidecar, a file or folder beside the video.
+def of_events(shape: EventShape, seconds: Seconds = "", empty: float = 0) -> ArrayForm:
+    """Return the form of an array that the kernel makes of the clip's events.
 
-    Attributes:
-        ending: of the sidecar's name, in the place of the video's: ".boxes.json" for ``clip.boxes.json`` beside
-            ``clip.mp4``; with a slash at its end for a folder.
-        form: dtype and shape, as for any array.
-        or_else: other endings that the array can be made from.
-        empty: value of the whole array in a sample without labels.
+    Args:
+        shape: its dtype and shape.
+        seconds, empty: see :class:`Needs` and :class:`ArrayForm`.
     """
-
-    ending: str
-    form: ArrayForm
-    or_else: tuple[str, ...] = ()
-    empty: int = 0
-
-    def __call__(self, recipe: Recipe, voxel_dtype: str) -> tuple[str, tuple[int, ...]]:
-        return self.form(recipe, voxel_dtype)
-
-    @property
-    def endings(self) -> tuple[str, ...]:
-        """Return all endings that the array can be made from."""
-        return self.ending, *self.or_else
+    return ArrayForm(
+        lambda recipe, voxel_dtype: shape(voxel_dtype, recipe.voxel_grids, recipe.bins, *recipe.crop_px),
+        Needs(events=True, seconds=seconds),
+        empty,
+        shape,
+    )
 
 
 _REAL = {"float32": "float32"}
 """dtype of values that are no counts, by ``voxel_dtype``; float16 for the others."""
 ARRAYS: dict[str, ArrayForm] = {
-    "voxels": OfEvents(lambda dtype, *shape: (dtype, shape)),
-    "event_counts": OfEvents(lambda dtype, grids, *rest: (dtype, (grids, 2, *rest))),
-    "voxels_bilinear": OfEvents(lambda dtype, *shape: (_REAL.get(dtype, "float16"), shape)),
-    "time_surface": OfEvents(
-        lambda dtype, grids, *rest: (_REAL.get(dtype, "float16"), (grids, 2, *rest)), in_seconds=True, empty=math.inf
+    "voxels": of_events(lambda dtype, *shape: (dtype, shape)),
+    "event_counts": of_events(lambda dtype, grids, *rest: (dtype, (grids, 2, *rest))),
+    "voxels_bilinear": of_events(lambda dtype, *shape: (_REAL.get(dtype, "float16"), shape)),
+    "time_surface": of_events(
+        lambda dtype, grids, *rest: (_REAL.get(dtype, "float16"), (grids, 2, *rest)), "if known", math.inf
     ),
-    "frames": lambda recipe, _: ("uint8", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
-    "frames_rgb": lambda recipe, _: (
-        "uint8", (recipe.voxels_per_clip + recipe.lead_frames, 3, *recipe.crop_px)
+    "frames": ArrayForm(lambda recipe, _: ("uint8", (recipe.delivered_frames, 1, *recipe.crop_px))),
+    "frames_rgb": ArrayForm(
+        lambda recipe, _: ("uint8", (recipe.delivered_frames, 3, *recipe.crop_px)), Needs(colour=True)
     ),
-    "frames_all": lambda recipe, _: ("uint8", (recipe.steps + 1, 1, *recipe.crop_px)),
-    "frames_u16": lambda recipe, _: ("uint16", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
-    "flow": lambda recipe, _: ("float16", (recipe.voxels_per_clip, 2, *recipe.crop_px)),
-    "flow_valid": lambda recipe, _: ("uint8", (recipe.voxels_per_clip, 1, *recipe.crop_px)),
-    "tracks": lambda recipe, _: (
-        "float32", (recipe.voxels_per_clip + recipe.lead_frames, recipe.track_points, len(TRACK_COLUMNS))
+    "frames_all": ArrayForm(lambda recipe, _: ("uint8", (recipe.steps + 1, 1, *recipe.crop_px))),
+    "frames_u16": ArrayForm(lambda recipe, _: ("uint16", (recipe.delivered_frames, 1, *recipe.crop_px))),
+    "flow": ArrayForm(
+        lambda recipe, _: ("float16", (recipe.voxels_per_clip, 2, *recipe.crop_px)), Needs(flow="estimated")
     ),
-    "boxes": FromSidecar(
-        ".boxes.json",
-        lambda recipe, _: (
-            "float32", (recipe.voxels_per_clip + recipe.lead_frames, recipe.max_boxes, len(BOX_COLUMNS))
-        ),
-        or_else=(".boxes.txt", ".boxes/"),
+    "flow_valid": ArrayForm(
+        lambda recipe, _: ("uint8", (recipe.voxels_per_clip, 1, *recipe.crop_px)), Needs(flow="checked")
+    ),
+    "tracks": ArrayForm(
+        lambda recipe, _: ("float32", (recipe.delivered_frames, recipe.track_points, len(TRACK_COLUMNS)))
+    ),
+    "boxes": ArrayForm(
+        lambda recipe, _: ("float32", (recipe.delivered_frames, recipe.max_boxes, len(BOX_COLUMNS))),
+        Needs(sidecars=(".boxes.json", ".boxes.txt", ".boxes/")),
         empty=-1,
     ),
-    "masks": FromSidecar(
-        ".masks/",
-        lambda recipe, _: ("uint8", (recipe.voxels_per_clip + recipe.lead_frames, 1, *recipe.crop_px)),
+    "masks": ArrayForm(
+        lambda recipe, _: ("uint8", (recipe.delivered_frames, 1, *recipe.crop_px)),
+        Needs(sidecars=(".masks/",)),
         empty=255,
     ),
 }  # fmt: skip
@@ -348,23 +382,17 @@ def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> L
     for name in arrays:
         if name not in ARRAYS:
             raise UsageError(f"arrays: unknown array {name!r}; known: {', '.join(ARRAYS)}")
-    return {name: ARRAYS[name](recipe, voxel_dtype) for name in arrays}
+    return {name: ARRAYS[name].shape(recipe, voxel_dtype) for name in arrays}
 
 
-def sidecar_endings(arrays: tuple[str, ...]) -> tuple[str, ...]:
+def needs_of(arrays: Iterable[str]) -> Needs:
+    """Return what these arrays need together; unknown ones need nothing."""
+    return reduce(or_, (ARRAYS[name].needs for name in arrays if name in ARRAYS), Needs())
+
+
+def sidecar_endings(arrays: Iterable[str]) -> tuple[str, ...]:
     """Return the endings of the sidecars that these arrays are made from, sorted."""
-    forms = (ARRAYS.get(name) for name in arrays)
-    return tuple(sorted({ending for form in forms if isinstance(form, FromSidecar) for ending in form.endings}))
-
-
-def needs_seconds(arrays: Iterable[str]) -> bool:
-    """Return whether one of these arrays needs the time between frames, see :class:`OfEvents`."""
-    return any(getattr(ARRAYS[name], "in_seconds", False) for name in arrays)
-
-
-def empty_value(name: str) -> float:
-    """Return the value of an array in a sample for which it cannot be made: ``empty`` of its form."""
-    return float(getattr(ARRAYS[name], "empty", 0))
+    return needs_of(arrays).sidecars
 
 
 def layout_bytes(layout: Layout) -> int:

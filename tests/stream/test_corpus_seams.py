@@ -23,9 +23,8 @@ FORM, BUILDER = re.findall(
 )[:2]
 """The line and the file that the page shows for depth."""
 DEPTH_LINES = (
-    ("v2v_protocol/sample.py", '    "flow_valid": lambda', FORM),
-    ("v2v_server/worker/produce.py", "from v2v_server.worker.arrays import",
-     "import v2v_server.worker.depth  # noqa: F401\n"),
+    ("v2v_protocol/sample.py", '    "flow_valid": ArrayForm(', FORM),
+    ("v2v_server/worker/arrays/__init__.py", '    "flow",', '    "depth",\n'),
 )  # fmt: skip
 
 SOURCE = '''
@@ -196,7 +195,7 @@ assert {each.video for batch in batches for each in batch.provenance} == {"toys/
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The files with both additions, which an import prefers to those of the packages, and two clips."""
     tmp_path = tmp_path_factory.mktemp("tree")
-    for name in ("v2v_server/worker", "v2v_server/corpus/sources", "v2v_protocol"):
+    for name in ("v2v_server/worker/arrays", "v2v_server/corpus/sources", "v2v_protocol"):
         (tmp_path / name).mkdir(parents=True)
     for name, *_ in (*DEPTH_LINES, SOURCE_LINE):
         shutil.copy(ROOT / name, tmp_path / name)
@@ -204,7 +203,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (tmp_path / "clips").mkdir()
     for name in ("a.mp4", "b.mp4"):
         write_clip(tmp_path / "clips" / name, panned_luma(30, 16, 24), gop=12)
-    (tmp_path / "v2v_server/worker/depth.py").write_text(BUILDER)
+    (tmp_path / "v2v_server/worker/arrays/depth.py").write_text(BUILDER)
     (tmp_path / "v2v_server/corpus/sources/toy.py").write_text(SOURCE)
     add(tmp_path, (*DEPTH_LINES, SOURCE_LINE))
     return tmp_path

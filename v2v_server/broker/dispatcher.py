@@ -55,7 +55,7 @@ from v2v_protocol.messages import (
     largest_packed_bytes,
 )
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import Form, Refusal, RefusalKind, SampleId, array_layout, layout_bytes
+from v2v_protocol.sample import Form, Refusal, RefusalKind, SampleId, array_layout, layout_bytes, needs_of
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import (
     MOST_WORKERS,
@@ -1005,7 +1005,7 @@ def work_seconds(spec: StreamSpec, arrays: tuple[str, ...], video: VideoEntry) -
     seconds = _DECODE_SECONDS * picture_px * frames
     parts = max(frames, recipe.most_segments(frames // recipe.frame_stride))
     seconds += _SIMULATION_SECONDS * recipe.crop_height_px * recipe.crop_width_px * parts
-    if not {"flow", "flow_valid"}.isdisjoint(arrays):
+    if needs_of(arrays).flow:
         seconds += _FLOW_SECONDS * picture_px * (frames - 1)
     return float(math.floor(seconds * spec.samples_per_decode))
 

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.persisted import FloatOrNaN, Persisted
-from v2v_protocol.sample import ARRAYS, FromSidecar, sidecar_endings
+from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import PIECE, Pieces, clip_pieces, firsts_of, sides_of
 from v2v_server.corpus.sources.source import VideoSource
@@ -484,7 +484,7 @@ def unknown_arrays(kind: str) -> dict[str, str]:
     """Return the arrays that cannot be made from any video of a kind, with the remedy."""
     if kind != "photographs":
         return {"tracks": "--videos-kind photographs, where all motion is known: ask for flow, which is estimated"}
-    labels = {name for name, form in ARRAYS.items() if isinstance(form, FromSidecar) and name != "masks"}
+    labels = {name for name, form in ARRAYS.items() if form.needs.sidecars and name != "masks"}
     return {
         "frames_rgb": "the colour of a video, and photographs are rendered in grey: ask for frames",
         **dict.fromkeys(labels, "labels beside a video, and photographs move: ask for masks and tracks"),

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import STARTS, TIME_UNITS, Recipe, effect_settings, most_events, pixel_thresholds
-from v2v_protocol.sample import SampleParams, needs_seconds
+from v2v_protocol.sample import SampleParams, needs_of
 from v2v_protocol.settings import nearest, require_known
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.effects import EFFECTS
@@ -253,8 +253,8 @@ def simulate_clip(
             different frames the clip shows.
         params, recipe: the draw and its recipe.
         voxel_dtype: "int8", "int16" or "float32".
-        step_seconds: [steps] duration of each step (``voxel.py``); given exactly when the recipe or an array of ``out``
-            needs seconds.
+        step_seconds: [steps] duration of each step (``voxel.py``); needed if the recipe or an array of ``out`` needs
+            seconds.
         out: C-contiguous arrays to fill, by name (``representations.NAMES``); None makes the voxels.
         levels: levels between frames; None: log intensity is linear in time there.
         signal: what the levels mean.
@@ -265,7 +265,7 @@ def simulate_clip(
         were simulated.
 
     Raises:
-        UsageError: too few frames, ``step_seconds`` missing, unwanted or of the wrong length, or a draw beyond what
+        UsageError: too few frames, ``step_seconds`` missing or of the wrong length, or a draw beyond what
             float64 can count (``precision.py``).
     """
     ends = params.ends(recipe)
@@ -276,11 +276,11 @@ def simulate_clip(
             f"frames {frames.dtype}{list(frames.shape)}: this draw shows {source_index[-1] + 1} frames, "
             f"{signal.dtype} [n, H, W]"
         )
-    if (step_seconds is None) == (recipe.needs_seconds or needs_seconds(out or ())):
+    if step_seconds is None and (recipe.needs_seconds or needs_of(out or ()).seconds):
         raise UsageError(
-            f"step_seconds is {'missing' if step_seconds is None else 'unwanted'}: noise_unit is "
-            f"{recipe.noise_unit!r}, voxel_seconds is {recipe.voxel_seconds[1]:g}, and there "
-            f"{'is an' if recipe.timed_effects else 'is no'} effect in Hz or seconds"
+            f"step_seconds is missing: noise_unit is {recipe.noise_unit!r}, voxel_seconds is "
+            f"{recipe.voxel_seconds[1]:g}, there {'is an' if recipe.timed_effects else 'is no'} effect in Hz or "
+            f"seconds, and the arrays are {', '.join(out or ('voxels',))}"
         )
     if step_seconds is None:
         step_seconds = np.ones(steps)

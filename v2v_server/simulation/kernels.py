@@ -15,7 +15,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList, check_duration, whole_edges
 from v2v_protocol.recipe import pixel_thresholds
-from v2v_protocol.sample import ARRAYS, OfEvents, SampleParams, html_table
+from v2v_protocol.sample import ARRAYS, EventShape, SampleParams, html_table
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import effects
 from v2v_server.simulation.effects.kernel import FIXED, TRIANGULAR, UNIFORM, Segments, simulate_general
@@ -105,8 +105,8 @@ class KernelInput:
     def form(self, name: str) -> tuple[str, tuple[int, ...]]:
         """Return dtype and shape of a representation."""
         height, width = self.frames.shape[1:]
-        form = cast(OfEvents, ARRAYS[name]).form
-        return form(self.dtype, (len(self.edges.step) - 1) // self.bins, self.bins, height, width)
+        shape = cast(EventShape, ARRAYS[name].of_events)
+        return shape(self.dtype, (len(self.edges.step) - 1) // self.bins, self.bins, height, width)
 
 
 def fill(
@@ -300,7 +300,7 @@ class _General:
         """
         given, real, pixels, params = self._given, self._real, self._pixels, self._given.params
         none = {name: np.empty((0, *shape[1:]), dtype) for name in NAMES for dtype, shape in (given.form(name),)}
-        memory = {name: new_memory(array, pixels) for name, array in (none | dict(arrays)).items()}
+        memory = {name: new_memory(name, array) for name, array in (none | dict(arrays)).items()}
         made = tuple(
             each.prepare(own, given, self.timeline, real) if hasattr(each, "prepare") else own
             for each, own in zip(REPRESENTATIONS.values(), (*memory.values(), listing), strict=True)

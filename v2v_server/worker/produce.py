@@ -5,9 +5,8 @@ Server workers and `v2v-simulate` both use this module, so they make equal sampl
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.resources.abc import Traversable
@@ -32,15 +31,16 @@ from v2v_protocol.events import EventList
 from v2v_protocol.messages import Lease
 from v2v_protocol.persisted import parse_json
 from v2v_protocol.sample import (
+    ARRAYS,
     Layout,
+    Needs,
     Provenance,
     Refusal,
     Sample,
     SampleId,
     SampleParams,
     array_layout,
-    empty_value,
-    needs_seconds,
+    needs_of,
     new_arrays,
     sidecar_endings,
 )
@@ -48,11 +48,11 @@ from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.source import VideoSource, open_sidecar, sidecar_id
 from v2v_server.flow import FlowSettings, flow_for
-from v2v_server.labels import READERS, BoxTable, kept_boxes, numbered_files, read_mask, view_boxes, view_mask
 from v2v_server.motion import cells_of, levels_of
+from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import choose_crop, draw
 from v2v_server.simulation.intensity import eight_bits
-from v2v_server.simulation.kernels import list_events
+from v2v_server.simulation.kernels import Voxels, list_events
 from v2v_server.simulation.precision import Variant, variants
 from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.view import apply_view, source_window, without_margin
@@ -62,7 +62,8 @@ from v2v_server.store.pixels import kind_of
 from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, SampleView
 from v2v_server.video.picture import MIXED, MOST_BITS, SDR, ChromaCut
 from v2v_server.video.rows import Rows
-from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, SourceClip, fill_rows, makes, simulate
+from v2v_server.worker.arrays import boxes
+from v2v_server.worker.arrays.context import ARRAY_BUILDERS, SampleContext, SourceClip
 from v2v_server.worker.scene_choice import (
     CleanFrames,
     FlowPlan,
@@ -75,39 +76,9 @@ from v2v_server.worker.scene_choice import (
     within_rows,
 )
 
-_KEPT = 4
-"""Sidecars that stay in memory once they are read: siblings use them one after the other."""
+_LISTED = ("listing",)
+"""What arrays that are not made by the kernel may take of it: the events one by one, by the general kernel."""
 _LONGEST_REASON = 500
-
-
-@makes("frames_rgb")
-def frames_rgb(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in the delivered frames, [T, 3, H, W]: the grey levels of ``frames`` and the colour of the video.
-
-    Raises:
-        VideoError: the clip was read without its colour.
-    """
-    if context.clip.colour is None:
-        raise VideoError(context.video, None, "was read without its colour")
-    (cells, matrix), cut = context.clip.colour
-    params, size = context.params, out.shape[2:]
-    grey = np.empty((len(out), 1, *size), np.uint8)
-    ARRAY_BUILDERS["frames"](context, grey)
-    # The cut names the delivered frames in ascending order.
-    places = np.unique(context.source[context.target_steps], return_inverse=True)[1]
-    chroma = np.ascontiguousarray(cells).view(np.uint8) ^ 128  # the bits of int8 plus 128
-    rows, columns = cut.places
-    if params.scale == 1.0:
-        columns = np.ascontiguousarray(columns[::-1]) if params.flip else columns
-    else:
-        # Colour differences are not grey levels: the contrast is a factor of them.
-        view = dataclasses.replace(params, contrast=0.0)
-        chroma = np.stack([apply_view(each[:, rows[:, None], columns], view, context.recipe) for each in chroma])
-        rows, columns = (np.arange(side, dtype=np.int64) for side in size)
-    # Import lazily: most workers make no colour.
-    from v2v_server.video.rgb import add_colour, differences_of
-
-    add_colour(grey[:, 0], chroma, places, rows, columns, differences_of(matrix, params.contrast or 1.0), out)
 
 
 def chroma_cut(
@@ -196,8 +167,8 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
     flow: FlowSettings | None = None
     still_px: int | None = 0
     flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture, place)
-    is_rendered = kind_of(lease.video) == "photographs"
-    if not is_rendered and not {"flow", "flow_valid"}.isdisjoint(lease.arrays):
+    is_rendered, needs = kind_of(lease.video) == "photographs", needs_of(lease.arrays)
+    if not is_rendered and needs.flow:
         flow = FlowSettings.of(spec)
         if flow_plan is not None and flow_plan.still:
             flow = replace(flow, margin_px=0)
@@ -205,7 +176,7 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
     has_motion = spec.substep_px > 0 and not is_rendered
     margin_px = max(still_px, MARGIN_PX) if has_motion and still_px is not None else still_px
     window, still = (source_window(params, recipe, picture, margin) for margin in (margin_px, still_px))
-    chroma = chroma_cut(lease, params, spec, frames, source) if "frames_rgb" in lease.arrays else None
+    chroma = chroma_cut(lease, params, spec, frames, source) if needs.colour else None
     cells = cells_of(params, recipe, within_rows(lease, frames.sides)) if has_motion else None
     cut = Cut(frames.count(int(source[-1]) + 1), window, chroma, cells, still)
     return SamplePlan(spec, params, source, frames, cut, margin_px, flow, flow_plan)
@@ -294,28 +265,34 @@ def make_sample(
     """
     plan, index = decoded.plan, lease.indices[0]
     arrays = new_arrays(sample_layout(lease)) if into is None else into
-    context, irregular = sample_context(lease, decoded, arrays, sidecars)
-    unlabelled = dict[str, str]()
-    for name, array in context.into.items():
-        if not context.can_time(name):
-            array[...] = empty_value(name)
-            unlabelled[name] = f"{lease.video}: its frame rate is unknown, and {name} needs it"
-            continue
-        try:
-            if name in decoded.clip.arrays:
-                array[...] = decoded.clip.arrays[name]
-                continue
-            with errors_of_sidecar(lease.video, name, sidecars, refused_sidecars(lease)):
-                ARRAY_BUILDERS[name](context, array)
-        except SidecarError as error:
-            if error.here:
-                raise
-            array[...] = empty_value(name)
-            unlabelled[name] = str(error)
-    saturated = dict(context.saturated or {})
+    context, irregular = sample_context(lease, decoded, needs_of(arrays), sidecars)
+    unlabelled = {
+        name: f"{lease.video}: its frame rate is unknown, and {name} needs it"
+        for name in arrays
+        if not context.can_time(name)
+    }
+    if any(ARRAYS[name].needs.events for name in arrays if name not in unlabelled):
+        of_kernel = {name: arrays[name] for name in NAMES if name in arrays and name not in unlabelled}
+        context = replace(context, simulated=simulate(context, of_kernel))
+    dropped = dict[str, int]()
+    for name, array in arrays.items():
+        if name in decoded.clip.arrays:
+            array[...] = decoded.clip.arrays[name]
+        elif name not in NAMES and name not in unlabelled:
+            try:
+                with errors_of_sidecar(lease.video, name, sidecars, refused_sidecars(lease)):
+                    dropped[name] = ARRAY_BUILDERS[name](context, array) or 0
+            except SidecarError as error:
+                if error.here:
+                    raise
+                unlabelled[name] = str(error)
+    for name in unlabelled:
+        arrays[name][...] = ARRAYS[name].empty
+    made = context.simulated
+    saturated = {} if made is None else dict(made.saturated)
     saturated_bins = saturated.pop("voxels", 0)
     return Sample(
-        arrays=context.into,
+        arrays=arrays,
         provenance=Provenance(
             id=SampleId(lease.spec_digest, lease.catalogue_digest, NUMERICS_VERSION, lease.seed, lease.epoch, index),
             video=lease.video,
@@ -331,15 +308,20 @@ def make_sample(
             scene="" if plan.flow_plan is None else plan.flow_plan.reason,
             sidecars=dict(context.clip.fingerprints),
             unlabelled=unlabelled,
-            boxes_dropped=context.dropped.pop("boxes", 0),
-            dropped={name: count for name, count in context.dropped.items() if count},
+            boxes_dropped=dropped.pop("boxes", 0),
+            dropped={name: count for name, count in dropped.items() if count},
             saturated={name: count for name, count in saturated.items() if count},
             grid_seconds=_grid_seconds(context),
-            left_out=context.left_out,
-            substeps=0 if context.saturated is None else context.substeps,
+            left_out=_left_out(plan.params, made),
+            substeps=0 if made is None else context.substeps,
             remark=lease.remark,
         ),
     )
+
+
+def _left_out(params: SampleParams, made: Voxels | None) -> tuple[str, ...]:
+    """Return the effects of a draw that a simulation left out."""
+    return () if made is None else tuple(name for name in params.effects if name not in made.given.params.effects)
 
 
 def list_sample_events(lease: Lease, decoded: Decoded) -> EventList:
@@ -348,37 +330,38 @@ def list_sample_events(lease: Lease, decoded: Decoded) -> EventList:
     Raises:
         VideoError: as :func:`make_sample`; or the video's frame rate is unknown.
     """
-    context, _ = sample_context(lease, decoded, {})
-    made, (seconds, _) = simulate(context, {}), _step_seconds(lease, decoded)
-    return list_events(made.given, made.real, 1e6 * seconds)
+    context, _ = sample_context(lease, decoded, Needs(events=True, seconds="must"))
+    made = simulate(context, {})
+    return list_events(made.given, made.real, 1e6 * made.given.step_seconds)
 
 
 def sample_context(
     lease: Lease,
     decoded: Decoded,
-    into: Mapping[str, npt.NDArray[Any]],
+    needs: Needs,
     sidecars: Mapping[str, Traversable | None] = MappingProxyType({}),
 ) -> tuple[SampleContext, int]:
-    """Return what the arrays are made from, and the number of irregular time stamps.
+    """Return what arrays with these needs are made from, and the number of irregular time stamps; no simulation.
 
-    Without arrays in ``into``, there is all that a simulation needs, and no flow.
+    Raises:
+        VideoError: the video's frame rate is unknown, and the recipe or an array must have it.
     """
     plan = decoded.plan
     params, recipe = plan.params, plan.spec.recipe
     frames, signal, flow, levels = decoded.clip.frames, decoded.clip.signal, None, decoded.clip.levels
-    if plan.flow is not None and into and "flow" not in decoded.clip.arrays:  # events need no flow
+    if plan.flow is not None and needs.flow and "flow" not in decoded.clip.arrays:
         methods = () if plan.flow_plan is None else plan.flow_plan.methods
         part = without_margin(frames, params, recipe, plan.margin_px, plan.flow.margin_px)
         flow = flow_for(
-            eight_bits(part, signal), params, recipe, plan.flow, validity="flow_valid" in lease.arrays, plan=methods
+            eight_bits(part, signal), params, recipe, plan.flow, validity=needs.flow == "checked", plan=methods
         )
     motion = decoded.clip.motion
-    if motion is not None and motion.any() and not (into and into.keys().isdisjoint(NAMES)):
+    if motion is not None and motion.any() and (needs.events or needs.levels):
         part = without_margin(frames, params, recipe, plan.margin_px, MARGIN_PX)
         picture = within_rows(lease, plan.frames.sides)
         levels = levels_of(part, params, recipe, plan.source, plan.spec.substep_px, motion, picture)
     # An array must not make a video unusable for the others: without a rate, it is left empty.
-    is_timed = recipe.needs_seconds or (bool(lease.frames_per_second) and needs_seconds(into))
+    is_timed = recipe.needs_seconds or needs.seconds == "must" or (bool(lease.frames_per_second and needs.seconds))
     seconds, irregular = _step_seconds(lease, decoded) if is_timed else (None, 0)
     view = frames
     if not decoded.clip.is_view:
@@ -394,8 +377,31 @@ def sample_context(
         usable=usable_window(lease, plan.frames.sides),
     )
     return SampleContext(
-        lease.video, clip, plan.spec, params, plan.source, view, signal, seconds, flow, levels, into
+        lease.video, clip, plan.spec, params, plan.source, view, signal, seconds, flow, levels
     ), irregular
+
+
+def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Voxels:
+    """Simulate the sample into ``out``, arrays that the kernel makes, such as voxels [T, bins, H, W], by name.
+
+    Raises:
+        VideoError: thresholds or time stamps that the corpus states for the video are beyond what can be simulated.
+    """
+    try:
+        return simulate_clip(
+            context.view,
+            context.params,
+            context.recipe,
+            context.spec.voxel_dtype,
+            context.step_seconds,
+            out,
+            context.levels,
+            context.signal,
+            context.spec.tolerance,
+        )
+    except UsageError as error:
+        # The recipe was checked before, so the values come from the corpus.
+        raise VideoError(context.video, None, f"cannot be simulated: {error}") from error
 
 
 def _grid_seconds(context: SampleContext) -> tuple[float, ...]:
@@ -431,8 +437,11 @@ def _decoder(clip: DecodedClip) -> str:
 def kernels_of(lease: Lease) -> frozenset[Variant]:
     """Return the compiled kernels that a lease's sample may need."""
     made = tuple(name for name in NAMES if name in lease.arrays)
-    kind = kind_of(lease.video)
-    return _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds, made, kind) if made else frozenset()
+    others = [name for name in lease.arrays if name not in NAMES and needs_of([name]).events]
+    found = frozenset[Variant]()
+    for arrays in filter(None, (made, _LISTED if others else ())):
+        found |= _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds, arrays, kind_of(lease.video))
+    return found
 
 
 @lru_cache(maxsize=64)
@@ -479,64 +488,11 @@ def _refuse_outside(video: str) -> None:
         raise ProtocolError(f"video id {video!r} leads out of the corpus folder")
 
 
-def _only_sidecar(array: str, video: str, sidecars: Mapping[str, Traversable | None]) -> tuple[str, Any]:
-    """Return the one sidecar that the array is made from, and its ending.
-
-    Raises:
-        SidecarError: there is none, or more than one.
-    """
-    endings = sidecar_endings((array,))
-    found = [(ending, opened) for ending in endings if (opened := sidecars.get(ending)) is not None]
-    if len(found) != 1:
-        why = f"there are {len(found)}: keep one" if found else "is missing: add it beside the video"
-        raise SidecarError(video, " or ".join(ending for ending, _ in found) or " or ".join(endings), why)
-    return found[0]
-
-
-@lru_cache(maxsize=_KEPT)
-def _boxes_of(ending: str, fingerprint: str, picture_px: tuple[int, int], opened: Any) -> BoxTable:
-    """Read boxes. Equal fingerprints mean equal files; of a folder each clip has a part, which equals itself only."""
-    return READERS[ending](opened, picture_px)
-
-
 def read_ahead(lease: Lease, sidecars: Mapping[str, Traversable | None]) -> None:
-    """Read the boxes of a lease, so that they are at hand when its sample is made. Errors come again then."""
+    """Read the boxes of a lease, so that they are at hand when its sample is made."""
     if "boxes" in lease.arrays:
-        with suppress(Exception):
-            ending, opened = _only_sidecar("boxes", lease.video, sidecars)
-            _boxes_of(ending, sidecar_files(lease)[ending][1], (lease.height_px, lease.width_px), opened)
-
-
-@makes("boxes")
-def boxes(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in the boxes of each delivered frame, [T, max_boxes, 7], the largest first."""
-    clip = context.clip
-    ending, opened = _only_sidecar("boxes", context.video, clip.sidecars)
-    table = _boxes_of(ending, clip.fingerprints[ending], clip.picture_px, opened)
-
-    def seen(frame: int) -> npt.NDArray[np.float64]:
-        corners, numbers = table.at(frame)
-        inside, share = view_boxes(corners, clip.usable, context.params, context.recipe)
-        kept = kept_boxes(inside, share)
-        return np.concatenate([inside[kept], numbers[kept], share[kept, None]], axis=1)
-
-    fill_rows(context, "boxes", out, map(seen, context.target_frames))
-
-
-@makes("masks")
-def masks(context: SampleContext, out: npt.NDArray[Any]) -> None:
-    """Fill in the class mask of each delivered frame, [T, 1, H, W]."""
-    files = numbered_files(_only_sidecar("masks", context.video, context.clip.sidecars)[1], ".png")
-    view: Callable[[int], npt.NDArray[np.uint8]] = lru_cache(maxsize=1)(lambda frame: _mask(context, files, frame))
-    for target, frame in zip(out[:, 0], context.target_frames, strict=True):
-        target[...] = view(frame)  # a paused camera repeats its frame
-
-
-def _mask(context: SampleContext, files: dict[int, Traversable], frame: int) -> npt.NDArray[np.uint8]:
-    if frame not in files:
-        raise ValueError(f"has no file of frame {frame}: add one")
-    mask = read_mask(files[frame], context.clip.picture_px)
-    return view_mask(mask, context.clip.usable, context.params, context.recipe)
+        fingerprints = {ending: fingerprint for ending, (_, fingerprint) in sidecar_files(lease).items()}
+        boxes.read_ahead(lease.video, sidecars, fingerprints, (lease.height_px, lease.width_px))
 
 
 def sidecar_files(lease: Lease) -> dict[str, tuple[str, str]]:

@@ -29,13 +29,13 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.messages import Lease
-from v2v_protocol.sample import DEFAULT_ARRAYS, SampleParams
+from v2v_protocol.sample import DEFAULT_ARRAYS, Needs, SampleParams
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.simulation.clip import simulate_clip
-from v2v_server.worker.arrays import SampleContext
+from v2v_server.worker.arrays.context import SampleContext
 from v2v_server.worker.produce import decode_for, make_sample, plan_sample, sample_context
 from v2v_tools.remake import lease_for
 from v2v_tools.tradeoff.report import THRESHOLDS
@@ -80,9 +80,9 @@ def seen(leases: Leases, number: int, views: int = 1) -> list[SampleContext]:
     """Return the first views of a lease before simulation, without hot pixels, from one decode."""
     lease, contexts = leases.each[number], []
     for decoded in decode_for(lease, lease.indices[:views], Folder(leases.root)):
-        context, _ = sample_context(lease, decoded, {})
-        context.params = dataclasses.replace(context.params, hot_pixel_count=0)
-        contexts.append(context)
+        context, _ = sample_context(lease, decoded, Needs(events=True))
+        params = dataclasses.replace(context.params, hot_pixel_count=0)
+        contexts.append(dataclasses.replace(context, params=params))
     return contexts
 
 

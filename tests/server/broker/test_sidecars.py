@@ -8,7 +8,7 @@ from tests.server.named_corpus import corpus, video
 from tests.server.peers import Peers, peers
 from v2v_protocol import sample
 from v2v_protocol.messages import Hello, Unavailable, Welcome
-from v2v_protocol.sample import FromSidecar
+from v2v_protocol.sample import ArrayForm, Needs
 from v2v_server.corpus.videos import Sidecars
 
 ENDING, ARRAYS = ".label.json", ("voxels", "label")
@@ -17,7 +17,9 @@ ENDING, ARRAYS = ".label.json", ("voxels", "label")
 @pytest.fixture
 def at(monkeypatch: pytest.MonkeyPatch) -> Peers:
     """Two workers, and a consumer that asks for an array from a sidecar, which one of two videos has."""
-    monkeypatch.setitem(sample.ARRAYS, "label", FromSidecar(ENDING, lambda recipe, _: ("float32", (1,))))
+    monkeypatch.setitem(
+        sample.ARRAYS, "label", ArrayForm(lambda recipe, _: ("float32", (1,)), Needs(sidecars=(ENDING,)))
+    )
     labels = Sidecars({"a.mp4": "3-abc"}, "d" * 32)
     made = peers(corpus(video("a.mp4"), video("b.mp4"), sidecars={ENDING: labels}))
     for name in (b"w1", b"w2"):

@@ -15,7 +15,7 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from v2v_protocol import sample
 from v2v_protocol.errors import VideoChanged, VideoError, VideoGone
-from v2v_protocol.sample import FromSidecar
+from v2v_protocol.sample import ArrayForm, Needs
 from v2v_server.corpus import probe as collecting
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources import source as asking
@@ -28,7 +28,9 @@ ARRAYS = ("boxes", "masks")
 @pytest.fixture(autouse=True)
 def _arrays(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, ending in zip(ARRAYS, (JSON, MASKS), strict=True):
-        monkeypatch.setitem(sample.ARRAYS, name, FromSidecar(ending, lambda recipe, _: ("uint8", (1,))))
+        monkeypatch.setitem(
+            sample.ARRAYS, name, ArrayForm(lambda recipe, _: ("uint8", (1,)), Needs(sidecars=(ending,)))
+        )
 
 
 @pytest.fixture

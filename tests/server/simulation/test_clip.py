@@ -87,7 +87,6 @@ def test_a_lead_voxel_is_one_more_in_front() -> None:
     [
         ({"frames": FRAMES[:10]}, "shows 11 frames"),
         ({"frames": FRAMES.astype(np.int16)}, "uint8"),
-        ({"step_seconds": np.ones(10)}, "unwanted"),
         ({"recipe": RECIPE.replace(noise_unit="second")}, "missing"),
         ({"recipe": RECIPE.replace(noise_unit="second"), "step_seconds": np.ones(9)}, "10 positive"),
         ({"recipe": RECIPE.replace(noise_unit="second"), "step_seconds": np.zeros(10)}, "10 positive"),

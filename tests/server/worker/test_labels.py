@@ -18,11 +18,11 @@ from PIL import Image
 from tests.clips import write_clip
 from v2v_client import Batch
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import ARRAYS, FromSidecar, Provenance, Sample
+from v2v_protocol.sample import ARRAYS, ArrayForm, Needs, Provenance, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.video.rows import Rows
-from v2v_server.worker.arrays import ARRAY_BUILDERS, SampleContext, fill_rows
+from v2v_server.worker.arrays.context import ARRAY_BUILDERS, SampleContext, fill_rows
 from v2v_tools.remake import Remaker
 
 FRAMES, HEIGHT_PX, WIDTH_PX, SIDE_PX = 40, 48, 64, 14
@@ -112,12 +112,13 @@ def test_a_toy_label_with_a_cap_needs_no_field_of_its_own(
 ) -> None:
     """Points, three a frame, of which two fit: a line and a function, as ``docs/extending.md`` says."""
 
-    def points(context: SampleContext, out: np.ndarray) -> None:
+    def points(context: SampleContext, out: np.ndarray) -> int:
         text = context.clip.sidecars[".points.txt"].read_text()
         found = np.array([line.split() for line in text.splitlines()], np.float32)
-        fill_rows(context, "points", out, (found[found[:, 0] == frame, 1:] for frame in context.target_frames))
+        return fill_rows("points", out, (found[found[:, 0] == frame, 1:] for frame in context.target_frames))
 
-    form = FromSidecar(".points.txt", lambda recipe, _: ("float32", (5, recipe.max_boxes, 2)), empty=-1)
+    needs = Needs(sidecars=(".points.txt",))
+    form = ArrayForm(lambda recipe, _: ("float32", (5, recipe.max_boxes, 2)), needs, empty=-1)
     monkeypatch.setitem(ARRAYS, "points", form)
     monkeypatch.setitem(ARRAY_BUILDERS, "points", points)
     (tmp_path / "a.mp4").symlink_to(corpus / "a.mp4")

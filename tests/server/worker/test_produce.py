@@ -18,7 +18,7 @@ from tests.server.named_corpus import SMALL_SPEC
 from v2v_protocol import sample
 from v2v_protocol.errors import ProtocolError, SidecarError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.messages import Lease, decode, encode
-from v2v_protocol.sample import FromSidecar
+from v2v_protocol.sample import ArrayForm, Needs
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources.folder import Folder
@@ -238,7 +238,9 @@ ENDING = ".label.json"
 
 @pytest.fixture(autouse=True)
 def _label(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sample.ARRAYS, "label", FromSidecar(ENDING, lambda recipe, _: ("float32", (1,))))
+    monkeypatch.setitem(
+        sample.ARRAYS, "label", ArrayForm(lambda recipe, _: ("float32", (1,)), Needs(sidecars=(ENDING,)))
+    )
 
 
 def leased(**changes: object) -> Lease:

@@ -6,7 +6,7 @@
     time_surface.py     age of the last event of each polarity at the end of each bin
     listing.py          the events one by one, which are no array of a sample
 
-A representation is one line of ``v2v_protocol.sample.ARRAYS`` (its form, as ``OfEvents``) and one file here, with
+A representation is one line of ``v2v_protocol.sample.ARRAYS`` (its form, by ``of_events``) and one file here, with
 compiled functions. It has some of these, and each does nothing if the array has no rows:
 
     begin(tables, first)     before the first step of a block of pixels; the first of them
@@ -14,8 +14,8 @@ compiled functions. It has some of these, and each does nothing if the array has
     end(tables, counts)      at the end of a bin (:class:`Counts`)
 
 They return how many values did not fit, allocate no memory and use no maths library. The tables are the memory of the
-array with height and width as one axis, of no rows if it is not wanted; or what this function of the file returns, of
-the same types in both cases:
+array, of no rows if it is not wanted, with height and width as one axis if the array ends with them; or what this
+function of the file returns, of the same types in both cases:
 
     prepare(memory, given, segments, real)
 
@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.sample import ARRAYS, OfEvents
+from v2v_protocol.sample import ARRAYS
 
 _LARGEST_FLOAT16 = 65504.0
 
@@ -79,19 +79,29 @@ class Counts(NamedTuple):
     off: Any
 
 
-NAMES = tuple(name for name, form in ARRAYS.items() if isinstance(form, OfEvents))
+NAMES = tuple(name for name, form in ARRAYS.items() if form.of_events is not None)
 """Names of the arrays."""
 REPRESENTATIONS = {name: import_module(f"{__name__}.{name}") for name in (*NAMES, "listing")}
 
 
-def new_memory(array: npt.NDArray[Any], pixels: int) -> npt.NDArray[Any]:
-    """Return what the kernel writes in the place of an array [..., H, W]: [..., pixels]."""
-    shape = (*array.shape[:-2], pixels)
+def has_pixels(name: str) -> bool:
+    """Return whether an array has a value for each pixel: its shape ends with height and width."""
+    shape = ARRAYS[name].of_events
+    return shape is not None and shape("int8", 5, 7, 11, 13)[1][-2:] == (11, 13)
+
+
+def new_memory(name: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return what the kernel writes in the place of an array [..., H, W]: [..., pixels]; or the array's own shape, if
+    it has no pixels.
+    """
+    shape = (*array.shape[:-2], array.shape[-2] * array.shape[-1]) if has_pixels(name) else array.shape
     return np.empty(shape, np.float32) if array.dtype == np.float16 else array.reshape(shape)
 
 
 def fill_array(array: npt.NDArray[Any], memory: npt.NDArray[Any]) -> int:
-    """Fill an array, [T, ..., H, W], from the memory that the kernel wrote; return how many values were clipped."""
+    """Fill an array, [T, ..., H, W] or [T, ...], from the memory that the kernel wrote; return how many values were
+    clipped.
+    """
     if array.dtype != np.float16:
         return 0
     within = np.clip(memory, -_LARGEST_FLOAT16, _LARGEST_FLOAT16)
