@@ -25,16 +25,16 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, ReadProgress, SensorSize
-from v2v_recordings.limits import LARGER, LIMITS, check_size
+from v2v_recordings.limits import LARGER, FORM_LIMITS, check_size
 
 Longs = npt.NDArray[np.int64]
-Words = npt.NDArray[np.uint16]
+Uint16s = npt.NDArray[np.uint16]
 WORD = np.dtype("<u2")
 GEOMETRY = re.compile(rb"(?im)^% *geometry +(\d{1,9}) *x *(\d{1,9})")
 WIDTH, HEIGHT = (re.compile(rb"(?im)^%% .*?\b%b[ =](\d{1,9})" % name) for name in (b"width", b"height"))
 """Where the lines of a header state the size: ``geometry 1280x720``, ``format EVT3;height=720;width=1280``."""
 BLOCK_WORDS = 1 << 17
-"""Words that are decoded at once; a word holds at most 12 events, which take 100 bytes each while they are decoded."""
+"""Uint16s that are decoded at once; a word holds at most 12 events, which take 100 bytes each while they are decoded."""
 ROUND, HIGH_US = 1 << 12, 1 << 12
 """Number of values of the upper bits of a time, and their unit."""
 MOST_LATE, MOST_AHEAD = 2, ROUND // 4
@@ -47,7 +47,7 @@ _ADVANCE_PX, _VALID = np.zeros(16, np.int64), np.zeros(16, np.uint16)
 _ADVANCE_PX[[4, 5]], _VALID[[4, 5]] = (12, 8), (0xFFF, 0xFF)
 _COUNTED, _COUNTER_BITS = np.zeros(16, np.int64), 20
 _COUNTED[[6, 8]], _COUNTED[[0, 1]], _COUNTED[3] = 1, 1 << _COUNTER_BITS, 1 << 2 * _COUNTER_BITS
-"""Counters of the words of times, rows and columns, in one number; a block has less words than a counter holds."""
+"""Counters of the words of times, rows and columns, in one number; a block has fewer words than a counter holds."""
 
 
 class Decoder:
@@ -63,7 +63,7 @@ class Decoder:
         self._high, self._camera = _UNKNOWN, -1
         self._last = {"t_ns": _UNKNOWN * HIGH_US * 1000, "row": -1, "base": 2 * _UNKNOWN}
 
-    def decode(self, words: Words) -> EventChunk:
+    def decode(self, words: Uint16s) -> EventChunk:
         """Return the events of the next words, [N]. Events before the first time, row or column are left out.
 
         Raises:
@@ -86,7 +86,8 @@ class Decoder:
         events, kinds, bases = words[places], kinds[places], np.flatnonzero(kinds == 3)
         x, p, is_known = events & 0x7FF, events & 0x800 != 0, (row >= 0) & (t_ns > _UNKNOWN)
         if (kinds == 2).all() and not len(bases):
-            return EventChunk(t_ns[is_known], x[is_known], row[is_known], p[is_known])
+            chosen = slice(None) if is_known.all() else is_known
+            return EventChunk(t_ns[chosen], x[chosen], row[chosen], p[chosen])
 
         # A vector begins at its base, and as much later as the vectors between the two advance.
         is_vector = kinds != 2
@@ -109,7 +110,7 @@ class Decoder:
         self._last[name] = int(values[-1])
         return values
 
-    def _rows(self, words: Words) -> npt.NDArray[np.int16]:
+    def _rows(self, words: Uint16s) -> npt.NDArray[np.int16]:
         """Return the row that each word sets, [R]; -1 if its events are to be left out."""
         if self._camera < 0 and (words < 0x1000).any():
             self._camera = int(words[words < 0x1000][0]) >> 11
@@ -118,28 +119,29 @@ class Decoder:
         self.foreign += int(np.count_nonzero(camera == 1 - self._camera))
         return row
 
-    def _times(self, kinds: npt.NDArray[np.uint8], words: Words) -> Longs:
+    def _times(self, kinds: npt.NDArray[np.uint8], words: Uint16s) -> Longs:
         """Return the time after each word that changes it, [T], ns. Repeated upper bits get a type to pass over.
 
         Args:
             kinds, words: [M], types of the words, some of which are changed, and the words.
         """
         places = np.flatnonzero((kinds == 6) | (kinds == 8))
-        is_high, low = kinds[places] == 8, (words[places] & 0xFFF).astype(np.int64)
-        highs = low[is_high]
+        low = (words[places] & 0xFFF).astype(np.int64)
+        at = np.flatnonzero(kinds[places] == 8)
+        highs = low[at]
         before = int(highs[0]) if self._high == _UNKNOWN and len(highs) else self._high
         steps = np.diff(highs, prepend=before % ROUND)
         is_next = (steps < -MOST_LATE) & (steps % ROUND <= MOST_AHEAD)
         is_previous = steps >= ROUND - MOST_LATE
         highs += before - before % ROUND + ROUND * np.cumsum(is_next.astype(np.int64) - is_previous)
         highs = np.concatenate([[self._high], highs])
-        high, self._high = highs[np.cumsum(is_high.astype(np.int64))], int(highs[-1])
-        low[is_high] = 0
-        changes = ~is_high
-        changes[is_high] = np.diff(highs) != 0
-        kinds[places[~changes]] = 0xF
-        times: Longs = ((high * HIGH_US + low) * 1000)[changes]
-        return times
+        self._high, repeated = int(highs[-1]), at[np.diff(highs) == 0]
+        low[at] = 0
+        low += np.repeat(highs * HIGH_US, np.diff(at, prepend=0, append=len(low)))
+        changes = np.ones(len(low), bool)
+        changes[repeated] = False
+        kinds[places[repeated]] = 0xF
+        return low[np.flatnonzero(changes)] * 1000
 
 
 def read(path: Path, header: bytes, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
@@ -191,7 +193,7 @@ class Encoder:
     def __init__(self) -> None:
         self._t_us, self._high, self._row = -1, -1, -1
 
-    def encode(self, chunk: EventChunk) -> Words:
+    def encode(self, chunk: EventChunk) -> Uint16s:
         """Return the words of the next events, [M].
 
         Args:
@@ -203,7 +205,7 @@ class Encoder:
         if not len(chunk):
             return np.empty(0, WORD)
         t_us, y = chunk.t_ns // 1000, chunk.y.astype(np.int64)
-        steps, end_us = np.diff(t_us, prepend=self._t_us), LIMITS["EVT 3"].end_us
+        steps, end_us = np.diff(t_us, prepend=self._t_us), FORM_LIMITS["EVT 3"].end_us
         if min(steps.min(), t_us[0]) < 0 or t_us[-1] >= end_us:
             raise UsageError(
                 f"events at {t_us.min()} to {t_us.max()} us: EVT 3 takes times in order, from 0 to {end_us - 1} us"

@@ -22,7 +22,7 @@ class Limit(NamedTuple):
     end_us: int = 1 << 62
 
 
-LIMITS = {
+FORM_LIMITS = {
     "EVT 2": Limit(1 << 11),
     "EVT 3": Limit(1 << 11, 1 << 35),
     "DAT": Limit((1 << 14) - 1, 1 << 32),
@@ -38,7 +38,7 @@ EVT 3 have 17 MB of words of time."""
 
 def fits(form: str, width_px: int, height_px: int) -> bool:
     """Return whether a form can hold pictures of this size."""
-    return max(width_px, height_px) <= LIMITS[form].side_px
+    return max(width_px, height_px) <= FORM_LIMITS[form].side_px
 
 
 def check_size(where: str, form: str, width_px: int, height_px: int, advice: str) -> None:
@@ -48,5 +48,5 @@ def check_size(where: str, form: str, width_px: int, height_px: int, advice: str
         UsageError: it cannot.
     """
     if not fits(form, width_px, height_px):
-        most = f"{form} holds at most {LIMITS[form].side_px} px a side"
+        most = f"{form} holds at most {FORM_LIMITS[form].side_px} px a side"
         raise UsageError(f"{where}: a picture of {width_px} x {height_px} px; {most}: {advice}")

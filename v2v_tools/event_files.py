@@ -16,7 +16,7 @@ from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_recordings.archive import package
 from v2v_recordings.evt3 import Encoder, header_of
 from v2v_recordings.items import EventChunk
-from v2v_recordings.limits import LIMITS, check_size, fits
+from v2v_recordings.limits import FORM_LIMITS, check_size, fits
 
 _NOTE = "simulated from video frames: log intensity is linear in time between frames"
 EVENTS_AT_ONCE = 1 << 16
@@ -39,8 +39,8 @@ def write_events(path: Path, events: EventList) -> None:
     if len(events) and (x >= events.width_px or y >= events.height_px):
         size = f"the picture of {events.width_px} x {events.height_px} px: correct its size"
         raise UsageError(f"{path}: events reach x = {x}, y = {y}, outside of {size}")
-    if t_us >= LIMITS[form].end_us:
-        limit = f"{form} holds times below {LIMITS[form].end_us} us"
+    if t_us >= FORM_LIMITS[form].end_us:
+        limit = f"{form} holds times below {FORM_LIMITS[form].end_us} us"
         raise UsageError(f"{path}: an event at {t_us} us; {limit}: give a shorter clip, or .h5 or .npz")
     try:
         # The package faery tells the format by the ending.
@@ -110,7 +110,7 @@ def _faery(path: Path, events: EventList) -> None:
 
 
 class EventWriter(NamedTuple):
-    """Writer of a form: its name in LIMITS, the function, and the package that it needs."""
+    """Writer of a form: its name in FORM_LIMITS, the function, and the package that it needs."""
 
     form: str
     write: Callable[[Path, EventList], None]

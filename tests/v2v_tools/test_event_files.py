@@ -13,7 +13,7 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
-from v2v_recordings.limits import LIMITS
+from v2v_recordings.limits import FORM_LIMITS
 from v2v_server.simulation import simulate
 from v2v_server.simulation.kernels import Voxels
 from v2v_tools import simulate as command
@@ -86,7 +86,7 @@ def listed(width_px: int, height_px: int, *t_us: int) -> EventList:
 
 @pytest.mark.parametrize("ending", EVENT_WRITERS)
 def test_the_largest_picture_is_written_and_larger_ones_are_refused(ending: str, tmp_path: Path) -> None:
-    side = LIMITS[EVENT_WRITERS[ending].form].side_px
+    side = FORM_LIMITS[EVENT_WRITERS[ending].form].side_px
     path = tmp_path / f"events{ending}"
     for size in ((side, 2), (2, side)):
         events = listed(*size, 5, 9)
@@ -104,7 +104,7 @@ def test_the_largest_picture_is_written_and_larger_ones_are_refused(ending: str,
 
 @pytest.mark.parametrize("ending", EVENT_WRITERS)
 def test_late_times_are_written_or_refused(ending: str, tmp_path: Path) -> None:
-    path, end_us = tmp_path / f"events{ending}", LIMITS[EVENT_WRITERS[ending].form].end_us
+    path, end_us = tmp_path / f"events{ending}", FORM_LIMITS[EVENT_WRITERS[ending].form].end_us
     if end_us < 2**36:
         with pytest.raises(UsageError, match=rf"an event at {end_us} us; .* holds times below {end_us} us: give"):
             write_events(path, listed(4, 4, 7, end_us))
