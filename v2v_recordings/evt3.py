@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, ReadProgress, SensorSize
-from v2v_recordings.limits import LARGER, FORM_LIMITS, check_size
+from v2v_recordings.limits import FORM_LIMITS, LARGER, check_size
 
 Longs = npt.NDArray[np.int64]
 Uint16s = npt.NDArray[np.uint16]
@@ -34,7 +34,7 @@ GEOMETRY = re.compile(rb"(?im)^% *geometry +(\d{1,9}) *x *(\d{1,9})")
 WIDTH, HEIGHT = (re.compile(rb"(?im)^%% .*?\b%b[ =](\d{1,9})" % name) for name in (b"width", b"height"))
 """Where the lines of a header state the size: ``geometry 1280x720``, ``format EVT3;height=720;width=1280``."""
 BLOCK_WORDS = 1 << 17
-"""Uint16s that are decoded at once; a word holds at most 12 events, which take 100 bytes each while they are decoded."""
+"""Words that are decoded at once; a word holds at most 12 events, which take 100 bytes each while they are decoded."""
 ROUND, HIGH_US = 1 << 12, 1 << 12
 """Number of values of the upper bits of a time, and their unit."""
 MOST_LATE, MOST_AHEAD = 2, ROUND // 4
