@@ -33,6 +33,7 @@ BENCHES = {
     "store": "speed.store",
     "photographs": "speed.photographs",
     "link": "speed.link",
+    "evt3": "speed.evt3",
     "physics": "accuracy.physics",
     "motion": "speed.motion",
     "substeps": "accuracy.substeps",

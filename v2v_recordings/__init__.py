@@ -7,7 +7,9 @@ mvsec.py         MVSEC: HDF5
 dsec.py          DSEC and v2v-simulate: HDF5, with frames in a folder
 npy_columns.py   EVREAL's folders, and .npz
 bag.py           ROS 1 bags
-faery_reader.py  aedat4, EVT 2 and 3, DAT, Event Stream, by the package faery
+faery_reader.py  aedat4, EVT 2, DAT, Event Stream, by the package faery
+evt3.py          EVT 3: words decoded and encoded
+limits.py        sizes and times that each form can hold
 archive.py       a zip file, a folder or a single file, through one interface
 hdf5.py          open HDF5 files, refuse those that refer to other files; read columns of events, and pictures;
                  the layout that v2v-convert writes

@@ -1,4 +1,6 @@
-"""Read files with the faery package: aedat4 of DAVIS cameras; Prophesee's EVT 2 and 3 (.raw) and DAT; Event Stream.
+"""Read files with the faery package: aedat4 of DAVIS cameras; Prophesee's EVT 2 (.raw) and DAT; Event Stream.
+
+Prophesee's EVT 3 is told apart by the header, and read without faery.
 
 A file that ends within an event or packet is read up to it.
 """
@@ -18,22 +20,25 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
+from v2v_recordings import evt3
 from v2v_recordings.archive import package, starts_with
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, ReadProgress, SensorSize
+from v2v_recordings.limits import LARGER, check_size
 
 ES_HEAD_BYTES, ES_EVENT_BYTES, ES_LONGEST_STEP_US = 20, 5, 127
 """Bytes before the first event and of an event; a longer time between two events is bytes of 0xff of this length."""
 CUT_PACKET = "failed to fill whole buffer"
 """Error of faery where a packet of aedat4 is longer than the file."""
-EVT_LINE = re.compile(rb"^% *(evt|format) ", re.MULTILINE)
-"""Line of a header that only EVT has."""
-WORDS: dict[str, np.dtype[Any]] = {"evt2": np.dtype("<u4"), "evt3": np.dtype("<u2")}
-"""Words of the versions that are decoded: for another one that it recognises, EVT 2.1, faery up to 0.7.1 panics."""
+HEADER_LINE = re.compile(rb"%( .*|[\t\x20-\x7e]*)\r?\n?")
+"""Words may begin like such a line, but not with a space after it or like text."""
+VERSIONS = re.compile(rb"(?im)^% *format +EVT(\d)"), re.compile(rb"(?im)^% *evt +(\d)")
+"""Lines with the version of EVT; the first decides where a header has both."""
+EVT2_WORD = np.dtype("<u4")
 DAT_WORD = np.dtype("<u8")
 """An event of DAT; the lower half is its time, us."""
 TIME_HIGH = 0x8
 """Value of the four upper bits of a word whose other bits are the upper bits of a time."""
-TIME_HIGH_US = {8: 1, 4: 64, 2: 4096}
+TIME_HIGH_US = {8: 1, 4: 64}
 """Unit of the upper bits, by the bytes of a word; DAT's words hold a whole time."""
 LATEST_US = 10_000
 """The upper bits may step back by at most this without a reset."""
@@ -90,20 +95,27 @@ def read_prophesee(path: Path, options: ConvertOptions, progress: ReadProgress) 
     are dropped.
 
     Raises:
-        UsageError: the file is damaged, does not state the size, or has a version that faery does not decode.
+        UsageError: the file is damaged, does not state the size or one beyond its coordinates, or is EVT 2.1.
     """
-    fallback = None if options.size is None else (options.size.width, options.size.height)
     header = _header(path)
-    is_evt = path.suffix.lower() != ".dat" or EVT_LINE.search(header) is not None
+    version = next((found[1] for line in VERSIONS if (found := line.search(header))), b"")
+    if version == b"3":
+        yield from evt3.read(path, header, options, progress)
+        yield from _cut_note(path, len(header), evt3.WORD.itemsize)
+        return
+    fallback = None if options.size is None else (options.size.width, options.size.height)
+    is_evt = path.suffix.lower() != ".dat" or version != b""
     faery = package("faery", "this form")
     decode = faery.evt.Decoder if is_evt else faery.dat.Decoder
     with _errors_of_faery(path), decode(path, fallback, None) as decoder:
-        if is_evt and decoder.version not in WORDS:
+        if is_evt and decoder.version != "evt2":  # for EVT 2.1, faery up to 0.7.1 panics
             raise UsageError(f"{path} is in EVT 2.1, which is not supported; EVT 2, EVT 3 and DAT are")
         if decoder.dimensions is None:
             raise UsageError(f"{path}: its header states no size of the sensor; give --size")
-        yield SensorSize(*decoder.dimensions)
-        word: np.dtype[Any] = WORDS[decoder.version] if is_evt else DAT_WORD
+        width, height = decoder.dimensions
+        yield SensorSize(width, height)
+        check_size(str(path), "EVT 2" if is_evt else "DAT", width, height, LARGER)
+    word: np.dtype[Any] = EVT2_WORD if is_evt else DAT_WORD
     # DAT's header ends with two bytes of its own.
     begin = len(header) if is_evt else len(header) + 2
     first_us, resets = _clock(path, word, begin)
@@ -154,9 +166,9 @@ def _header(path: Path) -> bytes:
     """Return the lines of the header, which begin with %; the last one may be ``% end``."""
     header = b""
     with path.open("rb") as file:
-        while (line := file.readline(LONGEST_LINE_BYTES)).startswith(b"%"):
+        while HEADER_LINE.fullmatch(line := file.readline(LONGEST_LINE_BYTES)):
             header += line
-            if line.strip() == b"% end":
+            if line.strip(b"% \t\r\n").lower() == b"end":
                 break
     return header
 

@@ -275,6 +275,14 @@ READERS: Mapping[str, Callable[[Traversable, tuple[int, int]], BoxTable]] = {
 """Reader of each ending. Arguments: the opened sidecar, and height and width of the video's upright picture."""
 
 
+_MEANING = {
+    ".boxes.json": ("COCO", "left, top, width, height", 0, False),
+    ".boxes.txt": ("MOT", "left, top, width, height", 1, False),
+    ".boxes/": ("YOLO", "centre x, centre y, width, height", 0, True),
+}
+"""Name of the format, meaning of its numbers, offset of the file's coordinates, whether two are centres in shares."""
+_BORDER_PX = 1.0
+"""Boxes may leave the picture by this: formats round and count differently."""
 _FRAME_FILES = {".boxes/": ".txt", ".masks/": ".png"}
 
 
@@ -304,6 +312,7 @@ def check_labels(ending: str, opened: Traversable, picture_px: tuple[int, int], 
     elif ending in READERS:
         table = READERS[ending](opened, picture_px)
         numbers = numbers or (table.frames.tolist() if table.annotated is None else table.annotated)
+        _check_meaning(ending, table, picture_px)
         _check_boxes(table, picture_px)
     if numbers and (max(numbers) >= frames or (not first and min(numbers) == 1)):
         raise ValueError(
@@ -311,6 +320,27 @@ def check_labels(ending: str, opened: Traversable, picture_px: tuple[int, int], 
             f"{frames - 1 + first}, so number them from {first}. If frame {first} has no labels, add it without any"
         )
     return not_read
+
+
+def _check_meaning(ending: str, table: BoxTable, picture_px: tuple[int, int]) -> None:
+    """Check that the boxes are not corners, read as what the format has.
+
+    Raises:
+        ValueError: at least half of them leave the picture, and those are boxes in the picture if they are corners.
+    """
+    (name, numbers, offset, has_centres), size = _MEANING[ending], np.array(picture_px[::-1])
+    starts, ends = np.hsplit(table.corners, 2)
+    leaves = np.flatnonzero(((starts < -_BORDER_PX) | (ends > size + _BORDER_PX)).any(axis=1))
+    sides = (ends - starts)[leaves]
+    firsts = starts[leaves] + has_centres * sides / 2
+    are_corners = (firsts >= -_BORDER_PX) & (firsts < sides) & (sides <= size + _BORDER_PX)
+    if len(leaves) and 2 * len(leaves) >= len(starts) and are_corners.all():
+        given = np.concatenate([firsts[0] + offset, sides[0]]) / ([*size, *size] if has_centres else 1)
+        shown = f"{[float(f'{value:.6g}') for value in given]} of frame {table.frames[leaves[0]]} (from 0)"
+        raise ValueError(
+            f"{len(leaves)} of {len(starts)} boxes leave the picture of {size[0]}x{size[1]} px, such as {shown}, but "
+            f"none if the numbers are corners: left, top, right, bottom. {name} has {numbers}: convert them"
+        )
 
 
 def _check_boxes(table: BoxTable, picture_px: tuple[int, int]) -> None:

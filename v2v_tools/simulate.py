@@ -82,7 +82,7 @@ def _run(asked: argparse.Namespace) -> None:
     if asked.picture is not None:
         check_drawable(arrays)
     if asked.events is not None:
-        check_event_file(asked.events)
+        check_event_file(asked.events, spec.recipe.crop_width_px, spec.recipe.crop_height_px)
     catalogue = open_shown(
         asked.video, list_file=asked.list, rows=asked.rows or "full", scene=spec.scene != "off",
         cache_dir=asked.cache_dir, kind=VideosKind.of(vars(asked)),

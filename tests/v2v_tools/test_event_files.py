@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cache
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
+from v2v_recordings.limits import FORM_LIMITS
 from v2v_server.simulation import simulate
 from v2v_server.simulation.kernels import Voxels
 from v2v_tools import simulate as command
@@ -74,6 +76,57 @@ def test_no_events_make_a_file_too(ending: str, tmp_path: Path) -> None:
     none = simulate(np.zeros((6, 4, 4), np.uint8), threshold_pos=1.0, start_residual=0.0).to_events(100)
     write_events(tmp_path / f"none{ending}", none)
     assert (tmp_path / f"none{ending}").stat().st_size > 0
+
+
+def listed(width_px: int, height_px: int, *t_us: int) -> EventList:
+    """Return events at the lower right."""
+    places = (np.full(len(t_us), side_px - 1, np.uint16) for side_px in (width_px, height_px))
+    return EventList(*places, np.array(t_us, np.int64), np.ones(len(t_us), bool), width_px, height_px)
+
+
+@pytest.mark.parametrize("ending", EVENT_WRITERS)
+def test_the_largest_picture_is_written_and_larger_ones_are_refused(ending: str, tmp_path: Path) -> None:
+    side = FORM_LIMITS[EVENT_WRITERS[ending].form].side_px
+    path = tmp_path / f"events{ending}"
+    for size in ((side, 2), (2, side)):
+        events = listed(*size, 5, 9)
+        write_events(path, events)
+        back = read(path)
+        assert (back.width_px, back.height_px, back.t.tolist()) == (*size, [5, 9])
+        assert (back.x.tolist(), back.y.tolist()) == (events.x.tolist(), events.y.tolist())
+    path.unlink()
+    for size in ((side + 1, 2), (2, side + 1)):
+        events = dataclasses.replace(listed(2, 2, 5), width_px=size[0], height_px=size[1])
+        with pytest.raises(UsageError, match=rf"{size[0]} x {size[1]} px; .* at most {side} px a side: give a smaller"):
+            write_events(path, events)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ending", EVENT_WRITERS)
+def test_late_times_are_written_or_refused(ending: str, tmp_path: Path) -> None:
+    path, end_us = tmp_path / f"events{ending}", FORM_LIMITS[EVENT_WRITERS[ending].form].end_us
+    if end_us < 2**36:
+        with pytest.raises(UsageError, match=rf"an event at {end_us} us; .* holds times below {end_us} us: give"):
+            write_events(path, listed(4, 4, 7, end_us))
+    last_us = min(end_us - 1, 2**32 + 5)
+    write_events(path, listed(4, 4, 7, last_us))
+    assert read(path).t.tolist() == [7, last_us]
+
+
+@pytest.mark.parametrize("ending", EVENT_WRITERS)
+def test_events_outside_of_the_picture_are_refused(ending: str, tmp_path: Path) -> None:
+    wrong = dataclasses.replace(listed(9, 9, 5), height_px=8)
+    with pytest.raises(UsageError, match=r"events reach x = 8, y = 8, outside of the picture of 9 x 8 px"):
+        write_events(tmp_path / f"events{ending}", wrong)
+
+
+def test_the_program_refuses_a_picture_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = ["missing.mp4", "--out", str(tmp_path / "s.npz"), "--set", "crop_width_px=2049", "--events"]
+    assert command.main([*line, str(tmp_path / "e.raw")]) == 2
+    said = capsys.readouterr().err
+    assert "EVT 3 holds at most 2048 px a side: give a smaller crop, or another ending: .h5, .hdf5, .npz, .aed" in said
+    assert command.main([*line, str(tmp_path / "e.dat")]) == 2
+    assert "missing.mp4" in capsys.readouterr().err
 
 
 def test_a_name_that_says_no_form_is_refused(tmp_path: Path) -> None:

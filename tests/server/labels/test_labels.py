@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -203,6 +203,65 @@ def test_labels_that_do_not_fit_are_refused_in_words(
         path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=message):
         check(ending, path)
+
+
+WRITERS = {".boxes.json": write_coco, ".boxes.txt": write_mot, ".boxes/": write_yolo}
+HAS = {".boxes.json": "COCO has left, top, width, height", ".boxes.txt": "MOT has left, top, width, height",
+       ".boxes/": "YOLO has centre x, centre y, width, height"}  # fmt: skip
+
+
+def as_corners(ending: str, boxes: Boxes) -> Boxes:
+    """Return boxes that a writer writes as corners."""
+    shift = 0.5 if ending == ".boxes/" else 0  # the writer adds half of what it takes for a side
+    return [
+        (frame, left - shift * (left + width), top - shift * (top + height), left + width, top + height, *rest)
+        for frame, left, top, width, height, *rest in boxes
+    ]  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("ending", WRITERS)
+@pytest.mark.parametrize(
+    ("true", "wrong", "refused"),
+    [
+        (0, 10, "10 of 10 boxes"),
+        (5, 5, "5 of 10 boxes"),
+        (6, 4, ""),
+    ],
+)
+def test_corners_are_refused_and_named(tmp_path: Path, ending: str, true: int, wrong: int, refused: str) -> None:
+    """Boxes at the lower right, some of them written as corners."""
+    boxes: Boxes = [(frame, 60, 45, 10 + frame, 12, 2, 3) for frame in range(10)]
+    path = tmp_path / f"a{ending.rstrip('/')}"
+    WRITERS[ending](path, as_corners(ending, boxes[:wrong]) + boxes[wrong:])
+    if refused:
+        given = {".boxes.json": "60.0, 45.0, 70.0, 57.0", ".boxes.txt": "61.0, 46.0, 70.0, 57.0"}
+        place = given.get(ending, "0.75, 0.75, 0.875, 0.95")
+        message = rf"{refused} leave the picture of 80x60 px, such as \[{place}\] of frame 0 .*corners.*{HAS[ending]}"
+        with pytest.raises(ValueError, match=message):
+            check(ending, path)
+    else:
+        assert check(ending, path) == ""
+
+
+@pytest.mark.parametrize("ending", WRITERS)
+@settings(max_examples=40)
+@given(data=st.data())
+def test_boxes_that_are_meant_so_are_taken(
+    tmp_path_factory: pytest.TempPathFactory, ending: str, data: st.DataObject
+) -> None:
+    """Boxes in the picture up to its border, and any that leave it and are no corners: their width is below x."""
+    inside = data.draw(st.lists(st.tuples(st.integers(0, 79), st.integers(0, 59)), max_size=4))
+    leaving = data.draw(st.lists(st.tuples(st.integers(42, 78), st.integers(0, 50), st.integers(40, 41)), max_size=4))
+    boxes: Boxes = [(frame, x, y, 80 - x, 60 - y, 1, 1) for frame, (x, y) in enumerate(inside)]
+    boxes += [(4 + frame, x, y, width, 20, 1, 1) for frame, (x, y, width) in enumerate(leaving)]
+    path = tmp_path_factory.mktemp("labels") / f"a{ending.rstrip('/')}"
+    WRITERS[ending](path, [(8, 30, 20, 10, 10, 1, 1), *boxes])
+    if ending == ".boxes/":  # centres may be corners even so
+        table = read(ending, path)
+        numbers = np.hstack([table.corners.reshape(-1, 2, 2).mean(1), table.corners[:, 2:] - table.corners[:, :2]])
+        leaves = (table.corners < -1).any(1) | (table.corners > [81, 61, 81, 61]).any(1)
+        assume(not (numbers[leaves, :2] < numbers[leaves, 2:]).all(1).all() or not leaves.any())
+    assert check(ending, path) == ""
 
 
 @pytest.mark.parametrize(

@@ -240,7 +240,7 @@ def test_a_guessed_size_is_reported(tmp_path: Path, capsys: pytest.CaptureFixtur
 @pytest.mark.parametrize("package", ["faery", "rosbags"])
 def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str) -> None:
     source = tmp_path / ("a.raw" if package == "faery" else "a.bag")
-    (raw_forms.write_evt3 if package == "faery" else raw_forms.write_bag)(source, scene())
+    (raw_forms.write_evt2 if package == "faery" else raw_forms.write_bag)(source, scene())
     for module in ("faery", "rosbags", "rosbags.rosbag1"):
         if module.startswith(package):
             monkeypatch.setitem(sys.modules, module, None)
