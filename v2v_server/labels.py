@@ -255,7 +255,7 @@ def read_mask(file: Traversable, picture_px: tuple[int, int]) -> npt.NDArray[np.
     """
     from PIL import Image  # only samples with masks need it
 
-    from v2v_server.video.picture_file import check_rows
+    from v2v_server.video.picture_file import check_rows, read_head
 
     data = file.read_bytes()
     try:
@@ -265,6 +265,8 @@ def read_mask(file: Traversable, picture_px: tuple[int, int]) -> npt.NDArray[np.
             if data[25] != _PALETTE and (data[25], data[24]) not in ((_GREY, 1), (_GREY, 8)):  # Pillow rescales others
                 raise ValueError("is neither 8-bit grey nor a palette: write the classes as one of these")
             check_rows(data)
+            if (exif := read_head(data).exif) != 1:
+                raise ValueError(f"has Exif orientation {exif}: write it upright")
             return np.asarray(picture).astype(np.uint8)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # Pillow raises all of these
         raise ValueError(f"{file.name} {error}") from error

@@ -47,11 +47,13 @@ _UPRIGHT = {
 }  # fmt: skip
 """What turns a picture upright, by its Exif orientation."""
 _WIDTH, _HEIGHT, _BITS, _COMPRESSION, _PHOTOMETRIC, _TILE_WIDTH, _EXTRA_SAMPLES = 256, 257, 258, 259, 262, 322, 338
+_STRIPS, _TILES = (273, 279), (324, 325)
+"""Tags of their places and sizes, bytes."""
 _BLACK_IS_ZERO, _PREMULTIPLIED = 1, 1
 _BIG_TIFF = b"II+\0"
 _FFMPEGS_COMPRESSIONS = frozenset({1, 2, 3, 4, 5, 8, 32773, 32946})
 """None, CCITT, LZW, Deflate and PackBits, by their numbers in TIFF files."""
-_JPEGS = 6, 7
+_JPEGS, _DEFLATES = (6, 7), (8, 32946)
 _GREY, _COLOUR, _DEEP = frozenset({"1", "L", "LA"}), frozenset({"P", "RGB", "RGBA"}), frozenset({"I;16", "I;16B"})
 _TOLERANCE = 16
 """Difference of grey levels between two readers that comes from rounding: pixels may have 5 bits a colour."""
@@ -174,6 +176,8 @@ def check_picture(data: bytes, head: PictureHead) -> None:
         if frame is None:
             return
         with _opened(data) as picture:
+            if head.form == "TIFF" and picture.tag_v2.get(_COMPRESSION) in _DEFLATES:
+                _check_sums(picture.tag_v2, data)
             picture.load()  # libtiff fails where a strip is damaged
             other = _frame_of(picture)
     if other is not None:
@@ -236,6 +240,33 @@ def _warning_of_libjpeg(data: bytes, head: PictureHead, said: BinaryIO) -> str:
     return warning[0] if warning else "no end of image" * is_cut
 
 
+def _check_sums(tags: Any, data: bytes) -> None:
+    """Check the checksums of the strips or tiles of a TIFF picture in Deflate, which libtiff does not.
+
+    Raises:
+        ValueError: one is wrong.
+    """
+    places, sizes = (np.atleast_1d(tags[tag]).tolist() for tag in (_TILES if _TILE_WIDTH in tags else _STRIPS))
+    for at, size in zip(places, sizes, strict=True):
+        if size:
+            _inflate(data[at : at + size])
+
+
+def _inflate(data: bytes, most: int = 0) -> bytes:
+    """Inflate data.
+
+    Args:
+        most: bytes to return at most; 0 returns all, and compares the checksum.
+
+    Raises:
+        ValueError: it is damaged.
+    """
+    try:
+        return zlib.decompressobj().decompress(data, most)
+    except zlib.error as error:
+        raise ValueError(f"is damaged: {error}") from error
+
+
 def check_rows(data: bytes) -> None:
     """Check that a PNG picture has the data of all its rows. Decoders leave the others black.
 
@@ -252,9 +283,5 @@ def check_rows(data: bytes) -> None:
         length, kind = struct.unpack_from(">I4s", data, at)
         parts += [data[at + 8 : at + 8 + length]] * (kind == b"IDAT")
         at += 12 + length
-    try:
-        found = len(zlib.decompressobj().decompress(b"".join(parts), wanted))
-    except zlib.error as error:
-        raise ValueError(f"is damaged: {error}") from error
-    if found < wanted:
+    if (found := len(_inflate(b"".join(parts), wanted))) < wanted:
         raise ValueError(f"is truncated or damaged: it has {found} of {wanted} bytes of its rows")
