@@ -29,6 +29,7 @@ from __future__ import annotations
 import codecs
 import io
 import re
+import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources.abc import Traversable
@@ -268,7 +269,7 @@ def read_mask(file: Traversable, picture_px: tuple[int, int]) -> npt.NDArray[np.
             if (exif := read_head(data).exif) != 1:
                 raise ValueError(f"has Exif orientation {exif}: write it upright")
             return np.asarray(picture).astype(np.uint8)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # Pillow raises all of these
+    except (OSError, SyntaxError, ValueError, zlib.error, Image.DecompressionBombError) as error:  # Pillow raises most
         raise ValueError(f"{file.name} {error}") from error
 
 

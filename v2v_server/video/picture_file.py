@@ -38,19 +38,16 @@ PICTURE_CODECS = {
 LARGEST_PICTURE_FILE_BYTES = 8 * LARGEST_PICTURE_PX + (1 << 20)
 """Most bytes that are read of a file: a picture of the most pixels and 16 bits without compression."""
 
-_FORMATS = "PNG", "JPEG", "TIFF", "WEBP", "BMP"
-_ORIENTATION = 0x0112
 _UPRIGHT = {
     2: Orientation(flip_x=True), 3: Orientation(flip_y=True, flip_x=True), 4: Orientation(flip_y=True),
     5: Orientation(True), 6: Orientation(True, flip_x=True), 7: Orientation(True, True, True),
     8: Orientation(True, flip_y=True),
 }  # fmt: skip
 """What turns a picture upright, by its Exif orientation."""
-_WIDTH, _HEIGHT, _BITS, _COMPRESSION, _PHOTOMETRIC, _TILE_WIDTH, _EXTRA_SAMPLES = 256, 257, 258, 259, 262, 322, 338
+_WIDTH, _HEIGHT, _BITS, _COMPRESSION, _PHOTOMETRIC, _ORIENTATION, _EXTRA_SAMPLES = 256, 257, 258, 259, 262, 274, 338
 _STRIPS, _TILES = (273, 279), (324, 325)
 """Tags of their places and sizes, bytes."""
-_BLACK_IS_ZERO, _PREMULTIPLIED = 1, 1
-_BIG_TIFF = b"II+\0"
+_BLACK_IS_ZERO, _PREMULTIPLIED, _BIG_TIFF = 1, 1, b"II+\0"
 _FFMPEGS_COMPRESSIONS = frozenset({1, 2, 3, 4, 5, 8, 32773, 32946})
 """None, CCITT, LZW, Deflate and PackBits, by their numbers in TIFF files."""
 _JPEGS, _DEFLATES = (6, 7), (8, 32946)
@@ -61,10 +58,8 @@ _DAMAGE = re.compile(
     r"Corrupt JPEG data: (?!\d+ extraneous bytes before marker 0x(c0|c1|c2|db|e.|fe)).*|Premature end.*"
 )
 """What libjpeg says of damage. Bytes between the segments of a head spoil no pixel."""
-_PNG_HEAD, _PNG_SIZE_AT = 8, 16
 _PNG_SAMPLES = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """Samples of a pixel, by the type of colour."""
-_WHOLE = ((0, 0, 1, 1),)
 _ADAM7 = ((0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1))
 """First row and column, and steps from row to row and column to column, of each pass of an interlaced PNG picture."""
 
@@ -164,7 +159,7 @@ def check_picture(data: bytes, head: PictureHead) -> None:
 
     Raises:
         ValueError: it is damaged, or FFmpeg reads it wrong.
-        av.FFmpegError, OSError: it is damaged.
+        av.FFmpegError, OSError, zlib.error: it is damaged.
     """
     is_compared = head.form in ("TIFF", "BMP")
     frame, codec = decode_picture(data) if is_compared else (None, codec_of(data))
@@ -177,7 +172,9 @@ def check_picture(data: bytes, head: PictureHead) -> None:
             return
         with _opened(data) as picture:
             if head.form == "TIFF" and picture.tag_v2.get(_COMPRESSION) in _DEFLATES:
-                _check_sums(picture.tag_v2, data)
+                spans = (picture.tag_v2[tag] for tag in (_TILES if _TILES[0] in picture.tag_v2 else _STRIPS))
+                for at, size in zip(*spans, strict=True):
+                    zlib.decompressobj().decompress(data[at : at + size])  # compares the checksum, as libtiff does not
             picture.load()  # libtiff fails where a strip is damaged
             other = _frame_of(picture)
     if other is not None:
@@ -202,13 +199,16 @@ def _opened(data: bytes) -> Any:
     """Return a picture that Pillow has read the head of."""
     from PIL import Image
 
-    return Image.open(io.BytesIO(data), formats=_FORMATS)
+    return Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "TIFF", "WEBP", "BMP"))
 
 
 def _is_left_to_pillow(picture: Any, data: bytes) -> bool:
     """Return whether FFmpeg does not decode a TIFF picture."""
-    tags = picture.tag_v2
-    return _TILE_WIDTH in tags or data.startswith(_BIG_TIFF) or tags.get(_COMPRESSION, 1) not in _FFMPEGS_COMPRESSIONS
+    return (
+        _TILES[0] in picture.tag_v2
+        or data.startswith(_BIG_TIFF)
+        or picture.tag_v2.get(_COMPRESSION, 1) not in _FFMPEGS_COMPRESSIONS
+    )
 
 
 def _frame_of(picture: Any) -> VideoFrame | None:
@@ -240,48 +240,22 @@ def _warning_of_libjpeg(data: bytes, head: PictureHead, said: BinaryIO) -> str:
     return warning[0] if warning else "no end of image" * is_cut
 
 
-def _check_sums(tags: Any, data: bytes) -> None:
-    """Check the checksums of the strips or tiles of a TIFF picture in Deflate, which libtiff does not.
-
-    Raises:
-        ValueError: one is wrong.
-    """
-    places, sizes = (np.atleast_1d(tags[tag]).tolist() for tag in (_TILES if _TILE_WIDTH in tags else _STRIPS))
-    for at, size in zip(places, sizes, strict=True):
-        if size:
-            _inflate(data[at : at + size])
-
-
-def _inflate(data: bytes, most: int = 0) -> bytes:
-    """Inflate data.
-
-    Args:
-        most: bytes to return at most; 0 returns all, and compares the checksum.
-
-    Raises:
-        ValueError: it is damaged.
-    """
-    try:
-        return zlib.decompressobj().decompress(data, most)
-    except zlib.error as error:
-        raise ValueError(f"is damaged: {error}") from error
-
-
 def check_rows(data: bytes) -> None:
     """Check that a PNG picture has the data of all its rows. Decoders leave the others black.
 
     Raises:
-        ValueError: it has not, or the data is damaged.
+        ValueError: it has not.
+        zlib.error: the data is damaged.
     """
-    width, height, depth, colour, _, _, is_interlaced = struct.unpack_from(">2I5B", data, _PNG_SIZE_AT)
+    width, height, depth, colour, _, _, is_interlaced = struct.unpack_from(">2I5B", data, 16)
     bits, wanted = depth * _PNG_SAMPLES[colour], 0
-    for top, left, down, across in _ADAM7 if is_interlaced else _WHOLE:
+    for top, left, down, across in _ADAM7 if is_interlaced else ((0, 0, 1, 1),):
         rows, columns = -((top - height) // down), -((left - width) // across)
         wanted += rows * (1 + (columns * bits + 7) // 8) * (columns > 0)  # each row begins with its filter
-    parts, at = list[bytes](), _PNG_HEAD
+    parts, at = list[bytes](), 8
     while at + 8 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
         parts += [data[at + 8 : at + 8 + length]] * (kind == b"IDAT")
         at += 12 + length
-    if (found := len(_inflate(b"".join(parts), wanted))) < wanted:
+    if (found := len(zlib.decompressobj().decompress(b"".join(parts), wanted))) < wanted:
         raise ValueError(f"is truncated or damaged: it has {found} of {wanted} bytes of its rows")
