@@ -29,6 +29,7 @@ from __future__ import annotations
 import codecs
 import io
 import re
+import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources.abc import Traversable
@@ -251,9 +252,11 @@ def read_mask(file: Traversable, picture_px: tuple[int, int]) -> npt.NDArray[np.
         picture_px: height and width of the video's upright picture.
 
     Raises:
-        ValueError: it is another kind of picture, or has another size.
+        ValueError: it is another kind of picture, has another size, or is damaged.
     """
     from PIL import Image  # only samples with masks need it
+
+    from v2v_server.video.picture_file import check_rows, read_head
 
     data = file.read_bytes()
     try:
@@ -262,8 +265,11 @@ def read_mask(file: Traversable, picture_px: tuple[int, int]) -> npt.NDArray[np.
                 raise ValueError(f"has {size[1]}x{size[0]} px: the video has {picture_px[1]}x{picture_px[0]} px")
             if data[25] != _PALETTE and (data[25], data[24]) not in ((_GREY, 1), (_GREY, 8)):  # Pillow rescales others
                 raise ValueError("is neither 8-bit grey nor a palette: write the classes as one of these")
+            check_rows(data)
+            if (exif := read_head(data).exif) != 1:
+                raise ValueError(f"has Exif orientation {exif}: write it upright")
             return np.asarray(picture).astype(np.uint8)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # Pillow raises all of these
+    except (OSError, SyntaxError, ValueError, zlib.error, Image.DecompressionBombError) as error:  # Pillow raises most
         raise ValueError(f"{file.name} {error}") from error
 
 

@@ -29,7 +29,7 @@ from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.sources.source import Notice, silent
 from v2v_server.system.process import make_private
 
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 """Raise it with every change of the table or of what probing finds: an index of another version is made again."""
 
 _BUSY_SECONDS, _SAY_SECONDS = 30.0, 2.0

@@ -1,12 +1,11 @@
 """A photograph whose frames are rendered for each sample: ``--videos-kind photographs``.
 
-The catalogue reads its head and hashes its bytes. A worker decodes it once, and renders what the camera of a sample
+The catalogue checks it and hashes its bytes. A worker decodes it once, and renders what the camera of a sample
 sees (:mod:`v2v_server.worlds`), with true flow, masks and tracks. Without a sample it stands still.
 """
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
@@ -18,18 +17,19 @@ import numpy.typing as npt
 import xxhash
 
 from v2v_server.simulation.intensity import eight_bits
-from v2v_server.store.picture_sequence import (
-    LARGEST_PICTURE_FILE_BYTES,
-    ORIENTATION,
-    PICTURE_CODECS,
-    decode_picture,
-    errors_of_pictures,
-)
+from v2v_server.store.picture_sequence import errors_of_pictures
 from v2v_server.store.pixels import IMAGE_SUFFIXES
 from v2v_server.video.decode import BIT_EXACT_CODECS, ClipRequest, Cut, DecodedClip, DecodedFrame, DecodedPicture
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import LARGEST_INDEXED_SIDE_PX, FrameIndex, unseekable
-from v2v_server.video.picture import SDR, LumaFormat, Orientation, PixelRect, Signal, luma_plane
+from v2v_server.video.picture import SDR, LumaFormat, PixelRect, Signal, luma_plane
+from v2v_server.video.picture_file import (
+    LARGEST_PICTURE_FILE_BYTES,
+    check_picture,
+    codec_of,
+    decode_picture,
+    read_head,
+)
 from v2v_server.video.probe import VideoFacts
 from v2v_server.video.source import LARGEST_PICTURE_PX
 
@@ -40,13 +40,6 @@ LOOKED_FOR = " ".join(sorted(IMAGE_SUFFIXES))
 _LEAST_SIDE_PX = 16
 _MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16", "I;16B"})
 """Pillow's names of the pixels that are read: grey, palettes and RGB."""
-_UPRIGHT = {
-    2: Orientation(flip_x=True), 3: Orientation(flip_y=True, flip_x=True), 4: Orientation(flip_y=True),
-    5: Orientation(True), 6: Orientation(True, flip_x=True), 7: Orientation(True, True, True),
-    8: Orientation(True, flip_y=True),
-}  # fmt: skip
-"""What turns a picture upright, by its Exif orientation."""
-_ENDS = {"mjpeg": b"\xff\xd9", "png": b"IEND"}
 _KEPT_BYTES = 256 << 20
 """Decoded photographs that a worker keeps; one at least."""
 
@@ -82,7 +75,7 @@ class Photograph:
         self._path = os.fspath(path)
 
     def facts(self) -> VideoFacts:
-        """Read the head of the file and hash it. It is one frame, which the catalogue shows for longer."""
+        """Check the file and hash it. It is one frame, which the catalogue shows for longer."""
         with errors_of_pictures(self._path, lambda: (None, "")):
             return _facts(self._read())
 
@@ -160,55 +153,45 @@ def _decoded(data: bytes, index: FrameIndex, usable: PixelRect) -> _Still:
 
 
 def _facts(data: bytes) -> VideoFacts:
-    """Return what the head of a file says.
+    """Return what a file holds.
 
     Raises:
-        ValueError: it is of a form that is not read, or truncated.
+        ValueError: it is of a form that is not read, or damaged.
         OSError: it is no picture.
     """
-    from PIL import Image  # only a catalogue needs it
-
-    codec = next((codec for magic, codec in PICTURE_CODECS.items() if data.startswith(magic)), "")
-    if not codec:
+    if not codec_of(data):
         raise ValueError("does not begin like a JPEG, PNG, WebP, TIFF or BMP file")
-    with Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "TIFF", "WEBP", "BMP")) as picture:
-        turned = Image.Image.getexif(picture).get(ORIENTATION, 1)  # that of PNG files would decode the picture
-        size, mode, transparent = picture.size, picture.mode, picture.has_transparency_data
-        is_animated = picture.format != "MPO" and getattr(picture, "is_animated", False)
-    if mode not in _MODES:
-        raise ValueError(f"has {mode} pixels: convert it to grey or RGB of 8 or 16 bits")
-    if is_animated:
+    head = read_head(data)
+    if head.mode not in _MODES:
+        raise ValueError(f"has {head.mode} pixels: convert it to grey or RGB of 8 or 16 bits")
+    if head.has_others:
         raise ValueError("has more than one picture: give one, or serve it as a video")
-    if min(size) < _LEAST_SIDE_PX or max(size) > LARGEST_INDEXED_SIDE_PX or size[0] * size[1] > LARGEST_PICTURE_PX:
+    width, height = head.width_px, head.height_px
+    if (
+        not _LEAST_SIDE_PX <= min(width, height) <= max(width, height) <= LARGEST_INDEXED_SIDE_PX
+        or width * height > LARGEST_PICTURE_PX
+    ):
         raise ValueError(
-            f"has {size[0]}x{size[1]} px: give sides from {_LEAST_SIDE_PX} to {LARGEST_INDEXED_SIDE_PX} px and at most "
+            f"has {width}x{height} px: give sides from {_LEAST_SIDE_PX} to {LARGEST_INDEXED_SIDE_PX} px and at most "
             f"{LARGEST_PICTURE_PX} pixels"
         )
-    if _is_truncated(data, codec):
-        raise ValueError("is truncated: its end is missing")
-    lies = _UPRIGHT.get(turned, Orientation())
-    index = unseekable(1, (1, 1), *lies.size(size[1], size[0]), lies)
+    check_picture(data, head)
+    frame, codec = decode_picture(data)
+    lies = head.orientation_of(frame)
+    index = unseekable(1, (1, 1), *lies.size(height, width), lies)
     return VideoFacts(
         frames=1,
         height_px=index.height_px,
         width_px=index.width_px,
         codec=codec,
-        pixel_format=mode,
+        pixel_format=head.mode,
         frames_per_second=float("nan"),
         rotation_degrees=0,
         full_range=True,
         index=index,
         content=xxhash.xxh3_128(data).hexdigest(),
-        remark="its transparency is left out" * transparent,
+        remark=head.remark,
     )
-
-
-def _is_truncated(data: bytes, codec: str) -> bool:
-    """Return whether a JPEG or PNG file lacks the mark of its end, which data behind it may follow."""
-    at = 2
-    while codec == "mjpeg" and data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] != b"\xda":
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")  # the head, where thumbnails lie
-    return data.find(_ENDS.get(codec, b""), at) < 0
 
 
 def open_pixels(path: str | os.PathLike[str]) -> AbstractContextManager[Photograph]:

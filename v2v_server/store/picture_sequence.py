@@ -7,7 +7,6 @@ each picture, with seconds and, if given, its name. Without such a file the rate
 
 from __future__ import annotations
 
-import io
 import os
 import posixpath
 from collections.abc import Callable, Generator, Iterator
@@ -19,7 +18,6 @@ from zipfile import ZipFile
 import av
 import numpy as np
 import xxhash
-from av.packet import Packet
 from av.video.frame import VideoFrame
 
 from v2v_protocol.errors import VideoError
@@ -32,20 +30,17 @@ from v2v_server.video.decode import Stack
 from v2v_server.video.fingerprint import TIMES, files_in, unreadable
 from v2v_server.video.frame_index import unseekable
 from v2v_server.video.picture import LumaFormat, Orientation
+from v2v_server.video.picture_file import (
+    LARGEST_PICTURE_FILE_BYTES,
+    PictureHead,
+    check_picture,
+    decode_picture,
+    read_head,
+)
 from v2v_server.video.probe import VideoFacts
-from v2v_server.video.source import LARGEST_PICTURE_PX, reason
+from v2v_server.video.source import reason
 
 LOOKED_FOR = f"folders and .zip archives of numbered {' '.join(sorted(IMAGE_SUFFIXES))}"
-PICTURE_CODECS = {
-    b"\x89PNG": "png", b"\xff\xd8\xff": "mjpeg", b"II*\0": "tiff", b"MM\0*": "tiff", b"RIFF": "webp", b"BM": "bmp",
-}  # fmt: skip
-"""FFmpeg's name of the decoder, by the first bytes of a file."""
-ORIENTATION = 0x0112
-"""Exif's tag of the orientation."""
-_MIRRORED = (2, 4, 5, 7)
-"""Orientations that PyAV cannot tell from turned ones."""
-LARGEST_PICTURE_FILE_BYTES = 8 * LARGEST_PICTURE_PX + (1 << 20)
-"""Most bytes that are read of a file: a picture of the most pixels and 16 bits without compression."""
 
 
 def id_of(path: str) -> str:
@@ -66,24 +61,26 @@ class PictureSequence(VideoFile):
         self._at: tuple[int | None, str] = None, ""  # frame and file in errors
 
     def facts(self) -> VideoFacts:
-        """Read all files; decode the first picture, and the heads of the others.
+        """Read and check all files, and decode the first picture.
 
         Raises:
-            VideoError: a file cannot be read, or differs from the first one in size or format.
+            VideoError: a file cannot be read, is damaged, or differs from the first one in size or format.
         """
-        stored, looks = xxhash.xxh3_128(), list[str]()
+        stored, heads = xxhash.xxh3_128(), list[PictureHead]()
         with self._opened() as (files, read):
             pictures = self._pictures(files)
             for self._at in enumerate(pictures):
                 stored.update(data := read(self._at[1]))
-                looks.append(_look(data))
-                if looks[-1] != looks[0]:
-                    raise ValueError(f"is {looks[-1]}, and {pictures[0]} {looks[0]}: give all one size and format")
+                heads.append(read_head(data))
+                if heads[-1] != heads[0]:
+                    raise ValueError(f"is {heads[-1]}, and {pictures[0]} {heads[0]}: give all one size and format")
+                check_picture(data, heads[0])
             self._at = 0, pictures[0]
-            head, codec = decode_picture(read(pictures[0]))
+            frame, codec = decode_picture(read(pictures[0]))
+            if (lies := heads[0].orientation_of(frame)) != Orientation.turned(frame.rotation):
+                stored.update(f"{lies};".encode())  # under the name without it, FFmpeg's orientation was applied
             times = self._times(files, pictures, read)
-        lies = Orientation.of(head)
-        index = unseekable(len(pictures), (1, 1), *lies.size(head.height, head.width), lies)
+        index = unseekable(len(pictures), (1, 1), *lies.size(frame.height, frame.width), lies)
         if len(times):
             index = index.timed(times)
             stored.update(times.astype("<i8").tobytes())
@@ -92,13 +89,13 @@ class PictureSequence(VideoFile):
             height_px=index.height_px,
             width_px=index.width_px,
             codec=codec,
-            pixel_format=head.format.name,
+            pixel_format=frame.format.name,
             frames_per_second=(len(times) - 1) * 1e9 / int(times[-1] - times[0]) if len(times) > 1 else float("nan"),
-            rotation_degrees=head.rotation,
-            full_range=LumaFormat.of(head).full_range,
+            rotation_degrees=frame.rotation,
+            full_range=LumaFormat.of(frame).full_range,
             index=index,
             content=stored.hexdigest(),
-            remark=looks[0].partition("; ")[2],
+            remark=heads[0].remark,
         )
 
     def _frames(self, stack: Stack) -> Generator[VideoFrame, None, None]:
@@ -187,32 +184,6 @@ def errors_of_pictures(path: str, at: Callable[[], tuple[int | None, str]]) -> I
         frame, name = at()
         why = "is damaged, or of a format that is not read" if isinstance(error, OSError) else reason(error)
         raise VideoError(path, frame, f"{printable(name)}: {why}".removeprefix(": ")) from None
-
-
-def decode_picture(data: bytes) -> tuple[VideoFrame, str]:
-    """Return a decoded picture, and FFmpeg's name of its format."""
-    codec = next((codec for magic, codec in PICTURE_CODECS.items() if data.startswith(magic)), "png")
-    decoder: Any = av.CodecContext.create(codec, "r")
-    decoder.thread_type, decoder.thread_count = "NONE", 1
-    # Without "explode" the rest of a truncated JPEG is filled up with grey; with it, some sound TIFF files fail.
-    strict = "explode" if codec == "mjpeg" else "crccheck"
-    decoder.options = {"max_pixels": str(LARGEST_PICTURE_PX), "err_detect": strict}
-    (picture,) = decoder.decode(Packet(data))
-    # swscale rounds the grey of a palette to the levels of limited range.
-    return picture.reformat(format="rgb24") if picture.format.name == "pal8" else picture, codec
-
-
-def _look(data: bytes) -> str:
-    """Return size and format of a picture, by its head."""
-    from PIL import Image  # only a catalogue needs it
-
-    with Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "TIFF", "WEBP", "BMP")) as picture:
-        turned = Image.Image.getexif(picture).get(ORIENTATION, 1)  # that of PNG files would decode the picture
-        if turned in _MIRRORED:
-            raise ValueError("is mirrored by its Exif orientation: convert it to a plain one")
-        transparent = "; its transparency is left out" if picture.has_transparency_data else ""
-        form = f"{picture.format} {picture.mode}{f' with Exif orientation {turned}' * (turned != 1)}"
-        return f"{picture.width}x{picture.height} px of {form}{transparent}"
 
 
 def open_pixels(path: str | os.PathLike[str]) -> AbstractContextManager[PictureSequence]:

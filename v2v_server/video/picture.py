@@ -59,16 +59,17 @@ class Orientation:
     flip_x: bool = False
 
     @classmethod
-    def of(cls, frame: VideoFrame) -> Orientation:
-        """Return the orientation in the frame's display matrix; upright without one.
+    def of(cls, frame: VideoFrame, codec: str = "") -> Orientation:
+        """Return the orientation in the display matrix of a frame of a codec; upright without one.
 
         A matrix that turns by another angle than a multiple of 90 degrees counts as the nearest one.
         """
+        if codec == "png":  # PyAV frees the name of its colour profile, which FFmpeg frees too
+            return cls.turned(frame.rotation)
         try:
             notes = cast(SideDataContainer, frame.side_data)  # PyAV's type hints describe something else
         except ValueError:  # it does not know Exif data; the angle is all that it tells then
-            turned = {0: cls(), 90: cls(True, flip_y=True), -90: cls(True, flip_x=True)}
-            return turned.get(frame.rotation, cls(flip_y=True, flip_x=True))
+            return cls.turned(frame.rotation)
         if "DISPLAYMATRIX" not in notes:
             return cls()
         # x' = a x + c y, y' = b x + d y (16.16 fixed point; libavutil/display.h). Only the signs matter here.
@@ -76,6 +77,12 @@ class Orientation:
         if abs(a) >= abs(b):
             return cls(False, flip_y=d < 0, flip_x=a < 0)
         return cls(True, flip_y=b < 0, flip_x=c < 0)
+
+    @classmethod
+    def turned(cls, degrees: int) -> Orientation:
+        """Return the orientation of a display matrix that turns by an angle, counter-clockwise, and mirrors nothing."""
+        turned = {0: cls(), 90: cls(True, flip_y=True), -90: cls(True, flip_x=True)}
+        return turned.get(degrees, cls(flip_y=True, flip_x=True))
 
     def size(self, height: int, width: int) -> tuple[int, int]:
         """Return (height, width) of the upright picture from the stored one's, or the reverse."""

@@ -106,7 +106,7 @@ def probe(path: str | os.PathLike[str]) -> VideoFacts:
             codec = stream.codec_context.codec.canonical_name
     except av.FFmpegError as error:
         raise VideoError(name, None, f"cannot be read: {reason(error)}") from error
-    orientation = Orientation.of(head)
+    orientation = Orientation.of(head, codec)
     height, width = orientation.size(head.height, head.width)
     if not (1 <= height <= LARGEST_INDEXED_SIDE_PX and 1 <= width <= LARGEST_INDEXED_SIDE_PX):
         raise VideoError(

@@ -13,6 +13,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from tests.server.picture_files import encoded, png_of_ffmpeg, shortened
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_server import labels as formats
@@ -375,6 +376,34 @@ def test_classes_are_grey_levels_or_palette_indices(tmp_path: Path) -> None:
 
 
 NOISE = Image.fromarray(np.random.default_rng(0).integers(0, 9, (64, 64), np.uint8))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        encoded(NOISE, "png"),
+        encoded(NOISE.point(lambda level: 255 * (level > 4)).convert("1"), "png"),
+        *(encoded(NOISE.quantize(1 << bits), "png", bits=bits) for bits in (1, 2, 4, 8)),
+        png_of_ffmpeg("gray", True, 64, 64),
+    ],
+)
+def test_masks_without_all_rows_are_refused(tmp_path: Path, data: bytes) -> None:
+    """Their classes would be 0."""
+    path = tmp_path / "12.png"
+    path.write_bytes(data)
+    assert read_mask(path, (64, 64)).any()
+    for share in (0.0, 0.4, 0.99):
+        path.write_bytes(shortened(data, lambda length, kept=share: int(length * kept)))
+        with pytest.raises(ValueError, match=r"^12\.png is truncated or damaged: it has \d+ of \d+ bytes of its rows"):
+            read_mask(path, (64, 64))
+
+
+def test_masks_that_lie_are_refused(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    NOISE.save(tmp_path / "12.png", exif=exif)
+    with pytest.raises(ValueError, match=r"^12\.png has Exif orientation 3: write it upright"):
+        read_mask(tmp_path / "12.png", (64, 64))
 
 
 @pytest.mark.parametrize(
