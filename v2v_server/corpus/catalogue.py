@@ -24,6 +24,7 @@ from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoC
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
+from v2v_recordings.time_stamps import PLAUSIBLE_HZ
 from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
 from v2v_server.corpus.probe import (
     SceneCollection,
@@ -583,7 +584,15 @@ def _snapshot(
     if remarks := {videos.ids[at]: videos.remark[at] for at in np.flatnonzero(videos.remark).tolist()}:
         notes = [
             *notes,
-            f"{len(remarks)} videos are served in part, or with wrong grey levels{format_problems(remarks)}",
+            f"{len(remarks)} videos are served in part, or with wrong grey levels or times{format_problems(remarks)}",
+        ]
+    rates = videos.frames_per_second
+    if len(odd := np.flatnonzero((rates > 0) & ((rates < PLAUSIBLE_HZ[0]) | (rates > PLAUSIBLE_HZ[1])))):
+        named = {videos.ids[at]: f"{rates[at]:.3g}" for at in odd.tolist()}
+        notes = [
+            *notes,
+            f"{len(odd)} videos have frame rates outside of {PLAUSIBLE_HZ[0]:g} to {PLAUSIBLE_HZ[1]:g} a second"
+            f"{format_problems(named)}: check the unit of their time stamps, or --rate",
         ]
     if corpus.left_out:
         notes = [*notes, corpus.left_out]

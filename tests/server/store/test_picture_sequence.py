@@ -216,12 +216,13 @@ def test_times_come_from_a_file(tmp_path: Path, place: str, named: bool) -> None
 @pytest.mark.parametrize(
     ("times", "why"),
     [
-        (["0", "1", "2"], "has 3 lines: give each of the 4 pictures one"),
+        (["0", "1", "2"], "states times of 3 pictures: give each of the 4 pictures one"),
+        (["0 0000.png", "1 0001.png", "2 0003.png"], "states times of 3 pictures; 0002.png has none: give each"),
         (["0 0000.png", "1 0001.png", "2 0003.png", "3 0002.png"], "in their order"),
-        (["0", "1", "1", "2"], "do not increase"),
-        (["0", "1", "nan", "2"], "do not increase"),
+        (["0", "1", "1", "2"], "do not increase: 1 in line 4 does not come after 1 in line 3"),
+        (["0", "1", "nan", "2"], "line 4: 'nan': a line is a time in seconds or a date"),
         (["0", "1", "2", "1e30"], "beyond 4e9 s"),
-        (["0", "1", "two", "3"], "'two'"),
+        (["0", "1", "two", "3"], "line 4: 'two'"),
     ],
 )
 def test_wrong_times_are_refused(tmp_path: Path, times: list[str], why: str) -> None:
