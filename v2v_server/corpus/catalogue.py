@@ -586,13 +586,13 @@ def _snapshot(
             *notes,
             f"{len(remarks)} videos are served in part, or with wrong grey levels or times{format_problems(remarks)}",
         ]
-    rates = videos.frames_per_second
-    if len(odd := np.flatnonzero((rates > 0) & ((rates < PLAUSIBLE_HZ[0]) | (rates > PLAUSIBLE_HZ[1])))):
-        named = {videos.ids[at]: f"{rates[at]:.3g}" for at in odd.tolist()}
+    rates, (low, high) = videos.frames_per_second, PLAUSIBLE_HZ
+    is_odd = (rates > 0) & ((rates < low) | (rates > high))
+    if odd := {videos.ids[at]: f"{rates[at]:.3g}" for at in np.flatnonzero(is_odd).tolist()}:
         notes = [
             *notes,
-            f"{len(odd)} videos have frame rates outside of {PLAUSIBLE_HZ[0]:g} to {PLAUSIBLE_HZ[1]:g} a second"
-            f"{format_problems(named)}: check the unit of their time stamps, or --rate",
+            f"{len(odd)} videos have rates outside of {low:g} to {high:g} frames a second{format_problems(odd)}: check "
+            "the unit of their time stamps, or --rate",
         ]
     if corpus.left_out:
         notes = [*notes, corpus.left_out]

@@ -136,18 +136,16 @@ def _levelled(facts: VideoFacts, bits: int) -> VideoFacts:
         VideoError: they hold more.
     """
     highest, remark = facts.highest_level, ""
-    if highest >= 0 and bits:
-        if highest >> bits:
-            raise VideoError("", None, f"has a level of {highest}: more than --picture-bits {bits} gives")
+    if bits and highest >> bits > 0:
+        raise VideoError("", None, f"has a level of {highest}, beyond those of --picture-bits {bits}")
+    if bits and highest >= 0:
         return replace(facts, index=replace(facts.index, bits=bits), content=f"{facts.content}~{bits}")
-    if bits and facts.made_of == "":
+    if bits and not facts.made_of:
         remark = f"--picture-bits {bits} does not apply: its pictures do not have 16 bits"
     elif 0 <= highest < 1 << _QUESTIONED_BITS:
         least = max(8, highest.bit_length())
-        remark = (
-            f"no level above {highest} of 65535 in the pictures looked at: if they hold {least} bits, they are "
-            f"{1 << 16 - least} times too dark, and --picture-bits {least} stretches them"
-        )
+        remark = f"no level above {highest} of 65535 in the pictures looked at: if they hold {least} bits, they are "
+        remark += f"{1 << 16 - least} times too dark, and --picture-bits {least} stretches them"
     return replace(facts, remark="; ".join(filter(None, (facts.remark, remark))))
 
 

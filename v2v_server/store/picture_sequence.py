@@ -73,13 +73,15 @@ class Files:
 
     Attributes:
         states: of itself, and of the files of times above a folder.
-        sizes: bytes of each file, by name; those of a folder are sorted.
-        packed: the archive, without its file; None of a folder.
+        sizes: bytes of each file, by name.
+        fingerprint: of a folder, see :mod:`v2v_server.video.fingerprint`; "" of an archive.
+        packed: the archive, whose file is closed; None of a folder.
         pictures: names of the pictures by number, once they were asked for.
     """
 
     states: list[tuple[int, int, int, int]]
     sizes: dict[str, int]
+    fingerprint: str = ""
     packed: ZipFile | None = None
     pictures: list[str] = field(default_factory=list)
 
@@ -110,8 +112,7 @@ class PictureSequence(VideoFile):
         A picture that changed since then is noticed when it is read.
         """
         with self._opened() as (files, _):
-            found = fingerprint_of(files.sizes) if files.packed is None else ""
-        check_fingerprint(self._path, fingerprint, found)
+            check_fingerprint(self._path, fingerprint, files.fingerprint)
 
     def facts(self) -> VideoFacts:
         """List and read all files; decode the first picture, and the heads of the others.
@@ -182,10 +183,9 @@ class PictureSequence(VideoFile):
         path, self._at = os.fspath(self._path), (None, "")
         with errors_of_pictures(path, lambda: self._at):
             files = list_files(path)
-            with nullcontext() if files.packed is None else open(path, "rb") as archive:
-                packed = copy(files.packed)
-                if packed is not None:
-                    packed.fp = archive  # its directory is known
+            with open(path, "rb") if files.packed else nullcontext() as archive:
+                if packed := copy(files.packed):
+                    packed.fp = archive  # to open it by its path would read its directory again
 
                 def read(name: str) -> bytes:
                     with packed.open(name) if packed else Path(path, name).open("rb") as file:
@@ -231,8 +231,8 @@ class PictureSequence(VideoFile):
             list(map(posixpath.basename, pictures)),
         )
         if len(times) != len(pictures) or found not in ([], there):
-            without = next((f"; {name} has none" for name in there if found and name not in found), "")
-            why = f"states times of {len(times)} pictures{without}"
+            first = next(iter(sorted(set(there).difference(found or there))), "")
+            why = f"states times of {len(times)} pictures{f'; {first} has none' * bool(first)}"
             raise ValueError(f"{why}: give each of the {len(pictures)} pictures one, in their order")
         return times, remark
 
@@ -271,18 +271,16 @@ def list_files(path: str) -> Files:
         OSError, BadZipFile: it cannot be read.
     """
     states = [file_state(each) for each in (os.stat(path), *(each for _, each in times_above(path)))]
-    if (kept := _kept.pop(path, None)) is not None and kept.states == states:
-        _kept[path] = kept  # the latest is the last one
-        return kept
-    is_settled = time.time_ns() - max(max(modified, changed) for _, modified, changed, _ in states) > _SETTLED_NS
-    if os.path.isdir(path):
-        files = Files(states, {name: status.st_size for name, status in files_in(path)})
-    else:
+    files, now = _kept.pop(path, None), time.time_ns()
+    if (files is None or files.states != states) and os.path.isdir(path):
+        sizes = {name: status.st_size for name, status in files_in(path)}
+        files = Files(states, sizes, fingerprint_of(sizes))
+    elif files is None or files.states != states:
         with open(path, "rb") as archive:
             packed = ZipFile(archive)
-        files = Files(states, {each.filename: each.file_size for each in packed.infolist()}, packed)
-    if is_settled:
-        _kept[path] = files
+        files = Files(states, {each.filename: each.file_size for each in packed.infolist()}, packed=packed)
+    if now - max(max(modified, changed) for _, modified, changed, _ in states) > _SETTLED_NS:
+        _kept[path] = files  # the latest is the last one
     while len(_kept) > 1 and sum(len(each.sizes) for each in _kept.values()) > _KEPT_FILES:
         del _kept[next(iter(_kept))]
     return files
