@@ -8,6 +8,7 @@ dsec.py          DSEC and v2v-simulate: HDF5, with frames in a folder
 npy_columns.py   EVREAL's folders, and .npz
 bag.py           ROS 1 bags
 faery_reader.py  aedat4, EVT 2 and 3, DAT, Event Stream, by the package faery
+time_stamps.py   times of pictures in a text, whose unit may be open
 archive.py       a zip file, a folder or a single file, through one interface
 hdf5.py          open HDF5 files, refuse those that refer to other files; read columns of events, and pictures;
                  the layout that v2v-convert writes
