@@ -32,6 +32,7 @@ BENCHES = {
     "cache": "speed.cache",
     "store": "speed.store",
     "photographs": "speed.photographs",
+    "sequences": "speed.sequences",
     "link": "speed.link",
     "evt3": "speed.evt3",
     "physics": "accuracy.physics",

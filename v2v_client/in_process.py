@@ -69,7 +69,7 @@ class V2VDataset(Dataset[Sample]):
         rows: rows of each picture to use, as for ``v2v-serve --rows``.
         list_file: list file that restricts a folder.
         cache_dir: folder of the catalogue's index; None uses the user's cache.
-        videos_kind, rate, photograph_seconds: what a video is, as for ``v2v-serve --videos-kind``.
+        videos_kind, rate, photograph_seconds, picture_bits: what a video is, as for ``v2v-serve --videos-kind``.
         labels: see :class:`v2v_client.V2VStreamDataset`.
         options: ``preset`` and other fields of :class:`v2v_protocol.spec.StreamSpec`.
 
@@ -91,6 +91,7 @@ class V2VDataset(Dataset[Sample]):
         videos_kind: str = "videos",
         rate: float = 0.0,
         photograph_seconds: float = 0.0,
+        picture_bits: int = 0,
         labels: Labels = "required",
         **options: Any,
     ) -> None:
@@ -100,7 +101,7 @@ class V2VDataset(Dataset[Sample]):
         self._needs_labels = check_labels(labels)
         self.spec = StreamSpec.from_dict({**options, "recipe": read_recipe(recipe)})
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
-        self._videos, self._kind = os.fspath(videos), (videos_kind, rate, photograph_seconds)
+        self._videos, self._kind = os.fspath(videos), (videos_kind, rate, photograph_seconds, picture_bits)
         self._source = {"rows": rows, "list_file": list_file, "cache_dir": cache_dir}
         self._maker: Any = None
         self._process = 0

@@ -330,7 +330,7 @@ class Lease(Persisted):
         sidecars: fingerprints of the video's sidecars that the arrays are made from, by ending; a missing one is left
             out. To workers it may be [fingerprint, part]: bytes, the table of the files of a folder that the clip
             needs; or a text, why the sidecar is not used, perhaps without a fingerprint.
-        remark: what of the video is not served, or served with wrong grey levels; goes into the provenance.
+        remark: what of the video is not served, or served with wrong grey levels or times; goes into the provenance.
     """
 
     lease: int

@@ -323,7 +323,7 @@ class Provenance(Persisted):
         left_out: effects of the draw that were not simulated (``tolerance`` of the spec); the others were.
         substeps: parts that the clip's steps were divided into along the motion, undivided steps included; 0: the spec
             states no ``substep_px``, so no motion was used.
-        remark: what of the video is not served, or served with wrong grey levels; empty for most.
+        remark: what of the video is not served, or served with wrong grey levels or times; empty for most.
         dropped: as ``boxes_dropped``, for other labels by name; only those that have any.
     """
 

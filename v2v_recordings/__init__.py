@@ -10,6 +10,7 @@ bag.py           ROS 1 bags
 faery_reader.py  aedat4, EVT 2, DAT, Event Stream, by the package faery
 evt3.py          EVT 3: words decoded and encoded
 limits.py        sizes and times that each form can hold
+time_stamps.py   times of pictures in a text, whose unit may be open
 archive.py       a zip file, a folder or a single file, through one interface
 hdf5.py          open HDF5 files, refuse those that refer to other files; read columns of events, and pictures;
                  the layout that v2v-convert writes

@@ -56,6 +56,11 @@ class ServeConfig:
     photograph_seconds: float = number(
         0.0, 0.0, 1e6, "time for which each photograph is shown; 0: 10", unit="s", metavar="S"
     )
+    picture_bits: int = whole(
+        0, 0, 15,
+        "bits, 8 to 15, that the levels of picture sequences of 16 bits hold, such as 12 for 0 to 4095; 0: all 16",
+        metavar="N",
+    )  # fmt: skip
     rows: str = text("full", "rows of each picture to use: full, top:0.54 (WebVid), top:180px, 0.1:0.6", metavar="ROWS")
     cache_dir: str = text(
         "", "folder of the catalogue index and the quarantine (default: the user's cache folder)", metavar="DIR"

@@ -87,7 +87,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
             cache_dir=config.cache_dir or None,
             copies=config.copies or None,
             copies_gib=config.copies_gib,
-            kind=VideosKind(config.videos_kind, config.rate, config.photograph_seconds),
+            kind=VideosKind(config.videos_kind, config.rate, config.photograph_seconds, config.picture_bits),
             scene=config.spec.scene != "off",
             # Without local workers all cores are free for probing.
             processes=min(config.most_workers or cores, cores),

@@ -53,7 +53,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         metavar="N",
         help="number of the quarantine snapshot in the sample's provenance",
     )
-    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "photograph_seconds", "cache_dir")
+    parser.add_settings(
+        ServeConfig, "list", "rows", "videos_kind", "rate", "photograph_seconds", "picture_bits", "cache_dir"
+    )
     out = parser.group("Output")
     parser.add_output(
         "Output", "--out", (".npz",), "output file for the arrays and the provenance (JSON)", required=True

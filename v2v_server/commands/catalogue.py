@@ -46,7 +46,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     videos.add_argument(
         "--scene", choices=SCENES, default="off", help="auto: also compute the statistics that --scene auto needs"
     )
-    names = "list", "rows", "videos_kind", "rate", "photograph_seconds", "cache_dir", "copies", "copies_gib"
+    names = (
+        "list",
+        "rows",
+        "videos_kind",
+        "rate",
+        "photograph_seconds",
+        "picture_bits",
+        "cache_dir",
+        "copies",
+        "copies_gib",
+    )
     parser.add_settings(ServeConfig, *names)
     run = parser.group("Run")
     run.add_argument(

@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         default="off",
         help="auto: also compute the statistics that v2v-serve --scene auto uses",
     )
-    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "cache_dir")
+    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "picture_bits", "cache_dir")
     stored = parser.group("Files")
     stored.add_argument(
         "--size", choices=tuple(SIZES), default=DEFAULT_SIZE,

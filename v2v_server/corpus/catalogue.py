@@ -25,6 +25,7 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.programs import counted
 from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
+from v2v_recordings.time_stamps import PLAUSIBLE_HZ
 from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
 from v2v_server.corpus.probe import (
     SceneCollection,
@@ -74,9 +75,10 @@ from v2v_server.video.rows import Rows
 _KEPT_SLICES = 64
 _KEPT_LONG_FRAMES = 1 << 22
 """Frames of the opened indexes that are kept, 32 MiB: two days at 25 a second; one index at least."""
-_SMALL_INDEX_BYTES = 4096
+_SMALL_INDEX_BYTES, _SMALL_INDEX_FRAMES = 4096, 4096
 """Up to here an index goes into a lease as it is stored: to open it, cut it and pack it again would be a quarter of all
-that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB."""
+that a server does for a sample. A thousand frames at a constant rate are 100 bytes, at a varying one 2 kB. To open it
+takes a worker 1 ms at most."""
 
 
 @dataclass(frozen=True)
@@ -352,7 +354,8 @@ class Catalogue:
         if key not in self._slices:
             index = self._long.get(id)
             encoded = b"" if index is not None else self._stored_index(id)
-            if index is None and len(encoded) > _SMALL_INDEX_BYTES:
+            is_small = len(encoded) <= _SMALL_INDEX_BYTES and self.videos.shape(id)[0] <= _SMALL_INDEX_FRAMES
+            if index is None and not is_small:
                 index = self._keep_long(id, FrameIndex.from_bytes(encoded))
             if index is not None:
                 index.position(start, count)
@@ -585,8 +588,16 @@ def _snapshot(
     if remarks := {videos.ids[at]: videos.remark[at] for at in np.flatnonzero(videos.remark).tolist()}:
         notes = [
             *notes,
-            f"{counted(len(remarks), 'video is', 'videos are')} served in part, or with wrong grey levels"
+            f"{counted(len(remarks), 'video is', 'videos are')} served in part, or with wrong grey levels or times"
             f"{format_problems(remarks)}",
+        ]
+    rates, (low, high) = videos.frames_per_second, PLAUSIBLE_HZ
+    is_odd = (rates > 0) & ((rates < low) | (rates > high))
+    if odd := {videos.ids[at]: f"{rates[at]:.3g}" for at in np.flatnonzero(is_odd).tolist()}:
+        notes = [
+            *notes,
+            f"{counted(len(odd), 'video has a rate', 'videos have rates')} outside of {low:g} to {high:g} frames a "
+            f"second{format_problems(odd)}: check the unit of their time stamps, or --rate",
         ]
     if corpus.left_out:
         notes = [*notes, corpus.left_out]

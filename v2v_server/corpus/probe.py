@@ -60,6 +60,8 @@ LARGEST_PROBE_BYTES = 2 << 30
 """Memory that a process may allocate to probe a file: enough for 16 pictures of the largest size, or a list of 2**24
 frames. A file of some kB can claim a thousand million frames, for which a demuxer would allocate memory."""
 
+_QUESTIONED_BITS = 14
+"""Pictures of 16 bits that need no more than these are questioned."""
 _MOST_TOGETHER = 1024
 _MOST_SECONDS = 10.0
 VideoProgress = Callable[[int, int], None]
@@ -80,7 +82,7 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
         before = source.state(id)
         with source.open_local(id, "") as path:
             mark = fingerprint(path)
-            facts = _timed(_facts(path, source.kind.videos_kind), source, id)
+            facts = _timed(_levelled(_facts(path, source.kind.videos_kind), source.kind.picture_bits), source, id)
         name = facts.made_of or (f"{mark}-{facts.content}" if facts.content else mark)
         if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
@@ -125,6 +127,26 @@ def _timed(facts: VideoFacts, source: VideoSource, id: str) -> VideoFacts:
     index = facts.index.timed(np.rint(np.arange(frames) * 1e9 / rate).astype(np.int64))
     content = f"{facts.content}@{rate:g}"
     return replace(facts, frames=frames, frames_per_second=rate, index=index, content=content)
+
+
+def _levelled(facts: VideoFacts, bits: int) -> VideoFacts:
+    """Return the facts of pictures of 16 bits that hold fewer, if the user states it; otherwise ask whether they do.
+
+    Raises:
+        VideoError: they hold more.
+    """
+    highest, remark = facts.highest_level, ""
+    if bits and highest >> bits > 0:
+        raise VideoError("", None, f"has a level of {highest}, beyond those of --picture-bits {bits}")
+    if bits and highest >= 0:
+        return replace(facts, index=replace(facts.index, bits=bits), content=f"{facts.content}~{bits}")
+    if bits and not facts.made_of:
+        remark = f"--picture-bits {bits} does not apply: its pictures do not have 16 bits"
+    elif 0 <= highest < 1 << _QUESTIONED_BITS:
+        least = max(8, highest.bit_length())
+        remark = f"no level above {highest} of 65535 in the pictures looked at: if they hold {least} bits, they are "
+        remark += f"{1 << 16 - least} times too dark, and --picture-bits {least} stretches them"
+    return replace(facts, remark="; ".join(filter(None, (facts.remark, remark))))
 
 
 def _facts(path: Path, kind: str) -> VideoFacts:

@@ -356,7 +356,8 @@ class VideoEntry(Persisted):
         threshold_pos, threshold_neg: contrast thresholds that the list file states, log units; None without.
         pieces: its pieces, see :func:`v2v_server.corpus.videos.encoded_pieces`; None where the catalogue was
             opened without ``scene``.
-        remark: what of it is not served, or served with wrong grey levels (:class:`v2v_server.video.probe.VideoFacts`).
+        remark: what of it is not served, or served with wrong grey levels or times
+            (:class:`v2v_server.video.probe.VideoFacts`).
     """
 
     id: str

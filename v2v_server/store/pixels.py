@@ -43,6 +43,7 @@ class VideosKind:
         videos_kind: one of :data:`PIXEL_KINDS`.
         rate: of picture sequences without time stamps, Hz, 0: unknown; of photographs, 0: 60.
         photograph_seconds: for which a photograph is shown, 0: 10.
+        picture_bits: that levels of 16-bit pictures in sequences hold, 8 to 15; 0: all 16.
 
     Raises:
         UsageError: there is no such kind, or it has no such rate or duration.
@@ -51,17 +52,20 @@ class VideosKind:
     videos_kind: str = "videos"
     rate: float = 0.0
     photograph_seconds: float = 0.0
+    picture_bits: int = 0
 
     def __post_init__(self) -> None:
         highest_hz = 0.0 if self.videos_kind == "videos" else HIGHEST_RATE_HZ
         longest = math.inf if self.is_rendered else 0.0
         is_within = 0 <= self.rate <= highest_hz and 0 <= self.photograph_seconds <= longest
+        is_within = is_within and (not self.picture_bits or (self.has_parts and 8 <= self.picture_bits <= 15))
         if self.videos_kind not in PIXEL_KINDS or not is_within:
             what = f"--videos-kind {self.videos_kind}, --rate {self.rate:g}"
             what += f", --photograph-seconds {self.photograph_seconds:g}" * (self.photograph_seconds != 0)
+            what += f", --picture-bits {self.picture_bits}" * (self.picture_bits != 0)
             raise UsageError(
                 f"{what}: choose one of {', '.join(PIXEL_KINDS)}; sequences can have a rate up to "
-                f"{HIGHEST_RATE_HZ:g} Hz, and photographs a rate and a duration"
+                f"{HIGHEST_RATE_HZ:g} Hz and 8 to 15 picture bits, and photographs a rate and a duration"
             )
         if self.is_rendered and not 2 <= self.frames <= LONGEST_PHOTOGRAPH_FRAMES:
             raise UsageError(
@@ -72,7 +76,8 @@ class VideosKind:
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> VideosKind:
         """Return the kind of a command's flags; None stands for a default."""
-        return cls(given["videos_kind"] or "videos", given["rate"] or 0.0, given.get("photograph_seconds") or 0.0)
+        names = "photograph_seconds", "picture_bits"
+        return cls(given["videos_kind"] or "videos", given["rate"] or 0.0, *(given.get(name) or 0 for name in names))
 
     @property
     def has_parts(self) -> bool:
@@ -131,12 +136,12 @@ class Pixels(Protocol):
 
 
 def signal_of(pixels: Pixels, index: FrameIndex) -> Signal:
-    """Return what the levels of a video mean, by its first frame, whatever the sample."""
+    """Return what the levels of a video mean, by its first frame, whatever the sample and the bits that are kept."""
     from v2v_server.video.decode import ClipRequest, Cut
-    from v2v_server.video.picture import MOST_BITS
 
     cut = Cut(1, (0, 0, 1, 1))
-    return pixels.clips(ClipRequest(index, index.first, (cut,), most_bits=MOST_BITS, samples=((0, 0, 0),)))[0].signal
+    (clip,) = pixels.clips(ClipRequest(index, index.first, (cut,), most_bits=16, samples=((0, 0, 0),)))
+    return clip.signal._replace(bits=min(clip.signal.bits, index.bits or 16))
 
 
 def kind_of(id: str) -> str:

@@ -244,8 +244,9 @@ class Stack:
         self._cuts = wanted.cuts if collects else ()
         self._stride = stride = wanted.stride
         first, most = wanted.start - index.first, wanted.count
-        self._pts: list[int] = index.pts.tolist()  # single numbers of an array take longer to get
-        self._expected = self._pts[first : first + (most - 1) * stride + 1 : stride]
+        # Single numbers of an array take longer to get.
+        self._pts: list[int] = index.pts.tolist() if index.seekable else []
+        self._expected: list[int] = index.pts[first : first + (most - 1) * stride + 1 : stride].tolist()
         self.seen = 0  # ordinal of the next delivered frame, for files where they must be counted
         self.name = ""  # of the next frame in error messages
         self.taken = 0

@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
+from collections.abc import Mapping
 
 from v2v_protocol.errors import VideoChanged, VideoDenied, VideoGone, VideoUnreadable
 
@@ -31,8 +32,7 @@ def fingerprint(path: str | os.PathLike[str]) -> str:
     """
     try:
         if os.path.isdir(path):
-            files = [(name, status.st_size) for name, status in files_in(path)]
-            return f"{sum(size for _, size in files)}-{hashlib.sha256(f'{files}'.encode()).hexdigest()[:32]}"
+            return fingerprint_of({name: status.st_size for name, status in files_in(path)})
         # An ordinary open of a named pipe would wait for somebody at its other end.
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
             status = os.fstat(file.fileno())
@@ -46,6 +46,12 @@ def fingerprint(path: str | os.PathLike[str]) -> str:
     return f"{status.st_size}-{digest.hexdigest()[:32]}"
 
 
+def fingerprint_of(sizes: Mapping[str, int]) -> str:
+    """Return the fingerprint of a folder of pictures from the sizes of its files, sorted by name."""
+    digest = hashlib.sha256(f"{list(sizes.items())}".encode()).hexdigest()
+    return f"{sum(sizes.values())}-{digest[:32]}"
+
+
 def files_in(folder: str | os.PathLike[str]) -> list[tuple[str, os.stat_result]]:
     """Return the regular files of a folder of pictures, by name, and their status: those in it that are not hidden, and
     its :data:`TIMES`.
@@ -55,8 +61,18 @@ def files_in(folder: str | os.PathLike[str]) -> list[tuple[str, os.stat_result]]
     """
     with os.scandir(folder) as listing:
         found = [(entry.name, entry.stat()) for entry in listing if entry.name[0] != "." and entry.is_file()]
+    return sorted(found + times_above(folder))
+
+
+def times_above(folder: str | os.PathLike[str]) -> list[tuple[str, os.stat_result]]:
+    """Return the :data:`TIMES_ABOVE` that there are, by name, and their status."""
     above = [(name, os.path.join(folder, name)) for name in TIMES_ABOVE]
-    return sorted(found + [(name, os.stat(path)) for name, path in above if os.path.isfile(path)])
+    return [(name, os.stat(path)) for name, path in above if os.path.isfile(path)]
+
+
+def file_state(status: os.stat_result) -> tuple[int, int, int, int]:
+    """Return what changes when a file does: its size, the times of its last changes, and which file it is."""
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino
 
 
 def unreadable(video: str, error: OSError) -> VideoUnreadable:
@@ -75,13 +91,18 @@ def is_same_file(one: str, other: str) -> bool:
     return len(parts) > 1 and all(a == b for a, b in parts)
 
 
-def check_fingerprint(path: str | os.PathLike[str], expected: str) -> None:
+def check_fingerprint(path: str | os.PathLike[str], expected: str, found: str = "") -> None:
     """Make sure that the file is the one that was catalogued, as far as its size, head and tail tell.
+
+    Args:
+        path: of the file.
+        expected: its fingerprint in the catalogue.
+        found: its fingerprint now; "" reads it.
 
     Raises:
         VideoChanged: it is another one now.
         VideoUnreadable: it cannot be read, or is not a regular file.
     """
-    found = fingerprint(path)
+    found = found or fingerprint(path)
     if not is_same_file(found, expected):
         raise VideoChanged(os.fspath(path), None, f"changed since it was catalogued: {found} instead of {expected}")

@@ -23,7 +23,7 @@ LARGEST_INDEXED_SIDE_PX = 2**16 - 1
 _MAGIC = b"VFI1"
 _HEADER = struct.Struct("<4sQIIIIHHB")  # magic, first, frames, keyframes, time base (2), height, width, flags
 _INT64 = np.dtype("<i8")
-_SEEKABLE, _TRANSPOSE, _FLIP_Y, _FLIP_X = 1, 2, 4, 8
+_SEEKABLE, _TRANSPOSE, _FLIP_Y, _FLIP_X, _BITS_SHIFT = 1, 2, 4, 8, 4
 _UPRIGHT = Orientation()
 
 
@@ -43,6 +43,7 @@ class FrameIndex:
             AVI): decoding then counts frames from the beginning of the file.
         orientation: how the stored pictures are turned upright, as the first frame says: H.264 and HEVC may say it with
             keyframes only.
+        bits: that levels of 16-bit pictures hold, 8 to 15, as the user states; 0: what the format says.
     """
 
     first: int
@@ -54,6 +55,7 @@ class FrameIndex:
     width_px: int
     seekable: bool
     orientation: Orientation = _UPRIGHT
+    bits: int = 0
 
     def __len__(self) -> int:
         return len(self.pts)
@@ -138,6 +140,7 @@ class FrameIndex:
         """Encode the index: a few bytes a frame at a varying rate, next to nothing at a constant one."""
         lies = self.orientation
         flags = _SEEKABLE * self.seekable | _TRANSPOSE * lies.transpose | _FLIP_Y * lies.flip_y | _FLIP_X * lies.flip_x
+        flags |= self.bits << _BITS_SHIFT
         head = _HEADER.pack(
             _MAGIC, self.first, len(self.pts), len(self.keyframes), *self.time_base,
             self.height_px, self.width_px, flags,
@@ -157,19 +160,19 @@ class FrameIndex:
         if len(data) < _HEADER.size:
             raise ProtocolError(f"frame index of {len(data)} bytes: shorter than its header of {_HEADER.size}")
         magic, first, frames, keys, numerator, denominator, height, width, flags = _HEADER.unpack_from(data)
-        seekable = bool(flags & _SEEKABLE)
+        seekable, bits = bool(flags & _SEEKABLE), flags >> _BITS_SHIFT
         orientation = Orientation(bool(flags & _TRANSPOSE), bool(flags & _FLIP_Y), bool(flags & _FLIP_X))
         if magic != _MAGIC:
             raise ProtocolError(f"frame index begins with {magic!r} instead of {_MAGIC!r}")
         if not 1 <= frames <= most_frames or first + frames > LARGEST_FRAMES or keys > frames:
             raise ProtocolError(f"frame index: {frames} frames from {first}, {keys} keyframes; limit {most_frames}")
-        if not (numerator and denominator and height and width) or flags > _SEEKABLE | _TRANSPOSE | _FLIP_Y | _FLIP_X:
+        if not (numerator and denominator and height and width) or 0 < bits < 8:
             raise ProtocolError(f"frame index: time base {numerator}/{denominator}, {width}x{height} px, flags {flags}")
         packed = data[_HEADER.size :]
         if not seekable:
             if keys or packed:
                 raise ProtocolError(f"frame index: {keys} keyframes and {len(packed)} bytes though it is not seekable")
-            return unseekable(frames, (numerator, denominator), height, width, orientation, first)
+            return unseekable(frames, (numerator, denominator), height, width, orientation, first, bits)
         stored = inflated("frame index", packed, (frames + 2 * keys) * _INT64.itemsize)
         values = np.frombuffer(stored, _INT64).astype(np.int64)
         pts, keyframes, dts = np.split(values, [frames, frames + keys])
@@ -180,7 +183,7 @@ class FrameIndex:
             raise ProtocolError(
                 f"frame index: keyframes outside frames {first} .. {first + frames - 1}, or in disorder"
             )
-        return cls(first, pts, keyframes, dts, (numerator, denominator), height, width, True, orientation)
+        return cls(first, pts, keyframes, dts, (numerator, denominator), height, width, True, orientation, bits)
 
 
 def unseekable(
@@ -190,11 +193,12 @@ def unseekable(
     width_px: int,
     orientation: Orientation = _UPRIGHT,
     first: int = 0,
+    bits: int = 0,
 ) -> FrameIndex:
     """Return the index of a file whose frames can only be counted from its beginning."""
     none = np.empty(0, np.int64)
     pts = np.broadcast_to(np.int64(NO_TIMESTAMP), (frames,))
-    return FrameIndex(first, pts, none, none, time_base, height_px, width_px, False, orientation)
+    return FrameIndex(first, pts, none, none, time_base, height_px, width_px, False, orientation, bits)
 
 
 def _steps(values: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

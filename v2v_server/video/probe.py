@@ -63,8 +63,9 @@ class VideoFacts:
         interlaced: whether the first picture, or any that is stored as two fields, says that its even and odd rows were
             taken at different times.
         content: 32 hexadecimal digits that name what the track stores: every packet, and when each frame is shown.
-        remark: what of the file is not served, or served with wrong grey levels, and why; "" if all is.
+        remark: what of the file is not served, or served with wrong grey levels or times, and why; "" if all is.
         made_of: fingerprint of the video that a store file was made from, which then names it; "" for any other.
+        highest_level: of the 16-bit pictures of a sequence that were looked at; -1 for any other.
     """
 
     frames: int
@@ -80,6 +81,7 @@ class VideoFacts:
     content: str = ""
     remark: str = ""
     made_of: str = ""
+    highest_level: int = -1
 
 
 def probe(path: str | os.PathLike[str]) -> VideoFacts:

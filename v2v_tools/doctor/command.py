@@ -265,6 +265,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     what.add_argument("--videos-kind", choices=PIXEL_KINDS, help="what a video is, as for v2v-serve (default videos)")
     what.add_argument("--rate", type=float, metavar="N", help="rate of picture sequences, or of photographs, Hz")
     what.add_argument("--photograph-seconds", type=float, metavar="S", help="time for which each photograph is shown")
+    what.add_argument(
+        "--picture-bits", type=int, metavar="N", help="bits that 16-bit pictures of sequences hold, 8 to 15"
+    )
     what.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
     return run_command(parser, _run, argv, failures=(V2VError,))
 

@@ -73,7 +73,10 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
         yield "note", "corpus", text, change
     for note in catalogue.notes:
         yield "note", "corpus", note, ""
-    for what, values in ("interlaced", found.interlaced), ("served in part, or with wrong grey levels", found.remark):
+    for what, values in (
+        ("interlaced", found.interlaced),
+        ("served in part, or with wrong grey levels or times", found.remark),
+    ):
         named = [f"{found.ids[at]} {values[at]}".removesuffix(" True") for at in np.flatnonzero(values).tolist()]
         if len(named) > 1:  # the notes name the first ones
             yield "note", "corpus", f"{what}: {name_all(named)}", ""

@@ -418,14 +418,15 @@ def test_fingerprints(tmp_path: Path) -> None:
         check_fingerprint(path, max(seen))
 
 
+@pytest.mark.parametrize(("limit", "most"), [("_SMALL_INDEX_BYTES", 60), ("_SMALL_INDEX_FRAMES", 119)])
 def test_a_small_index_is_handed_on_whole_and_of_a_large_one_the_encoded_slice_the_latest_of_which_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, most: int
 ) -> None:
     folder = write_clip(tmp_path / "clips" / "a.mp4", panned_luma(120), gop=12).parent
     with closing(open_catalogue(folder, processes=0)) as catalogue:
         whole = catalogue.frame_index("a.mp4").to_bytes()
         assert {catalogue.frame_index_bytes("a.mp4", start, 20) for start in (0, 50, 100)} == {whole}
-    monkeypatch.setattr(catalogue_module, "_SMALL_INDEX_BYTES", 60)
+    monkeypatch.setattr(catalogue_module, limit, most)
     monkeypatch.setattr(catalogue_module, "PIECE_FRAMES", 16)
     with closing(open_catalogue(folder, processes=0)) as catalogue:
         first = catalogue.frame_index_bytes("a.mp4", 0, 20)

@@ -7,9 +7,11 @@ import math
 import os
 import shutil
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +25,16 @@ from PIL import Image
 
 from tests.clips import panned_luma, write_clip
 from tests.digests.rows import Row, samples_of
-from v2v_protocol.errors import CorpusError, VideoError
+from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources.source import SourceOptions, open_source
 from v2v_server.prepare import prepare
+from v2v_server.store import picture_sequence
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.picture_sequence import PictureSequence, id_of
-from v2v_server.store.pixels import VideosKind
+from v2v_server.store.pixels import VideosKind, signal_of
 from v2v_server.video.decode import ClipRequest, Cut
+from v2v_server.video.fingerprint import fingerprint
 
 SEQUENCES, AT_25 = VideosKind("sequences"), VideosKind("sequences", 25.0)
 FRAMES, HEIGHT, WIDTH = 30, 32, 40
@@ -216,12 +220,13 @@ def test_times_come_from_a_file(tmp_path: Path, place: str, named: bool) -> None
 @pytest.mark.parametrize(
     ("times", "why"),
     [
-        (["0", "1", "2"], "has 3 lines: give each of the 4 pictures one"),
+        (["0", "1", "2"], "states times of 3 pictures: give each of the 4 pictures one"),
+        (["0 0000.png", "1 0001.png", "2 0003.png"], "states times of 3 pictures; 0002.png has none: give each"),
         (["0 0000.png", "1 0001.png", "2 0003.png", "3 0002.png"], "in their order"),
-        (["0", "1", "1", "2"], "do not increase"),
-        (["0", "1", "nan", "2"], "do not increase"),
+        (["0", "1", "1", "2"], "do not increase: 1 in line 4 does not come after 1 in line 3"),
+        (["0", "1", "nan", "2"], "line 4: 'nan': a line is a time in seconds or a date"),
         (["0", "1", "2", "1e30"], "beyond 4e9 s"),
-        (["0", "1", "two", "3"], "'two'"),
+        (["0", "1", "two", "3"], "line 4: 'two'"),
     ],
 )
 def test_wrong_times_are_refused(tmp_path: Path, times: list[str], why: str) -> None:
@@ -230,6 +235,24 @@ def test_wrong_times_are_refused(tmp_path: Path, times: list[str], why: str) -> 
     message = refusal(tmp_path / "seqs")
     assert "s/: timestamps.txt: " in message
     assert why in message
+
+
+def test_what_is_assumed_of_times_is_said(tmp_path: Path) -> None:
+    write_pictures(tmp_path / "seqs/s", panned_luma(4, HEIGHT, WIDTH))
+    (tmp_path / "seqs/s/timestamps.txt").write_text("4132468\n4168182\n4203896\n4239610\n")
+    with opened(tmp_path / "seqs") as catalogue:
+        assert catalogue.videos.frames_per_second.tolist() == pytest.approx([28], abs=0.01)
+        assert catalogue.videos[0].remark == "its times are taken for us, 28 pictures a second"
+        assert any("s/: its times are taken for us" in note for note in catalogue.notes)
+    write_times(tmp_path / "seqs/s/timestamps.txt", ["0", "10", "20", "30"])
+    with opened(tmp_path / "seqs") as catalogue:
+        assert catalogue.videos.frames_per_second.tolist() == [0.1]
+        (note,) = catalogue.notes
+        assert "1 videos have rates outside of 0.5 to 20000 frames a second (s/: 0.1)" in note
+    (tmp_path / "seqs/s/timestamps.txt").unlink()
+    for rate, is_odd in ((0.4, True), (0.5, False), (20000.0, False), (20001.0, True), (0.0, False)):
+        with opened(tmp_path / "seqs", VideosKind("sequences", rate)) as catalogue:
+            assert any("outside of" in note for note in catalogue.notes) == is_odd, rate
 
 
 def test_rates_come_from_the_flag_or_a_list(tmp_path: Path) -> None:
@@ -297,6 +320,199 @@ def test_jpeg_is_turned_upright_and_transparency_is_said(tmp_path: Path) -> None
     write = tmp_path / "clear"
     np.testing.assert_array_equal(grey_of(write, encoded(Image.fromarray(clear, "LA"), "png"), "png"), ramp)
     assert PictureSequence(write).facts().remark == "its transparency is left out"
+
+
+def deep(count: int, bits: int, channels: int) -> list[npt.NDArray[np.uint16]]:
+    """Return pictures that use all levels of a number of bits."""
+    white = (1 << bits) - 1
+    ramp = np.linspace(0, white, HEIGHT * WIDTH).round().astype(np.uint16).reshape(HEIGHT, WIDTH)
+    return [np.roll(ramp, 7 * number).repeat(channels).reshape(HEIGHT, WIDTH, channels) for number in range(count)]
+
+
+def write_deep(folder: Path, pictures: list[npt.NDArray[np.uint16]], form: str) -> None:
+    """Write pictures of 16 bits; ya16 and rgba64 are opaque."""
+    folder.mkdir(parents=True, exist_ok=True)
+    codec, pixel_format = form.split()
+    for number, picture in enumerate(pictures):
+        encoder: Any = av.CodecContext.create(codec, "w")
+        encoder.width, encoder.height, encoder.pix_fmt, encoder.time_base = WIDTH, HEIGHT, pixel_format, Fraction(1, 25)
+        frame = av.VideoFrame(WIDTH, HEIGHT, pixel_format)
+        sample = ">u2" if pixel_format.endswith("be") else "<u2"
+        if pixel_format[:4] in ("ya16", "rgba"):
+            picture = np.concatenate([picture, np.full((HEIGHT, WIDTH, 1), 65535, np.uint16)], -1)
+        rows = np.zeros((HEIGHT, frame.planes[0].line_size), np.uint8)
+        data = np.ascontiguousarray(picture.astype(sample)).view(np.uint8).reshape(HEIGHT, -1)
+        rows[:, : data.shape[1]] = data
+        frame.planes[0].update(rows.tobytes())
+        packets = [*encoder.encode(frame), *encoder.encode(None)]
+        (folder / f"{number:04}.{codec}").write_bytes(b"".join(map(bytes, packets)))
+
+
+FORMS = {"png gray16be": 1, "png ya16be": 1, "png rgb48be": 3, "png rgba64be": 3, "tiff gray16le": 1, "tiff rgb48le": 3}
+
+
+@pytest.mark.parametrize(
+    ("form", "bits"),
+    [*(("png gray16be", bits) for bits in (8, 10, 11, 14, 15, 16)), *((form, 12) for form in FORMS)],
+)
+def test_fewer_bits_than_the_picture_has_are_asked_about_and_stretched_if_stated(
+    tmp_path: Path, form: str, bits: int
+) -> None:
+    def grey(catalogue: Catalogue) -> npt.NDArray[Any]:
+        index = catalogue.frame_index("s/")
+        with catalogue.source.open_pixels("s/", catalogue.videos[0].fingerprint) as pixels:
+            return pixels.clips(ClipRequest(index, 0, (Cut(3),)))[0].frames.astype(int)
+
+    write_deep(tmp_path / "seqs/s", deep(3, bits, FORMS[form]), form)
+    with opened(tmp_path / "seqs", AT_25) as catalogue:
+        digest, plain, remark = (
+            catalogue.digest,
+            grey(catalogue),
+            catalogue.videos[0].remark.removeprefix(CLEAR).lstrip("; "),
+        )
+        said = (
+            f"no level above {(1 << bits) - 1} of 65535 in the pictures looked at: if they hold {bits} bits, they are"
+        )
+        assert remark.startswith(said) == (bits <= 14)
+        assert bool(remark) == (bits <= 14)
+    write_deep(tmp_path / "whole/s", [picture << (16 - bits) for picture in deep(3, bits, FORMS[form])], form)
+    with opened(tmp_path / "whole", AT_25) as catalogue:
+        whole = grey(catalogue)
+    assert abs(plain.max() - 255 * ((1 << bits) - 1) / 65535) <= 1, "never stretched unasked"
+    if bits == 16:
+        return
+    with opened(tmp_path / "seqs", VideosKind("sequences", 25.0, picture_bits=bits)) as catalogue:
+        assert catalogue.digest != digest
+        assert np.abs(grey(catalogue) - whole).max() <= 1
+        assert grey(catalogue).max() == 255
+        assert catalogue.videos[0].remark in (CLEAR, "")
+        assert signal_of(PictureSequence(tmp_path / "seqs/s"), catalogue.frame_index("s/")).bits in (bits, 8)
+        catalogue.check("s/", catalogue.videos[0].fingerprint)
+    with opened(tmp_path / "seqs", AT_25) as catalogue:
+        assert catalogue.digest == digest
+    if bits > 8:
+        message = refusal(tmp_path / "seqs", VideosKind("sequences", 25.0, picture_bits=bits - 1))
+        assert f"has a level of {(1 << bits) - 1}, beyond those of --picture-bits {bits - 1}" in message
+
+
+CLEAR = "its transparency is left out"
+
+
+def test_a_level_beyond_the_stated_bits_is_never_cut(tmp_path: Path) -> None:
+    """Probing looks at 16 of the pictures; a worker at each that it serves."""
+    pictures = deep(40, 12, 1)
+    pictures[1][3, 5] = 4096
+    write_deep(tmp_path / "seqs/s", pictures, "png gray16be")
+    with opened(tmp_path / "seqs", VideosKind("sequences", 25.0, picture_bits=12)) as catalogue:
+        index, pixels = catalogue.frame_index("s/"), PictureSequence(tmp_path / "seqs/s")
+    assert len(pixels.clips(ClipRequest(index, 2, (Cut(3),)))[0].frames) == 3
+    with pytest.raises(
+        VideoError, match=r"0001.png: has a level of 4096, beyond 4095, the highest of --picture-bits 12"
+    ):
+        pixels.clips(ClipRequest(index, 0, (Cut(3),)))
+
+
+def test_bits_of_pictures_of_8_are_said_not_to_apply(tmp_path: Path) -> None:
+    write_pictures(tmp_path / "seqs/s", panned_luma(3, HEIGHT, WIDTH))
+    with opened(tmp_path / "seqs", AT_25) as catalogue:
+        fingerprint = catalogue.videos[0].fingerprint
+    with opened(tmp_path / "seqs", VideosKind("sequences", 25.0, picture_bits=12)) as catalogue:
+        assert catalogue.videos[0].fingerprint == fingerprint
+        assert "--picture-bits 12 does not apply" in catalogue.videos[0].remark
+
+
+@pytest.mark.parametrize(("kind", "bits"), [("videos", 12), ("photographs", 12), ("sequences", 7), ("sequences", 16)])
+def test_bits_that_no_picture_has_are_refused(kind: str, bits: int) -> None:
+    with pytest.raises(UsageError, match=f"--picture-bits {bits}: .*8 to 15 picture bits"):
+        VideosKind(kind, picture_bits=bits)
+
+
+@pytest.fixture
+def listings(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """Count the listings of folders and archives by their samples; every state counts as old."""
+    counts = Counter[str]()
+    monkeypatch.setattr(picture_sequence, "_kept", {})
+    monkeypatch.setattr(picture_sequence, "_SETTLED_NS", -(10**18))
+    listed, opened_zip = picture_sequence.files_in, picture_sequence.ZipFile
+
+    def count(call: Callable[..., Any], path: Any) -> Any:
+        counts["all"] += 1
+        return call(path)
+
+    monkeypatch.setattr(picture_sequence, "files_in", partial(count, listed))
+    monkeypatch.setattr(picture_sequence, "ZipFile", partial(count, opened_zip))
+    return counts
+
+
+@pytest.mark.parametrize("is_packed", [False, True])
+def test_samples_list_a_folder_once_a_change(tmp_path: Path, listings: Counter[str], is_packed: bool) -> None:
+    folder, luma = tmp_path / "a", panned_luma(6, HEIGHT, WIDTH)
+    write_pictures(folder, luma)
+    path = tmp_path / "a.zip" if is_packed else folder
+    if is_packed:
+        with zipfile.ZipFile(path, "w") as packed:
+            for file in sorted(folder.iterdir()):
+                packed.write(file, file.name)
+    pixels, mark = PictureSequence(path), fingerprint(path)
+    index = pixels.facts().index
+    for start in (0, 2, 3):
+        PictureSequence(path).check(mark)
+        (clip,) = PictureSequence(path).clips(ClipRequest(index, start, (Cut(3),)))
+        np.testing.assert_array_equal(clip.frames, luma[start : start + 3])
+    assert listings["all"] == 1
+    if is_packed:
+        return
+    (folder / "0005.png").unlink()
+    with pytest.raises(VideoError, match="changed since it was catalogued"):
+        pixels.check(mark)
+    assert listings["all"] == 2
+    write_times(tmp_path / "timestamps.txt", ["1"])  # above the folder
+    pixels.check(fingerprint(path))
+    assert listings["all"] == 3
+
+
+def test_a_picture_that_changed_in_place_is_noticed_when_it_is_read(tmp_path: Path, listings: Counter[str]) -> None:
+    folder, luma = tmp_path / "a", panned_luma(6, HEIGHT, WIDTH)
+    write_pictures(folder, luma)
+    pixels, mark = PictureSequence(folder), fingerprint(folder)
+    index = pixels.facts().index
+    with (folder / "0004.png").open("ab") as file:
+        file.write(b"more")
+    pixels.check(mark)
+    assert len(pixels.clips(ClipRequest(index, 0, (Cut(3),)))[0].frames) == 3
+    with pytest.raises(VideoChanged, match=r"0004.png: changed while it is served: \d+ bytes instead of \d+") as caught:
+        pixels.clips(ClipRequest(index, 3, (Cut(3),)))
+    assert caught.value.frame == 4
+    with pytest.raises(VideoChanged, match="changed since it was catalogued"):
+        pixels.check(mark)
+    assert listings["all"] == 2
+
+
+def test_a_folder_that_has_just_changed_is_listed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock of a file system has steps, so its state may hide a change."""
+    monkeypatch.setattr(picture_sequence, "_kept", {})
+    write_pictures(tmp_path, panned_luma(2, HEIGHT, WIDTH))
+    now = os.stat(tmp_path).st_ctime_ns
+    for age_ns, is_kept in (
+        (0, False),
+        (picture_sequence._SETTLED_NS, False),
+        (picture_sequence._SETTLED_NS + 1, True),
+    ):
+        monkeypatch.setattr(picture_sequence.time, "time_ns", lambda age_ns=age_ns: now + age_ns)
+        picture_sequence.list_files(os.fspath(tmp_path))
+        assert bool(picture_sequence._kept) == is_kept
+
+
+def test_listings_are_kept_up_to_a_number_of_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, listings: Counter[str]
+) -> None:
+    monkeypatch.setattr(picture_sequence, "_KEPT_FILES", 5)
+    for name in "abc":
+        write_pictures(tmp_path / name, panned_luma(2, HEIGHT, WIDTH))
+    for name in "abacb":
+        picture_sequence.list_files(os.fspath(tmp_path / name))
+    assert [Path(path).name for path in picture_sequence._kept] == ["c", "b"]
+    assert listings["all"] == 4
 
 
 BREAKS: dict[str, Callable[[Path, Image.Image], object]] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import zlib
 
 import numpy as np
@@ -28,19 +29,21 @@ def indices(draw: st.DrawFn) -> FrameIndex:
 
 
 def assert_equal(one: FrameIndex, other: FrameIndex) -> None:
-    for name in ("first", "time_base", "height_px", "width_px", "seekable", "orientation"):
+    for name in ("first", "time_base", "height_px", "width_px", "seekable", "orientation", "bits"):
         assert getattr(one, name) == getattr(other, name)
     for name in ("pts", "keyframes", "keyframe_dts"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-@given(indices())
-def test_bytes_round_trip(index: FrameIndex) -> None:
+@given(indices(), st.sampled_from((0, *range(8, 16))))
+def test_bytes_round_trip(index: FrameIndex, bits: int) -> None:
+    index = dataclasses.replace(index, bits=bits)
     assert_equal(FrameIndex.from_bytes(index.to_bytes()), index)
+    assert FrameIndex.from_bytes(index.slice(index.first, 1).to_bytes()).bits == bits
 
 
 def test_unseekable_round_trip() -> None:
-    index = unseekable(10_000, (1, 25), 48, 64)
+    index = unseekable(10_000, (1, 25), 48, 64, bits=12)
     assert len(index.to_bytes()) < 64
     assert_equal(FrameIndex.from_bytes(index.to_bytes()), index)
 

@@ -510,7 +510,9 @@ def test_a_picture_that_grows_is_said_everywhere(tmp_path: Path) -> None:
     recipe = Recipe(voxels_per_clip=1, bins=5, crop_height_px=32, crop_width_px=32)
     with closing(open_catalogue(videos, cache_dir=tmp_path / "index", processes=0)) as catalogue:
         (note,) = (note for note in catalogue.notes if "are left out" in note)
-        assert note.startswith("1 video is served in part, or with wrong grey levels (grows.ts: 50 of 80 pictures")
+        assert note.startswith(
+            "1 video is served in part, or with wrong grey levels or times (grows.ts: 50 of 80 pictures"
+        )
         samples = Remaker(catalogue, StreamSpec(recipe=recipe))
         remarks = {
             sample.provenance.video: sample.provenance.remark

@@ -251,7 +251,12 @@ def look_at_pictures(
         if each.signal != SDR and DOLBY_VISION not in each.excerpt.remark
     ]:
         text = f"{len(stated)} of {len(found)} videos have other levels than {SDR} ({name_all(stated)})"
-        yield "note", "pictures", text, "v2v-serve --set light=declared uses them; otherwise they are read as 8-bit SDR"
+        yield (
+            "note",
+            "pictures",
+            text,
+            "v2v-serve --set light=declared uses them, up to 12 bits; otherwise they are read as 8-bit SDR",
+        )
     return {each.excerpt.id: each.defects for each in found}
 
 

@@ -45,16 +45,19 @@ from v2v_protocol.programs import printable
 from v2v_server.corpus.sources.source import (
     GONE,
     MANIFEST_NAME,
+    NO_STATE,
     UNPRINTABLE,
     FileState,
     ListEntry,
     SourceOptions,
     VideoSource,
+    answers,
     count_left_out,
     is_sidecar,
     sidecar_fingerprint,
     state_text,
 )
+from v2v_server.store.pixels import PIXEL_KINDS, VideosKind
 from v2v_server.store.quota import MOST_GIB, PARTIAL, QuotaFolder
 from v2v_server.system.process import cache_folder, lock, make_private, open_private
 from v2v_server.video.fingerprint import TIMES_ABOVE, is_same_file
@@ -64,8 +67,8 @@ T = TypeVar("T")
 
 TRIES = 3
 _FIRST_WAIT_SECONDS = 0.5
-_MARKS = ("ETag", "etag", "md5Hash", "generation", "blob_id", "mtime", "created")
-"""What names a state of an object: the terms of S3, Google, Hugging Face, a disk, memory."""
+_MARKS = ("ETag", "etag", "md5Hash", "generation", "blob_id", "mtime", "created", "Last-Modified")
+"""What names a state of an object: the terms of S3, Google, Hugging Face, a disk, memory, HTTP."""
 _OPTIONS: dict[str, dict[str, Any]] = {
     # No cached listings: they would hide that an object was deleted. We retry ourselves.
     "s3": {"use_listings_cache": False, "config_kwargs": {"connect_timeout": 5, "read_timeout": 15}},
@@ -86,13 +89,14 @@ class Bucket:
 
     Args:
         url: the address.
+        only: the only object that is listed; "" lists all. What is unpickled lists all.
 
     Raises:
         UsageError: it contains a password, which would be shown wherever the address is.
     """
 
-    def __init__(self, url: str) -> None:
-        self.url = url.rstrip("/")
+    def __init__(self, url: str, only: str = "") -> None:
+        self.url, self.only = url.rstrip("/"), only
         if "@" in self.url.partition("://")[2].partition("/")[0]:
             raise UsageError("--videos: leave user and password out of the address; its store's own settings hold them")
 
@@ -132,9 +136,10 @@ class Bucket:
             CorpusError: they cannot be listed.
         """
         try:
-            return self.find("")
+            return {self.only: self.state(self.only)} if self.only else self.find("")
         except VideoGone as error:
-            raise CorpusError(f"--videos {self.url}: there is no such bucket or prefix") from error
+            what = f"file {self.only}" if self.only else "bucket or prefix"
+            raise CorpusError(f"--videos {self.url}: there is no such {what}") from error
         except VideoDenied as error:
             raise CorpusError(
                 f"--videos {self.url}: {error.reason}: give this user credentials of the store as its own "
@@ -147,15 +152,26 @@ class Bucket:
     def find(self, below: str, tries: int = TRIES) -> dict[str, FileState]:
         """Return the states of all objects below a folder of the address, "" or ending in a slash, by relative path.
 
+        Listings over HTTP state no sizes: there each object is asked for its state.
+
         Raises:
             VideoGone, VideoDenied, VideoUnreadable: they cannot be listed.
         """
+
+        def asked(name: str) -> FileState:
+            try:
+                return self.state(below + name, tries)
+            except VideoUnreadable:
+                return NO_STATE
+
         start = f"{self._prefix}/{below}"
         listed = self._ask(below, lambda: self._store.find(start.rstrip("/"), detail=True), tries)
-        found = {path[len(start) :]: _state(info) for path, info in listed.items() if path.startswith(start)}
+        found = {path[len(start) :]: info for path, info in listed.items() if path.startswith(start) and path != start}
+        states = {name: _state(info) for name, info in found.items() if info.get("size") is not None}
+        states.update(answers(asked, [name for name in found if name not in states]))
         if below and not found:
             raise VideoGone(below, None, f"is not in {self.url} any more")
-        return found
+        return states
 
     def state(self, id: str, tries: int = TRIES) -> FileState:
         """Ask for the state of one object: its size, and 63 bits that stand for its ETag or the store's equivalent.
@@ -186,11 +202,16 @@ class Bucket:
                 return question()
             except ProtocolError:
                 raise
-            except FileNotFoundError as error:
-                raise VideoGone(id, None, f"is not in {self.url} any more") from error
             except Exception as error:
-                said = " ".join(f"{type(error).__name__}: {error}".split())[:300]
-                if isinstance(error, PermissionError) or _CREDENTIALS.search(type(error).__name__):
+                # fsspec reports any failure over HTTP as a missing file; its cause is an answer's status or an OSError.
+                is_wrapped = hasattr(error.__cause__, "status") or isinstance(error.__cause__, OSError)
+                why = error.__cause__ if is_wrapped else error
+                status = getattr(why, "status", 404 if isinstance(why, FileNotFoundError) else 0)
+                if status in (404, 410):
+                    raise VideoGone(id, None, f"is not in {self.url} any more") from error
+                said = " ".join(f"{type(why).__name__}: {why}".split())[:300]
+                is_denied = isinstance(why, PermissionError) or status in (401, 403)
+                if is_denied or _CREDENTIALS.search(type(why).__name__):
                     raise VideoDenied(id, None, f"access is denied ({said})") from error
                 if not left:
                     raise VideoUnreadable(
@@ -201,8 +222,10 @@ class Bucket:
 
 
 def _state(info: dict[str, Any]) -> FileState:
-    mark = next((str(info[key]) for key in _MARKS if info.get(key) is not None), "")
-    return int(info["size"]), int.from_bytes(hashlib.sha256(mark.encode()).digest()[:8]) >> 1, 0
+    mark, size = next((str(info[key]) for key in _MARKS if info.get(key) is not None), ""), info.get("size")
+    if size is None:  # answered in chunks: without a mark either, nothing tells a change
+        size = 0 if mark else NO_STATE[0]
+    return int(size), int.from_bytes(hashlib.sha256(mark.encode()).digest()[:8]) >> 1, 0
 
 
 _ZIP_EPOCH = 315_619_200
@@ -274,7 +297,9 @@ class Copies(VideoSource):
             parts = name.split("/")
             if any(part.startswith(".") for part in parts):
                 continue
-            if not (id := self.kind.form.id_of(name)):
+            if not (id := self.kind.form.id_of(name)) and self.kind.form.id_of(name.partition("?")[0]):
+                refused[printable(name)] = "is a link with a query, which is not followed: link to the file itself"
+            elif not id:
                 count_left_out(parts[-1], left_out)
             elif printable(name) != name:
                 refused[printable(name)] = UNPRINTABLE
@@ -302,7 +327,7 @@ class Copies(VideoSource):
         """Return the states of many objects, from the listing."""
         found = array("q")
         for id in ids:
-            found.extend(self.state(id, self._objects))
+            found.extend(self.state(id, None if self.bucket.only else self._objects))
         return found
 
     def state(self, id: str, listed: Mapping[str, FileState] | None = None, tries: int = TRIES) -> FileState:
@@ -550,7 +575,10 @@ def open_source(name: str, options: SourceOptions) -> Copies | None:
     if not 0 < options.copies_gib <= MOST_GIB:
         raise UsageError(f"--copies-gib {options.copies_gib:g}: give more than 0, at most {MOST_GIB:g}")
     folder = Path(options.copies or cache_folder(options.cache_dir) / "copies").absolute()
-    return Copies(Bucket(name), folder, int(options.copies_gib * (1 << 30)), options.listed)
+    bucket, listed, (above, _, file) = Bucket(name), options.listed, name.rpartition("/")
+    if options.list_file is None and any(VideosKind(kind).form.id_of(file) == file != "" for kind in PIXEL_KINDS):
+        bucket, listed = Bucket(above, file), lambda: (ListEntry(file),)
+    return Copies(bucket, folder, int(options.copies_gib * (1 << 30)), listed)
 
 
 def _slot_number(id: str) -> int:

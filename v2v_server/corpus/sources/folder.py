@@ -32,7 +32,7 @@ from v2v_server.corpus.sources.source import (
     sidecar_id,
 )
 from v2v_server.store.pixels import VIDEOS, VideosKind
-from v2v_server.video.fingerprint import files_in, unreadable
+from v2v_server.video.fingerprint import check_fingerprint, files_in, unreadable
 
 PSEUDO_FILE_SYSTEMS = frozenset({
     "binfmt_misc", "bpf", "cgroup", "cgroup2", "configfs", "debugfs", "devpts", "devtmpfs", "efivarfs", "fusectl",
@@ -129,6 +129,8 @@ class Folder(VideoSource):
         """
         if is_sidecar(id):
             check_local(self.folder / id, id, fingerprint, str(state or ""))
+        elif (path := self.folder / self.file_of(id)).is_dir():  # not as a worker has listed it
+            check_fingerprint(path, fingerprint)
         else:
             with self.open_pixels(id, fingerprint) as pixels:
                 pixels.check(fingerprint)

@@ -452,6 +452,8 @@ FileState = tuple[int, int, int]
 or a mark of an object's ETag and 0."""
 NO_STATE: FileState = (-1, 0, 0)
 """The state cannot be told now."""
+_SEQUENCE_READER = 2
+"""Raise it with every change of what probing a sequence finds: they are probed again."""
 GONE: FileState = (-2, 0, 0)
 """There is no such file."""
 
@@ -667,10 +669,12 @@ class VideoSource(ABC):
         return self.kind.rendered_hz if self.kind.is_rendered else self.rates.get(id, self.kind.rate)
 
     def mark(self, id: str) -> int:
-        """Return a number for the state of a video, which changes with the rate that is stated for it."""
+        """Return a number for the state of a video, which changes with what the user states of it."""
         if self.kind.is_rendered:
             return 1 + zlib.crc32(f"{self.kind.rendered_hz} {self.kind.frames}".encode())
-        return 1 + int(1e6 * self.rate(id)) if self.kind.has_parts else 0
+        return (
+            _SEQUENCE_READER + int(1e6 * self.rate(id)) + (self.kind.picture_bits << 44) if self.kind.has_parts else 0
+        )
 
     def state_of_parts(self, id: str, files: Sequence[tuple[str, FileState]]) -> FileState:
         """Return the state of a folder of pictures from those of its files.
