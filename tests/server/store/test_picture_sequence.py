@@ -248,7 +248,7 @@ def test_what_is_assumed_of_times_is_said(tmp_path: Path) -> None:
     with opened(tmp_path / "seqs") as catalogue:
         assert catalogue.videos.frames_per_second.tolist() == [0.1]
         (note,) = catalogue.notes
-        assert "1 videos have rates outside of 0.5 to 20000 frames a second (s/: 0.1)" in note
+        assert "1 video has a rate outside of 0.5 to 20000 frames a second (s/: 0.1)" in note
     (tmp_path / "seqs/s/timestamps.txt").unlink()
     for rate, is_odd in ((0.4, True), (0.5, False), (20000.0, False), (20001.0, True), (0.0, False)):
         with opened(tmp_path / "seqs", VideosKind("sequences", rate)) as catalogue:
