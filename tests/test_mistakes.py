@@ -27,6 +27,7 @@ import torch
 from tests.clips import panned_luma, write_clip
 from tests.test_commands import MODULES, ROOT, flags_of
 from trainer.config import StreamConfig
+from trainer.run.checkpoint import require_writable
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.options import Options
 from v2v_pictures.files import write_png
@@ -38,6 +39,10 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
 from v2v_protocol.write_aside import write_json
 from v2v_server.config import ServeConfig
+from v2v_server.corpus.catalogue import list_corpus
+from v2v_server.corpus.sources.source import SourceOptions, open_source
+from v2v_server.store.cache import make_cache
+from v2v_server.video.rows import Rows
 from v2v_tools.event_files import EVENT_WRITERS, write_events
 
 OUTPUTS = [
@@ -50,6 +55,20 @@ OUTPUTS = [
     ("v2v-preview clips --out linked/b.mp4", ["beside other .mp4 files"]),
     ("v2v-preview clips/list.txt --out clips/b.mp4", ["beside other .mp4 files"]),
     ("v2v-preview clips --out clips", ["it is a folder"]),
+    ("v2v-preview clips --out clips/new.mp4", ["--out clips/new.mp4", "a later run would read", "such as new.mp4"]),
+    ("v2v-preview . --out sheet.png", ["it lies in .", "/sheet.png"]),
+    ("v2v-preview linked --out clips/new.gif", ["it lies in linked"]),
+    ("v2v-simulate clips --out s.npz --picture clips/s.png", ["it lies in clips"]),
+    ("v2v-simulate clips --out s.npz --events clips/e.h5", ["--events clips/e.h5", "it lies in clips"]),
+    ("v2v-catalogue --videos clips --shard 1/2 --out clips/parts", ["--out clips/parts", "such as parts"]),
+    ("v2v-catalogue --videos clips --shard 1/2 --out clips", ["--out clips", "such as clips-out"]),
+    ("v2v-convert clips --out clips/h5", ["it lies in clips"]),
+    ("v2v-eval --data clips --out clips/pictures", ["it lies in clips"]),
+    ("v2v-serve --videos clips --cache clips", ["--cache clips", "such as clips-cache"]),
+    ("v2v-serve --videos linked --cache clips/cache", ["--cache clips/cache", "it lies in linked"]),
+    ("v2v-train finetune-cpu --videos .", ["--out runs/finetune-cpu", "it lies in .", "films"]),
+    ("v2v-train finetune-cpu --videos clips --out clips/run", ["it lies in clips"]),
+    ("v2v-train finetune-cpu --set stream.videos=clips --out clips/run", ["it lies in clips"]),
     ("v2v-preview a.mp4 --out sheet.bmp", ["unknown ending", ".png"]),
     ("v2v-preview a.mp4 --out nowhere/sheet.png", ["there is no folder nowhere"]),
     ("v2v-preview a.mp4 --out locked.png", ["locked.png is write-protected"]),
@@ -156,6 +175,7 @@ def _noise(path: Path) -> None:
     write_png(path, np.random.default_rng(1).integers(0, 255, (99, 99, 3), np.uint8))
 
 
+OLDER = b"\x89PNG\r\n\x1a\nthe older file"
 WRITERS: dict[str, Callable[[Path], None]] = {
     ".png": _noise,
     ".json": lambda path: write_json(path, [{"key": "x" * 5000}]),
@@ -166,14 +186,14 @@ WRITERS: dict[str, Callable[[Path], None]] = {
 @pytest.mark.parametrize("ending", WRITERS)
 def test_a_full_disk_leaves_the_older_file(ending: str, tmp_path: Path) -> None:
     path, limits = tmp_path / f"old{ending}", resource.getrlimit(resource.RLIMIT_FSIZE)
-    path.write_bytes(b"the older file")
+    path.write_bytes(OLDER)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
     try:
         with pytest.raises(UsageError, match=path.name):
             WRITERS[ending](path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert path.read_bytes() == b"the older file"
+    assert path.read_bytes() == OLDER
     assert [each.name for each in tmp_path.iterdir()] == [path.name]
 
 
@@ -183,6 +203,53 @@ def test_outputs_replace_older_ones_and_follow_links(tmp_path: Path) -> None:
         write_json(tmp_path / "named.json", [{"key": text}])
     assert (tmp_path / "named.json").is_symlink()
     assert '"b"' in (tmp_path / "target.json").read_text()
+
+
+NO_PICTURES = [
+    "a.mp4",
+    "clips",
+    "x.py",
+    "x",
+    "x.gif",
+    "x.jpg",
+    "e.h5",
+    "c.yaml",
+    "e.png",
+    "link.png",
+    "b.masks/1.png.txt",
+]
+
+
+@pytest.mark.parametrize("name", NO_PICTURES)
+def test_a_picture_replaces_only_a_picture(name: str, desk: Path) -> None:
+    (desk / "e.png").write_text("precious: 1\n")
+    (desk / "link.png").symlink_to("a.mp4")
+    before = contents(desk)
+    with pytest.raises(UsageError, match=name):
+        _noise(Path(name))
+    assert contents(desk) == before
+
+
+def test_a_picture_replaces_a_picture(tmp_path: Path) -> None:
+    (tmp_path / "empty.png").touch()
+    for name in ("new.PNG", "new.PNG", "empty.png"):
+        _noise(tmp_path / name)
+        assert (tmp_path / name).stat().st_size > 1000
+
+
+def test_a_catalogue_passes_over_folders_of_outputs(desk: Path) -> None:
+    clip = (desk / "a.mp4").read_bytes()
+    make_cache(desk / "clips" / "cache")
+    require_writable(desk / "clips" / "runs" / "one")
+    require_writable(desk / "clips")  # not made here: it stays a corpus
+    before = list_corpus(open_source("clips", SourceOptions()), Rows.parse("full"), print).ids
+    for folder in ("cache", "runs/one/films"):
+        (desk / "clips" / folder).mkdir(exist_ok=True)
+        (desk / "clips" / folder / "film.mp4").write_bytes(clip)
+    corpus = list_corpus(open_source("clips", SourceOptions()), Rows.parse("full"), print)
+    assert corpus.ids == before == ("b.mp4", "c.mp4")
+    assert corpus.left_out.startswith("2 folders that a v2v command wrote were passed over: cache/, runs/one/.")
+    assert list_corpus(open_source("clips/cache", SourceOptions()), Rows.parse("full"), print).ids == ("film.mp4",)
 
 
 WRONG = [

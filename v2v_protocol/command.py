@@ -20,7 +20,7 @@ from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION, __version__
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import COMPLETION, open_standard_streams, show
 from v2v_protocol.settings import Setting, nearest, settings_of
-from v2v_protocol.write_aside import check_output
+from v2v_protocol.write_aside import check_output, check_outside
 
 FAILED = 1
 WRONG_USAGE = 2
@@ -32,7 +32,9 @@ JSON = (".json",)
 _GENERAL = "General"
 _FILES = ("FILE", "DIR", "VIDEO", "SRC", "DST", "PATH", "CONFIG", "RECORDING")
 """Words in the placeholder of an argument that names a file or folder."""
-_NO_INPUTS = frozenset({"out", "destination", "cache_dir", "copies"})
+_FOLDERS = ("out", "cache")
+"""Arguments that name a folder to write to, which may not lie in a folder of inputs."""
+_NO_INPUTS = frozenset({*_FOLDERS, "destination", "cache_dir", "copies"})
 """Arguments that name a folder to write to."""
 
 
@@ -101,10 +103,10 @@ class Parser(argparse.ArgumentParser):
         self._outputs[flag.removeprefix("--").replace("-", "_")] = flag, endings
 
     def check_outputs(self, arguments: argparse.Namespace) -> None:
-        """Check the files to write against the other arguments that name files or folders.
+        """Check the files and folders to write against the other arguments that name files or folders.
 
         Raises:
-            UsageError: see :func:`check_output`.
+            UsageError: see :func:`check_output` and :func:`check_outside`.
         """
         values = {name: value for name, value in vars(arguments).items() if name not in {*self._outputs, *_NO_INPUTS}}
         lists = (value if isinstance(value, list) else [value] for value in values.values())
@@ -113,6 +115,9 @@ class Parser(argparse.ArgumentParser):
             if (path := getattr(arguments, name)) is not None:
                 check_output(flag, path, endings, taken)
                 taken.append(path)
+        for name in _FOLDERS:
+            if name not in self._outputs:
+                check_outside(flag_of(name), getattr(arguments, name, None) or "", taken)
 
     def format_help(self) -> str:
         """Format the help; options that every command has come last."""

@@ -75,6 +75,11 @@ def _fit(arguments: argparse.Namespace) -> None:
     with Progress(source.name, "%") as progress:
         fitted = fit(source, static=arguments.static, options=options, progress=progress)
     show("\n".join(report_lines(fitted, source.name)))
+    if not fitted.camera:
+        raise V2VError(
+            f"{source}: no parameter could be fitted, so no recipe was written: record more events and more change of "
+            "light, as docs/guides/fit-your-camera.md describes"
+        )
     write_recipe(out, fitted, source.name)
     if arguments.picture is not None:
         write_png(arguments.picture, draw_fit(fitted, source.name))
