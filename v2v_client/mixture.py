@@ -26,7 +26,7 @@ from v2v_client.passes import Iteration, Position
 from v2v_client.position import Consumer, EpochPlan, ResumeState, StreamIdentity
 from v2v_protocol.errors import StateMismatch, UsageError
 from v2v_protocol.sample import LARGEST_SEED
-from v2v_protocol.settings import format_value, require_whole
+from v2v_protocol.settings import format_value, plain, require_whole
 
 _ROUNDING = 1e-6
 """Deviation from 1 that a sum of rounded weights may have."""
@@ -80,7 +80,7 @@ class Mixture(V2VStreamDataset):
     def __init__(self, weights: Mapping[V2VStreamDataset, float | Sequence[float]], seed: int) -> None:
         self.members = members = tuple(weights)
         given: list[list[Any]] = [
-            ([*each] or [None]) if isinstance(each, list | tuple) else [each] for each in weights.values()
+            (each or [None]) if isinstance(each, list | tuple) else [each] for each in map(plain, weights.values())
         ]
         epochs = range(max(map(len, given), default=1))
         self._weights = [[each[min(epoch, len(each) - 1)] for each in given] for epoch in epochs]

@@ -63,7 +63,9 @@ def _run(arguments: argparse.Namespace) -> None:
     if arguments.recording is not None:
         _fit(arguments)
     if arguments.check is not None:
-        columns = {"recipe": measure(camera_of(recipe_setting(arguments.check, arguments.set)))}
+        recipe = recipe_setting(arguments.check, arguments.set)
+        recipe.warn()
+        columns = {"recipe": measure(camera_of(recipe))}
         if arguments.sheet is not None:
             columns["sheet"] = _sheet(arguments.sheet)
         show(table(columns))
