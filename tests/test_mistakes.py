@@ -34,7 +34,7 @@ from v2v_pictures.files import write_png
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.events import EventList
 from v2v_protocol.recipe import PRESETS, Recipe
-from v2v_protocol.settings import settings_of
+from v2v_protocol.settings import nearest, settings_of
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
 from v2v_protocol.write_aside import write_json
@@ -289,6 +289,41 @@ WRONG = [
     ("v2v-preview a.mp4 --out x.png --rows top:2", "0 <= top < bottom <= 1"),
     ("v2v-simulate a.mp4 --out x.npz --arrays voxel", "voxels"),
     ("v2v-simulate a.mp4 --out x.npz", "voxels_per_clip at most 5"),
+    # words of other commands, tools and libraries
+    ("v2v-preview a.mp4 --out x.png --lr 1", "(v2v-train --set optimizer.learning_rate=X)"),
+    ("v2v-preview --input a.mp4 --out x.png", "(give the input without a flag)"),
+    ("v2v-serve --input clips", "did you mean '--videos'"),
+    ("v2v-serve --videos clips --port 5555", "did you mean '--bind'"),
+    ("v2v-serve --videos clips --seed 3", "the consumer chooses it: V2VStreamDataset(..., seed=N)"),
+    ("v2v-serve --videos clips --batch-size 3", "the consumer chooses it: V2VStreamDataset(..., batch_size=N)"),
+    ("v2v-serve --videos clips --device cuda", "v2v-train --set compute.device=cuda"),
+    ("v2v-loadtest --videos clips --host x", "did you mean '--connect'"),
+    ("v2v-serve --videos clips --num-workers 3", "did you mean '--workers'"),
+    ("v2v-train finetune-cpu --videos clips --batch-size 3", "v2v-train --set stream.batch_size=N"),
+    ("v2v-train finetune-cpu --videos clips --lr 3", "v2v-train --set optimizer.learning_rate=X"),
+    ("v2v-simulate a.mp4 --out x.npz --dvs-h5 e.h5", "did you mean '--events'"),
+    ("v2v-simulate a.mp4 --output-folder x", "did you mean '--out'"),
+    ("v2v-simulate a.mp4 --out x.npz --pos-thres .2", "it belongs to the recipe, --set threshold=..."),
+    ("v2v-serve --videos clips --threshold .2", "it belongs to the recipe, --set threshold=..."),
+    ("v2v-preview a.mp4 --out x.png --cutoff-hz 30", "--set photoreceptor_hz=..."),
+    ("v2v-preview a.mp4 --out x.png --set pos_thres=.2", "did you mean 'threshold'"),
+    ("v2v-preview a.mp4 --out x.png --set leak_rate_hz=1", "did you mean 'leak_hz'"),
+    # flags without effect, and a space in place of a sign
+    ("v2v-serve --videos clips --cache-gib 3", "--cache-gib has no effect without --cache DIR; give both, or neither"),
+    ("v2v-serve --videos clips --keep-defects bars", "--keep-defects has no effect without --scene auto"),
+    ("v2v-preview a.mp4 --out x.png --keep-defects bars", "--keep-defects has no effect without --scene auto"),
+    ("v2v-simulate a.mp4 --out x.npz --keep-defects bars", "--keep-defects has no effect without --scene auto"),
+    ("v2v-serve --videos clips --page-host 127.0.0.1", "--page-host has no effect without --page"),
+    ("v2v-serve --videos clips --page-names a", "--page-names has no effect without --page"),
+    ("v2v-serve --videos clips --scale-seconds 9", "--scale-seconds has no effect without --workers LEAST:MOST"),
+    ("v2v-serve --videos clips --ray-label a=b", "--ray-label has no effect without --engine ray"),
+    ("v2v-serve --videos clips --photograph-seconds 3", "has no effect without --videos-kind photographs"),
+    ("v2v-serve --videos clips --workers 0", "--worker-bind tcp://HOST:5556"),
+    ("v2v-preview a.mp4 --out x.png --set bins 3", "--set bins 3: write --set bins=3"),
+    ("v2v-preview a.mp4 --out x.png --set bins = 3", "write --set bins=3"),
+    ("v2v-preview a.mp4 --out x.png --set bins =3", "write --set bins=3"),
+    ("v2v-simulate a.mp4 --out x.npz --arrays voxels flow", "write --arrays voxels,flow"),
+    ("v2v-simulate a.mp4 --out x.npz --arrays voxels, flow", "write --arrays voxels,flow"),
     # numbers and addresses
     ("v2v-serve --videos clips --workers many", "give a whole number"),
     ("v2v-serve --videos clips --bind 127.0.0.1:5555", "tcp://HOST:PORT"),
@@ -310,10 +345,25 @@ def test_an_answer_names_what_to_type(line: str, word: str, desk: Path, capsys: 
     assert contents(desk) == before
 
 
+NO_HINT = ["--lr", "--xyz", "--put", "--q", "--frobnicate", "--ten", "--a", "--", "zz", "abc", ""]
+
+
+@pytest.mark.parametrize("word", NO_HINT)
+def test_nothing_is_suggested_rather_than_nonsense(word: str) -> None:
+    known = ["--help", "--out", "--videos", "--debug", "--version", "--set", "--recipe", "--page"]
+    assert "did you mean" not in nearest(word, known)
+
+
 IN_PYTHON: list[tuple[Callable[[], object], str]] = [
     (lambda: dataset()[0], r"dataset\[0\]: a stream has no index; .* V2VDataset makes samples by index"),
     (lambda: dataset().load_state_dict("last.pt"), r"'last.pt', .* Batch.resume_state itself"),  # type: ignore[arg-type]
     (lambda: dataset().load_state_dict({"network": {}}), r"version None, expected version \d+. Give the saved"),
+    (lambda: dataset(workers=3), r"V2VStreamDataset.local\(..., workers=N\)"),
+    (lambda: dataset(num_workers=3), r"DataLoader\(dataset, batch_size=None, num_workers=N\)"),
+    (lambda: dataset(videos="clips"), r"V2VStreamDataset.local\(videos\) starts a server"),
+    (lambda: dataset(pin_memory=True), r"DataLoader\(..., pin_memory=True\)"),
+    (lambda: dataset(recipe={"pos_thres": 0.2}), r"did you mean 'threshold'"),
+    (lambda: dataset(recipe={"contrast_threshold": 0.2}), r"did you mean 'threshold'"),
     (lambda: dataset(bins=3), r"no argument 'bins': it belongs to the recipe, recipe={'bins': ...}"),
     (lambda: dataset(substep=1), r"did you mean 'substep_px'"),
     (lambda: dataset(recipe={"substep_px": 1}), r"give substep_px=1 beside the recipe"),

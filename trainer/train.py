@@ -25,6 +25,8 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import array_layout
+from v2v_protocol.spec import StreamSpec
 from v2v_protocol.write_aside import check_outside
 
 SIGNAL_STATUS = 128
@@ -146,6 +148,20 @@ def _trained(config: TrainConfig, mine: Ranks, out: Path, resume: Checkpoint | N
     """Train; return the steps so far, and the signal that ended the run or 0. The learner is freed on return."""
     require_servable(config, out, mine)
     learner = build(config, mine)
+    forms = {
+        name: array_layout(
+            learner.task.asked.recipe(stream.resolved_recipe),
+            StreamSpec.from_dict(dict(stream.spec)).voxel_dtype,
+            learner.task.asked.arrays,
+        )
+        for name, (stream, _) in config.stream.mixed.items()
+    }
+    for name, form in forms.items():
+        if form != forms["stream"]:
+            raise UsageError(
+                f"{name}: its samples are {form}, those of stream are {forms['stream']}; give recipes of one size, and "
+                "one voxel_dtype"
+            )
     if mine.first:
         require_writable(out)
     with ExitStack() as stack:

@@ -314,6 +314,10 @@ class V2VStreamDataset(Fixed, IterableDataset[Batch]):
             field.name: getattr(stream, field.name) for field in dataclasses.fields(StreamIdentity)
         } | self._settings()
 
+    def _samples(self) -> tuple[object, ...]:
+        """Return what names its samples, before the server's answer."""
+        return self._connector.brokers, self._connector.seed, self._connector.options.spec(None, "")
+
     def _settings(self) -> dict[str, Any]:
         return {
             "address": ",".join(self._connector.brokers),

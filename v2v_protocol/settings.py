@@ -22,11 +22,15 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.foreign_words import FOREIGN
 
 _SETTING = "v2v setting"
 LATER = "v2v later"
 """Key in the metadata of a field that is left out of its record at its default (:mod:`v2v_protocol.persisted`)."""
 _LONGEST_SHOWN = 200
+_LEAST_ALIKE = 0.74
+"""Share of characters in common, from which a key counts as misspelt."""
+_SHORTEST_STEM = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,17 +289,31 @@ def as_whole(value: object) -> int | None:
 
 
 def nearest(key: object, known: Iterable[str]) -> str:
-    """Return a hint, " (did you mean 'bins'?)", or "" if no known key is similar. A longer key is compared in part: the
-    time grows with its length, and a peer may send one of 60 kB.
+    """Return a hint, " (did you mean 'bins'?)", or "" if no known key is similar. A word of another tool
+    (:mod:`v2v_protocol.foreign_words`) names what it is called here. A longer key is compared in part: the time grows
+    with its length, and a peer may send one of 60 kB.
     """
-    names, word = list(known), str(key)[:_LONGEST_SHOWN]
-    close = difflib.get_close_matches(word, names, n=1) or [name for name in names if _is_part(word, name)]
-    return f" (did you mean {' or '.join(map(repr, close[:3]))}?)" if close else ""
+    word, names = _bare(str(key)[:_LONGEST_SHOWN]), {_bare(name): name for name in known}
+    for meant in FOREIGN.get(word, ()) if word not in names else ():
+        if meant in names:
+            return f" (did you mean {names[meant]!r}?)"
+        if not meant.isidentifier():
+            return f" ({meant})"
+    close = difflib.get_close_matches(word, list(names), n=1, cutoff=_LEAST_ALIKE)
+    close = close or [name for name in names if _is_part(word, name)]
+    return f" (did you mean {' or '.join(repr(names[name]) for name in close[:3])}?)" if close else ""
+
+
+def _bare(name: str) -> str:
+    """Return a key or flag in the form of a key: page_host for --page-host."""
+    return name.lstrip("-").replace("-", "_").lower()
 
 
 def _is_part(word: str, name: str) -> bool:
-    """Return whether a name has a word as one of its words: crop of crop_width_px, finetune of finetune-cpu."""
-    return bool(word) and word in re.split("[^a-z0-9]+", name.lower())
+    """Return whether a name has a word as one of its words, crop of crop_width_px, or a word is longer: output, out."""
+    return bool(word) and (
+        word in re.split("[^a-z0-9]+", name) or (len(name) >= _SHORTEST_STEM and word.startswith(name))
+    )
 
 
 def format_value(value: object) -> str:

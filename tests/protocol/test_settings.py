@@ -121,9 +121,9 @@ def test_a_long_key_costs_no_more_than_a_short_one(monkeypatch: pytest.MonkeyPat
     """The time of a comparison grows with the length: 60 kB took 10 ms of the server's only thread."""
     compared: list[str] = []
 
-    def compare(key: str, known: list[str], n: int) -> list[str]:
+    def compare(key: str, known: list[str], n: int, cutoff: float) -> list[str]:
         compared.append(key)
-        return difflib.get_close_matches(key, known, n)
+        return difflib.get_close_matches(key, known, n, cutoff)
 
     monkeypatch.setattr("v2v_protocol.settings.difflib", SimpleNamespace(get_close_matches=compare))
     for key in ("size" * 15_000, ["size"] * 15_000):
