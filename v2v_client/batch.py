@@ -266,24 +266,24 @@ class Batch(Drawn):
         def move(item: torch.Tensor) -> torch.Tensor:
             # PyTorch keeps page-locked memory until the copy is done, but does not track this library's memory.
             safe = non_blocking and (item.device.type != "cpu" or item.is_pinned())
-            return item.to(device, non_blocking=safe) if dtype is None else item.to(device, dtype, non_blocking=safe)
+            return item.to(*((device,) if dtype is None else (device, dtype)), non_blocking=safe)  # type: ignore[call-overload, no-any-return]
 
         return dataclasses.replace(self, arrays={name: move(item) for name, item in self.arrays.items()})
 
 
-def refuse_assignment(cls: type[Any]) -> None:
-    """Let a frozen dataclass with arrays say how to change them, in place of Python's own message."""
+def refuse(self: Any, name: str, value: object) -> Never:
+    """Refuse to assign to a frozen dataclass with arrays, and say what to do, in place of Python's own message.
 
-    def refuse(self: Any, name: str, value: object) -> Never:
-        raise dataclasses.FrozenInstanceError(
-            f"{self._KIND}.{name} = ...: a {self._KIND} cannot be changed; keep the array in a variable, or in a "
-            f"dict, dict({self._KIND}, {name}=...)"
-        )
+    Raises:
+        FrozenInstanceError: always.
+    """
+    raise dataclasses.FrozenInstanceError(
+        f"{self._KIND}.{name} = ...: a {self._KIND} cannot be changed; keep the array in a variable, or in a dict, "
+        f"dict({self._KIND}, {name}=...)"
+    )
 
-    cls.__setattr__ = refuse
 
-
-refuse_assignment(Batch)
+Batch.__setattr__ = refuse  # type: ignore[method-assign]
 
 
 def _collate(batches: Any, *, collate_fn_map: Any) -> Any:

@@ -18,7 +18,7 @@ import torch
 from torch.utils.data import Dataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from v2v_client.batch import Batch, Drawn, draw_samples, refuse_assignment
+from v2v_client.batch import Batch, Drawn, draw_samples, refuse
 from v2v_client.options import Fixed, Labels, check_labels, require_arguments, require_labels
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
@@ -48,7 +48,7 @@ class ShownSample(Drawn, Sample):
         return Sample._repr_html_(self) + self._html_image()
 
 
-refuse_assignment(ShownSample)
+ShownSample.__setattr__ = refuse  # type: ignore[method-assign]
 
 
 class V2VDataset(Fixed, Dataset[Sample]):

@@ -15,7 +15,6 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -94,13 +93,13 @@ class Mixture(V2VStreamDataset):
                 raise UsageError(f"mix: {format_value(each)} is no dataset to mix: give {hint}")
         self.members = members = tuple(weights)
         given: list[list[Any]] = [
-            (each or [None]) if isinstance(each, list | tuple) else [each] for each in map(plain, weights.values())
+            ([*each] or [None]) if isinstance(each, list | tuple) else [each] for each in map(plain, weights.values())
         ]
         epochs = range(max(map(len, given), default=1))
         self._weights = [[each[min(epoch, len(each) - 1)] for each in given] for epoch in epochs]
         for epoch, row in enumerate(self._weights):
             are_shares = all(
-                isinstance(weight, Real) and not isinstance(weight, bool) and 0 <= weight <= 1 for weight in row
+                isinstance(weight, int | float) and not isinstance(weight, bool) and 0 <= weight <= 1 for weight in row
             )
             if not are_shares or abs(sum(row) - 1) > _ROUNDING:
                 raise UsageError(

@@ -6,7 +6,6 @@ import dataclasses
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any, Literal
 
 from v2v_client.position import StreamIdentity
@@ -51,7 +50,7 @@ class Patience:
     def __post_init__(self) -> None:
         for name in ("timeout_seconds", "ping_seconds", "rewant_seconds", "takeover_seconds"):
             value = plain(getattr(self, name))
-            if not isinstance(value, Real) or not value > 0:
+            if not isinstance(value, int | float) or not value > 0:
                 raise UsageError(f"{name} = {getattr(self, name)!r}: give a positive number of seconds")
 
 

@@ -279,7 +279,7 @@ def plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else value
 
 
-def as_whole(value: object) -> int | None:
+def as_whole(value: Any) -> int | None:
     """Return a whole number of any type as an int; None for other values, truth values included."""
     value = plain(value)
     try:
