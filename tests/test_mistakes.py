@@ -27,17 +27,22 @@ import torch
 from tests.clips import panned_luma, write_clip
 from tests.test_commands import MODULES, ROOT, flags_of
 from trainer.config import StreamConfig
+from trainer.run.checkpoint import require_writable
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.options import Options
 from v2v_pictures.files import write_png
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.events import EventList
 from v2v_protocol.recipe import PRESETS, Recipe
-from v2v_protocol.settings import settings_of
+from v2v_protocol.settings import nearest, settings_of
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
 from v2v_protocol.write_aside import write_json
 from v2v_server.config import ServeConfig
+from v2v_server.corpus.catalogue import list_corpus
+from v2v_server.corpus.sources.source import SourceOptions, open_source
+from v2v_server.store.cache import make_cache
+from v2v_server.video.rows import Rows
 from v2v_tools.event_files import EVENT_WRITERS, write_events
 
 OUTPUTS = [
@@ -50,6 +55,20 @@ OUTPUTS = [
     ("v2v-preview clips --out linked/b.mp4", ["beside other .mp4 files"]),
     ("v2v-preview clips/list.txt --out clips/b.mp4", ["beside other .mp4 files"]),
     ("v2v-preview clips --out clips", ["it is a folder"]),
+    ("v2v-preview clips --out clips/new.mp4", ["--out clips/new.mp4", "a later run would read", "such as new.mp4"]),
+    ("v2v-preview . --out sheet.png", ["it lies in .", "/sheet.png"]),
+    ("v2v-preview linked --out clips/new.gif", ["it lies in linked"]),
+    ("v2v-simulate clips --out s.npz --picture clips/s.png", ["it lies in clips"]),
+    ("v2v-simulate clips --out s.npz --events clips/e.h5", ["--events clips/e.h5", "it lies in clips"]),
+    ("v2v-catalogue --videos clips --shard 1/2 --out clips/parts", ["--out clips/parts", "such as parts"]),
+    ("v2v-catalogue --videos clips --shard 1/2 --out clips", ["--out clips", "such as clips-out"]),
+    ("v2v-convert clips --out clips/h5", ["it lies in clips"]),
+    ("v2v-eval --data clips --out clips/pictures", ["it lies in clips"]),
+    ("v2v-serve --videos clips --cache clips", ["--cache clips", "such as clips-cache"]),
+    ("v2v-serve --videos linked --cache clips/cache", ["--cache clips/cache", "it lies in linked"]),
+    ("v2v-train finetune-cpu --videos .", ["--out runs/finetune-cpu", "it lies in .", "films"]),
+    ("v2v-train finetune-cpu --videos clips --out clips/run", ["it lies in clips"]),
+    ("v2v-train finetune-cpu --set stream.videos=clips --out clips/run", ["it lies in clips"]),
     ("v2v-preview a.mp4 --out sheet.bmp", ["unknown ending", ".png"]),
     ("v2v-preview a.mp4 --out nowhere/sheet.png", ["there is no folder nowhere"]),
     ("v2v-preview a.mp4 --out locked.png", ["locked.png is write-protected"]),
@@ -156,6 +175,7 @@ def _noise(path: Path) -> None:
     write_png(path, np.random.default_rng(1).integers(0, 255, (99, 99, 3), np.uint8))
 
 
+OLDER = b"\x89PNG\r\n\x1a\nthe older file"
 WRITERS: dict[str, Callable[[Path], None]] = {
     ".png": _noise,
     ".json": lambda path: write_json(path, [{"key": "x" * 5000}]),
@@ -166,14 +186,14 @@ WRITERS: dict[str, Callable[[Path], None]] = {
 @pytest.mark.parametrize("ending", WRITERS)
 def test_a_full_disk_leaves_the_older_file(ending: str, tmp_path: Path) -> None:
     path, limits = tmp_path / f"old{ending}", resource.getrlimit(resource.RLIMIT_FSIZE)
-    path.write_bytes(b"the older file")
+    path.write_bytes(OLDER)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
     try:
         with pytest.raises(UsageError, match=path.name):
             WRITERS[ending](path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert path.read_bytes() == b"the older file"
+    assert path.read_bytes() == OLDER
     assert [each.name for each in tmp_path.iterdir()] == [path.name]
 
 
@@ -183,6 +203,53 @@ def test_outputs_replace_older_ones_and_follow_links(tmp_path: Path) -> None:
         write_json(tmp_path / "named.json", [{"key": text}])
     assert (tmp_path / "named.json").is_symlink()
     assert '"b"' in (tmp_path / "target.json").read_text()
+
+
+NO_PICTURES = [
+    "a.mp4",
+    "clips",
+    "x.py",
+    "x",
+    "x.gif",
+    "x.jpg",
+    "e.h5",
+    "c.yaml",
+    "e.png",
+    "link.png",
+    "b.masks/1.png.txt",
+]
+
+
+@pytest.mark.parametrize("name", NO_PICTURES)
+def test_a_picture_replaces_only_a_picture(name: str, desk: Path) -> None:
+    (desk / "e.png").write_text("precious: 1\n")
+    (desk / "link.png").symlink_to("a.mp4")
+    before = contents(desk)
+    with pytest.raises(UsageError, match=name):
+        _noise(Path(name))
+    assert contents(desk) == before
+
+
+def test_a_picture_replaces_a_picture(tmp_path: Path) -> None:
+    (tmp_path / "empty.png").touch()
+    for name in ("new.PNG", "new.PNG", "empty.png"):
+        _noise(tmp_path / name)
+        assert (tmp_path / name).stat().st_size > 1000
+
+
+def test_a_catalogue_passes_over_folders_of_outputs(desk: Path) -> None:
+    clip = (desk / "a.mp4").read_bytes()
+    make_cache(desk / "clips" / "cache")
+    require_writable(desk / "clips" / "runs" / "one")
+    require_writable(desk / "clips")  # not made here: it stays a corpus
+    before = list_corpus(open_source("clips", SourceOptions()), Rows.parse("full"), print).ids
+    for folder in ("cache", "runs/one/films"):
+        (desk / "clips" / folder).mkdir(exist_ok=True)
+        (desk / "clips" / folder / "film.mp4").write_bytes(clip)
+    corpus = list_corpus(open_source("clips", SourceOptions()), Rows.parse("full"), print)
+    assert corpus.ids == before == ("b.mp4", "c.mp4")
+    assert corpus.left_out.startswith("2 folders that a v2v command wrote were passed over: cache/, runs/one/.")
+    assert list_corpus(open_source("clips/cache", SourceOptions()), Rows.parse("full"), print).ids == ("film.mp4",)
 
 
 WRONG = [
@@ -222,6 +289,41 @@ WRONG = [
     ("v2v-preview a.mp4 --out x.png --rows top:2", "0 <= top < bottom <= 1"),
     ("v2v-simulate a.mp4 --out x.npz --arrays voxel", "voxels"),
     ("v2v-simulate a.mp4 --out x.npz", "voxels_per_clip at most 5"),
+    # words of other commands, tools and libraries
+    ("v2v-preview a.mp4 --out x.png --lr 1", "(v2v-train --set optimizer.learning_rate=X)"),
+    ("v2v-preview --input a.mp4 --out x.png", "(give the input without a flag)"),
+    ("v2v-serve --input clips", "did you mean '--videos'"),
+    ("v2v-serve --videos clips --port 5555", "did you mean '--bind'"),
+    ("v2v-serve --videos clips --seed 3", "the consumer chooses it: V2VStreamDataset(..., seed=N)"),
+    ("v2v-serve --videos clips --batch-size 3", "the consumer chooses it: V2VStreamDataset(..., batch_size=N)"),
+    ("v2v-serve --videos clips --device cuda", "v2v-train --set compute.device=cuda"),
+    ("v2v-loadtest --videos clips --host x", "did you mean '--connect'"),
+    ("v2v-serve --videos clips --num-workers 3", "did you mean '--workers'"),
+    ("v2v-train finetune-cpu --videos clips --batch-size 3", "v2v-train --set stream.batch_size=N"),
+    ("v2v-train finetune-cpu --videos clips --lr 3", "v2v-train --set optimizer.learning_rate=X"),
+    ("v2v-simulate a.mp4 --out x.npz --dvs-h5 e.h5", "did you mean '--events'"),
+    ("v2v-simulate a.mp4 --output-folder x", "did you mean '--out'"),
+    ("v2v-simulate a.mp4 --out x.npz --pos-thres .2", "it belongs to the recipe, --set threshold=..."),
+    ("v2v-serve --videos clips --threshold .2", "it belongs to the recipe, --set threshold=..."),
+    ("v2v-preview a.mp4 --out x.png --cutoff-hz 30", "--set photoreceptor_hz=..."),
+    ("v2v-preview a.mp4 --out x.png --set pos_thres=.2", "did you mean 'threshold'"),
+    ("v2v-preview a.mp4 --out x.png --set leak_rate_hz=1", "did you mean 'leak_hz'"),
+    # flags without effect, and a space in place of a sign
+    ("v2v-serve --videos clips --cache-gib 3", "--cache-gib has no effect without --cache DIR; give both, or neither"),
+    ("v2v-serve --videos clips --keep-defects bars", "--keep-defects has no effect without --scene auto"),
+    ("v2v-preview a.mp4 --out x.png --keep-defects bars", "--keep-defects has no effect without --scene auto"),
+    ("v2v-simulate a.mp4 --out x.npz --keep-defects bars", "--keep-defects has no effect without --scene auto"),
+    ("v2v-serve --videos clips --page-host 127.0.0.1", "--page-host has no effect without --page"),
+    ("v2v-serve --videos clips --page-names a", "--page-names has no effect without --page"),
+    ("v2v-serve --videos clips --scale-seconds 9", "--scale-seconds has no effect without --workers LEAST:MOST"),
+    ("v2v-serve --videos clips --ray-label a=b", "--ray-label has no effect without --engine ray"),
+    ("v2v-serve --videos clips --photograph-seconds 3", "has no effect without --videos-kind photographs"),
+    ("v2v-serve --videos clips --workers 0", "--worker-bind tcp://HOST:5556"),
+    ("v2v-preview a.mp4 --out x.png --set bins 3", "--set bins 3: write --set bins=3"),
+    ("v2v-preview a.mp4 --out x.png --set bins = 3", "write --set bins=3"),
+    ("v2v-preview a.mp4 --out x.png --set bins =3", "write --set bins=3"),
+    ("v2v-simulate a.mp4 --out x.npz --arrays voxels flow", "write --arrays voxels,flow"),
+    ("v2v-simulate a.mp4 --out x.npz --arrays voxels, flow", "write --arrays voxels,flow"),
     # numbers and addresses
     ("v2v-serve --videos clips --workers many", "give a whole number"),
     ("v2v-serve --videos clips --bind 127.0.0.1:5555", "tcp://HOST:PORT"),
@@ -243,10 +345,25 @@ def test_an_answer_names_what_to_type(line: str, word: str, desk: Path, capsys: 
     assert contents(desk) == before
 
 
+NO_HINT = ["--lr", "--xyz", "--put", "--q", "--frobnicate", "--ten", "--a", "--", "zz", "abc", ""]
+
+
+@pytest.mark.parametrize("word", NO_HINT)
+def test_nothing_is_suggested_rather_than_nonsense(word: str) -> None:
+    known = ["--help", "--out", "--videos", "--debug", "--version", "--set", "--recipe", "--page"]
+    assert "did you mean" not in nearest(word, known)
+
+
 IN_PYTHON: list[tuple[Callable[[], object], str]] = [
     (lambda: dataset()[0], r"dataset\[0\]: a stream has no index; .* V2VDataset makes samples by index"),
     (lambda: dataset().load_state_dict("last.pt"), r"'last.pt', .* Batch.resume_state itself"),  # type: ignore[arg-type]
     (lambda: dataset().load_state_dict({"network": {}}), r"version None, expected version \d+. Give the saved"),
+    (lambda: dataset(workers=3), r"V2VStreamDataset.local\(..., workers=N\)"),
+    (lambda: dataset(num_workers=3), r"DataLoader\(dataset, batch_size=None, num_workers=N\)"),
+    (lambda: dataset(videos="clips"), r"V2VStreamDataset.local\(videos\) starts a server"),
+    (lambda: dataset(pin_memory=True), r"DataLoader\(..., pin_memory=True\)"),
+    (lambda: dataset(recipe={"pos_thres": 0.2}), r"did you mean 'threshold'"),
+    (lambda: dataset(recipe={"contrast_threshold": 0.2}), r"did you mean 'threshold'"),
     (lambda: dataset(bins=3), r"no argument 'bins': it belongs to the recipe, recipe={'bins': ...}"),
     (lambda: dataset(substep=1), r"did you mean 'substep_px'"),
     (lambda: dataset(recipe={"substep_px": 1}), r"give substep_px=1 beside the recipe"),

@@ -55,8 +55,8 @@ class StreamConfig:
         loader_workers: processes of each rank that receive batches; 0: the training process receives them.
         timeout_seconds: silence after which the server counts as lost.
         mix: other streams whose batches are mixed in: a list of sections like this one, each with its ``weight`` (see
-            :meth:`v2v_client.V2VStreamDataset.mix`). Keys that one leaves out are those of this section; but with
-            ``videos`` it has no ``address`` or ``list`` of this section.
+            :meth:`v2v_client.V2VStreamDataset.mix`). Keys that one leaves out are those of this section, and so are
+            fields of its ``recipe``; but with ``videos`` it has no ``address`` or ``list`` of this section.
     """
 
     address: str = ""
@@ -91,6 +91,8 @@ class StreamConfig:
                 )
             rest = round(rest - weight, 9)
             base = own | ({"address": "", "list": ""} if "videos" in keys else {})
+            if isinstance(keys.get("recipe"), Mapping):  # fields that it leaves out are those of this section
+                keys["recipe"] = {**_fields(self.recipe), **keys["recipe"]}
             found[name] = _section(StreamConfig, name, base | keys), weight
         return {"stream": (self, rest), **found}
 
@@ -101,8 +103,13 @@ class StreamConfig:
         Raises:
             RecipeError: an unknown preset or field, or a value outside its limits.
         """
-        recipe = read_recipe(self.recipe)
-        return StreamSpec.from_dict({"recipe": recipe if isinstance(recipe, Mapping) else {"preset": recipe}}).recipe
+        return StreamSpec.from_dict({"recipe": _fields(self.recipe)}).recipe
+
+
+def _fields(recipe: Any) -> Mapping[str, Any]:
+    """Return the fields of a recipe that is given by its name, its YAML file or its fields."""
+    recipe = read_recipe(recipe)
+    return recipe if isinstance(recipe, Mapping) else {"preset": recipe}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

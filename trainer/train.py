@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -25,6 +26,9 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import counted
 from v2v_protocol.recipe import Recipe
+from v2v_protocol.sample import array_layout
+from v2v_protocol.spec import StreamSpec
+from v2v_protocol.write_aside import check_outside
 
 SIGNAL_STATUS = 128
 
@@ -75,26 +79,48 @@ def _settings(arguments: argparse.Namespace) -> list[str]:
     return [*arguments.settings, *flags]
 
 
+def require_servable(config: TrainConfig, out: Path, mine: Ranks) -> None:
+    """Check, before any server starts, that one can be started for each stream without an address.
+
+    Args:
+        out: folder of the run.
+
+    Raises:
+        UsageError: a stream has no videos, its list is missing, the ranks run on several hosts, or the folder lies in
+            the videos.
+    """
+    for name, (stream, _) in config.stream.mixed.items():
+        if stream.address:
+            continue
+        if not stream.videos:
+            raise UsageError(f"{name}.videos is missing: give --videos DIR, or --connect ADDRESS of a running server")
+        if not os.path.exists(stream.videos) and "://" not in stream.videos:
+            raise UsageError(
+                f"{name}.videos = {stream.videos}: there is no such folder, video or list file on this host"
+            )
+        if stream.list and not Path(stream.list).is_file():
+            raise UsageError(
+                f"{name}.list {stream.list}: no such file; --set stream.list=FILE names it, or --set stream.list= for "
+                "all videos"
+            )
+        if mine.hosts > 1:
+            raise UsageError(
+                f"ranks on {mine.hosts} hosts: start v2v-serve yourself and give all ranks --connect ADDRESS"
+            )
+        check_outside("--out", out, [stream.videos], "films")
+
+
 @contextmanager
 def serving(stream: StreamConfig, recipe: Recipe, mine: Ranks) -> Iterator[str]:
     """Yield the address to connect to; if none is configured, of a server that runs until the block ends.
 
     Raises:
-        UsageError: no videos, or the server of rank 0 did not start.
+        UsageError: the server of rank 0 did not start.
         ServerLost: the server did not start.
     """
     if stream.address:
         yield stream.address
         return
-    if not stream.videos:
-        raise UsageError("stream.videos is missing: give --videos DIR, or --connect ADDRESS of a running server")
-    if stream.list and not Path(stream.list).is_file():
-        raise UsageError(
-            f"stream.list {stream.list}: no such file; --set stream.list=FILE names it, or --set stream.list= for all "
-            "videos"
-        )
-    if mine.hosts > 1:
-        raise UsageError(f"ranks on {mine.hosts} hosts: start v2v-serve yourself and give all ranks --connect ADDRESS")
     if not mine.first:
         address, error = mine.from_first(None)
         if error:
@@ -123,7 +149,22 @@ def _lacks_bfloat16() -> bool:
 
 def _trained(config: TrainConfig, mine: Ranks, out: Path, resume: Checkpoint | None) -> tuple[int, int]:
     """Train; return the steps so far, and the signal that ended the run or 0. The learner is freed on return."""
+    require_servable(config, out, mine)
     learner = build(config, mine)
+    forms = {
+        name: array_layout(
+            learner.task.asked.recipe(stream.resolved_recipe),
+            StreamSpec.from_dict(dict(stream.spec)).voxel_dtype,
+            learner.task.asked.arrays,
+        )
+        for name, (stream, _) in config.stream.mixed.items()
+    }
+    for name, form in forms.items():
+        if form != forms["stream"]:
+            raise UsageError(
+                f"{name}: its samples are {form}, those of stream are {forms['stream']}; give recipes of one size, and "
+                "one voxel_dtype"
+            )
     if mine.first:
         require_writable(out)
     with ExitStack() as stack:

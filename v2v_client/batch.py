@@ -9,10 +9,10 @@ import base64
 import dataclasses
 import importlib
 import os
-from collections.abc import KeysView, Mapping, Sequence
+from collections.abc import ItemsView, KeysView, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Never
 
 import numpy as np
 import numpy.typing as npt
@@ -27,10 +27,71 @@ from v2v_protocol.settings import nearest
 _SHOWN = 3
 
 
+_OF_TENSORS = {
+    "cuda": '; write .to("cuda")', "cpu": '; write .to("cpu")', "device": "; each array has its own",
+    "half": "; write .to(torch.float16)", "float": "; write .to(torch.float32)", "size": "; write .voxels.shape",
+    "shape": "; write .voxels.shape", "dtype": "; write .voxels.dtype", "values": "; write .arrays.values()",
+}  # fmt: skip
+"""Answers to names of PyTorch and of mappings."""
+
+
 class Drawn:
-    """Give a notebook the picture that ``_picture`` draws, [height, width, 3] uint8 RGB."""
+    """Give access to arrays by name, and give a notebook the picture that ``_picture`` draws, [height, width, 3] uint8
+    RGB.
+    """
 
     __slots__ = ()
+    _KIND: ClassVar = "sample"
+
+    arrays: Mapping[str, Any]
+
+    def keys(self) -> KeysView[str]:
+        """Return the names of the arrays. They make ``dict(batch)`` and ``network(**batch)`` work."""
+        return self.arrays.keys()
+
+    def items(self) -> ItemsView[str, Any]:
+        """Return the names and the arrays."""
+        return self.arrays.items()
+
+    def __getitem__(self, name: str) -> Any:
+        """Return the array called ``name``.
+
+        Raises:
+            KeyError: there is no array of that name.
+        """
+        if name not in self.arrays:
+            raise KeyError(f"{name!r}: this {self._KIND} has {', '.join(self.arrays)}; index it by one of these names")
+        return self.arrays[name]
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is an array of that name."""
+        return name in self.arrays
+
+    __iter__ = None  # ambiguous: the length of a batch counts samples, the keys name arrays
+
+    def __getattr__(self, name: str) -> Any:
+        """Return the array of this name.
+
+        Raises:
+            UsageError: the dataset did not request this array.
+            AttributeError: there is no such array; the message names the nearest attribute.
+        """
+        if name not in ARRAYS:
+            hint = _OF_TENSORS.get(name) or nearest(name, (*ARRAYS, *dir(type(self))))
+            raise AttributeError(f"a {self._KIND.title()} has no {name!r}{hint}")
+        return self._array(name)
+
+    def __dir__(self) -> list[str]:
+        """List the arrays among the attributes, for the completion of a notebook."""
+        return [*object.__dir__(self), *self.arrays]
+
+    def _array(self, name: str) -> Any:
+        if name not in self.arrays:
+            raise UsageError(
+                f"{self._KIND}.{name}: this {self._KIND} has only {', '.join(self.arrays)}; create the dataset with "
+                f"arrays={(*self.arrays, name)!r}, or check `{name!r} in {self._KIND}` first"
+            )
+        return self.arrays[name]
 
     def _picture(self) -> npt.NDArray[np.uint8]:
         raise NotImplementedError
@@ -94,7 +155,8 @@ class Batch(Drawn):
 
     Attributes:
         arrays: the requested tensors by name (``v2v_protocol.sample.ARRAYS``).
-        indices: global index of each sample.
+        indices: place of each sample in the order of its epoch, 0 .. sequences - 1. In another epoch the same place has
+            another clip: ``provenance`` names the video.
         epoch: epoch of the samples.
         provenance: origin of each sample.
         resume_state: the state after this batch, for :meth:`v2v_client.dataset.V2VStreamDataset.load_state_dict`.
@@ -104,6 +166,8 @@ class Batch(Drawn):
         decodes: clips decoded for it; fewer than its samples if siblings share a decode.
         recipe: the virtual cameras that its samples were drawn from.
     """
+
+    _KIND: ClassVar = "batch"
 
     arrays: Mapping[str, torch.Tensor]
     indices: tuple[int, ...]
@@ -117,26 +181,6 @@ class Batch(Drawn):
 
     def __len__(self) -> int:
         return len(self.indices)
-
-    def keys(self) -> KeysView[str]:
-        """Return the names of the tensors. They make ``dict(batch)`` and ``network(**batch)`` work."""
-        return self.arrays.keys()
-
-    def __getitem__(self, name: str) -> torch.Tensor:
-        """Return the tensor called ``name``.
-
-        Raises:
-            KeyError: the batch has no tensor of that name.
-        """
-        if name not in self.arrays:
-            raise KeyError(f"{name!r}: this batch has {', '.join(self.arrays)}; index it by one of these names")
-        return self.arrays[name]
-
-    def __contains__(self, name: object) -> bool:
-        """Return whether the batch has a tensor of that name."""
-        return name in self.arrays
-
-    __iter__ = None  # ambiguous: the length counts samples, the keys name tensors
 
     def __repr__(self) -> str:
         arrays = "".join(
@@ -194,29 +238,6 @@ class Batch(Drawn):
         """Return, for each sample, whether all arrays that were requested could be made."""
         return tuple(origin.labelled for origin in self.provenance)
 
-    def __getattr__(self, name: str) -> torch.Tensor:
-        """Return the array of this name.
-
-        Raises:
-            UsageError: the dataset did not request this array.
-            AttributeError: there is no such array; the message names the nearest attribute.
-        """
-        if name not in ARRAYS:
-            raise AttributeError(f"a Batch has no {name!r}{nearest(name, (*ARRAYS, *dir(type(self))))}")
-        return self._array(name)
-
-    def __dir__(self) -> list[str]:
-        """List the arrays among the attributes, for the completion of a notebook."""
-        return [*object.__dir__(self), *self.arrays]
-
-    def _array(self, name: str) -> torch.Tensor:
-        if name not in self.arrays:
-            raise UsageError(
-                f"batch.{name}: this batch has only {', '.join(self.arrays)}; create the dataset with "
-                f"arrays={(*self.arrays, name)!r}, or check `{name!r} in batch` first"
-            )
-        return self.arrays[name]
-
     @property
     def nbytes(self) -> int:
         """Return the size of all tensors in bytes."""
@@ -226,21 +247,43 @@ class Batch(Drawn):
         """Return a copy in page-locked memory. ``DataLoader(pin_memory=True)`` calls this."""
         return dataclasses.replace(self, arrays={name: tensor.pin_memory() for name, tensor in self.arrays.items()})
 
-    def to(self, device: torch.device | str, non_blocking: bool = False) -> Batch:
-        """Return this batch with its tensors on ``device``.
+    def to(
+        self, device: torch.device | str | torch.dtype, dtype: torch.dtype | None = None, *, non_blocking: bool = False
+    ) -> Batch:
+        """Return this batch with its tensors on ``device``, converted to ``dtype``. Either one may come alone.
 
         Args:
             non_blocking: True returns before the copy is done, if this batch is in page-locked memory or on a device.
                 A copy from other memory is always completed first, because that memory is reused for new samples once
                 this batch is dropped.
+
+        Raises:
+            UsageError: ``dtype`` is no dtype.
         """
+        if not isinstance(dtype, torch.dtype | None):
+            raise UsageError(f"batch.to({device!r}, {dtype!r}): give a torch.dtype, or non_blocking=True by its name")
 
         def move(item: torch.Tensor) -> torch.Tensor:
             # PyTorch keeps page-locked memory until the copy is done, but does not track this library's memory.
             safe = non_blocking and (item.device.type != "cpu" or item.is_pinned())
-            return item.to(device, non_blocking=safe)
+            return item.to(*((device,) if dtype is None else (device, dtype)), non_blocking=safe)  # type: ignore[call-overload, no-any-return]
 
         return dataclasses.replace(self, arrays={name: move(item) for name, item in self.arrays.items()})
+
+
+def refuse(self: Any, name: str, value: object) -> Never:
+    """Refuse to assign to a frozen dataclass with arrays, and say what to do, in place of Python's own message.
+
+    Raises:
+        FrozenInstanceError: always.
+    """
+    raise dataclasses.FrozenInstanceError(
+        f"{self._KIND}.{name} = ...: a {self._KIND} cannot be changed; keep the array in a variable, or in a dict, "
+        f"dict({self._KIND}, {name}=...)"
+    )
+
+
+Batch.__setattr__ = refuse  # type: ignore[method-assign]
 
 
 def _collate(batches: Any, *, collate_fn_map: Any) -> Any:

@@ -20,13 +20,13 @@ from v2v_client.delivery import deliver
 from v2v_client.loaders import distributed_rank, end_with_parent, send_before_exit
 from v2v_client.local_server import LocalServer, server_flags
 from v2v_client.memory import BatchBuffers
-from v2v_client.options import Labels, Options, Patience, check_labels, require_arguments, require_labels
+from v2v_client.options import Fixed, Labels, Options, Patience, check_labels, require_arguments, require_labels
 from v2v_client.passes import Iteration, Position
 from v2v_client.position import Consumer, EpochPlan, ResumeState, StreamIdentity
 from v2v_protocol.errors import RepeatedSamplesWarning, StateMismatch, UsageError
 from v2v_protocol.keys import leaves_host
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, html_table
+from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_INDEX, LARGEST_SEED, html_table
 from v2v_protocol.settings import require_whole
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import read_recipe
@@ -40,7 +40,7 @@ _NOT_SHARED = (
 )
 
 
-class V2VStreamDataset(IterableDataset[Batch]):
+class V2VStreamDataset(Fixed, IterableDataset[Batch]):
     """Stream batches of freshly simulated event-camera clips from a v2v server.
 
         for batch in V2VStreamDataset("tcp://127.0.0.1:5555", batch_size=12):
@@ -151,6 +151,9 @@ class V2VStreamDataset(IterableDataset[Batch]):
         )
         self._shared_memory = shared_memory
         self._needs_labels = check_labels(labels)
+        if rank is not None:
+            rank = require_whole("rank", rank, 0, LARGEST_INDEX)
+            world_size = require_whole("world_size", world_size, 1, LARGEST_INDEX)
         self._explicit = None if rank is None or world_size is None else (rank, world_size)
         self._ambient = distributed_rank() or (0, 1)
         self._position = Position(seed, require_whole("epoch", epoch, 0, LARGEST_EPOCH))
@@ -283,6 +286,12 @@ class V2VStreamDataset(IterableDataset[Batch]):
         return (self._explicit or distributed_rank() or self._ambient)[1]
 
     @property
+    def seed(self) -> int:
+        """Return the seed of the draws and of the order."""
+        seed: int = self._settings()["seed"]
+        return seed
+
+    @property
     def epoch(self) -> int:
         """Return the epoch that the next iteration delivers."""
         return self._position.start(self._consumer).epoch
@@ -304,6 +313,10 @@ class V2VStreamDataset(IterableDataset[Batch]):
         return {
             field.name: getattr(stream, field.name) for field in dataclasses.fields(StreamIdentity)
         } | self._settings()
+
+    def _samples(self) -> tuple[object, ...]:
+        """Return what names its samples, before the server's answer."""
+        return self._connector.brokers, self._connector.seed, self._connector.options.spec(None, "")
 
     def _settings(self) -> dict[str, Any]:
         return {
@@ -429,6 +442,8 @@ class V2VStreamDataset(IterableDataset[Batch]):
         consumer = self.rank, self.world_size, max(workers, 1)
         with closing(self._connector.connection(start, *consumer)) as connection:
             connection.open()
+            if (loader := get_worker_info()) is None or loader.id == 0:  # other loader workers would repeat it
+                connection.conversation.stream.resolved.recipe.warn()
             if workers and start.stream is None:
                 self._connector.compare(connection, start, *consumer)
             yield connection

@@ -18,21 +18,21 @@ import torch
 from torch.utils.data import Dataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from v2v_client.batch import Batch, Drawn, draw_samples
-from v2v_client.options import Labels, check_labels, require_arguments, require_labels
+from v2v_client.batch import Batch, Drawn, draw_samples, refuse
+from v2v_client.options import Fixed, Labels, check_labels, require_arguments, require_labels
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
 from v2v_protocol.programs import counted, name_extra
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS, LARGEST_EPOCH, LARGEST_SEED, Sample, html_table
-from v2v_protocol.settings import require_whole
+from v2v_protocol.settings import as_whole, format_value, require_whole
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import read_recipe
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class ShownSample(Drawn, Sample):
-    """Hold a sample that a notebook can display.
+    """Hold a sample that a notebook can display. Each array is an attribute and an item, as of a batch.
 
     Attributes:
         recipe: needed to mark pauses, which are runs of repeated frames.
@@ -49,7 +49,10 @@ class ShownSample(Drawn, Sample):
         return Sample._repr_html_(self) + self._html_image()
 
 
-class V2VDataset(Dataset[Sample]):
+ShownSample.__setattr__ = refuse  # type: ignore[method-assign]
+
+
+class V2VDataset(Fixed, Dataset[Sample]):
     """Give indexed access to one epoch of a stream: ``dataset[i]`` equals the sample that a server streams at index i.
 
         dataset = V2VDataset("my-videos/", recipe="paper")
@@ -96,16 +99,27 @@ class V2VDataset(Dataset[Sample]):
         **options: Any,
     ) -> None:
         require_arguments(V2VDataset.__init__, options)
-        self.seed = require_whole("seed", seed, 0, LARGEST_SEED)
-        self.epoch = require_whole("epoch", epoch, 0, LARGEST_EPOCH)
+        self._seed = require_whole("seed", seed, 0, LARGEST_SEED)
+        self._epoch = require_whole("epoch", epoch, 0, LARGEST_EPOCH)
         self._needs_labels = check_labels(labels)
         self.spec = StreamSpec.from_dict({**options, "recipe": read_recipe(recipe)})
+        self.spec.recipe.warn()
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
         self._videos, self._kind = os.fspath(videos), (videos_kind, rate, photograph_seconds, picture_bits)
         self._source = {"rows": rows, "list_file": list_file, "cache_dir": cache_dir}
         self._maker: Any = None
         self._process = 0
         self._length = int(self._open().count)
+
+    @property
+    def seed(self) -> int:
+        """Return the seed of the draws and of the order."""
+        return self._seed
+
+    @property
+    def epoch(self) -> int:
+        """Return the epoch of the samples."""
+        return self._epoch
 
     def __len__(self) -> int:
         return self._length
@@ -115,6 +129,7 @@ class V2VDataset(Dataset[Sample]):
 
         Raises:
             IndexError: ``index`` is outside -len .. len - 1.
+            UsageError: it is not a whole number.
             SampleUnavailable: no candidate video could give it, or it lacks its labels.
         """
         place = self._place(index)
@@ -135,8 +150,12 @@ class V2VDataset(Dataset[Sample]):
         return events
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the epoch, which selects other cameras and another order. Call it before a DataLoader starts workers."""
-        self.epoch = epoch
+        """Set the epoch, which selects other cameras and another order. Call it before a DataLoader starts workers.
+
+        Raises:
+            UsageError: it is out of range.
+        """
+        self._epoch = require_whole("epoch", epoch, 0, LARGEST_EPOCH)
 
     def __repr__(self) -> str:
         return f"V2VDataset({self._videos!r}, {counted(self._length, 'sample')}, seed {self.seed}, epoch {self.epoch})"
@@ -155,7 +174,12 @@ class V2VDataset(Dataset[Sample]):
         return {**self.__dict__, "_maker": None}
 
     def _place(self, index: int) -> int:
-        place = index + self._length if index < 0 else index
+        number = as_whole(index)
+        if number is None:
+            raise UsageError(
+                f"dataset[{format_value(index)}]: give one whole number; Subset(dataset, numbers) takes several"
+            )
+        place = number + self._length if number < 0 else number
         if not 0 <= place < self._length:
             raise IndexError(f"index {index}: the epoch has {counted(self._length, 'sample')}")
         return place

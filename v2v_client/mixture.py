@@ -24,9 +24,9 @@ from v2v_client.batch import Batch
 from v2v_client.dataset import V2VStreamDataset
 from v2v_client.passes import Iteration, Position
 from v2v_client.position import Consumer, EpochPlan, ResumeState, StreamIdentity
-from v2v_protocol.errors import StateMismatch, UsageError
+from v2v_protocol.errors import ProtocolError, StateMismatch, UsageError
 from v2v_protocol.sample import LARGEST_SEED
-from v2v_protocol.settings import format_value, require_whole
+from v2v_protocol.settings import format_value, plain, require_whole
 
 _ROUNDING = 1e-6
 """Deviation from 1 that a sum of rounded weights may have."""
@@ -78,17 +78,38 @@ class Mixture(V2VStreamDataset):
     """
 
     def __init__(self, weights: Mapping[V2VStreamDataset, float | Sequence[float]], seed: int) -> None:
+        if not isinstance(weights, Mapping):
+            raise UsageError(
+                f"mix: {format_value(weights)}: give a dict of datasets with their weights, "
+                "V2VStreamDataset.mix({first: 0.7, second: 0.3})"
+            )
+        for each in weights:
+            if not isinstance(each, V2VStreamDataset) or isinstance(each, Mixture):
+                hint = (
+                    f"V2VStreamDataset({each!r}, ...)"
+                    if isinstance(each, str)
+                    else "a V2VStreamDataset that is no mixture"
+                )
+                raise UsageError(f"mix: {format_value(each)} is no dataset to mix: give {hint}")
         self.members = members = tuple(weights)
         given: list[list[Any]] = [
-            ([*each] or [None]) if isinstance(each, list | tuple) else [each] for each in weights.values()
+            ([*each] or [None]) if isinstance(each, list | tuple) else [each] for each in map(plain, weights.values())
         ]
         epochs = range(max(map(len, given), default=1))
         self._weights = [[each[min(epoch, len(each) - 1)] for each in given] for epoch in epochs]
         for epoch, row in enumerate(self._weights):
-            are_shares = all(isinstance(weight, int | float) and 0 <= weight <= 1 for weight in row)
+            are_shares = all(
+                isinstance(weight, int | float) and not isinstance(weight, bool) and 0 <= weight <= 1 for weight in row
+            )
             if not are_shares or abs(sum(row) - 1) > _ROUNDING:
                 raise UsageError(
                     f"mix: weights {format_value(row)} in epoch {epoch}: give shares from 0 to 1 that sum to 1"
+                )
+        for number, member in enumerate(members):
+            if any(member._samples() == other._samples() for other in members[:number]):
+                raise UsageError(
+                    f"mix: {member!r} is a member twice, so its samples would come twice: give one weight, or "
+                    "another seed, recipe or address"
                 )
         for name in ("arrays", "batch_size", "rank", "world_size"):
             values = [member._settings()[name] for member in members]
@@ -123,7 +144,13 @@ class Mixture(V2VStreamDataset):
 
     def _check(self, state: ResumeState, stream: StreamIdentity) -> StreamIdentity:
         """Return the stream of a state, if it is of these datasets. In a new epoch their order may be another."""
-        streams = [StreamIdentity.from_dict(each) for each in stream.spec.get("members", [])]
+        members = stream.spec.get("members")
+        try:
+            streams = [
+                StreamIdentity.from_dict(each) for each in (members if isinstance(members, list | tuple) else [])
+            ]
+        except ProtocolError as error:
+            raise StateMismatch(f"the state is not one of mixed datasets: {error}") from error
         ours, theirs = self._identity(streams or [stream]).spec["mixture"], stream.spec.get("mixture")
         is_new = state.is_beginning and not (state.share and state.share.batches)
         if len(streams) != len(self.members) or (ours != theirs and not is_new):

@@ -12,7 +12,7 @@ from v2v_client.position import StreamIdentity
 from v2v_protocol.errors import SampleUnavailable, UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, array_layout
-from v2v_protocol.settings import nearest, settings_of
+from v2v_protocol.settings import format_value, nearest, plain, settings_of
 from v2v_protocol.spec import MOST_SAMPLES_PER_DECODE, SPEC_KEYS, StreamSpec
 from v2v_protocol.spec_flags import read_recipe
 
@@ -49,8 +49,27 @@ class Patience:
 
     def __post_init__(self) -> None:
         for name in ("timeout_seconds", "ping_seconds", "rewant_seconds", "takeover_seconds"):
-            if not getattr(self, name) > 0:
+            value = plain(getattr(self, name))
+            if not isinstance(value, int | float) or not value > 0:
                 raise UsageError(f"{name} = {getattr(self, name)!r}: give a positive number of seconds")
+
+
+class Fixed:
+    """Refuse to assign the arguments that a dataset was created with: the assignment would have no effect."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute.
+
+        Raises:
+            AttributeError: it is an argument of the dataset.
+        """
+        is_given = name in inspect.signature(type(self).__init__).parameters or name in SPEC_KEYS
+        if is_given or isinstance(getattr(type(self), name, None), property):
+            remedy = "call set_epoch" if name == "epoch" else f"create another one with {name}=..."
+            raise AttributeError(
+                f"dataset.{name} = {format_value(value)}: it is fixed when the dataset is created; {remedy}"
+            )
+        super().__setattr__(name, value)
 
 
 class Options:
@@ -67,7 +86,7 @@ class Options:
 
     def __init__(self, arrays: tuple[str, ...], **fields: Any) -> None:
         fields = fields | {"recipe": _plain(fields.get("recipe"))}
-        self._asked = {name: value for name, value in fields.items() if value is not None}
+        self._asked = {name: plain(value) for name, value in fields.items() if value is not None}
         spec = StreamSpec.from_dict(self._asked | {"flow_from": None}, default=_ANY)
         array_layout(spec.recipe, spec.voxel_dtype, arrays)
         asked = self._asked.get("recipe", {})
@@ -147,4 +166,5 @@ def _plain(recipe: Any) -> Any:
         return recipe.to_dict()
     if not isinstance(recipe, Mapping):
         return recipe
+    recipe = {key: plain(value) for key, value in recipe.items()}
     return {key: list(value) if isinstance(value, list | tuple) else value for key, value in recipe.items()}

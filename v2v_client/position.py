@@ -28,7 +28,7 @@ from v2v_protocol.errors import ProtocolError, StateMismatch, UsageError
 from v2v_protocol.messages import Welcome
 from v2v_protocol.persisted import Limits, Persisted, always_written, later, read_fields
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_INDEX, LARGEST_SEED
-from v2v_protocol.settings import format_value
+from v2v_protocol.settings import format_value, plain
 from v2v_protocol.spec import StreamSpec
 
 STATE_VERSION = 1
@@ -190,18 +190,19 @@ class ResumeState(Persisted):
         Raises:
             UsageError: the values are not a state of this release; the message names field, value and limit.
         """
+        values = plain(values)
         if not isinstance(values, Mapping) or values.get("version") != STATE_VERSION:
             found = f"version {values.get('version')!r}" if isinstance(values, Mapping) else format_value(values)
             raise UsageError(
                 f"not a state of V2VStreamDataset: {found}, expected version {STATE_VERSION}. Give the saved "
                 "Batch.resume_state itself, for instance torch.load('last.pt')['stream']"
             )
-        plain = {name: value for name, value in values.items() if name not in ("version", *_OF_STREAM)}
+        fields = {name: value for name, value in values.items() if name not in ("version", *_OF_STREAM)}
         stream = {name: values[name] for name in _OF_STREAM if name in values}
-        plain["stream"] = None if values.get("spec", "") is None else stream
-        plain["share"] = plain.pop("loader_worker", None)
+        fields["stream"] = None if values.get("spec", "") is None else stream
+        fields["share"] = fields.pop("loader_worker", None)
         try:
-            return read_fields(cls, plain)
+            return read_fields(cls, fields)
         except ProtocolError as error:
             raise UsageError(f"not a state of V2VStreamDataset: {error}") from error
 

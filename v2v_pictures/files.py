@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import html
 import io
 from collections.abc import Sequence
@@ -15,10 +16,13 @@ from PIL import Image as Pictures
 
 from v2v_pictures import canvas
 from v2v_pictures.colours import BRIGHTER, DARKER, Image
-from v2v_protocol.write_aside import write_file
+from v2v_protocol.errors import UsageError
+from v2v_protocol.write_aside import is_stream, write_file
 
 _GIF_COLOURS, _GIF_COMMON, _GIF_STEP = 96, 24, 8
 _GIF_EXACT = (canvas.PAPER, canvas.INK, canvas.SOFT, canvas.LINE, canvas.MARK, canvas.PAUSED_INK, BRIGHTER, DARKER)
+_PNG = b"\x89PNG\r\n\x1a\n"
+"""The first bytes of every PNG file."""
 _QUALITY = "20"  # x264's rate factor: no visible loss of thin red and blue lines
 
 
@@ -84,9 +88,21 @@ def html_page(title: str, sheet: Image, film: Sequence[Image], frames_per_second
 
 
 def write_png(path: Path, image: Image) -> None:
-    """Write a picture as PNG.
+    """Write a picture as PNG, which may replace an older one, but no other file.
 
     Raises:
-        UsageError: the folder is missing or cannot be written.
+        UsageError: the name does not end in .png, a file of another kind has it, or it cannot be written.
     """
+    if not is_stream(path):
+        if path.suffix.lower() != ".png":
+            raise UsageError(f"{path}: pictures are written as PNG; give a name that ends in .png")
+        if path.is_file() and not _may_be_replaced(path):
+            raise UsageError(f"{path}: the file exists and is not a PNG picture; give another name")
     write_file(path, png_bytes(image))
+
+
+def _may_be_replaced(path: Path) -> bool:
+    """Return whether a file is empty or a PNG picture."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        return file.read(len(_PNG)) in (b"", _PNG)
+    return False

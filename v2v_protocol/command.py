@@ -17,19 +17,24 @@ from pathlib import Path
 from typing import Any, Never
 
 from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.foreign_words import FOREIGN
 from v2v_protocol.programs import COMPLETION, open_standard_streams, show, version_of
 from v2v_protocol.settings import Setting, nearest, settings_of
-from v2v_protocol.write_aside import JSON, check_output
+from v2v_protocol.write_aside import JSON, check_output, check_outside
 
 FAILED = 1
 WRONG_USAGE = 2
 INTERRUPTED = 128 + signal.SIGINT
 _LONGEST_CHOICE = 30
 _HELP_WIDTH = 100
+_LISTS = ("--arrays", "--metrics", "--connect", "--page-names", "--keep-defects")
+"""Flags whose value is a list with commas."""
 _GENERAL = "General"
 _FILES = ("FILE", "DIR", "VIDEO", "SRC", "DST", "PATH", "CONFIG", "RECORDING")
 """Words in the placeholder of an argument that names a file or folder."""
-_NO_INPUTS = frozenset({"out", "destination", "cache_dir", "copies"})
+_FOLDERS = ("out", "cache")
+"""Arguments that name a folder to write to, which may not lie in a folder of inputs."""
+_NO_INPUTS = frozenset({*_FOLDERS, "destination", "cache_dir", "copies"})
 """Arguments that name a folder to write to."""
 
 
@@ -98,10 +103,10 @@ class Parser(argparse.ArgumentParser):
         self._outputs[flag.removeprefix("--").replace("-", "_")] = flag, endings
 
     def check_outputs(self, arguments: argparse.Namespace) -> None:
-        """Check the files to write against the other arguments that name files or folders.
+        """Check the files and folders to write against the other arguments that name files or folders.
 
         Raises:
-            UsageError: see :func:`check_output`.
+            UsageError: see :func:`check_output` and :func:`check_outside`.
         """
         values = {name: value for name, value in vars(arguments).items() if name not in {*self._outputs, *_NO_INPUTS}}
         lists = (value if isinstance(value, list) else [value] for value in values.values())
@@ -110,6 +115,9 @@ class Parser(argparse.ArgumentParser):
             if (path := getattr(arguments, name)) is not None:
                 check_output(flag, path, endings, taken)
                 taken.append(path)
+        for name in _FOLDERS:
+            if name not in self._outputs:
+                check_outside(flag_of(name), getattr(arguments, name, None) or "", taken)
 
     def format_help(self) -> str:
         """Format the help; options that every command has come last."""
@@ -121,6 +129,16 @@ class Parser(argparse.ArgumentParser):
         self._given = list(sys.argv[1:] if args is None else args)
         return super().parse_known_args(args, namespace)
 
+    def _joined(self, words: Sequence[str]) -> str:
+        """Return an error that names the sign to write in place of the space before words; "" if there is none."""
+        at = self._given.index(words[0]) if words[0] in self._given else 0
+        for flag, sign in (("--set", "="), *((flag, ",") for flag in _LISTS)):
+            if at >= 2 and self._given[at - 2] == flag:
+                parts = [self._given[at - 1], *words]
+                joined = sign.join(filter(None, (part.strip(sign) for part in parts)))
+                return f"{flag} {' '.join(parts)}: write {flag} {joined}, without a space"
+        return ""
+
     def error(self, message: str) -> Never:
         """Exit with status 2 and one line. An unknown flag is reported before any other error."""
         known = self._option_string_actions
@@ -130,13 +148,27 @@ class Parser(argparse.ArgumentParser):
                 break
             if flag.startswith("--") and flag not in known:
                 is_bare = flag in ("--video", "--videos") and "--videos" not in known
+                key = flag[2:].replace("-", "_")
                 hint = ": give the videos without a flag" if is_bare else nearest(flag, known)
+                if {"--set", "--recipe"} <= known.keys():  # also fields of the recipe
+                    hint = _of_recipe(key) or hint
                 message = f"unknown flag {flag}{hint}"
                 break
         else:
+            if (rest := message.removeprefix("unrecognized arguments: ")) != message:
+                message = self._joined(rest.split()) or message
             if (first := self._given[:1]) and os.path.exists(first[0]) and "--videos" in known:
                 message = f"{first[0]}: give the videos with a flag, --videos {first[0]}"
         self.exit(WRONG_USAGE, f"{self.prog}: {message}; {self.prog} --help shows all flags\n")
+
+
+def _of_recipe(key: str) -> str:
+    """Return a hint to the field of a recipe that a flag names; "" if it names none."""
+    from v2v_protocol.recipe import Recipe  # lazily: it loads NumPy, which --help does not need
+
+    fields = settings_of(Recipe)
+    meant = next((name for name in (key, *FOREIGN.get(key, ())) if name in fields), "")
+    return f": it belongs to the recipe, --set {meant}=..." if meant else ""
 
 
 def run_command(

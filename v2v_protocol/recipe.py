@@ -24,8 +24,9 @@ equations and sources are in ``docs/effects.md``.
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -179,6 +180,9 @@ photographs.
 """
 
 
+_LOG = logging.getLogger(__name__)
+_WARNED: set[str] = set()
+"""Warnings that this process has given."""
 Range = tuple[float, float]
 """Lowest and highest value of a uniform draw; equal ends fix the value."""
 
@@ -220,6 +224,7 @@ class Recipe(Persisted):
         "duration of a voxel grid: it spans the number of steps between video frames that comes nearest, and its bins "
         "are equal parts of its time",
         unit="s", off=True, is_later=True,
+        usual=(1e-4, 2.0), mistake="A grid would hold {0:g} s of events. Divide milliseconds by 1000.",
     )  # fmt: skip
     lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
     lead_voxels: int = whole(0, 0, 1, "1 adds one voxel grid before the first (ERAFT)")
@@ -247,9 +252,22 @@ class Recipe(Persisted):
     )
     contrast_scale: Range = span((1.0, 3.0), 0.0, 100.0, "range of s in contrast_probability")
 
-    gamma: float = number(2.2, 0.05, 20.0, "exponent of the reverse gamma correction", group="Intensity")
+    gamma: float = number(
+        2.2,
+        0.05,
+        20.0,
+        "exponent of the reverse gamma correction",
+        group="Intensity",
+        usual=(0.4, 3.0),
+        mistake="Videos are coded with about 2.2.",
+    )
     log_eps: Range = span(
-        (0.001, 0.001), 1e-12, 1.0, "epsilon inside the logarithm: the dark current as a share of white's photocurrent"
+        (0.001, 0.001),
+        1e-12,
+        1.0,
+        "epsilon inside the logarithm: the dark current as a share of white's photocurrent",
+        usual=(1e-6, 0.5),
+        mistake="It is a share of white's photocurrent: of 8-bit grey levels, divide by 255.",
     )
     light: str = word(
         "sdr", ("sdr", "declared"),
@@ -259,10 +277,22 @@ class Recipe(Persisted):
     )  # fmt: skip
 
     threshold: Range = span(
-        (0.05, 2.0), 1e-6, 1e6, "smaller of the two contrast thresholds", unit="log units", group="Pixel"
+        (0.05, 2.0),
+        1e-6,
+        1e6,
+        "smaller of the two contrast thresholds",
+        unit="log units",
+        group="Pixel",
+        usual=(0.01, 5.0),
+        mistake="An event would need a brightness e^{0:g} times as high. Divide percent by 100.",
     )
     threshold_ratio: Range = span(
-        (1.0, 1.5), 1e-6, 1e6, "the larger threshold as a multiple of the smaller; which of them is positive is random"
+        (1.0, 1.5),
+        1e-6,
+        1e6,
+        "the larger threshold as a multiple of the smaller; which of them is positive is random",
+        usual=(0.1, 10.0),
+        mistake="One polarity would hardly fire. It is a multiple: divide percent by 100.",
     )
     threshold_source: str = word(
         "sample", ("sample", "video"),
@@ -278,12 +308,21 @@ class Recipe(Persisted):
     noise_sigma: Range = span(
         (0.0, 0.1), 0.0, 1e6, "standard deviation of the noise, per frame, or per square root of a second",
         unit="log units",
+        usual=(0.0, 1.0), mistake="Noise would make events in most pixels of each frame. Divide percent by 100.",
     )  # fmt: skip
     noise_scales_with_threshold: bool = switch(False, "multiply noise_sigma by the drawn positive threshold")
-    hot_pixel_share: Range = span((0.0, 0.001), 0.0, 1.0, "share of the crop's pixels that are hot")
+    hot_pixel_share: Range = span(
+        (0.0, 0.001),
+        0.0,
+        1.0,
+        "share of the crop's pixels that are hot",
+        usual=(0.0, 0.05),
+        mistake="Events of hot pixels would hide the others. It is a share: divide percent by 100.",
+    )
     hot_pixel_sigma: Range = span(
         (0.0, 10.0), 0.0, 1e9, "standard deviation of a hot pixel's constant drift, per frame, or per second",
         unit="log units",
+        usual=(0.0, 1000.0), mistake="A hot pixel would fire hundreds of events in each frame.",
     )  # fmt: skip
     noise_unit: str = word("frame", ("frame", "second"), "the time base of noise_sigma and hot_pixel_sigma")
 
@@ -296,20 +335,50 @@ class Recipe(Persisted):
     threshold_mismatch_sigma: Range = span(
         (0.0, 0.0), 0.0, 1.0, "standard deviation of each pixel's thresholds, as a share of the nominal ones",
         group=EFFECTS_SECTION,
+        usual=(0.0, 0.3), mistake="Many pixels would fire far too easily. Divide percent by 100.",
     )  # fmt: skip
     shot_noise_hz: Range = span(
         (0.0, 0.0), 0.0, 1e4,
         "rate of noise events of a black pixel, both polarities together; a white pixel has a quarter",
         unit="Hz",
+        usual=(0.0, 100.0), mistake="Each dark pixel would fire {0:g} times a second, the sensor many more.",
     )  # fmt: skip
     leak_hz: Range = span(
-        (0.0, 0.0), 0.0, 1e4, "rate of positive events that every pixel fires without a change of brightness", unit="Hz"
+        (0.0, 0.0),
+        0.0,
+        1e4,
+        "rate of positive events that every pixel fires without a change of brightness",
+        unit="Hz",
+        usual=(0.0, 20.0),
+        mistake="Every pixel would fire {0:g} events a second without a change. Divide millihertz by 1000.",
     )
-    refractory_seconds: Range = span((0.0, 0.0), 0.0, 1e3, "time after an event in which a pixel fires none", unit="s")
+    refractory_seconds: Range = span(
+        (0.0, 0.0),
+        0.0,
+        1e3,
+        "time after an event in which a pixel fires none",
+        unit="s",
+        usual=(0.0, 0.02),
+        mistake="A pixel would be blind for {0:g} s after each event. Divide milliseconds by 1000.",
+    )
     photoreceptor_hz: Range = span(
-        (0.0, 0.0), 0.01, 1e6, "corner frequency of a white pixel's low-pass filter", unit="Hz", off=True
+        (0.0, 0.0),
+        0.01,
+        1e6,
+        "corner frequency of a white pixel's low-pass filter",
+        unit="Hz",
+        off=True,
+        usual=(1.0, 1e5),
+        mistake="Pixels would see no change faster than {0:g} Hz. A time constant of T s is 0.16 / T Hz.",
     )
-    dead_pixel_share: Range = span((0.0, 0.0), 0.0, 1.0, "share of the crop's pixels that never fire")
+    dead_pixel_share: Range = span(
+        (0.0, 0.0),
+        0.0,
+        1.0,
+        "share of the crop's pixels that never fire",
+        usual=(0.0, 0.05),
+        mistake="It is a share: divide percent by 100.",
+    )
 
     world_speed_px: Range = span(
         (0.0, 0.0), 1e-3, 1e4,
@@ -549,6 +618,14 @@ class Recipe(Persisted):
         steps = self.spans * int(self.steps_at(self.frame_stride / step_seconds))
         segments = self.most_segments(steps) + steps * levels_per_step
         return most_events(segments, ends, (smallest, largest), steps * (sigma * math.sqrt(unit) + hot * unit + leak))
+
+    def warn(self, say: Callable[[str], object] = _LOG.warning) -> None:
+        """Warn of values that no real camera has, each once in a process."""
+        for name, setting in settings_of(Recipe).items():
+            line = setting.warning(f"warning: recipe {name}", getattr(self, name))
+            if line and line not in _WARNED:
+                _WARNED.add(line)
+                say(line)
 
     def to_dict(self) -> dict[str, Any]:
         """Return all fields as plain values: ranges as lists, without those of later releases that are at their

@@ -11,20 +11,26 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import operator
 import re
 import typing
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from numbers import Real
 from types import MappingProxyType
 from typing import Any, Literal
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.foreign_words import FOREIGN
 
 _SETTING = "v2v setting"
 LATER = "v2v later"
 """Key in the metadata of a field that is left out of its record at its default (:mod:`v2v_protocol.persisted`)."""
 _LONGEST_SHOWN = 200
+_LEAST_ALIKE = 0.74
+"""Share of characters in common, from which a key counts as misspelt."""
+_SHORTEST_STEM = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +50,8 @@ class Setting:
         metavar: placeholder for the value in help.
         bare: value of a flag that is given without one; None: a value is required.
         is_hidden: internal to a program: left out of help and the reference page.
+        usual: range of real devices, within the limits. A value outside it is allowed, with a warning.
+        mistake: what a value outside ``usual`` (``{0:g}``) means, and the unit that was probably meant.
         is_later: a later release added the field: a record leaves it out at its default, so older digests hold.
     """
 
@@ -60,6 +68,8 @@ class Setting:
     bare: Any = None
     is_hidden: bool = False
     is_later: bool = False
+    usual: tuple[float, float] = (-math.inf, math.inf)
+    mistake: str = ""
 
     @property
     def expected(self) -> str:
@@ -81,6 +91,15 @@ class Setting:
         """Setting of one number drawn from this range."""
         return dataclasses.replace(self, kind="number")
 
+    def warning(self, name: str, value: Any) -> str:
+        """Return a warning if a checked value, or an end of its range, lies outside ``usual``; "" otherwise."""
+        low, high = self.usual
+        for end in value if isinstance(value, tuple) else (value,):
+            if self.mistake and not low <= end <= high and not (self.off and end == 0):
+                span = f"{low:g} to {high:g} {self.unit}".rstrip()
+                return f"{name} = {end:g}: real cameras have {span}. {self.mistake.format(end)}"
+        return ""
+
     def check(self, name: str, value: object, error: type[UsageError] = UsageError) -> Any:
         """Return ``value`` in the field's own type: a float for a number, two for a range.
 
@@ -100,6 +119,7 @@ class Setting:
 
     def _converted(self, value: object) -> Any:
         """Convert a value; None if it has another type or is outside the limits."""
+        value = plain(value)
         if self.kind == "switch":
             return value if isinstance(value, bool) else None
         if self.kind == "text":
@@ -107,8 +127,8 @@ class Setting:
         if self.kind == "word":
             return value if isinstance(value, str) and value in self.words else None
         if self.kind == "whole":
-            is_whole = isinstance(value, int) and not isinstance(value, bool)
-            return value if is_whole and self._allows(value) else None  # type: ignore[arg-type]
+            number = as_whole(value)
+            return number if number is not None and self._allows(number) else None
         if self.kind == "number":
             return self._number(value)
         if self.kind == "bounds":
@@ -124,15 +144,14 @@ class Setting:
         if isinstance(value, list | tuple):
             ends = list(value)
         try:
-            wholes = [int(end) if isinstance(end, str) else end for end in ends]
+            wholes = [int(end) if isinstance(end, str) else as_whole(end) for end in ends]
         except ValueError:
             return None
-        if len(wholes) not in (1, 2) or any(isinstance(end, bool) or not isinstance(end, int) for end in wholes):
-            return None
-        return (wholes[0], wholes[-1]) if all(self._allows(end) for end in wholes) else None
+        allowed = [end for end in wholes if end is not None and self._allows(end)]
+        return (allowed[0], allowed[-1]) if len(wholes) == len(allowed) in (1, 2) else None
 
     def _number(self, value: object) -> float | None:
-        if isinstance(value, bool) or not isinstance(value, int | float | str):
+        if isinstance(value, bool) or not isinstance(value, Real | str):
             return None
         try:
             # Text, because YAML 1.1 takes 1e-3 for text. Minus zero equals zero, but would not give the same digest.
@@ -245,23 +264,56 @@ def require_whole(name: str, value: object, low: int, high: int) -> int:
     Raises:
         UsageError: it is not; the message uses ``name``.
     """
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+    number = as_whole(value)
+    if number is None or not low <= number <= high:
         raise UsageError(f"{name} = {format_value(value)}: give a whole number from {low} to {high}")
-    return value
+    return number
+
+
+def plain(value: Any) -> Any:
+    """Return the numbers of NumPy and of tensors as Python's, arrays as lists, also within lists and mappings."""
+    if isinstance(value, list | tuple):
+        return type(value)(map(plain, value))
+    if isinstance(value, Mapping):
+        return {key: plain(each) for key, each in value.items()}
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def as_whole(value: Any) -> int | None:
+    """Return a whole number of any type as an int; None for other values, truth values included."""
+    value = plain(value)
+    try:
+        return None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        return None
 
 
 def nearest(key: object, known: Iterable[str]) -> str:
-    """Return a hint, " (did you mean 'bins'?)", or "" if no known key is similar. A longer key is compared in part: the
-    time grows with its length, and a peer may send one of 60 kB.
+    """Return a hint, " (did you mean 'bins'?)", or "" if no known key is similar. A word of another tool
+    (:mod:`v2v_protocol.foreign_words`) names what it is called here. A longer key is compared in part: the time grows
+    with its length, and a peer may send one of 60 kB.
     """
-    names, word = list(known), str(key)[:_LONGEST_SHOWN]
-    close = difflib.get_close_matches(word, names, n=1) or [name for name in names if _is_part(word, name)]
-    return f" (did you mean {' or '.join(map(repr, close[:3]))}?)" if close else ""
+    word, names = _bare(str(key)[:_LONGEST_SHOWN]), {_bare(name): name for name in known}
+    for meant in FOREIGN.get(word, ()) if word not in names else ():
+        if meant in names:
+            return f" (did you mean {names[meant]!r}?)"
+        if not meant.isidentifier():
+            return f" ({meant})"
+    close = difflib.get_close_matches(word, list(names), n=1, cutoff=_LEAST_ALIKE)
+    close = close or [name for name in names if _is_part(word, name)]
+    return f" (did you mean {' or '.join(repr(names[name]) for name in close[:3])}?)" if close else ""
+
+
+def _bare(name: str) -> str:
+    """Return a key or flag in the form of a key: page_host for --page-host."""
+    return name.lstrip("-").replace("-", "_").lower()
 
 
 def _is_part(word: str, name: str) -> bool:
-    """Return whether a name has a word as one of its words: crop of crop_width_px, finetune of finetune-cpu."""
-    return bool(word) and word in re.split("[^a-z0-9]+", name.lower())
+    """Return whether a name has a word as one of its words, crop of crop_width_px, or a word is longer: output, out."""
+    return bool(word) and (
+        word in re.split("[^a-z0-9]+", name) or (len(name) >= _SHORTEST_STEM and word.startswith(name))
+    )
 
 
 def format_value(value: object) -> str:

@@ -60,7 +60,14 @@ def asked_recipe(arguments: argparse.Namespace) -> str | None:
 
 
 def spec_fields(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the values of these flags, without ``--recipe`` and ``--set``; None for a flag that was not given."""
+    """Return the values of these flags, without ``--recipe`` and ``--set``; None for a flag that was not given.
+
+    Raises:
+        UsageError: a flag has no effect.
+    """
+    scene = StreamSpec.from_dict({"preset": arguments.preset, "scene": arguments.scene}).scene
+    if arguments.keep_defects and scene == "off" and not getattr(arguments, "connect", None):
+        raise UsageError("--keep-defects has no effect without --scene auto; give both, or neither")
     return {name: getattr(arguments, name) for name in ("preset", *settings_of(StreamSpec))}
 
 

@@ -15,6 +15,10 @@ _LISTS = frozenset({".txt", ".csv", ".lst"})
 """Endings of files that may name the videos beside them."""
 JSON = (".json",)
 """Endings of ``--json FILE``. Another name will do, unless a file of that name exists that is not JSON."""
+_RESULTS = _LISTS | {"", ".json", ".yaml", ".yml", ".html", ".npz"}
+"""Endings of files that no command finds in a folder of videos or recordings: their name has to be given."""
+OUTPUT_MARKER = ".v2v-output"
+"""File in a folder of outputs: a catalogue of videos passes over the folder."""
 _STREAMS = frozenset({"/dev", "/dev/fd"})
 """Folders whose files, such as /dev/stdout, are written in place."""
 
@@ -34,7 +38,7 @@ def write_aside_and_rename(path: Path, *, partial: Path | None = None, durable: 
     Raises:
         OSError: the file cannot be flushed or renamed.
     """
-    if _is_stream(path):
+    if is_stream(path):
         yield path
         return
     path = path.resolve()
@@ -85,6 +89,7 @@ def check_output(
 
     It may not be one of the inputs under any name, or hold labels of a video. An existing file in a folder of inputs
     (or beside a list file) is also refused where other files of its ending lie beside it: it may be an input like them.
+    So is a file in a folder of inputs that a later run may take for one of them.
 
     Args:
         flag: names the file in messages.
@@ -98,7 +103,7 @@ def check_output(
     try:
         if path.is_dir():
             raise UsageError(f"{named}: it is a folder; give the name of a file")
-        if _is_stream(path):
+        if is_stream(path):
             return
         if path.suffix.lower() not in endings and (endings != JSON or _is_other_than_json(path)):
             raise UsageError(f"{named}: unknown ending; give a name that ends in {', '.join(endings)}")
@@ -107,10 +112,50 @@ def check_output(
         locked = next((at for at in (path, path.parent) if at.exists() and not is_writable(at)), None)
         if locked is not None:
             raise UsageError(f"{named}: {locked} is write-protected; give another name, or allow writing")
-        if why := _input_reason(path.resolve(), inputs):
+        if why := _input_reason(path.resolve(), given := list(inputs)):
             raise UsageError(f"{named}: {why}; give another name")
+        if path.suffix.lower() not in _RESULTS:
+            check_outside(flag, path, given)
     except (OSError, ValueError) as error:  # too long a name, a NUL in it, a share that has gone
         raise UsageError(f"{named}: {getattr(error, 'strerror', None) or error}") from error
+
+
+def check_outside(
+    flag: str, output: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]], what: str = "outputs"
+) -> None:
+    """Check, before any work, that later runs will not take an output for one of their inputs.
+
+    Args:
+        flag: names the output in messages.
+        output: file or folder to write; "" is none. A marked folder (:func:`make_output_folder`) may lie anywhere.
+        inputs: what the command reads; only folders count.
+        what: names the content of the output in messages.
+
+    Raises:
+        UsageError: it is an input folder, or lies in one.
+    """
+    path = Path(output).resolve()
+    if not os.fspath(output) or (path / OUTPUT_MARKER).exists():
+        return
+    for given in filter(os.fspath, inputs):
+        folder = Path(given).resolve()
+        if folder.is_dir() and path.is_relative_to(folder):
+            name = path.name if path != folder else f"{path.name}-{flag.lstrip('-')}"
+            raise UsageError(
+                f"{flag} {output}: it lies in {given}, which this command reads, so a later run would read its {what} "
+                f"too; give a place outside, such as {os.path.relpath(folder.parent / name)}"
+            )
+
+
+def make_output_folder(folder: Path) -> None:
+    """Create a folder, and mark it if it is empty. One that holds something may be the user's, and stays as it is.
+
+    Raises:
+        OSError: it cannot be created, listed or written to.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if not any(folder.iterdir()):
+        (folder / OUTPUT_MARKER).write_text("A v2v command wrote this folder; a catalogue of videos passes over it.\n")
 
 
 def is_writable(path: Path) -> bool:
@@ -146,7 +191,8 @@ def _is_other_than_json(path: Path) -> bool:
         return file.read(1) not in b"[{"
 
 
-def _is_stream(path: Path) -> bool:
+def is_stream(path: Path) -> bool:
+    """Return whether a path is a pipe or device, which is written in place."""
     return os.fspath(path.parent) in _STREAMS or (path.exists() and not path.is_file() and not path.is_dir())
 
 

@@ -4,7 +4,7 @@ wins). Every message names the flag.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -214,7 +214,29 @@ class ServeConfig:
             named = {**STREAM_PRESETS.get(values.get("preset") or "", {}), **values}
             values["recipe"] = recipe_setting(None, settings, named.get("recipe"))
         fields = {name: values.pop(name) for name in SPEC_KEYS if name in values}
-        return cls(**values, spec=StreamSpec.from_dict(fields))
+        config = cls(**values, spec=StreamSpec.from_dict(fields))
+        for name, (needed, is_given) in _NEEDS.items():
+            if (values | fields).get(name) and not is_given(config):
+                raise UsageError(f"{flag_of(name)} has no effect without {needed}; give both, or neither")
+        if not config.most_workers and not config.worker_bind:
+            raise UsageError(
+                "--workers 0: no worker can connect; give --worker-bind tcp://HOST:5556 for those of other hosts, or "
+                "at least one worker"
+            )
+        return config
+
+
+_NEEDS: Mapping[str, tuple[str, Callable[[ServeConfig], object]]] = {
+    "cache_gib": ("--cache DIR", lambda it: it.cache),
+    "keep_defects": ("--scene auto", lambda it: it.spec.scene != "off"),
+    "page_host": ("--page", lambda it: it.page),
+    "page_names": ("--page", lambda it: it.page),
+    "scale_seconds": ("--workers LEAST:MOST", lambda it: it.least_workers < it.most_workers),
+    "ray_address": ("--engine ray", lambda it: it.engine == "ray"),
+    "ray_label": ("--engine ray", lambda it: it.engine == "ray"),
+    "photograph_seconds": ("--videos-kind photographs", lambda it: it.videos_kind == "photographs"),
+}
+"""Settings that need another one: its flag, and whether it is given."""
 
 
 SERVE_KEYS = (*settings_of(ServeConfig), *SPEC_KEYS)

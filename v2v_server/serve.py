@@ -143,6 +143,7 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
         summary = corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused)
         for line in (*catalogue.notes, *summary):
             log.say(line)
+        config.spec.recipe.warn(log.say)
         catalogue.fail_fast()
         if not table.count:
             raise CorpusError(f"--videos {config.videos}: no video gives a sequence under the recipe, see above")

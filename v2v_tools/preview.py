@@ -339,6 +339,8 @@ def _run(arguments: argparse.Namespace) -> None:
         recipe = recipe_setting(name, arguments.set)
         wanted = [PreviewCamera("", recipe, seed) for seed in range(first, first + count)]
         what = f'virtual cameras drawn from the recipe "{Path(name).stem}"'
+    for each in wanted:
+        each.recipe.warn()
     kind = VideosKind.of(vars(arguments))
     if arguments.seed is None and not kind.is_rendered:
         what += ", chosen where something moves"

@@ -80,6 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(asked: argparse.Namespace) -> None:
     """Make one sample, and write it: the requested arrays and ``provenance``, a JSON text."""
     spec = StreamSpec.from_dict(spec_fields(asked) | {"recipe": recipe_setting(asked_recipe(asked), asked.set)})
+    spec.recipe.warn()
     arrays = tuple(asked.arrays.split(","))
     if asked.picture is not None:
         check_drawable(arrays)

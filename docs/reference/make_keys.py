@@ -110,6 +110,8 @@ def _row(name: str, setting: Setting) -> str:
     allowed = setting.expected.removeprefix("give ").removeprefix("choose ")
     for long, short in _SHORTER.items():
         allowed = allowed.replace(long, short)
+    if setting.mistake:
+        allowed += f"; real cameras: {setting.usual[0]:g} to {setting.usual[1]:g}"
     return f"| `{name}` | {_value(setting.default)} | {allowed} | {setting.help} |".replace(" |  |", " | |")
 
 

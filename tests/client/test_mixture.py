@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils.data import DataLoader
@@ -208,6 +210,86 @@ def test_datasets_that_do_not_fit_together_are_refused(servers: tuple[FakeServer
     other.spec = StreamSpec(recipe=SPEC.recipe.replace(bins=3))
     with pytest.raises(UsageError, match=r"mix: samples differ in form, .*127\.0\.0\.1.*give recipes of one size"):
         next(iter(mixed(servers)))
+
+
+NO_MIXTURES: list[tuple[Any, str]] = [
+    (lambda one, other: [one, other], "give a dict of datasets with their weights"),
+    (lambda one, other: (one, other), "give a dict"),
+    (lambda one, other: one, "give a dict"),
+    (lambda one, other: {}, r"weights \[\]"),
+    (lambda one, other: None, "give a dict"),
+    (lambda one, other: {"tcp://127.0.0.1:9": 0.5, other: 0.5}, r"give V2VStreamDataset\('tcp://127.0.0.1:9', ...\)"),
+    (lambda one, other: {one: 0.5, 3: 0.5}, "3 is no dataset to mix"),
+    (lambda one, other: {V2VStreamDataset.mix({one: 1}): 0.5, other: 0.5}, "is no dataset to mix"),
+    (lambda one, other: {one: 0.5, copy.copy(one): 0.5}, "is a member twice"),
+    (lambda one, other: {one: 0.5, V2VStreamDataset("tcp://127.0.0.1:8"): 0.5}, "is a member twice"),
+    (lambda one, other: {one: True}, "shares from 0 to 1"),
+    (lambda one, other: {one: "1"}, "shares from 0 to 1"),
+    (lambda one, other: {one: {0: 1}}, "shares from 0 to 1"),
+    (lambda one, other: {one: torch.tensor(0.5), other: 0.4}, "shares from 0 to 1"),
+]
+
+
+@pytest.mark.parametrize("number", range(len(NO_MIXTURES)))
+def test_what_is_no_mixture_is_refused_in_words(number: int) -> None:
+    weights, words = NO_MIXTURES[number]
+    one, other = V2VStreamDataset("tcp://127.0.0.1:8"), V2VStreamDataset("tcp://127.0.0.1:9")
+    with pytest.raises(UsageError, match=words):
+        V2VStreamDataset.mix(weights(one, other))
+
+
+def test_weights_are_numbers_of_every_type() -> None:
+    one, other = V2VStreamDataset("tcp://127.0.0.1:8"), V2VStreamDataset("tcp://127.0.0.1:9")
+    mixture = V2VStreamDataset.mix({one: np.float32(0.75), other: torch.tensor([0.25, 0.25])}, seed=np.int64(1))
+    assert mixture._settings()["weights"] == [[0.75, 0.25], [0.75, 0.25]]
+
+
+EDITS = [
+    None,
+    0,
+    -1,
+    2**70,
+    1.5,
+    "",
+    "x",
+    b"x",
+    True,
+    [],
+    [1],
+    [[]],
+    [{}],
+    {},
+    {"a": 1},
+    {"members": 3},
+    {"members": [3]},
+]
+
+
+def edited(value: Any) -> Iterator[Any]:
+    """Yield copies of plain values, each with one part that is another, missing or more."""
+    if isinstance(value, dict):
+        for key, part in value.items():
+            yield {name: each for name, each in value.items() if name != key}
+            yield from (value | {key: other} for other in edited(part))
+        yield value | {"other": 1}
+    elif isinstance(value, list | tuple):
+        for place, part in enumerate(value):
+            yield [*value[:place], *value[place + 1 :]]
+            yield from ([*value[:place], other, *value[place + 1 :]] for other in edited(part))
+    yield from EDITS
+
+
+def test_an_edited_state_is_refused_in_words(servers: tuple[FakeServer, FakeServer]) -> None:
+    mixture, alone = mixed(servers), dataset(servers[0])
+    states = [next(iter(each)).resume_state for each in (mixture, alone)]
+    for each, state in zip((mixture, alone), states, strict=True):
+        for number, wrong in enumerate(edited(state)):
+            try:
+                each.load_state_dict(wrong)
+            except (UsageError, StateMismatch):
+                continue
+            except Exception as error:  # noqa: BLE001 - any other
+                pytest.fail(f"edit {number} of {each!r} gives {error!r}")
 
 
 def test_a_lost_server_and_a_small_member_are_named(servers: tuple[FakeServer, FakeServer]) -> None:

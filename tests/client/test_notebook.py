@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import pickle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Subset
 
 from tests.clips import panned_luma, write_clip
 from v2v_client import UsageError, V2VDataset, V2VStreamDataset
@@ -54,6 +56,61 @@ def test_a_sample_shows_itself_as_text_table_and_picture(dataset: V2VDataset, tm
     assert alone._repr_png_() is None
     assert "drawn: threshold_pos" in alone._repr_html_()
     assert pickle.loads(pickle.dumps(sample)).title == sample.title
+
+
+def test_a_sample_and_a_batch_name_their_arrays_alike(dataset: V2VDataset) -> None:
+    sample, batch = dataset[np.int64(0)], next(iter(DataLoader(Subset(dataset, np.array([0])), batch_size=1)))
+    for each in (sample, batch):
+        assert dict(each.items()).keys() == dict(each).keys() == {*each.keys()} == {"voxels", "frames"}
+        assert each.voxels is each["voxels"] is each.arrays["voxels"]
+        assert "voxels" in each
+        assert "flow" not in each
+        with pytest.raises(UsageError, match="has only voxels, frames; create the dataset with arrays="):
+            _ = each.flow
+        with pytest.raises(AttributeError, match=r"did you mean 'voxels'"):
+            _ = each.voxel
+        with pytest.raises(KeyError, match="has voxels, frames; index it by one of these names"):
+            _ = each[0]
+        with pytest.raises(AttributeError, match=r"voxels = \.\.\.: a (batch|sample) cannot be changed; .* dict"):
+            each.voxels = 1
+        with pytest.raises(AttributeError, match=r'has no \'cuda\'; write .to\("cuda"\)'):
+            each.cuda()
+    assert np.array_equal(batch.voxels[0], sample.voxels)
+
+
+def test_a_batch_is_converted_and_moved(dataset: V2VDataset) -> None:
+    batch = next(iter(DataLoader(dataset, batch_size=1)))
+    for made in (batch.to(torch.float16), batch.to("cpu", torch.float16), batch.to("cpu", dtype=torch.float16)):
+        assert {tensor.dtype for _, tensor in made.items()} == {torch.float16}
+        assert torch.equal(made.voxels.to(torch.int8), batch.voxels)
+    assert batch.to("cpu", non_blocking=True).voxels.dtype == torch.int8
+    with pytest.raises(UsageError, match=r"batch.to\('cpu', True\): .* non_blocking=True by its name"):
+        batch.to("cpu", True)
+
+
+def test_an_argument_is_not_assigned(dataset: V2VDataset) -> None:
+    stream = V2VStreamDataset("tcp://127.0.0.1:9", seed=np.int64(7), rank=np.int8(1), world_size=torch.tensor(2))
+    assert (stream.seed, stream.rank, stream.world_size) == (7, 1, 2)
+    mixture = V2VStreamDataset.mix({stream: np.float32(1)}, seed=np.int64(3))
+    assert mixture.seed == 3
+    for each, names in {
+        dataset: ("seed", "epoch", "recipe", "videos", "rows"),
+        stream: ("seed", "epoch", "rank", "batch_size", "arrays", "shuffle"),
+        mixture: ("seed", "epoch", "weights"),
+    }.items():
+        for name in names:
+            remedy = "call set_epoch" if name == "epoch" else f"create another one with {name}=..."
+            with pytest.raises(AttributeError, match=rf"dataset.{name} = 3: it is fixed .*; {remedy}"):
+                setattr(each, name, 3)
+        each.note = "a name of the user's"
+
+
+@pytest.mark.parametrize(
+    "index", ["0", None, 0.0, True, slice(0, 2), [0, 1], np.array([0, 1]), torch.tensor(0.0)], ids=repr
+)
+def test_an_index_is_one_whole_number(index: Any, dataset: V2VDataset) -> None:
+    with pytest.raises(UsageError, match="give one whole number"):
+        dataset[index]
 
 
 def test_a_simulated_result_shows_itself(tmp_path: Path) -> None:

@@ -181,7 +181,7 @@ NO_PAIR = ([], [1.0], [1.0, 1.0, 1.0], [math.nan, 1.0], [0.5, True], [[1.0], 1.0
     [
         (NUMBERS + RANGES, NO_NUMBER),
         (RANGES, NO_PAIR),
-        (WHOLE, (1.0, True, "1", None, [1], np.int64(1))),
+        (WHOLE, (1.0, True, "1", None, [1], np.float64(1))),
         (FLAGS, (0, 1, "true", None)),
         (WORDS, ("", "samples", None, 1, True)),
     ],
@@ -210,3 +210,45 @@ def test_the_frames_of_a_sample_are_limited() -> None:
         Recipe(voxels_per_clip=1_000_000, bins=1, lead_voxels=1)
     with pytest.raises(RecipeError, match="the limit is 1000001"):
         Recipe(voxels_per_clip=1_000_000, bins=1024, frames_per_bin=1024)
+
+
+MISTAKEN = [
+    ({"threshold": 20}, "e^20 times as high. Divide percent"),
+    ({"threshold": (0.2, 15)}, "threshold = 15"),
+    ({"threshold": 1e-3}, "threshold = 0.001: real cameras have 0.01 to 5 log units"),
+    ({"threshold_ratio": 120}, "Divide percent".lower()),
+    ({"refractory_seconds": 1}, "blind for 1 s after each event. Divide milliseconds by 1000"),
+    ({"refractory_seconds": 0.5}, "real cameras have 0 to 0.02 s"),
+    ({"photoreceptor_hz": 0.05}, "no change faster than 0.05 Hz. A time constant"),
+    ({"noise_sigma": 5}, "Divide percent by 100"),
+    ({"leak_hz": 1000}, "fire 1000 events a second"),
+    ({"shot_noise_hz": 5000}, "5000 times a second"),
+    ({"hot_pixel_share": 0.5}, "divide percent by 100"),
+    ({"dead_pixel_share": 0.2}, "divide percent by 100"),
+    ({"threshold_mismatch_sigma": 0.9}, "Divide percent by 100"),
+    ({"voxel_seconds": 50, "bins": 1}, "a grid would hold 50 s of events".capitalize()),
+    ({"gamma": 0.2}, "about 2.2"),
+    ({"log_eps": 1.0}, "divide by 255"),
+]
+
+
+@pytest.mark.parametrize(("fields", "words"), MISTAKEN, ids=repr)
+def test_a_value_of_another_unit_is_warned_of_once(fields: dict[str, Any], words: str) -> None:
+    said: list[str] = []
+    for _ in range(2):
+        Recipe(**fields).warn(said.append)
+    assert len(said) == 1
+    assert said[0].startswith(f"warning: recipe {next(iter(fields))} = ")
+    assert words in said[0]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_recipes_by_name_are_real_cameras(name: str) -> None:
+    said: list[str] = []
+    PRESETS[name].warn(said.append)
+    assert not said
+
+
+@pytest.fixture(autouse=True)
+def nothing_warned(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("v2v_protocol.recipe._WARNED", set())

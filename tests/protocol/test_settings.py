@@ -5,19 +5,25 @@ from __future__ import annotations
 import difflib
 import math
 from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
 from types import SimpleNamespace
 from typing import Any, Literal
 
+import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from v2v_protocol.errors import RecipeError, UsageError
 from v2v_protocol.settings import (
+    Setting,
     check_settings,
     format_value,
     number,
     require_known,
+    require_whole,
     settings_of,
     span,
     switch,
@@ -115,9 +121,9 @@ def test_a_long_key_costs_no_more_than_a_short_one(monkeypatch: pytest.MonkeyPat
     """The time of a comparison grows with the length: 60 kB took 10 ms of the server's only thread."""
     compared: list[str] = []
 
-    def compare(key: str, known: list[str], n: int) -> list[str]:
+    def compare(key: str, known: list[str], n: int, cutoff: float) -> list[str]:
         compared.append(key)
-        return difflib.get_close_matches(key, known, n)
+        return difflib.get_close_matches(key, known, n, cutoff)
 
     monkeypatch.setattr("v2v_protocol.settings.difflib", SimpleNamespace(get_close_matches=compare))
     for key in ("size" * 15_000, ["size"] * 15_000):
@@ -129,3 +135,51 @@ def test_a_long_key_costs_no_more_than_a_short_one(monkeypatch: pytest.MonkeyPat
 def test_a_message_shows_no_page_of_a_value() -> None:
     assert len(format_value("x" * 10_000)) < 300
     assert format_value((0.1, 1e-6)) == "[0.1, 1e-06]"
+
+
+class Index:
+    def __index__(self) -> int:
+        return 2
+
+
+WHOLE = [np.int64(2), np.uint8(2), np.array(2), torch.tensor(2), torch.tensor(2, dtype=torch.uint8), Index()]
+REAL = [np.float32(0.25), np.float64(0.25), np.array(0.25), torch.tensor(0.25), Fraction(1, 4), "0.25"]
+NEITHER = [
+    np.bool_(True),
+    torch.tensor(True),
+    np.array([2, 2, 2]),
+    np.array([]),
+    None,
+    1j,
+    Decimal("0.25"),
+    b"2",
+    [[2]],
+]
+
+
+@pytest.mark.parametrize("value", WHOLE, ids=repr)
+def test_whole_numbers_of_every_type_are_taken_as_pythons(value: Any) -> None:
+    taken = Toy(size=value).size, require_whole("x", value, 0, 9), Setting("bounds", (1, 1), "", 1, 9).check("x", value)
+    assert taken == (2, 2, (2, 2))
+    assert {type(taken[0]), type(taken[1]), *map(type, taken[2])} == {int}
+
+
+@pytest.mark.parametrize("value", REAL, ids=repr)
+def test_numbers_of_every_type_are_taken_as_pythons(value: Any) -> None:
+    taken = Toy(share=value).share
+    assert (type(taken), taken) == (float, 0.25)
+    assert Toy(corner=[value if float(value) > 0.5 else 1, 2]).corner == (1.0, 2.0)
+
+
+def test_arrays_are_ranges_and_numpy_has_truth_values() -> None:
+    toy = Toy(corner=np.array([0.5, 2], np.float32), is_on=np.bool_(True))  # type: ignore[arg-type]
+    assert (toy.corner, toy.is_on) == ((0.5, 2.0), True)
+
+
+@pytest.mark.parametrize("value", NEITHER, ids=repr)
+def test_what_is_no_number_is_refused(value: Any) -> None:
+    for field in ("size", "share"):
+        with pytest.raises(RecipeError, match=f"toy {field} = "):
+            Toy(**{field: value})
+    with pytest.raises(UsageError, match="x = "):
+        require_whole("x", value, 0, 9)

@@ -102,7 +102,7 @@ def test_single_fields_are_changed_in_the_recipe_of_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: str, recipe: str
 ) -> None:
     file = tmp_path / "serve.yaml"
-    file.write_text("videos: a\nworkers: 0\nrecipe: {preset: clean, gamma: 1.5}\n")
+    file.write_text("videos: a\nrecipe: {preset: clean, gamma: 1.5}\n")
     served: list[ServeConfig] = []
     monkeypatch.setattr("v2v_server.serve.serve", lambda config, *_: served.append(config))
     main(["--config", str(file), *flags.split()])
@@ -353,7 +353,11 @@ def test_workers_are_a_number_or_two(tmp_path: Path, said: str, meant: tuple[int
 
 @pytest.mark.parametrize(
     ("workers", "expected"),
-    [({}, 2), ({"workers": 0, "expect_workers": 64}, 64), ({"workers": 9, "expect_workers": 5}, 9)],
+    [
+        ({}, 2),
+        ({"workers": 0, "expect_workers": 64, "worker_bind": "tcp://127.0.0.1:*"}, 64),
+        ({"workers": 9, "expect_workers": 5}, 9),
+    ],
 )
 def test_the_workers_that_a_credit_is_settled_for(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, workers: dict[str, int], expected: int

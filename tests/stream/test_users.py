@@ -70,7 +70,7 @@ def status_of(address: str, user: int) -> subprocess.CompletedProcess[str]:
 
 
 def test_another_user_gets_no_reply_and_root_and_the_own_user_do(serve: Callable[..., tuple[str, Path]]) -> None:
-    address, log = serve(ROOT, "--workers", "0")
+    address, log = serve(ROOT, "--workers", "0", "--worker-bind", "tcp://127.0.0.1:*")
     refused = status_of(address, OTHER_USER)
     assert refused.returncode == 1
     assert "Without keys it serves its own user only" in refused.stderr
@@ -87,7 +87,7 @@ def test_a_workers_port_without_keys_is_for_the_same_user(serve: Callable[..., t
 
 
 def test_insecure_serves_every_user(serve: Callable[..., tuple[str, Path]]) -> None:
-    address, log = serve(ALICE, "--workers", "0", "--insecure")
+    address, log = serve(ALICE, "--workers", "0", "--worker-bind", "tcp://127.0.0.1:*", "--insecure")
     assert status_of(address, OTHER_USER).returncode == 0
     assert "refused" not in log.read_text()
 
@@ -106,11 +106,11 @@ def test_the_page_is_for_the_same_user_unless_it_is_insecure(serve: Callable[...
                 return asked.stdout
 
     closed, opened = free_ports(2)
-    _, log = serve(ALICE, "--workers", "0", "--page", str(closed))
+    _, log = serve(ALICE, "--workers", "0", "--worker-bind", "tcp://127.0.0.1:*", "--page", str(closed))
     assert got(closed, ALICE) == "200\n"
     assert got(closed, ROOT) == "200\n"
     assert got(closed, OTHER_USER) == ""
     assert "refused a connection of user 65534" in log.read_text()
     assert "the page serves only root and the server's user" in log.read_text()
-    serve(ROOT, "--workers", "0", "--page", str(opened), "--insecure")
+    serve(ROOT, "--workers", "0", "--worker-bind", "tcp://127.0.0.1:*", "--page", str(opened), "--insecure")
     assert got(opened, OTHER_USER) == "200\n"

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from trainer.config import TrainConfig, differences
 from trainer.config_file import load_config, shipped
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import preset
+from v2v_protocol.recipe import Recipe, preset
 
 
 def written(folder: Path, name: str, text: str) -> str:
@@ -156,6 +157,7 @@ def test_numbers_without_a_point_are_numbers(tmp_path):
         ("stream.mix=[{weight: .5, mix: []}]", r"stream\.mix\.0 = "),
         ("stream.mix=[{weight: .5, lst: a}]", r"unknown key stream\.mix\.0\.lst \(did you mean 'list'"),
         ("stream.mix=[{weight: .5, spec: {flow_from: 3}}]", r"stream\.mix\.0\.spec\.flow_from: section loss decides"),
+        ("stream.mix=[{weight: .5, recipe: {gama: 2}}]", r"unknown recipe key 'gama'.*gamma"),
         ("stream.spec.preset=natural-davis346", r"natural-davis346 names a recipe: set stream\.recipe"),
         ("stream.spec.voxel_dtype=int4", r"voxel_dtype = 'int4'"),
         ("loss.l1_weight=0", r"l1_weight, lpips_weight and temporal_weight are all 0"),
@@ -199,3 +201,20 @@ def test_differences_name_keys_and_both_values():
     theirs = TrainConfig.from_dict({"optimizer": {"learning_rate": 0.5}}).to_dict()
     assert differences(ours, ours) == {}
     assert differences(ours, theirs) == {"optimizer.learning_rate": (1e-4, 0.5)}
+
+
+@pytest.mark.parametrize(
+    ("own", "entry", "expected"),
+    [
+        ("{preset: clean, bins: 3}", "{gamma: 2}", {"preset": "clean", "bins": 3, "gamma": 2}),
+        ("{preset: clean, bins: 3}", "{preset: sensor}", {"preset": "sensor", "bins": 3}),
+        ("{preset: clean, bins: 3}", "sensor", {"preset": "sensor"}),
+        ("davis346", "{bins: 3}", {"preset": "davis346", "bins": 3}),
+    ],
+)
+def test_an_entry_of_a_mixture_inherits_the_fields_of_the_recipe(
+    own: str, entry: str, expected: dict[str, Any]
+) -> None:
+    config = load_config("e2vid", [f"stream.recipe={own}", f"stream.mix=[{{weight: .5, videos: a, recipe: {entry}}}]"])
+    mixed, _ = config.stream.mixed["stream.mix.0"]
+    assert mixed.resolved_recipe == Recipe.from_dict(expected)

@@ -24,7 +24,7 @@ from torch import Tensor
 from trainer.config import TrainConfig, differences
 from trainer.unpickle import read_torch_file
 from v2v_protocol.errors import UsageError
-from v2v_protocol.write_aside import write_aside_and_rename
+from v2v_protocol.write_aside import make_output_folder, write_aside_and_rename
 
 FORMAT = 2
 LAST = "last.pt"
@@ -185,7 +185,7 @@ def require_writable(out: Path) -> None:
         UsageError: it cannot be created or written.
     """
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        make_output_folder(out)
         with tempfile.TemporaryFile(dir=out):
             pass
     except OSError as error:

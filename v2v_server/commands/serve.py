@@ -11,7 +11,7 @@ from pathlib import Path
 from v2v_protocol.command import INTERRUPTED, Parser, run_command
 from v2v_protocol.errors import V2VError
 from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting
-from v2v_protocol.write_aside import check_output
+from v2v_protocol.write_aside import check_output, check_outside
 from v2v_server.config import SERVE_KEYS, ServeConfig
 from v2v_server.supervise.local_host import start_ahead
 from v2v_server.system.log import report_errors
@@ -48,6 +48,7 @@ def _run(arguments: argparse.Namespace) -> int:
         port_file = Path(config.port_file)
         read = [config.videos, config.list, arguments.config or ""]
         check_output("--port-file", port_file, (port_file.suffix.lower(),), read)
+    check_outside("--cache", config.cache, [config.videos], "files")
     with start_ahead(config) as standbys:
         from v2v_server.serve import serve  # takes as long as the imports of a worker, which run meanwhile
 

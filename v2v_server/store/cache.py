@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.errors import CorpusError, VideoError, VideoUnreadable
+from v2v_protocol.write_aside import make_output_folder
 from v2v_server.store.format import PIECE_FRAMES, QUICK
 from v2v_server.store.pixels import Pixels
 from v2v_server.store.planes import OPTIONAL, PLANES, whole_cut
@@ -281,6 +282,7 @@ def make_cache(folder: Path) -> None:
         CorpusError: the folder cannot be created, read or written.
     """
     try:
+        make_output_folder(folder)
         QuotaFolder(folder, 0, _LOCK_SECONDS).make()
     except OSError as error:
         raise CorpusError(f"--cache {folder}: cannot be written to: {error.strerror or error}") from error

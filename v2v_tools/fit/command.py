@@ -63,7 +63,9 @@ def _run(arguments: argparse.Namespace) -> None:
     if arguments.recording is not None:
         _fit(arguments)
     if arguments.check is not None:
-        columns = {"recipe": measure(camera_of(recipe_setting(arguments.check, arguments.set)))}
+        recipe = recipe_setting(arguments.check, arguments.set)
+        recipe.warn()
+        columns = {"recipe": measure(camera_of(recipe))}
         if arguments.sheet is not None:
             columns["sheet"] = _sheet(arguments.sheet)
         show(table(columns))
@@ -75,6 +77,11 @@ def _fit(arguments: argparse.Namespace) -> None:
     with Progress(source.name, "%") as progress:
         fitted = fit(source, static=arguments.static, options=options, progress=progress)
     show("\n".join(report_lines(fitted, source.name)))
+    if not fitted.camera:
+        raise V2VError(
+            f"{source}: no parameter could be fitted, so no recipe was written: record more events and more change of "
+            "light, as docs/guides/fit-your-camera.md describes"
+        )
     write_recipe(out, fitted, source.name)
     if arguments.picture is not None:
         write_png(arguments.picture, draw_fit(fitted, source.name))

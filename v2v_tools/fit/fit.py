@@ -88,6 +88,8 @@ def fit(
                 f"the recording has {frames} frames, and a fit needs {LEAST_FRAMES}: record frames with the events, or "
                 "give --static if nothing moved"
             )
+        if given.seconds <= 0:
+            raise V2VError("all events have the same time: record for longer")
         given, frames = _with_constant_frames(given), 0
     estimates, late = _estimates(given, not frames, static)
     left_out = {

@@ -102,6 +102,7 @@ def _run(asked: argparse.Namespace) -> int:
     _check(asked)
     rows = Rows.parse(asked.rows)
     spec = StreamSpec.from_dict({"recipe": recipe_setting(asked.recipe or "paper", asked.set)})
+    spec.recipe.warn()
     named = asked.forms if asked.beside is None else [BESIDE, *asked.forms]
     compared = settings(named, spec, axes(asked.vary))
     cv2.setNumThreads(1)

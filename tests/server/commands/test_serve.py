@@ -26,15 +26,15 @@ def test_a_page_has_a_port_of_its_own_or_the_usual_one(
 ) -> None:
     asked: list[ServeConfig] = []
     monkeypatch.setattr("v2v_server.serve.serve", lambda config, *_: asked.append(config))
-    assert command.main(["--videos", "a", "--workers", "0", *flags]) == 0
-    assert command.main([*flags, "--videos", "a", "--workers", "0"]) == 0
+    assert command.main(["--videos", "a", "--workers", "0", "--worker-bind", "tcp://127.0.0.1:*", *flags]) == 0
+    assert command.main([*flags, "--videos", "a", "--workers", "0", "--worker-bind", "tcp://127.0.0.1:*"]) == 0
     assert [config.page for config in asked] == [port, port]
 
 
 def test_an_error_that_ends_it_is_an_object_too_where_programs_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    missing = ["--videos", str(tmp_path / "missing"), "--workers", "0"]
+    missing = ["--videos", str(tmp_path / "missing"), "--workers", "0", "--worker-bind", "tcp://127.0.0.1:*"]
     assert command.main([*missing, "--log-format", "json"]) == command.main(missing)
     as_object, for_people = capsys.readouterr().err.splitlines()
     assert (json.loads(as_object)["level"], json.loads(as_object)["text"] in for_people) == ("error", True)
@@ -49,7 +49,18 @@ def test_every_line_of_a_run_is_an_object(tmp_path: Path) -> None:
     (videos / "damaged.mp4").write_bytes(b"no video")
     (videos / "other.foo").write_bytes(b"")
     flags = [
-        *("--videos", str(videos), "--bind", "tcp://127.0.0.1:*", "--workers", "0", "--log-format", "json"),
+        *(
+            "--videos",
+            str(videos),
+            "--bind",
+            "tcp://127.0.0.1:*",
+            "--workers",
+            "0",
+            "--worker-bind",
+            "tcp://127.0.0.1:*",
+            "--log-format",
+            "json",
+        ),
         *(
             "--page",
             str(free_ports(1)[0]),

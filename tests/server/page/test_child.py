@@ -156,7 +156,18 @@ def test_the_page_ends_with_its_server_even_when_that_is_killed(clips: Path) -> 
     (port,) = free_ports(1)
     server = subprocess.Popen(
         [
-            *(sys.executable, "-m", "v2v_server", "--videos", str(clips), "--workers", "0", *SMALL),
+            *(
+                sys.executable,
+                "-m",
+                "v2v_server",
+                "--videos",
+                str(clips),
+                "--workers",
+                "0",
+                "--worker-bind",
+                "tcp://127.0.0.1:*",
+                *SMALL,
+            ),
             *("--bind", "tcp://127.0.0.1:*", "--page", str(port)),
         ],
         stderr=subprocess.DEVNULL,

@@ -77,3 +77,19 @@ def test_a_recording_that_does_not_state_its_size_needs_one(events: Path, capsys
     events.write_text("".join(events.read_text().splitlines(keepends=True)[1:]))
     assert main([str(events), "--out", "x.yaml"]) == 2
     assert "give --size WIDTHxHEIGHT" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("count", "message"),
+    [(1, "all events have the same time"), (3, "no parameter could be fitted"), (20, "no parameter could be fitted")],
+)
+def test_a_recording_that_fits_nothing_leaves_no_file(
+    count: int, message: str, events: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = tmp_path / "few.txt"
+    few.write_text("\n".join(events.read_text().splitlines()[: count + 1]) + "\n")
+    before = set(tmp_path.iterdir())
+    out = ["--out", str(tmp_path / "camera.yaml"), "--picture", str(tmp_path / "camera.png")]
+    assert main([str(few), "--static", *out]) == 1
+    assert message in capsys.readouterr().err
+    assert set(tmp_path.iterdir()) == before

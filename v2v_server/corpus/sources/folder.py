@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 
 from v2v_protocol.errors import CorpusError
 from v2v_protocol.programs import printable
+from v2v_protocol.write_aside import OUTPUT_MARKER
 from v2v_server.corpus.sources.source import (
     GONE,
     LIST_SUFFIXES,
@@ -242,12 +243,12 @@ def video_files(
     under each path, because each such id is part of the digests of existing corpora. Folders that link to each other
     have a factorial number of paths, so a folder is searched by at most :data:`MOST_PATHS` paths with two or more
     links; paths with fewer links are not limited. Kernel file systems (/proc, /sys, /dev) are not entered. Hidden files
-    and folders (".name") are passed over.
+    and folders (".name") are passed over, and so are folders below ``root`` that hold outputs (``OUTPUT_MARKER``).
 
     Args:
         root: the folder.
         refused: receives, by relative path, why a folder or file cannot be taken in.
-        left_out: counts, by suffix, files that may be videos of other endings.
+        left_out: counts, by suffix, files that may be videos of other endings; and, by path, folders of outputs.
         kind: what a video is; the id of a folder of pictures ends with a slash.
     """
     id_of, pseudo, paths_of = kind.form.id_of, pseudo_devices(), Counter[tuple[int, int]]()
@@ -277,6 +278,9 @@ def video_files(
                     return
             with os.scandir(folder) as listing:
                 entries = sorted(listing, key=attrgetter("name"))
+            if prefix and any(entry.name == OUTPUT_MARKER for entry in entries):
+                left_out[prefix] += 1
+                return
         except OSError as error:
             refused[name] = f"the folder cannot be read: {error.strerror or error}"
             return

@@ -291,15 +291,27 @@ def count_left_out(name: str, left_out: Counter[str]) -> None:
 
 
 def left_out_note(left_out: Counter[str]) -> str:
-    """Return the line that reports files with other endings; "" where there is no such file."""
-    if not left_out:
-        return ""
-    shown = ", ".join(f"{suffix} ({count})" for suffix, count in sorted(left_out.items())[:_MOST_SUFFIXES_SHOWN])
-    more = len(left_out) - _MOST_SUFFIXES_SHOWN
-    return (
-        f"{left_out.total()} files have endings that are not looked at and were left out: {shown}"
-        f"{f' and {more} other endings' if more > 0 else ''}. Name those that are videos in a list file to serve them"
-    )
+    """Return the line that reports folders of outputs, and files with other endings; "" where there are none."""
+    folders = sorted(name for name in left_out if name.endswith("/"))
+    endings = sorted(item for item in left_out.items() if not item[0].endswith("/"))
+    lines = []
+    if folders:
+        lines.append(
+            f"{len(folders)} folders that a v2v command wrote were passed over: {_shown(folders)}. Move videos out of "
+            "them to serve them"
+        )
+    if endings:
+        shown = _shown([f"{suffix} ({count})" for suffix, count in endings])
+        lines.append(
+            f"{sum(count for _, count in endings)} files have endings that are not looked at and were left out: "
+            f"{shown}. Name those that are videos in a list file to serve them"
+        )
+    return ". ".join(lines)
+
+
+def _shown(names: Sequence[str]) -> str:
+    more = len(names) - _MOST_SUFFIXES_SHOWN
+    return ", ".join(names[:_MOST_SUFFIXES_SHOWN]) + (f" and {more} others" if more > 0 else "")
 
 
 @dataclass(frozen=True, slots=True)
