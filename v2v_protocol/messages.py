@@ -289,6 +289,7 @@ class LeaseFailed(Persisted):
     Attributes:
         here: the worker's host cannot read the file, or has another one in its place; the video may be sound elsewhere.
         sidecar: ending of the sidecar that failed, not the video; "" if the video failed.
+        changed: the worker has read the file, and it is not the catalogued one.
     """
 
     lease: int
@@ -296,6 +297,7 @@ class LeaseFailed(Persisted):
     reason: str
     here: bool = False
     sidecar: str = later("")
+    changed: bool = later(False)
 
 
 # --- server -> worker -------------------------------------------------------------------------------------------------
@@ -331,6 +333,8 @@ class Lease(Persisted):
             out. To workers it may be [fingerprint, part]: bytes, the table of the files of a folder that the clip
             needs; or a text, why the sidecar is not used, perhaps without a fingerprint.
         remark: what of the video is not served, or served with wrong grey levels; goes into the provenance.
+        state: numbers that the file's size and times had when it was catalogued: a worker whose file has them need not
+            read all of it; empty if they are not known.
     """
 
     lease: int
@@ -359,6 +363,7 @@ class Lease(Persisted):
     packed: bool = False
     sidecars: Mapping[str, Any] = later(default_factory=dict)
     remark: str = later("")
+    state: tuple[int, ...] = later(())
 
 
 @dataclass(frozen=True, slots=True)

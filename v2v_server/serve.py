@@ -367,7 +367,7 @@ class Server:
         alike) that the worker's host does not have it.
         """
         try:
-            self._catalogue.check(missing.video, missing.fingerprint, missing.sidecar)
+            self._catalogue.check(missing.video, missing.fingerprint, missing.sidecar, missing.changed)
         except (VideoChanged, VideoGone):
             if not missing.sidecar:
                 self._catalogue.mark_stale(missing.video)

@@ -91,6 +91,7 @@ class CheckVideo:
         frame, reason: what the worker reported.
         request: the request that it could not make.
         sidecar: ending of the video's sidecar that is meant, with its fingerprint; "": the video itself.
+        changed: whether the worker has read the file, and found another one than the catalogued one.
     """
 
     video: str
@@ -100,6 +101,7 @@ class CheckVideo:
     reason: str
     request: Request
     sidecar: str = ""
+    changed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -313,18 +313,35 @@ class Catalogue:
         self._fingerprint(id)
         return self.folder / self.source.file_of(id)
 
-    def check(self, id: str, fingerprint: str, sidecar: str = "") -> None:
+    def check(self, id: str, fingerprint: str, sidecar: str = "", is_changed: bool = False) -> None:
         """Check that the video is as catalogued, or its sidecar of that ending, see :meth:`VideoSource.verify`.
+
+        Args:
+            id, fingerprint: of the file.
+            sidecar: ending of the sidecar that is meant; "": the video.
+            is_changed: whether a worker has found its file changed, having read all of it. Then a file on this host is
+                as catalogued only if its size and times are.
 
         Raises:
             CorpusError: there is no such id in this catalogue.
             VideoError: the video is gone, another one by now, or (on a disk) cannot be read.
         """
-        self._fingerprint(id)
+        kept = self.state(id)
         state: FileState | str | None = self.sidecars[sidecar].states.get(id) if sidecar else None
+        self.source.verify(sidecar_id(id, sidecar) if sidecar else id, fingerprint, state or kept)
+        if is_changed and self.source.is_local and self.source.state(id) != kept:
+            raise VideoChanged(id, None, "changed since it was catalogued")
+
+    def state(self, id: str) -> FileState | None:
+        """Return the state in which a video was catalogued; None if the index cannot tell.
+
+        Raises:
+            CorpusError: there is no such id in this catalogue.
+        """
+        fingerprint = self._fingerprint(id)
         with suppress(sqlite3.Error):
-            state = state or self._store.state(id)
-        self.source.verify(sidecar_id(id, sidecar) if sidecar else id, fingerprint, state)
+            return self._store.state(id, fingerprint)
+        return None
 
     def frame_index(self, id: str) -> FrameIndex:
         """Read the frames of a video from the index on disk.
@@ -483,7 +500,10 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
         elif mark and ending.endswith("/"):
             sidecars[ending] = [mark, catalogue.sidecar_files(video, ending, mark, start, count)]
     frames = catalogue.frame_index_bytes(video, start, count)
-    return replace(lease, frame_index=frames, scene=part, sidecars=sidecars)
+    state = catalogue.state(video)
+    # A message has no number below 0, such as a time before 1970.
+    known = catalogue.source.unmarked(video, state) if state is not None and min(state) >= 0 else ()
+    return replace(lease, frame_index=frames, scene=part, sidecars=sidecars, state=known)
 
 
 def open_catalogue(

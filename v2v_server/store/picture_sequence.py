@@ -58,12 +58,17 @@ def id_of(path: str) -> str:
 
 
 class PictureSequence(VideoFile):
-    """:class:`v2v_server.store.pixels.Pixels` of numbered pictures."""
+    """:class:`v2v_server.store.pixels.Pixels` of numbered pictures.
+
+    Attributes:
+        latest_ns: the latest change of status of the files of a folder that were read so far, behind their last byte.
+    """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         super().__init__(path)
         self.ways = (self._frames,)
         self._at: tuple[int | None, str] = None, ""  # frame and file in errors
+        self.latest_ns = 0
 
     def facts(self) -> VideoFacts:
         """Read all files; decode the first picture, and the heads of the others.
@@ -129,7 +134,10 @@ class PictureSequence(VideoFile):
                 with packed.open(name) if packed else Path(path, name).open("rb") as file:
                     # Memory for all bytes that are asked for is allocated first, except by zipfile.
                     size = LARGEST_PICTURE_FILE_BYTES if packed else os.fstat(file.fileno()).st_size
-                    return file.read(min(size, LARGEST_PICTURE_FILE_BYTES))
+                    data = file.read(min(size, LARGEST_PICTURE_FILE_BYTES))
+                    if not packed:
+                        self.latest_ns = max(self.latest_ns, os.fstat(file.fileno()).st_ctime_ns)
+                    return data
 
             yield packed.namelist() if packed else [name for name, _ in files_in(path)], read
 

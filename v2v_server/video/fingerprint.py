@@ -5,7 +5,8 @@
 A folder of pictures has the size of its files, a hash of their names and sizes, and a hash of what they hold.
 
 The whole name is known once the file has been probed, which reads it from end to end anyhow. What is opened later is
-compared by the first two parts: a worker that read everything would read a film for each two seconds of it.
+compared by the first two parts, and read whole only if its size or times changed (:mod:`v2v_server.store.verified`): a
+worker that read everything would read a film for each two seconds of it.
 """
 
 from __future__ import annotations
@@ -73,6 +74,18 @@ def is_same_file(one: str, other: str) -> bool:
     """Return whether two fingerprints can be of one file; a part that one of them lacks is not compared."""
     parts = list(zip(one.split("-"), other.split("-"), strict=False))
     return len(parts) > 1 and all(a == b for a, b in parts)
+
+
+def check_content(path: str | os.PathLike[str], content: str, expected: str) -> None:
+    """Compare the hash of all that a video stores with that of a fingerprint, if it has one.
+
+    Raises:
+        VideoChanged: it is another one.
+    """
+    stated = (*expected.split("-", 2), "", "")[2].partition("@")[0]  # a rate that the user states follows
+    if stated not in ("", content):
+        why = f"changed since it was catalogued: what it stores has the hash {content} instead of {stated}"
+        raise VideoChanged(os.fspath(path), None, why)
 
 
 def check_fingerprint(path: str | os.PathLike[str], expected: str) -> None:
