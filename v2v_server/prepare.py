@@ -54,7 +54,7 @@ from v2v_server.store.pixels import kind_of, open_pixels
 from v2v_server.store.planes import OPTIONAL, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES
 from v2v_server.store.store_file import StoreFile, write_store
-from v2v_server.store.verified import CHANGES, Verified
+from v2v_server.store.verified import CHANGES_MEANWHILE, Verified
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.decode import ClipRequest, Cut
@@ -583,7 +583,7 @@ def transcode(job: Transcoding) -> Made:
             lasting=True, see=partial(_add, written),
         )  # fmt: skip
         if source.known(job.video.fingerprint) != state:
-            raise VideoUnreadable(os.fspath(job.source), None, f"{CHANGES}: run the same command again")
+            raise VideoUnreadable(os.fspath(job.source), None, f"{CHANGES_MEANWHILE}: run the same command again")
         return _read_back(job, path, written)
 
 

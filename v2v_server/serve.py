@@ -367,7 +367,9 @@ class Server:
         alike) that the worker's host does not have it.
         """
         try:
-            self._catalogue.check(missing.video, missing.fingerprint, missing.sidecar, missing.changed)
+            self._catalogue.check(missing.video, missing.fingerprint, missing.sidecar)
+            if missing.changed:
+                self._catalogue.check_state(missing.video)
         except (VideoChanged, VideoGone):
             if not missing.sidecar:
                 self._catalogue.mark_stale(missing.video)

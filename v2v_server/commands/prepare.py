@@ -141,10 +141,9 @@ def summary(report: Report, size: str, seconds: float) -> list[str]:
             f"{before / 1e6:.1f} MB -> {after / 1e6:.1f} MB ({after / before:.2f} of the size): "
             f"{change} {abs(before - after) / 1e6:.1f} MB"
         )
-        lines.append(
-            "every frame was read back and equals the source's, bit for bit; all that each source stores has the hash "
-            "of the catalogue"
-        )
+        lines.append("every frame was read back and equals the source's, bit for bit")
+        if read := len(prepared) - report.kept - report.looked_at:
+            lines.append(f"{read} sources were read whole, before and after: they are the catalogued ones, by a hash")
     lines += _listed("could not be prepared:", [(video.id, str(video.problem)) for video in report.failed])
     lines += _listed(
         "lack requested statistics or planes (their files stay):",

@@ -313,14 +313,8 @@ class Catalogue:
         self._fingerprint(id)
         return self.folder / self.source.file_of(id)
 
-    def check(self, id: str, fingerprint: str, sidecar: str = "", is_changed: bool = False) -> None:
+    def check(self, id: str, fingerprint: str, sidecar: str = "") -> None:
         """Check that the video is as catalogued, or its sidecar of that ending, see :meth:`VideoSource.verify`.
-
-        Args:
-            id, fingerprint: of the file.
-            sidecar: ending of the sidecar that is meant; "": the video.
-            is_changed: whether a worker has found its file changed, having read all of it. Then a file on this host is
-                as catalogued only if its size and times are.
 
         Raises:
             CorpusError: there is no such id in this catalogue.
@@ -329,7 +323,14 @@ class Catalogue:
         kept = self.state(id)
         state: FileState | str | None = self.sidecars[sidecar].states.get(id) if sidecar else None
         self.source.verify(sidecar_id(id, sidecar) if sidecar else id, fingerprint, state or kept)
-        if is_changed and self.source.is_local and self.source.state(id) != kept:
+
+    def check_state(self, id: str) -> None:
+        """Check the size and times of a file on this host, of which a worker has read another content.
+
+        Raises:
+            VideoChanged, VideoUnreadable: they are not the catalogued ones, or cannot be told.
+        """
+        if self.source.is_local and self.source.state(id) != self.state(id):
             raise VideoChanged(id, None, "changed since it was catalogued")
 
     def state(self, id: str) -> FileState | None:

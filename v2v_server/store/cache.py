@@ -28,7 +28,7 @@ from v2v_server.store.pixels import Pixels
 from v2v_server.store.planes import OPTIONAL, PLANES, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder, delete_unless_read
 from v2v_server.store.store_file import StoreFile, read_clips, write_store
-from v2v_server.store.verified import CHANGES, read_unchanged
+from v2v_server.store.verified import CHANGES_MEANWHILE, read_unchanged
 from v2v_server.system.log import GIB
 from v2v_server.video.decode import ClipRequest, DecodedClip
 from v2v_server.video.picture import PixelRect
@@ -207,7 +207,7 @@ class Cache:
                     fingerprint=fingerprint, packing=QUICK, planes=planes, is_private=True,
                 )  # fmt: skip
                 if pixels.check(fingerprint) != state:
-                    raise VideoUnreadable(video, None, CHANGES)
+                    raise VideoUnreadable(video, None, CHANGES_MEANWHILE)
                 with self._waiting():
                     self._quota.add(partial, piece.path)
             finally:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # a server's command line starts without the decoder
     from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture
     from v2v_server.video.probe import VideoFacts
 
-CHANGES = "changes while it is read"
+CHANGES_MEANWHILE = "changes while it is read"
 _TRIES = 3
 _MOST_KNOWN = 1 << 16
 _SOON_BYTES = 1 << 30
@@ -51,7 +51,7 @@ def read_unchanged(pixels: Pixels, fingerprint: str, request: ClipRequest) -> tu
         else:
             if pixels.check(fingerprint) == state:
                 return clips
-    raise VideoUnreadable("", None, CHANGES)
+    raise VideoUnreadable("", None, CHANGES_MEANWHILE)
 
 
 def content_of(pixels: Pixels) -> str:
@@ -169,7 +169,7 @@ class Verified:
         except VideoChanged as error:
             reason = error.reason
         if _status(self._path) != status or self._latest_ns(status) != latest_ns:
-            raise VideoUnreadable(self._path, None, CHANGES)
+            raise VideoUnreadable(self._path, None, CHANGES_MEANWHILE)
         return self._keep(KnownState(fingerprint, status, latest_ns, reason))
 
     def _latest_ns(self, status: tuple[int, int, int, int]) -> int:
