@@ -289,7 +289,6 @@ class LeaseFailed(Persisted):
     Attributes:
         here: the worker's host cannot read the file, or has another one in its place; the video may be sound elsewhere.
         sidecar: ending of the sidecar that failed, not the video; "" if the video failed.
-        changed: the worker has read the file, and it is not the catalogued one.
     """
 
     lease: int
@@ -297,7 +296,6 @@ class LeaseFailed(Persisted):
     reason: str
     here: bool = False
     sidecar: str = later("")
-    changed: bool = later(False)
 
 
 # --- server -> worker -------------------------------------------------------------------------------------------------

@@ -359,9 +359,8 @@ class Dispatcher(Broker):
         video, sidecar = session.sequence(request).video, failed.sidecar
         fingerprint = self.facts.sidecars_of(video.id, session.arrays).get(sidecar) if sidecar else video.fingerprint
         failure = CheckVideo(
-            video.id, fingerprint or "", identity, failed.frame, failed.reason, request,
-            sidecar if fingerprint else "", failed.changed,
-        )  # fmt: skip
+            video.id, fingerprint or "", identity, failed.frame, failed.reason, request, sidecar if fingerprint else ""
+        )
         if not failed.here:
             self.registry.can_work(identity)
             return [*_blame(self, failure), *_assign(self, now)]

@@ -91,7 +91,6 @@ class CheckVideo:
         frame, reason: what the worker reported.
         request: the request that it could not make.
         sidecar: ending of the video's sidecar that is meant, with its fingerprint; "": the video itself.
-        changed: whether the worker has read the file, and found another one than the catalogued one.
     """
 
     video: str
@@ -101,7 +100,6 @@ class CheckVideo:
     reason: str
     request: Request
     sidecar: str = ""
-    changed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -67,6 +67,7 @@ from v2v_server.store.pixels import VIDEOS, VideosKind, kind_of
 from v2v_server.store.store_file import STORE_FORMAT
 from v2v_server.system.log import gauge, text
 from v2v_server.system.process import cache_folder, without_collections
+from v2v_server.video.fingerprint import CHANGED
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
 
@@ -325,13 +326,13 @@ class Catalogue:
         self.source.verify(sidecar_id(id, sidecar) if sidecar else id, fingerprint, state or kept)
 
     def check_state(self, id: str) -> None:
-        """Check the size and times of a file on this host, of which a worker has read another content.
+        """Check the size and times of a file on this host, after a worker has read another content.
 
         Raises:
             VideoChanged, VideoUnreadable: they are not the catalogued ones, or cannot be told.
         """
         if self.source.is_local and self.source.state(id) != self.state(id):
-            raise VideoChanged(id, None, "changed since it was catalogued")
+            raise VideoChanged(id, None, CHANGED)
 
     def state(self, id: str) -> FileState | None:
         """Return the state in which a video was catalogued; None if the index cannot tell.

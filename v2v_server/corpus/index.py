@@ -239,8 +239,9 @@ class Store:
         Raises:
             sqlite3.Error: the file is damaged.
         """
-        query = "SELECT size_bytes, mtime_ns, ctime_ns FROM video WHERE id = ? AND fingerprint = ?"
-        row = self._database.execute(query, (id, fingerprint)).fetchone()
+        row = self._database.execute(
+            "SELECT size_bytes, mtime_ns, ctime_ns FROM video WHERE id = ? AND fingerprint = ?", (id, fingerprint)
+        ).fetchone()
         return None if row is None else (row[0], row[1], row[2])
 
     def make_figures(self) -> None:

@@ -13,16 +13,15 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from v2v_protocol.errors import VideoChanged, VideoError, VideoUnreadable
-from v2v_server.video.fingerprint import check_content, files_in, unreadable
+from v2v_server.video.fingerprint import CHANGED, check_content, files_in, unreadable
 
 if TYPE_CHECKING:  # a server's command line starts without the decoder
     from v2v_server.store.pixels import Pixels
-    from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture
-    from v2v_server.video.probe import VideoFacts
+    from v2v_server.video.decode import ClipRequest, DecodedClip
 
 CHANGES_MEANWHILE = "changes while it is read"
 _TRIES = 3
@@ -67,7 +66,7 @@ def content_of(pixels: Pixels) -> str:
         raise
     except VideoError as error:
         kind = VideoUnreadable if isinstance(error.__cause__, OSError) else VideoChanged
-        raise kind(error.video, error.frame, f"changed since it was catalogued: {error.reason}") from error
+        raise kind(error.video, error.frame, f"{CHANGED}: {error.reason}") from error
 
 
 class KnownState(NamedTuple):
@@ -102,18 +101,7 @@ class Verified:
         self, pixels: Pixels, path: str, known: dict[str, KnownState], is_expected: Callable[[], bool] = lambda: False
     ) -> None:
         self._pixels, self._path, self._known, self._is_expected = pixels, path, known, is_expected
-
-    def facts(self) -> VideoFacts:
-        """See :class:`v2v_server.store.pixels.Pixels`."""
-        return self._pixels.facts()
-
-    def clips(self, request: ClipRequest) -> tuple[DecodedClip, ...]:
-        """See :class:`v2v_server.store.pixels.Pixels`."""
-        return self._pixels.clips(request)
-
-    def pictures(self, request: ClipRequest) -> Iterator[DecodedPicture]:
-        """See :class:`v2v_server.store.pixels.Pixels`."""
-        return self._pixels.pictures(request)
+        self.facts, self.clips, self.pictures = pixels.facts, pixels.clips, pixels.pictures
 
     def check(self, fingerprint: str) -> KnownState:
         """Return the state of the file, in which it is the catalogued video.

@@ -20,6 +20,8 @@ from v2v_protocol.errors import VideoChanged, VideoDenied, VideoGone, VideoUnrea
 TIMES_ABOVE = ("../timestamps.txt", "../images.txt")
 TIMES = ("timestamps.txt", "images.txt", *TIMES_ABOVE)
 """Files with the times of the pictures of a folder, by their places from there; the first that is found counts."""
+CHANGED = "changed since it was catalogued"
+"""The beginning of the reason of a video that is another one by now, wherever that was found."""
 _BLOCK_BYTES = 64 * 1024
 
 
@@ -84,7 +86,7 @@ def check_content(path: str | os.PathLike[str], content: str, expected: str) -> 
     """
     stated = (*expected.split("-", 2), "", "")[2].partition("@")[0]  # a rate that the user states follows
     if stated not in ("", content):
-        why = f"changed since it was catalogued: what it stores has the hash {content} instead of {stated}"
+        why = f"{CHANGED}: what it stores has the hash {content} instead of {stated}"
         raise VideoChanged(os.fspath(path), None, why)
 
 
@@ -97,4 +99,4 @@ def check_fingerprint(path: str | os.PathLike[str], expected: str) -> None:
     """
     found = fingerprint(path)
     if not is_same_file(found, expected):
-        raise VideoChanged(os.fspath(path), None, f"changed since it was catalogued: {found} instead of {expected}")
+        raise VideoChanged(os.fspath(path), None, f"{CHANGED}: {found} instead of {expected}")

@@ -246,10 +246,8 @@ class WorkerConversation:
         if isinstance(error, SidecarError):
             failed = LeaseFailed(lease.lease, None, error.reason, error.here, error.ending)
             return [Send(encode(failed)), Listen(0.0)]
-        changed = isinstance(error, VideoChanged)
-        here = changed or isinstance(error, VideoUnreadable)
-        failure = LeaseFailed(lease.lease, error.frame, error.reason, here, changed=changed)
-        return [Send(encode(failure)), Listen(0.0)]
+        here = isinstance(error, VideoChanged | VideoUnreadable)
+        return [Send(encode(LeaseFailed(lease.lease, error.frame, error.reason, here))), Listen(0.0)]
 
     # --- what the server says -----------------------------------------------------------------------------------------
 
