@@ -328,7 +328,7 @@ def test_prepare_stores_nothing_of_a_changed_file(
     status, said = prepared(corpus, capsys)
     assert status == 0, said
     assert "every frame was read back and equals the source's, bit for bit" in said
-    assert "1 sources were read whole" in said
+    assert "read whole first, and have the hash of the catalogue: 1" in said
     store = corpus.root.parent / "store"
     with closing(open_catalogue(store, cache_dir=store.parent / "index", processes=0)) as catalogue:
         assert made(leases_of(catalogue), Clips(open_source(store))) == right
