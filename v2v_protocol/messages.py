@@ -331,6 +331,8 @@ class Lease(Persisted):
             out. To workers it may be [fingerprint, part]: bytes, the table of the files of a folder that the clip
             needs; or a text, why the sidecar is not used, perhaps without a fingerprint.
         remark: what of the video is not served, or served with wrong grey levels or times; goes into the provenance.
+        state: numbers that the file's size and times had when it was catalogued: a worker whose file has them need not
+            read all of it; empty if they are not known.
     """
 
     lease: int
@@ -359,6 +361,7 @@ class Lease(Persisted):
     packed: bool = False
     sidecars: Mapping[str, Any] = later(default_factory=dict)
     remark: str = later("")
+    state: tuple[int, ...] = later(())
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ import numpy as np
 import numpy.typing as npt
 import xxhash
 
-from v2v_protocol.errors import CorpusError, UsageError, VideoError
+from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnreadable
 from v2v_protocol.persisted import Persisted
 from v2v_protocol.sample import Refusal
 from v2v_protocol.write_aside import is_writable, write_aside_and_rename
@@ -54,6 +54,7 @@ from v2v_server.store.pixels import kind_of, open_pixels
 from v2v_server.store.planes import OPTIONAL, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES
 from v2v_server.store.store_file import StoreFile, write_store
+from v2v_server.store.verified import CHANGES_MEANWHILE, Verified
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.decode import ClipRequest, Cut
@@ -569,16 +570,20 @@ def transcode(job: Transcoding) -> Made:
     cut, rate = whole_cut(len(index), job.window, job.planes), job.video.frames_per_second
     written = _Hashes(xxhash.xxh3_128)
     with (
-        open_pixels(job.source, kind_of(job.video.id)) as source,
+        open_pixels(job.source, kind_of(job.video.id)) as pixels,
         write_aside_and_rename(job.target, partial=hidden) as path,
     ):
-        source.check(job.video.fingerprint)
+        source = Verified(pixels, os.fspath(job.source), {})
+        source.learn(job.video.fingerprint)
+        state = source.check(job.video.fingerprint)
         write_store(
             path, source.pictures(ClipRequest(index, 0, (cut,), most_bits=MOST_BITS)), index, job.window, 0,
             len(index), video=job.video.id, fingerprint=job.video.fingerprint, packing=SIZES[job.size],
             planes=job.planes, frames_per_second=0.0 if math.isnan(rate) else rate, stored_index=job.index,
             lasting=True, see=partial(_add, written),
         )  # fmt: skip
+        if source.known(job.video.fingerprint) != state:
+            raise VideoUnreadable(os.fspath(job.source), None, f"{CHANGES_MEANWHILE}: run the same command again")
         return _read_back(job, path, written)
 
 

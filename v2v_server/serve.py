@@ -52,6 +52,7 @@ from v2v_server.supervise.local_host import WorkerProcess
 from v2v_server.supervise.pool import Pool, Scaling, make_pool, question_workers
 from v2v_server.system.log import GIB, Level, Log
 from v2v_server.system.process import keep_freed_memory, most_connections, open_many_files, usable_cores
+from v2v_server.video.fingerprint import CHANGED
 from v2v_server.video.rows import Rows
 
 _LONGEST_TURN_SECONDS = 1.0
@@ -373,6 +374,8 @@ class Server:
         """
         try:
             self._catalogue.check(missing.video, missing.fingerprint, missing.sidecar)
+            if missing.reason.startswith(CHANGED) and not missing.sidecar:  # a worker has read it
+                self._catalogue.check_state(missing.video)
         except (VideoChanged, VideoGone):
             if not missing.sidecar:
                 self._catalogue.mark_stale(missing.video)

@@ -61,6 +61,9 @@ class NamedCorpus:
     def digest_under(self, scene: str) -> str:
         return self.facts.digest_under(scene)
 
+    def state(self, name: str) -> None:
+        """Return nothing: there is no file."""
+
     def frame_index_bytes(self, name: str, start: int, count: int) -> bytes:
         return self.frame_index(name).slice(start, count).to_bytes()
 

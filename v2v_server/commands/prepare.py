@@ -142,6 +142,8 @@ def summary(report: Report, size: str, seconds: float) -> list[str]:
             f"{change} {abs(before - after) / 1e6:.1f} MB"
         )
         lines.append("every frame was read back and equals the source's, bit for bit")
+        if read := len(prepared) - report.kept - report.looked_at:
+            lines.append(f"sources that were read whole first, and have the hash of the catalogue: {read}")
     lines += _listed("could not be prepared:", [(video.id, str(video.problem)) for video in report.failed])
     lines += _listed(
         "lack requested statistics or planes (their files stay):",

@@ -69,6 +69,7 @@ from v2v_server.store.pixels import VIDEOS, VideosKind, kind_of
 from v2v_server.store.store_file import STORE_FORMAT
 from v2v_server.system.log import gauge, text
 from v2v_server.system.process import cache_folder, without_collections
+from v2v_server.video.fingerprint import CHANGED
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
 
@@ -323,11 +324,29 @@ class Catalogue:
             CorpusError: there is no such id in this catalogue.
             VideoError: the video is gone, another one by now, or (on a disk) cannot be read.
         """
-        self._fingerprint(id)
+        kept = self.state(id)
         state: FileState | str | None = self.sidecars[sidecar].states.get(id) if sidecar else None
+        self.source.verify(sidecar_id(id, sidecar) if sidecar else id, fingerprint, state or kept)
+
+    def check_state(self, id: str) -> None:
+        """Check the size and times of a file on this host, after a worker has read another content.
+
+        Raises:
+            VideoChanged, VideoUnreadable: they are not the catalogued ones, or cannot be told.
+        """
+        if self.source.is_local and self.source.state(id) != self.state(id):
+            raise VideoChanged(id, None, CHANGED)
+
+    def state(self, id: str) -> FileState | None:
+        """Return the state in which a video was catalogued; None if the index cannot tell.
+
+        Raises:
+            CorpusError: there is no such id in this catalogue.
+        """
+        fingerprint = self._fingerprint(id)
         with suppress(sqlite3.Error):
-            state = state or self._store.state(id)
-        self.source.verify(sidecar_id(id, sidecar) if sidecar else id, fingerprint, state)
+            return self._store.state(id, fingerprint)
+        return None
 
     def frame_index(self, id: str) -> FrameIndex:
         """Read the frames of a video from the index on disk.
@@ -487,7 +506,10 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
         elif mark and ending.endswith("/"):
             sidecars[ending] = [mark, catalogue.sidecar_files(video, ending, mark, start, count)]
     frames = catalogue.frame_index_bytes(video, start, count)
-    return replace(lease, frame_index=frames, scene=part, sidecars=sidecars)
+    state = catalogue.state(video)
+    # A message has no number below 0, such as a time before 1970.
+    known = catalogue.source.unmarked(video, state) if state is not None and min(state) >= 0 else ()
+    return replace(lease, frame_index=frames, scene=part, sidecars=sidecars, state=known)
 
 
 def open_catalogue(

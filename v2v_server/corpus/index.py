@@ -233,13 +233,15 @@ class Store:
         query = "SELECT frame_index FROM video WHERE id = ? AND fingerprint = ?"
         return _blob(self._database.execute(query, (id, fingerprint)).fetchone())
 
-    def state(self, id: str) -> tuple[int, int, int] | None:
-        """Return the state of a file when it was probed; None if it is not known.
+    def state(self, id: str, fingerprint: str) -> tuple[int, int, int] | None:
+        """Return the state of a file when it was probed; None if the index does not know this state of it.
 
         Raises:
             sqlite3.Error: the file is damaged.
         """
-        row = self._database.execute("SELECT size_bytes, mtime_ns, ctime_ns FROM video WHERE id = ?", (id,)).fetchone()
+        row = self._database.execute(
+            "SELECT size_bytes, mtime_ns, ctime_ns FROM video WHERE id = ? AND fingerprint = ?", (id, fingerprint)
+        ).fetchone()
         return None if row is None else (row[0], row[1], row[2])
 
     def make_figures(self) -> None:

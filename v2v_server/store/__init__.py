@@ -7,6 +7,7 @@ store_file   store files: opened, read as clips, and written frame by frame
 pixels       what frames are read from: the protocol, and its kinds
 video_file   a video, decoded
 picture_sequence  a folder or archive of numbered pictures, decoded
+verified     a decoded video whose file other programs may change in place
 photograph   a photograph, whose frames are rendered for each sample
 quota        a folder that many processes fill up to a limit: the cache, and copies of videos in object storage
 cache        a folder of pieces that are stored when they are first decoded

@@ -29,6 +29,7 @@ from v2v_server.store.pixels import Pixels
 from v2v_server.store.planes import OPTIONAL, PLANES, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES, PARTIAL, QuotaFolder, delete_unless_read
 from v2v_server.store.store_file import StoreFile, read_clips, write_store
+from v2v_server.store.verified import CHANGES_MEANWHILE, read_unchanged
 from v2v_server.system.log import GIB
 from v2v_server.video.decode import ClipRequest, DecodedClip
 from v2v_server.video.picture import PixelRect
@@ -120,9 +121,9 @@ class Cache:
             missing = [piece for piece in pieces if piece in lacking or not piece.path.exists()]
             if not missing or index.first > missing[0].first or not self._has_room(missing, usable):
                 break
-            pixels.check(fingerprint)
+            state, wanted = pixels.check(fingerprint), tuple(dict.fromkeys((*planes, *kept)))
             try:
-                self._fill(pixels, video, fingerprint, request, missing, tuple(dict.fromkeys((*planes, *kept))))
+                self._fill(pixels, video, fingerprint, state, request, missing, wanted)
             except OSError as error:
                 self._rest(f"cannot be written to: {error.strerror or error}")
                 break
@@ -180,6 +181,7 @@ class Cache:
         pixels: Pixels,
         video: str,
         fingerprint: str,
+        state: object,
         request: ClipRequest,
         missing: Sequence[_Piece],
         planes: Sequence[str],
@@ -187,7 +189,7 @@ class Cache:
         """Decode the missing pieces in one pass, and store each that fits the limit.
 
         Raises:
-            VideoError: they cannot be decoded.
+            VideoError: they cannot be decoded, or the file is not in that state any more.
             OSError: they cannot be written.
         """
         usable, index = request.usable, request.index
@@ -205,6 +207,8 @@ class Cache:
                     partial, frames, index, usable, piece.first, piece.end - piece.first, video=video,
                     fingerprint=fingerprint, packing=QUICK, planes=planes, is_private=True,
                 )  # fmt: skip
+                if pixels.check(fingerprint) != state:
+                    raise VideoUnreadable(video, None, CHANGES_MEANWHILE)
                 with self._waiting():
                     self._quota.add(partial, piece.path)
             finally:
@@ -251,10 +255,7 @@ class Cached:
     def clips(self, request: ClipRequest) -> tuple[DecodedClip, ...]:
         """Return the cuts of a request from the cache; decode them where it can neither read nor store them."""
         clips = self._cache.clips(self._pixels, *self._name, request)
-        if clips is None:
-            self._pixels.check(self._name[1])
-            clips = self._pixels.clips(request)
-        return clips
+        return read_unchanged(self._pixels, self._name[1], request) if clips is None else clips
 
 
 @dataclass(frozen=True, slots=True)

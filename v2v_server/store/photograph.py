@@ -20,7 +20,7 @@ from v2v_server.simulation.intensity import eight_bits
 from v2v_server.store.picture_sequence import errors_of_pictures
 from v2v_server.store.pixels import IMAGE_SUFFIXES
 from v2v_server.video.decode import BIT_EXACT_CODECS, ClipRequest, Cut, DecodedClip, DecodedFrame, DecodedPicture
-from v2v_server.video.fingerprint import check_fingerprint
+from v2v_server.video.fingerprint import check_content, check_fingerprint
 from v2v_server.video.frame_index import LARGEST_INDEXED_SIDE_PX, FrameIndex, unseekable
 from v2v_server.video.picture import SDR, LumaFormat, PixelRect, Signal, luma_plane
 from v2v_server.video.picture_file import (
@@ -73,6 +73,7 @@ class Photograph:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._path = os.fspath(path)
+        self._fingerprint = ""
 
     def facts(self) -> VideoFacts:
         """Check the file and hash it. It is one frame, which the catalogue shows for longer."""
@@ -80,7 +81,8 @@ class Photograph:
             return _facts(self._read())
 
     def check(self, fingerprint: str) -> None:
-        """Compare size, head and tail."""
+        """Compare size, head and tail; the rest is compared when it is decoded."""
+        self._fingerprint = fingerprint
         check_fingerprint(self._path, fingerprint)
 
     def clips(self, request: ClipRequest) -> tuple[DecodedClip, ...]:
@@ -117,14 +119,17 @@ class Photograph:
         """Return the photograph of an index, which may be kept.
 
         Raises:
+            VideoChanged: it is not the one that was checked.
             VideoError: it is damaged or differs from the index.
         """
         index = request.index
         with errors_of_pictures(self._path, lambda: (None, "")):
             status = os.stat(self._path)
-            key = self._path, status.st_size, status.st_mtime_ns, status.st_ino, request.rows
+            key = self._path, status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, request.rows
             if key not in kept_photographs:
-                kept_photographs[key] = _decoded(self._read(), index, request.usable)
+                data = self._read()
+                check_content(self._path, xxhash.xxh3_128(data).hexdigest(), self._fingerprint)
+                kept_photographs[key] = _decoded(data, index, request.usable)
             found = kept_photographs[key] = kept_photographs.pop(key)  # the latest is the last one
             while (
                 len(kept_photographs) > 1

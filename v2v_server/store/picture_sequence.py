@@ -94,12 +94,17 @@ def id_of(path: str) -> str:
 
 
 class PictureSequence(VideoFile):
-    """:class:`v2v_server.store.pixels.Pixels` of numbered pictures, which are listed once a change."""
+    """:class:`v2v_server.store.pixels.Pixels` of numbered pictures, which are listed once a change.
+
+    Attributes:
+        latest_ns: the latest change of status of the files of a folder that were read so far, behind their last byte.
+    """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         super().__init__(path)
         self.ways = (self._frames,)
         self._at: tuple[int | None, str] = None, ""  # frame and file in errors
+        self.latest_ns = 0
 
     def check(self, fingerprint: str) -> None:
         """Compare a folder's names and sizes, as listed when it last changed; an archive's size, head and tail.
@@ -191,7 +196,10 @@ class PictureSequence(VideoFile):
                             _kept.pop(path, None)
                             why = f"{name}: changed while it is served: {size} bytes instead of {files.sizes[name]}"
                             raise VideoChanged(path, self._at[0], why)
-                        return file.read(min(size, LARGEST_PICTURE_FILE_BYTES))
+                        data = file.read(min(size, LARGEST_PICTURE_FILE_BYTES))
+                        if not packed:
+                            self.latest_ns = max(self.latest_ns, os.fstat(file.fileno()).st_ctime_ns)
+                        return data
 
                 yield files, read
 

@@ -125,8 +125,10 @@ class Pixels(Protocol):
     def facts(self) -> VideoFacts:
         """Return what the catalogue needs to know. May read all of the video."""
 
-    def check(self, fingerprint: str) -> None:
-        """Check cheaply that this is the catalogued video, or was made from it."""
+    def check(self, fingerprint: str) -> object:
+        """Check cheaply that this is the catalogued video, or was made from it. What is returned stays equal while the
+        file does (:func:`v2v_server.store.verified.read_unchanged`).
+        """
 
     def clips(self, request: ClipRequest) -> tuple[DecodedClip, ...]:
         """Return the cuts of a request, in order, with all that they ask for."""

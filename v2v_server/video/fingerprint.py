@@ -5,7 +5,8 @@
 A folder of pictures has the size of its files, a hash of their names and sizes, and a hash of what they hold.
 
 The whole name is known once the file has been probed, which reads it from end to end anyhow. What is opened later is
-compared by the first two parts: a worker that read everything would read a film for each two seconds of it.
+compared by the first two parts, and read whole only if its size or times changed (:mod:`v2v_server.store.verified`): a
+worker that read everything would read a film for each two seconds of it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from v2v_protocol.errors import VideoChanged, VideoDenied, VideoGone, VideoUnrea
 TIMES_ABOVE = ("../timestamps.txt", "../images.txt")
 TIMES = ("timestamps.txt", "images.txt", *TIMES_ABOVE)
 """Files with the times of the pictures of a folder, by their places from there; the first that is found counts."""
+CHANGED = "changed since it was catalogued"
+"""The beginning of the reason of a video that is another one by now, wherever that was found."""
 _BLOCK_BYTES = 64 * 1024
 
 
@@ -91,6 +94,19 @@ def is_same_file(one: str, other: str) -> bool:
     return len(parts) > 1 and all(a == b for a, b in parts)
 
 
+def check_content(path: str | os.PathLike[str], content: str, expected: str) -> None:
+    """Compare the hash of all that a video stores with that of a fingerprint, if it has one.
+
+    Raises:
+        VideoChanged: it is another one.
+    """
+    # Bits and a rate that the user states follow.
+    stated = (*expected.split("-", 2), "", "")[2].partition("@")[0].partition("~")[0]
+    if stated not in ("", content):
+        why = f"{CHANGED}: what it stores has the hash {content} instead of {stated}"
+        raise VideoChanged(os.fspath(path), None, why)
+
+
 def check_fingerprint(path: str | os.PathLike[str], expected: str, found: str = "") -> None:
     """Make sure that the file is the one that was catalogued, as far as its size, head and tail tell.
 
@@ -105,4 +121,4 @@ def check_fingerprint(path: str | os.PathLike[str], expected: str, found: str = 
     """
     found = found or fingerprint(path)
     if not is_same_file(found, expected):
-        raise VideoChanged(os.fspath(path), None, f"changed since it was catalogued: {found} instead of {expected}")
+        raise VideoChanged(os.fspath(path), None, f"{CHANGED}: {found} instead of {expected}")

@@ -59,6 +59,7 @@ from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache, Cached
 from v2v_server.store.pixels import kind_of
+from v2v_server.store.verified import read_unchanged
 from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, SampleView
 from v2v_server.video.picture import MIXED, MOST_BITS, SDR, ChromaCut
 from v2v_server.video.rows import Rows
@@ -207,11 +208,11 @@ def decode_for(
             tuple((lease.seed, lease.epoch, index) for index in indices),
             tuple(SampleView(plan.spec, plan.params, lease.arrays) for plan in plans),
         )  # fmt: skip
+        source.expect(lease.video, lease.state)
         with source.open_pixels(lease.video, lease.fingerprint) as pixels:
             if cache is not None and not pixels.is_stored:
                 pixels = Cached(pixels, cache, lease.video, lease.fingerprint)
-            pixels.check(lease.fingerprint)
-            clips = pixels.clips(request)
+            clips = read_unchanged(pixels, lease.fingerprint, request)
     except VideoError as error:
         # Consumer and log identify videos by id; a path of this host means nothing elsewhere.
         raise type(error)(lease.video, error.frame, error.reason) from error

@@ -57,10 +57,11 @@ from v2v_server.corpus.sources.source import (
     sidecar_fingerprint,
     state_text,
 )
-from v2v_server.store.pixels import PIXEL_KINDS, VideosKind
+from v2v_server.store.pixels import PIXEL_KINDS, VideosKind, kind_of, open_pixels
 from v2v_server.store.quota import MOST_GIB, PARTIAL, QuotaFolder
+from v2v_server.store.verified import content_of
 from v2v_server.system.process import cache_folder, lock, make_private, open_private
-from v2v_server.video.fingerprint import TIMES_ABOVE, is_same_file
+from v2v_server.video.fingerprint import TIMES_ABOVE, check_content, is_same_file
 from v2v_server.video.fingerprint import fingerprint as video_fingerprint
 
 T = TypeVar("T")
@@ -506,6 +507,7 @@ class Copies(VideoSource):
     def _fetch(self, id: str, fingerprint: str, slot: Path) -> IO[bytes]:
         try:
             make_private(slot)
+            is_expected = self._is_expected(id)
             if id.endswith("/"):
                 self._pack(id, slot)
             else:
@@ -515,6 +517,8 @@ class Copies(VideoSource):
             if fingerprint and not is_same_file(found, fingerprint):
                 why = f"changed in {self} since it was catalogued: {found} instead of {fingerprint}"
                 raise VideoChanged(id, None, why)
+            if id == self._expected[0] and not (is_expected and self._is_expected(id)):
+                self._check_content(id, slot, fingerprint)
             path = self._path(id, fingerprint or found)
             with slot.open("rb") as file:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # the lock outlives renaming: no eviction in between
@@ -547,6 +551,21 @@ class Copies(VideoSource):
             return sidecar_fingerprint(slot)
         with ZipFile(slot) as packed:
             return sidecar_fingerprint(ZipPath(packed))
+
+    def _check_content(self, id: str, slot: Path, fingerprint: str) -> None:
+        """Read all of a fetched video, whose object did not have the catalogued mark before and after.
+
+        Raises:
+            VideoError: it is not the catalogued one.
+        """
+        named = slot.with_name(f"{slot.name}-of{PurePosixPath(id).suffix}")  # FFmpeg looks at the ending as well
+        named.unlink(missing_ok=True)
+        named.symlink_to(slot.name)
+        try:
+            with open_pixels(named, kind_of(id)) as pixels:
+                check_content(named, content_of(pixels), fingerprint)
+        finally:
+            named.unlink()
 
     def _place(self, id: str, slot: Path, path: Path) -> None:
         """Give the fetched file its name. If space runs out, evict copies without a reader, least recently read first.

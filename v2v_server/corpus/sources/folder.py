@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import stat
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from functools import partial
 from itertools import chain
 from operator import attrgetter
 from pathlib import Path, PurePosixPath
 
-from v2v_protocol.errors import CorpusError
+from v2v_protocol.errors import CorpusError, VideoError
 from v2v_protocol.programs import printable
 from v2v_protocol.write_aside import OUTPUT_MARKER
 from v2v_server.corpus.sources.source import (
@@ -32,7 +32,8 @@ from v2v_server.corpus.sources.source import (
     read_list,
     sidecar_id,
 )
-from v2v_server.store.pixels import VIDEOS, VideosKind
+from v2v_server.store.pixels import VIDEOS, Pixels, VideosKind
+from v2v_server.store.verified import KnownState, Verified
 from v2v_server.video.fingerprint import check_fingerprint, files_in, unreadable
 
 PSEUDO_FILE_SYSTEMS = frozenset({
@@ -55,6 +56,7 @@ class Folder(VideoSource):
 
     def __init__(self, root: Path, listed: Callable[[], tuple[ListEntry, ...] | None] = lambda: None) -> None:
         super().__init__(str(root), listed)
+        self._known: dict[str, KnownState] = {}
 
     @property
     def folder(self) -> Path:
@@ -99,6 +101,38 @@ class Folder(VideoSource):
             check_local(self.folder / id, id, fingerprint)
         return nullcontext(self.folder / (id if is_sidecar(id) else self.file_of(id)))
 
+    @contextmanager
+    def open_pixels(self, id: str, fingerprint: str) -> Iterator[Pixels]:
+        """Lend the frames of a video, see :meth:`VideoSource.open_pixels`; decoded ones are verified
+        (:mod:`v2v_server.store.verified`).
+        """
+        with super().open_pixels(id, fingerprint) as pixels:
+            path = f"{self.name}/{self.file_of(id)}"
+            yield pixels if pixels.is_stored else Verified(pixels, path, self._known, partial(self._is_expected, id))
+
+    def has(self, files: Mapping[str, str]) -> bool:
+        """Return whether no video has to be read whole first. One that cannot be read counts as well."""
+        with suppress(VideoError), closing(self._videos(files)) as videos:
+            return all(pixels.known(fingerprint) for pixels, fingerprint in videos)
+        return True
+
+    def fetch(self, files: Mapping[str, str]) -> None:
+        """Read each video whole whose file may have changed.
+
+        Raises:
+            VideoError: it is another one by now, or cannot be read.
+        """
+        with closing(self._videos(files)) as videos:
+            for pixels, fingerprint in videos:
+                pixels.learn(fingerprint)
+
+    def _videos(self, files: Mapping[str, str]) -> Generator[tuple[Verified, str], None, None]:
+        for id, fingerprint in files.items():
+            if not is_sidecar(id):
+                with self.open_pixels(id, fingerprint) as pixels:
+                    if isinstance(pixels, Verified):
+                        yield pixels, fingerprint
+
     def with_sidecars(self, ids: Sequence[str], endings: Sequence[str]) -> Mapping[str, Sequence[str]]:
         """Return the videos beside which such a name is listed. Each folder is listed once."""
         names = dict[str, frozenset[str] | None]()
@@ -123,7 +157,7 @@ class Folder(VideoSource):
             return error
 
     def verify(self, id: str, fingerprint: str, state: FileState | str | None) -> None:
-        """Check the file against its fingerprint; of a sidecar, only sizes and times.
+        """Check the file's size, head and tail; of a sidecar, only sizes and times.
 
         Raises:
             VideoError: it is gone, another one by now, or cannot be read.
@@ -133,7 +167,7 @@ class Folder(VideoSource):
         elif (path := self.folder / self.file_of(id)).is_dir():  # not as a worker has listed it
             check_fingerprint(path, fingerprint)
         else:
-            with self.open_pixels(id, fingerprint) as pixels:
+            with super().open_pixels(id, fingerprint) as pixels:
                 pixels.check(fingerprint)
 
     def _regular_files(self, refused: dict[str, str]) -> Iterator[str]:

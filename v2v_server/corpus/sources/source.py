@@ -576,6 +576,7 @@ class VideoSource(ABC):
 
     is_local = True
     kind = VIDEOS
+    _expected: tuple[str, tuple[int, ...]] = "", ()
 
     def __init__(self, name: str, listed: Callable[[], tuple[ListEntry, ...] | None] = lambda: None) -> None:
         self.name, self._read_list = name, listed
@@ -675,6 +676,23 @@ class VideoSource(ABC):
         """
         with self.open_local(id, fingerprint) as path, open_pixels(path, kind_of(id)) as pixels:
             yield pixels
+
+    def unmarked(self, id: str, state: FileState) -> FileState:
+        """Return a state without the mark of a rate, which a worker does not know."""
+        return state[0], state[1], state[2] ^ self.mark(id)
+
+    def expect(self, id: str, state: Sequence[int]) -> None:
+        """Say in which :meth:`unmarked` state a video was catalogued, before it is opened. A file or object that is in
+        it need not be read whole.
+
+        Args:
+            id: of the video.
+            state: as catalogued; empty if unknown.
+        """
+        self._expected = id, tuple(state)
+
+    def _is_expected(self, id: str) -> bool:
+        return self._expected[0] == id and self._expected[1] == self.unmarked(id, self.state(id))
 
     def rate(self, id: str) -> float:
         """Return the rate of a video that does not state one, Hz; 0 if it is unknown."""

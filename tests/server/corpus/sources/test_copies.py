@@ -384,3 +384,57 @@ def test_a_prepared_corpus_has_to_be_on_a_disk(clips: Path) -> None:
     (clips / "deep" / "v2v-prepared.jsonl").write_text("{}\n", encoding="utf-8")
     with pytest.raises(CorpusError, match="makes it a prepared corpus"), catalogue(clips):
         pass
+
+
+def test_an_object_of_another_mark_is_read_whole(clips: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Size, head and tail stay: an object that was uploaded again is served, and another middle is not kept."""
+    luma = panned_luma(126, 90, 70)
+    file = write_clip(clips / "a.avi", luma, codec="rawvideo")
+    right = file.read_bytes()
+    luma[60] ^= 255
+    wrong = write_clip(clips.parent / "a.avi", luma, codec="rawvideo").read_bytes()
+    read: list[Path] = []
+    content_of = copies_module.content_of
+
+    def noted(pixels: Any) -> str:
+        read.append(pixels)
+        return content_of(pixels)
+
+    monkeypatch.setattr(copies_module, "content_of", noted)
+    with catalogue(clips) as found:
+        number = found.videos.find("a.avi")
+        assert number is not None
+        wanted = {"a.avi": found.videos[number].fingerprint}
+        state = found.state("a.avi")
+        assert state is not None
+
+    def fetched() -> bytes:
+        made = copies(clips, 1 << 30)
+        made.expect("a.avi", state)
+        try:
+            made.fetch(wanted)
+            with made.open_local("a.avi", wanted["a.avi"]) as path:
+                return path.read_bytes()
+        finally:
+            made.release()
+            for path in made.copies.glob("??/*"):
+                path.unlink()
+            assert [each.name for each in (made.copies / PARTIAL).iterdir() if each.suffix != ".lock"] == []
+
+    assert (fetched(), read) == (right, []), "the mark is that of the catalogue"
+    file.write_bytes(wrong)
+    with pytest.raises(VideoChanged, match="what it stores has the hash"):
+        fetched()
+    file.write_bytes(right)
+    assert (fetched(), len(read)) == (right, 2)
+
+    fetch = Bucket.fetch
+
+    def late(self: Bucket, id: str, to: Path) -> None:
+        file.write_bytes(wrong)
+        fetch(self, id, to)
+        file.write_bytes(right)
+
+    monkeypatch.setattr(Bucket, "fetch", late)
+    with pytest.raises(VideoChanged, match="what it stores has the hash"):
+        fetched()
