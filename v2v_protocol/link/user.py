@@ -114,7 +114,11 @@ def _ask(family: int, local: _End, remote: _End) -> int | None:
 
 def _look_up(family: int, local: _End, remote: _End) -> int | None:
     """Look for one socket in the kernel's table."""
-    with suppress(OSError), (_TABLES / ("tcp" if family == socket.AF_INET else "tcp6")).open() as table:
+    # Not without a descriptor for it, which says nothing of the user.
+    with (
+        suppress(FileNotFoundError, PermissionError),
+        (_TABLES / ("tcp" if family == socket.AF_INET else "tcp6")).open() as table,
+    ):
         for line in table:
             fields = line.split()
             if fields[1:4] == [_hexadecimal(local), _hexadecimal(remote), f"{_ESTABLISHED:02X}"] and fields[9] != "0":

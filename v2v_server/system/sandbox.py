@@ -53,12 +53,11 @@ _REFUSED = {
 the filter.
 """
 
-_NAMESPACES, _THREAD = 0x7E020000, 0x00010000  # flags of clone
 _REFUSED_IF = (
     ((16, 29), 1, _EQUAL, 0x5412, True),  # ioctl TIOCSTI, which types into a terminal
     ((16, 29), 1, _EQUAL, 0x541C, True),  # ioctl TIOCLINUX, which pastes into a console
-    ((56, 220), 0, _ANY_BIT, _NAMESPACES, True),  # clone
-    ((56, 220), 0, _ANY_BIT, _THREAD, False),  # clone, for a process
+    ((56, 220), 0, _ANY_BIT, 0x7E020000, True),  # clone into any new namespace
+    ((56, 220), 0, _ANY_BIT, 0x00010000, False),  # clone without CLONE_THREAD: a process
     # prlimit64, sched_setaffinity, sched_setscheduler, sched_setparam, sched_setattr: 0 is the caller itself
     *((numbers, 0, _AT_LEAST, 1, True) for numbers in ((302, 261), (203, 122), (144, 119), (142, 118), (314, 274))),
 )
@@ -131,10 +130,12 @@ def confine(writable: Iterable[Path] | None, *, network: bool) -> Confined:
 def program(machine: _Machine, *, network: bool) -> bytes:
     """Build the filter over system calls, which allows each call or refuses it with EPERM."""
     refuse, load = _instruction(_RETURN, _REFUSE), _instruction(_LOAD, 0)
-    code = [_instruction(_LOAD, 4), _instruction(_EQUAL, machine.architecture, then=1), refuse, load]
-    code += [_instruction(_AT_LEAST, _OTHER_ABI, otherwise=1), refuse]
-    # clone3, whose flags a filter does not see; without it, threads are made with clone
-    code += [_instruction(_EQUAL, 435, otherwise=1), _instruction(_RETURN, _MISSING)]
+    code = [
+        *(_instruction(_LOAD, 4), _instruction(_EQUAL, machine.architecture, then=1), refuse, load),
+        *(_instruction(_AT_LEAST, _OTHER_ABI, otherwise=1), refuse),
+        # clone3, whose flags a filter does not see; without it, threads are made with clone
+        *(_instruction(_EQUAL, 435, otherwise=1), _instruction(_RETURN, _MISSING)),
+    ]
     for number in (*(each[machine.column] for each in _REFUSED.values()), *(() if network else machine.sockets)):
         code += [_instruction(_EQUAL, number, otherwise=1), refuse]
     for calls, argument, comparison, value, at in _REFUSED_IF:
