@@ -25,7 +25,7 @@ from pathlib import Path
 _PR_SET_NO_NEW_PRIVS = 38
 _SECCOMP_SET_MODE_FILTER, _SECCOMP_GET_ACTION_AVAIL = 1, 2
 _ALL_THREADS, _NO_SLOWDOWN = 1, 4  # flags; the second: without the mitigation that made old kernels' filters expensive
-_ALLOW, _REFUSE, _MISSING = 0x7FFF0000, 0x00050000 | errno.EPERM, 0x00050000 | errno.ENOSYS
+_ALLOW, _SKIP, _REFUSE, _MISSING = 0x7FFF0000, 0x00050000, 0x00050000 | errno.EPERM, 0x00050000 | errno.ENOSYS
 _LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
 _OTHER_ABI = 0x40000000
 """Calls from this number on belong to x86_64's 32-bit variant, which repeats every call."""
@@ -54,15 +54,17 @@ the filter.
 """
 
 _REFUSED_IF = (
-    ((16, 29), 1, _EQUAL, 0x5412, True),  # ioctl TIOCSTI, which types into a terminal
-    ((16, 29), 1, _EQUAL, 0x541C, True),  # ioctl TIOCLINUX, which pastes into a console
-    ((56, 220), 0, _ANY_BIT, 0x7E020000, True),  # clone into any new namespace
-    ((56, 220), 0, _ANY_BIT, 0x00010000, False),  # clone without CLONE_THREAD: a process
-    # prlimit64, sched_setaffinity, sched_setscheduler, sched_setparam, sched_setattr: 0 is the caller itself
-    *((numbers, 0, _AT_LEAST, 1, True) for numbers in ((302, 261), (203, 122), (144, 119), (142, 118), (314, 274))),
+    ((16, 29), 1, _EQUAL, 0x5412, True, _REFUSE),  # ioctl TIOCSTI, which types into a terminal
+    ((16, 29), 1, _EQUAL, 0x541C, True, _REFUSE),  # ioctl TIOCLINUX, which pastes into a console
+    ((56, 220), 0, _ANY_BIT, 0x7E020000, True, _REFUSE),  # clone into any new namespace
+    ((56, 220), 0, _ANY_BIT, 0x00010000, False, _REFUSE),  # clone without CLONE_THREAD: a process
+    # prlimit64, sched_setaffinity, sched_setattr: 0 is the caller itself
+    *((numbers, 0, _AT_LEAST, 1, True, _REFUSE) for numbers in ((302, 261), (203, 122), (314, 274))),
+    # sched_setscheduler, sched_setparam: skipped, as ZeroMQ calls them for its own threads and insists on success
+    *((numbers, 0, _AT_LEAST, 1, True, _SKIP) for numbers in ((144, 119), (142, 118))),
 )
 """Calls that are refused for an argument: their numbers, which argument, how its lower half is compared with which
-value, and the outcome at which the call is refused. The kernel reads no more than this half of them.
+value, the outcome at which the call is refused, and the answer. The kernel reads no more than this half of them.
 """
 
 
@@ -128,7 +130,7 @@ def confine(writable: Iterable[Path] | None, *, network: bool) -> Confined:
 
 
 def program(machine: _Machine, *, network: bool) -> bytes:
-    """Build the filter over system calls, which allows each call or refuses it with EPERM."""
+    """Build the filter over system calls, which allows each call or refuses it."""
     refuse, load = _instruction(_RETURN, _REFUSE), _instruction(_LOAD, 0)
     code = [
         *(_instruction(_LOAD, 4), _instruction(_EQUAL, machine.architecture, then=1), refuse, load),
@@ -138,10 +140,10 @@ def program(machine: _Machine, *, network: bool) -> bytes:
     ]
     for number in (*(each[machine.column] for each in _REFUSED.values()), *(() if network else machine.sockets)):
         code += [_instruction(_EQUAL, number, otherwise=1), refuse]
-    for calls, argument, comparison, value, at in _REFUSED_IF:
+    for calls, argument, comparison, value, at, answer in _REFUSED_IF:
         # A filter sees arguments from byte 16 on, 8 bytes each, the lower half first.
         code += [_instruction(_EQUAL, calls[machine.column], otherwise=4), _instruction(_LOAD, 16 + 8 * argument)]
-        code += [_instruction(comparison, value, then=not at, otherwise=at), refuse, load]
+        code += [_instruction(comparison, value, then=not at, otherwise=at), _instruction(_RETURN, answer), load]
     return b"".join([*code, _instruction(_RETURN, _ALLOW)])
 
 
