@@ -103,7 +103,7 @@ def test_another_users_server_is_not_spoken_to(serve: Callable[..., tuple[str, P
 def test_a_workers_port_without_keys_is_for_the_same_user(serve: Callable[..., tuple[str, Path]]) -> None:
     _, log = serve(ALICE, "--workers", "0", "--worker-bind", "tcp://127.0.0.1:*")
     (port,) = [line.rpartition("workers to ")[2] for line in log.read_text().splitlines() if "workers to " in line]
-    assert status_of(port, OTHER_USER).returncode == 1
+    assert status_of(port, OTHER_USER, "--insecure").returncode == 1
     assert status_of(port, ALICE).returncode == 0
 
 

@@ -86,7 +86,7 @@ _HELP = {
 _RULE = "the page serves only root and the server's user; give --insecure to let every user of this host watch"
 STATIC = Path(__file__).parent / "static"
 EVENT_SECONDS = 0.5
-MOST_CONNECTIONS = 256
+MOST_PAGE_CONNECTIONS = 256
 """Open connections; a further one is closed at once."""
 _PAUSE_SECONDS = 5.0
 """Time until connections are accepted again after there were no descriptors for one."""
@@ -396,7 +396,7 @@ class PageServer(uvicorn.Server):
             try:
                 link, _ = await asyncio.get_running_loop().sock_accept(listening)
                 os.close(os.dup(link.fileno()))  # an error if no descriptor is left to ask for its user
-                if len(self.server_state.connections) < MOST_CONNECTIONS and self._admits(link):
+                if len(self.server_state.connections) < MOST_PAGE_CONNECTIONS and self._admits(link):
                     await asyncio.get_running_loop().connect_accepted_socket(self._protocol, link)
                 else:
                     link.close()
