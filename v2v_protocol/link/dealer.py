@@ -25,15 +25,15 @@ import struct
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from socket import create_connection, fromfd, gaierror
+from socket import create_connection, gaierror
 from threading import Thread
 from typing import Any
 
 import zmq
 
 from v2v_protocol.errors import KeyRefused, ServerLost, UsageError
-from v2v_protocol.keys import VARIABLE, PeerKey, is_loopback, key_for
-from v2v_protocol.link.user import other_user
+from v2v_protocol.keys import VARIABLE, PeerKey, key_for
+from v2v_protocol.link.user import loopback_user
 from v2v_protocol.messages import LARGEST_HEADER_BYTES, Frames
 
 _CONNECTED, _SILENT, _SUCCEEDED, _MECHANISM, _AUTHENTICATION = 0x0001, 0x0800, 0x1000, 0x2000, 0x4000
@@ -222,8 +222,8 @@ class Dealer:
         if questions:
             self._handshakes.connections = 0
         if questions and has_asked:
-            with suppress(OSError), fromfd(self._handshakes.descriptor, -1, -1) as link:  # otherwise it has just ended
-                if is_loopback(link.getpeername()[0]) and (user := other_user(link)):
+            with suppress(OSError):  # it has just ended
+                if user := loopback_user(self._handshakes.descriptor):
                     raise UsageError(
                         f"{self._address}: the server there belongs to {user}, not to root or user {os.geteuid()}: "
                         "nothing was sent; use a key of that server (keys=, --keys), or give insecure=True "

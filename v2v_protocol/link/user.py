@@ -20,6 +20,8 @@ from ipaddress import IPv6Address, ip_address
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+from v2v_protocol.keys import is_loopback
+
 _TABLES = Path("/proc/net")
 _OVERFLOW_USER = Path("/proc/sys/kernel/overflowuid")
 _SAY_SECONDS = 60.0
@@ -68,6 +70,12 @@ def other_user(link: socket.socket) -> str:
     if link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] != _ESTABLISHED:
         raise ConnectionAbortedError
     return "an unknown user" if user is None else f"user {user}"
+
+
+def loopback_user(descriptor: int) -> str:
+    """Do the same for a connection of ZeroMQ; empty if its other end has no loopback address."""
+    with socket.fromfd(descriptor, -1, -1) as link:
+        return other_user(link) if is_loopback(link.getpeername()[0]) else ""
 
 
 def owner(local: _End, remote: _End) -> int | None:
