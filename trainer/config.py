@@ -54,6 +54,7 @@ class StreamConfig:
         spec: other fields of :class:`v2v_protocol.spec.StreamSpec`; missing ones have the server's default.
         loader_workers: processes of each rank that receive batches; 0: the training process receives them.
         timeout_seconds: silence after which the server counts as lost.
+        insecure: without a key, also use another user's server on this host.
         mix: other streams whose batches are mixed in: a list of sections like this one, each with its ``weight`` (see
             :meth:`v2v_client.V2VStreamDataset.mix`). Keys that one leaves out are those of this section, and so are
             fields of its ``recipe``; but with ``videos`` it has no ``address`` or ``list`` of this section.
@@ -71,6 +72,7 @@ class StreamConfig:
     spec: Mapping[str, Any] = field(default_factory=dict)
     loader_workers: int = limited(0, 0, 64)
     timeout_seconds: float = limited(60.0, 0.1, 1e6)
+    insecure: bool = False
     mix: Any = field(default_factory=lambda: [])  # noqa: PIE807 - here, `list` is the field above
 
     @property

@@ -47,6 +47,7 @@ def stream(config: TrainConfig, asked: Asked, address: str, **changes: Any) -> V
         "flow_from": asked.flow_from,
         "timeout_seconds": settings.timeout_seconds,
         "keys": None if settings.address else "",  # a server of our own asks for none
+        "insecure": settings.insecure,
         **settings.spec,
     }
     return V2VStreamDataset(address, **(arguments | changes))

@@ -108,7 +108,7 @@ class Connection:
             ServerLost: no answer within the deadline.
             RemoteError: the server refuses the spec.
             StateMismatch: the server offers another stream than the pinned one.
-            UsageError: the address is malformed, or an array is unknown.
+            UsageError: the address is malformed, an array is unknown, or the server belongs to another user.
         """
         self._link = self._transport(self.address)
         try:
@@ -276,7 +276,7 @@ class Connector:
     Attributes:
         brokers: addresses of the servers.
         options: the requested stream.
-        arrays, batch_size, seed, compress, keys, patience: see :class:`v2v_client.dataset.V2VStreamDataset`.
+        arrays, batch_size, seed, compress, keys, insecure, patience: see :class:`v2v_client.dataset.V2VStreamDataset`.
     """
 
     brokers: tuple[str, ...]
@@ -286,6 +286,7 @@ class Connector:
     seed: int
     compress: bool
     keys: str | None
+    insecure: bool
     patience: Patience
 
     def connection(
@@ -330,7 +331,7 @@ class Connector:
             pinned=state.stream,
             pinned_by="this dataset" if state.is_beginning else "the saved state",
             patience=patience or self.patience,
-            transport=functools.partial(Dealer, keys=self.keys),
+            transport=functools.partial(Dealer, keys=self.keys, insecure=self.insecure),
         )
 
     def compare(self, connection: Connection, state: ResumeState, *consumer: int) -> None:

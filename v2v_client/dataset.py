@@ -82,6 +82,7 @@ class V2VStreamDataset(Fixed, IterableDataset[Batch]):
             None: only if the server is on another host.
         keys: path of this consumer's key file, see `v2v-keys`; None uses the file that ``V2V_KEYS`` names, which ranks
             and loader workers inherit; "" uses no key.
+        insecure: without a key, also receive from another user's server on this host; otherwise UsageError is raised.
         timeout_seconds: silence after which the server counts as lost.
         patience: the other timeouts; None for the defaults. Its ``timeout_seconds`` is not used.
         options: ``preset`` ("exact", "balanced", "fast", "natural" or "natural-davis346", see
@@ -107,7 +108,8 @@ class V2VStreamDataset(Fixed, IterableDataset[Batch]):
     Iterating raises ServerLost (nothing received for ``timeout_seconds``), RemoteError (the server refuses), KeyRefused
     (the server does not accept the key), SampleUnavailable (a sample cannot be made), StateMismatch (the server offers
     another stream than the one begun), ProtocolError (the peer is not a v2v server) or UsageError (the epoch is smaller
-    than a global batch). Errors in a loader worker arrive as the same types, with the worker's traceback in their text.
+    than a global batch, or the server belongs to another user). Errors in a loader worker arrive as the same types,
+    with the worker's traceback in their text.
     PyTorch raises RuntimeError if a loader worker was killed.
 
     Raises:
@@ -129,6 +131,7 @@ class V2VStreamDataset(Fixed, IterableDataset[Batch]):
         labels: Labels = "required",
         compress: bool | None = None,
         keys: str | os.PathLike[str] | None = None,
+        insecure: bool = False,
         timeout_seconds: float = 60.0,
         patience: Patience | None = None,
         **options: Any,
@@ -147,6 +150,7 @@ class V2VStreamDataset(Fixed, IterableDataset[Batch]):
             require_whole("seed", seed, 0, LARGEST_SEED),
             compress=any(map(leaves_host, brokers)) if compress is None else bool(compress),
             keys=None if keys is None else os.fspath(keys),
+            insecure=insecure,
             patience=dataclasses.replace(patience or Patience(), timeout_seconds=timeout_seconds),
         )
         self._shared_memory = shared_memory

@@ -206,6 +206,9 @@ def _parser() -> Parser:
         "--connect", metavar="ADDRESS", help="measure a running server, tcp://host:port, or several, comma-separated"
     )
     server.add_argument(
+        "--insecure", action="store_true", help="with --connect: without a key, also measure another user's server"
+    )
+    server.add_argument(
         "--workers", type=_counts, metavar="N,N", help="with --videos: server workers, one run each (default 1,2)"
     )
     server.add_argument("--rows", help="with --videos: rows of the pictures to use, as for v2v-serve")
@@ -260,6 +263,7 @@ def _dataset(arguments: argparse.Namespace, address: str) -> V2VStreamDataset:
         world_size=1,
         timeout_seconds=arguments.timeout_seconds,
         keys=None if arguments.connect else "",  # a local server needs no key
+        insecure=arguments.insecure,
         **spec_fields(arguments),
     )
 

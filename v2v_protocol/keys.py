@@ -137,7 +137,7 @@ def nameless_key(key: PeerKey) -> IO[bytes]:
 def is_loopback(host: str) -> bool:
     """Return whether a host name, or an IP address in digits, is certainly this machine."""
     try:
-        return ipaddress.ip_address(host).is_loopback
+        return ipaddress.ip_address(host.removeprefix("::ffff:")).is_loopback  # IPv4 over a socket for IPv6
     except ValueError:
         return host == "localhost"
 

@@ -12,9 +12,7 @@ does the rest. Files of videos that a run does not include stay, for a later run
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import fcntl
 import hashlib
 import math
 import os
@@ -57,6 +55,7 @@ from v2v_server.store.store_file import StoreFile, write_store
 from v2v_server.store.verified import CHANGES_MEANWHILE, Verified
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated
+from v2v_server.system.process import locked
 from v2v_server.video.decode import ClipRequest, Cut
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.picture import MOST_BITS, PixelRect
@@ -159,7 +158,7 @@ def prepare(
     done, looked_at, not_looked_at = 0, 0, list[Refusal]()
     try:
         target.mkdir(parents=True, exist_ok=True)
-        with locked(target):
+        with locked(target / _LOCK_NAME):
             known = known_records(target, header, catalogue.videos)
             with closing(_standing_files(target, catalogue, size)) as files:
                 for video, file in files:
@@ -198,6 +197,8 @@ def prepare(
                     room.done(video, made.bytes if isinstance(made, Made) and not job.stands else 0)
                     tell(done, total, room.made, room.expected)
                     check_free_space(target)
+    except BlockingIOError:
+        raise CorpusError(f"{target}: another v2v-prepare works there; wait until it ends") from None
     except OSError as error:
         raise CorpusError(f"{target}: cannot be written to: {error.strerror or error}") from error
     return Report(
@@ -390,22 +391,6 @@ def refuse_links(catalogue: Catalogue, target: Path) -> None:
             inside[folder] = path.parent.resolve().is_relative_to(target)
         if inside[folder] or (path.is_symlink() and path.resolve().is_relative_to(target)):
             raise CorpusError(f"{target}: {video.id} of the source is a link into it; choose another destination")
-
-
-@contextlib.contextmanager
-def locked(target: Path) -> Iterator[None]:
-    """Lock the folder against other processes. The system releases the lock when this process ends in any way.
-
-    Raises:
-        CorpusError: another process works there.
-        OSError: the folder cannot be written to.
-    """
-    with (target / _LOCK_NAME).open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise CorpusError(f"{target}: another v2v-prepare works there; wait until it ends") from None
-        yield
 
 
 def known_records(target: Path, header: Header, videos: Sequence[VideoEntry]) -> dict[str, PreparedVideo]:

@@ -30,7 +30,7 @@ from v2v_protocol.persisted import Persisted, parse_json
 from v2v_protocol.write_aside import flush
 from v2v_server.corpus.catalogue import index_path
 from v2v_server.system.log import gauge, short, text
-from v2v_server.system.process import lock, open_private
+from v2v_server.system.process import locked, open_private
 
 VERDICTS_PER_VIDEO = 2
 _MOST_VERDICTS = 20
@@ -222,9 +222,10 @@ def write_entry(
         CorpusError: the file is damaged, or is not the file that ``known`` came from.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = open_private(file, os.O_RDWR | os.O_APPEND | os.O_CREAT)
-    with open(descriptor, "a+b", buffering=0) as out:
-        lock(descriptor, wait_seconds, file)  # until the file is closed
+    with (
+        locked(file.with_suffix(".lock"), wait_seconds),
+        open(open_private(file, os.O_RDWR | os.O_APPEND | os.O_CREAT), "a+b", buffering=0) as out,
+    ):
         out.seek(0)
         whole = out.readall()
         lines = _parse(file, whole).lines

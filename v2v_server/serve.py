@@ -57,7 +57,7 @@ from v2v_server.video.rows import Rows
 
 _LONGEST_TURN_SECONDS = 1.0
 """A longer step than this counts as time in which the process was stopped."""
-_FILES_A_WORKER = 6
+_FILES_A_WORKER = 7
 _TURN_SECONDS = 0.1
 """Longest wait of the loop without a message; also the interval of checks of deadlines and workers."""
 _SOON_SECONDS = 5.0
@@ -167,7 +167,7 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
         worker_flags = [*(["--keys", ""] if config.engine == "local" else []), "--log-format", config.log_format]
         if config.cache:
             worker_flags += ["--cache", str(Path(config.cache).absolute()), "--cache-gib", str(config.cache_gib)]
-        worker_flags += ["--debug"] * debug
+        worker_flags += ["--debug"] * debug + ["--insecure"] * config.insecure
         worker_flags += catalogue.source.worker_flags()
         stop = threading.Event()
         sockets.has_session = dispatcher.has_session

@@ -24,8 +24,8 @@ class NextDealer(Dealer):
     """
 
     def __init__(self, first: Dealer, address: str, keys: str | PeerKey | None = None, side: str = "consumer") -> None:
-        super().__init__(address, keys, side)
-        self._context.term()
+        super().__init__(address, keys, side, insecure=True)
+        self._context.destroy()
         self._context = first._context
 
     def close(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -37,6 +36,7 @@ from v2v_server.corpus.sources.folder import Folder
 from v2v_server.quarantine import QuarantineEntry, read_quarantine
 from v2v_server.serve import Server
 from v2v_server.supervise.pool import question_workers
+from v2v_server.system.process import locked
 
 VERDICT = QuarantineEntry(0, "v.mp4", "f", 0, "crash", "t")
 RECORD = AddToQuarantine(VERDICT, Request(b"c", 0, 0))
@@ -148,8 +148,7 @@ def test_a_record_that_cannot_be_written_is_said_and_the_server_goes_on(
 def test_a_record_waits_for_another_writer_and_the_server_does_not(is_freed: bool, tmp_path: Path) -> None:
     file, times = tmp_path / "quarantine.jsonl", [0.0]
     dispatcher = Scripted([RECORD])
-    with file.open("wb") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
+    with locked(file.with_suffix(".lock")):
         server = served(dispatcher, tmp_path, clock=lambda: times[0])
         times[0] = 1.0
         server.turn(0.0)
@@ -323,8 +322,7 @@ def test_a_sequence_that_ends_two_workers_while_the_file_is_locked_is_written_on
     file, times = tmp_path / "quarantine.jsonl", [0.0]
     both = [AddToQuarantine(VERDICT, Request(session, 0, 1)) for session in (b"one", b"other")]
     dispatcher = Recording(both)
-    with file.open("a+b") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
+    with locked(file.with_suffix(".lock")):
         server = served(dispatcher, tmp_path, clock=lambda: times[0])
         times[0] = 1.0
         server.turn(0.0)

@@ -14,6 +14,8 @@ import pytest
 
 from bench.processes import free_ports
 from tests.clips import panned_luma, write_clip
+from v2v_client import V2VStreamDataset
+from v2v_protocol.errors import UsageError
 
 pytestmark = [
     pytest.mark.skipif(
@@ -63,9 +65,9 @@ def serve(tmp_path: Path) -> Iterator[Callable[..., tuple[str, Path]]]:
         each.wait(60)
 
 
-def status_of(address: str, user: int) -> subprocess.CompletedProcess[str]:
+def status_of(address: str, user: int, *flags: str) -> subprocess.CompletedProcess[str]:
     """Ask for the status, as v2v-top does."""
-    command = [*acting_as(user), "-m", "v2v_server.commands.top", "--once", "--connect", address]
+    command = [*acting_as(user), "-m", "v2v_server.commands.top", "--once", "--connect", address, *flags]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, cwd="/")
 
 
@@ -79,16 +81,35 @@ def test_another_user_gets_no_reply_and_root_and_the_own_user_do(serve: Callable
     assert status_of(address, ROOT).returncode == 0
 
 
+def test_another_users_server_is_not_spoken_to(serve: Callable[..., tuple[str, Path]], tmp_path: Path) -> None:
+    """By no peer, unless it is told to: the server would serve all."""
+    address, log = serve(ALICE, "--workers", "0", "--insecure", "--worker-bind", "tcp://127.0.0.1:*")
+    (port,) = [line.rpartition("workers to ")[2] for line in log.read_text().splitlines() if "workers to " in line]
+    refusal = f"the server there belongs to user {ALICE}, not to root or user {ROOT}: nothing was sent"
+    for program, flags in (
+        ("v2v_server.commands.top", ("--once", "--connect", address)),
+        ("v2v_client.loadtest", ("--connect", address)),
+        ("v2v_server.commands.worker", ("--connect", port, "--videos", str(tmp_path / "clips"))),
+    ):
+        command = [sys.executable, "-m", program, *flags]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        assert (done.returncode, refusal in done.stderr) == (2, True), done.stderr
+    with pytest.raises(UsageError, match=refusal):
+        len(V2VStreamDataset(address, batch_size=1))
+    assert len(V2VStreamDataset(address, batch_size=1, insecure=True)) > 0
+    assert status_of(address, ROOT, "--insecure").returncode == 0
+
+
 def test_a_workers_port_without_keys_is_for_the_same_user(serve: Callable[..., tuple[str, Path]]) -> None:
     _, log = serve(ALICE, "--workers", "0", "--worker-bind", "tcp://127.0.0.1:*")
     (port,) = [line.rpartition("workers to ")[2] for line in log.read_text().splitlines() if "workers to " in line]
-    assert status_of(port, OTHER_USER).returncode == 1
+    assert status_of(port, OTHER_USER, "--insecure").returncode == 1
     assert status_of(port, ALICE).returncode == 0
 
 
 def test_insecure_serves_every_user(serve: Callable[..., tuple[str, Path]]) -> None:
     address, log = serve(ALICE, "--workers", "0", "--worker-bind", "tcp://127.0.0.1:*", "--insecure")
-    assert status_of(address, OTHER_USER).returncode == 0
+    assert status_of(address, OTHER_USER, "--insecure").returncode == 0
     assert "refused" not in log.read_text()
 
 

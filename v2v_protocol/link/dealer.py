@@ -7,6 +7,13 @@ caller when to send its requests again.
 ZeroMQ does not recover from two faults: a peer whose packets vanish without an error, and a byte stream that is no
 longer ZeroMQ's (the socket is dead after that). For those a :class:`Dealer` can connect again, under a new routing id,
 because the server still holds the old one. The server recognises the peer by the secret of its Hello.
+
+A key names its server. Without one, any user of this host could listen at a port on loopback in the server's place, at
+once or after the server has ended. So ZeroMQ asks about each connection before its handshake (ZAP, RFC 27), and the
+answer comes from the kernel (:mod:`v2v_protocol.link.user`): until then it sends nothing, and afterwards only to root
+and our own user. ZeroMQ's questions do not name a connection. There is one at a time, and the monitor has reported its
+descriptor by then. A question that may be one of an earlier connection gets no answer, which ZeroMQ would give to the
+next one. The server then ends this connection after some seconds, and ZeroMQ asks again.
 """
 
 from __future__ import annotations
@@ -15,6 +22,7 @@ import itertools
 import math
 import os
 import struct
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from socket import create_connection, gaierror
@@ -25,10 +33,13 @@ import zmq
 
 from v2v_protocol.errors import KeyRefused, ServerLost, UsageError
 from v2v_protocol.keys import VARIABLE, PeerKey, key_for
+from v2v_protocol.link.user import loopback_user
 from v2v_protocol.messages import LARGEST_HEADER_BYTES, Frames
 
-_SILENT, _SUCCEEDED, _MECHANISM, _AUTHENTICATION = 0x0800, 0x1000, 0x2000, 0x4000
-"""Handshake events of a socket monitor: failed without detail, succeeded, protocol error, authentication failed."""
+_CONNECTED, _SILENT, _SUCCEEDED, _MECHANISM, _AUTHENTICATION = 0x0001, 0x0800, 0x1000, 0x2000, 0x4000
+"""Events of a socket monitor: connected; handshake failed without detail, succeeded, protocol error, authentication
+failed.
+"""
 _MISMATCH = 0x11000002
 _MOST_SILENT = 5
 """Consecutive handshakes that the server ended without a reply; a server that is stopping may end one or two."""
@@ -46,6 +57,7 @@ class Dealer:
         address: ``tcp://host:port``.
         keys: this peer's key, or the path of its file; None uses the file that ``V2V_KEYS`` names, "" uses no key.
         side: what this peer is: "consumer" or "worker".
+        insecure: without a key, also speak to a server on loopback that belongs to another user.
 
     Raises:
         KeyRefused: the key file cannot be used.
@@ -58,11 +70,16 @@ class Dealer:
         address: str,
         keys: str | PeerKey | None = None,
         side: str = "consumer",
+        *,
+        insecure: bool = False,
     ) -> None:
         self._address = address
         self._key = keys if isinstance(keys, PeerKey) else key_for(address, side, keys)
         self._handshakes = Handshakes(address, self._key, side)
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._asks = self._key is None and not insecure and sys.platform == "linux" and address.startswith("tcp:")
+        self._questions = self._context.socket(zmq.ROUTER)
+        self._questions.bind("inproc://zeromq.zap.01")
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
         self._poller = zmq.Poller()
@@ -94,17 +111,19 @@ class Dealer:
             socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
             socket.setsockopt(zmq.RECONNECT_IVL_MAX, _LONGEST_RECONNECT_MS)
             events = f"inproc://handshakes-{next(_monitors)}"
-            socket.monitor(events, _SILENT | _SUCCEEDED | _MECHANISM | _AUTHENTICATION)
+            socket.monitor(events, _CONNECTED | _SILENT | _SUCCEEDED | _MECHANISM | _AUTHENTICATION)
             if self._key is not None:
                 secure(socket, self._key)
+            if self._asks:
+                socket.setsockopt(zmq.ZAP_DOMAIN, b"server")
             monitor = self._context.socket(zmq.PAIR)
             monitor.setsockopt(zmq.LINGER, 0)
             monitor.connect(events)
             self._socket, self._monitor = socket, monitor
-            self._handshakes.succeeded = 0
+            self._handshakes.succeeded = self._handshakes.connections = 0
             self._poller = zmq.Poller()
-            self._poller.register(socket, zmq.POLLIN)
-            self._poller.register(monitor, zmq.POLLIN)
+            for each in (socket, monitor, self._questions):
+                self._poller.register(each, zmq.POLLIN)
         try:
             socket.connect(self._address)
         except zmq.ZMQError as error:
@@ -162,7 +181,8 @@ class Dealer:
             raise ServerLost(f"{self._address}: cannot send: {error}") from error
 
     def receive(self, seconds: float) -> Frames | None:
-        """Return the next message, or None if ``seconds`` passed or the monitor had an event instead.
+        """Return the next message. None if ``seconds`` passed or something happened to the connection: then call
+        :meth:`has_reconnected`, without which a connection may wait for its handshake.
 
         Raises:
             ServerLost: the link is closed, or the system refuses to receive.
@@ -187,14 +207,29 @@ class Dealer:
 
         Raises:
             KeyRefused: the server does not accept this key.
+            UsageError: the server belongs to another user.
         """
         before = self._handshakes.succeeded
         return self._count_handshakes() > max(1, before)
 
     def _count_handshakes(self) -> int:
-        """Return how often the socket has connected."""
-        monitor = self._open(self._monitor)
+        """Return how often the socket has connected. Tell ZeroMQ that it may speak to the server, if it asks."""
+        monitor, questions = self._open(self._monitor), list[list[bytes]]()
+        while self._questions.poll(0):
+            questions.append(self._questions.recv_multipart())
         self._handshakes.take(lambda: monitor.poll(0), lambda: monitor.recv_multipart(flags=zmq.NOBLOCK))
+        has_asked = len(questions) == self._handshakes.connections  # so has the newest, as each asks once
+        if questions:
+            self._handshakes.connections = 0
+        if questions and has_asked:
+            with suppress(OSError):  # it has just ended
+                if user := loopback_user(self._handshakes.descriptor):
+                    raise UsageError(
+                        f"{self._address}: the server there belongs to {user}, not to root or user {os.geteuid()}: "
+                        "nothing was sent; use a key of that server (keys=, --keys), or give insecure=True "
+                        "(--insecure) to trust it"
+                    )
+                self._questions.send_multipart([*questions[-1][:4], b"200", b"", b"", b""])
         return self._handshakes.succeeded
 
     def _open(self, socket: zmq.Socket[bytes] | None) -> zmq.Socket[bytes]:
@@ -218,10 +253,12 @@ class Handshakes:
 
     Attributes:
         succeeded: how many have succeeded; a new socket begins at 0.
+        connections: made since ZeroMQ last asked about one.
+        descriptor: of the newest connection; -1 before the first.
     """
 
     def __init__(self, address: str, key: PeerKey | None, side: str) -> None:
-        self.succeeded = 0
+        self.succeeded, self.connections, self.descriptor = 0, 0, -1
         self._is_proven = False  # that the server is the one of the key
         self._silent = 0
         self._address, self._side = address, side
@@ -240,6 +277,9 @@ class Handshakes:
         """
         while waiting():
             event, value = struct.unpack("=Hi", receive()[0])
+            if event == _CONNECTED:
+                self.descriptor, self.connections = value, self.connections + 1
+                continue
             self._silent = self._silent + 1 if event == _SILENT else 0
             if event == _SUCCEEDED:
                 self.succeeded += 1

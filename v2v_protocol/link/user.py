@@ -1,8 +1,9 @@
 """Find the user at the other end of a connection on loopback. I/O, Linux.
 
-A peer on this host has a socket of its own, whose local end is the address that we see as its peer. The kernel knows
-which user made it. An exact query (``sock_diag(7)``) takes microseconds and needs no rights. Where it finds nothing or
-is not allowed, ``/proc/net/tcp`` is read, in time that grows with the number of connections.
+A server asks this about each peer, and a peer about its server before it says anything. The other end on this host has
+a socket of its own, whose local end is the address that we see as its peer. The kernel knows which user made it. An
+exact query (``sock_diag(7)``) takes microseconds and needs no rights. Where it finds nothing or is not allowed,
+``/proc/net/tcp`` is read, in time that grows with the number of connections.
 
 A closed socket has no inode and seems to belong to root, so only an established one with an inode counts.
 """
@@ -18,6 +19,8 @@ from contextlib import suppress
 from ipaddress import IPv6Address, ip_address
 from pathlib import Path
 from typing import Literal, TypeAlias
+
+from v2v_protocol.keys import is_loopback
 
 _TABLES = Path("/proc/net")
 _OVERFLOW_USER = Path("/proc/sys/kernel/overflowuid")
@@ -40,24 +43,39 @@ class OwnUser:
 
     def __init__(self, rule: str, say: Callable[[str, Literal["warning"]], object]) -> None:
         self._rule, self._say = rule, say
-        self._said_at: dict[int | None, float] = {}
-        # Users that a user namespace does not map all have this number, so it identifies none.
-        self._overflow = int(_OVERFLOW_USER.read_text())
+        self._said_at: dict[str, float] = {}
 
     def admits(self, link: socket.socket) -> bool:
         """Return whether a connection may stay."""
-        if link.family == socket.AF_UNIX:  # ZeroMQ admits only our own user there
-            return True
         with suppress(OSError):  # it has just ended
-            own, user = os.geteuid(), owner(_end(link.getpeername()), _end(link.getsockname()))
-            if user == 0 or (user == own and user != self._overflow):
+            if not (who := other_user(link)):
                 return True
-            is_there = link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] == _ESTABLISHED
-            if is_there and (now := time.monotonic()) >= self._said_at.get(user, now):
-                self._said_at[user] = now + _SAY_SECONDS
-                who = "an unknown user" if user is None else f"user {user}"
-                self._say(f"refused a connection of {who} to a process of user {own}: {self._rule}", "warning")
+            if (now := time.monotonic()) >= self._said_at.get(who, now):
+                self._said_at[who] = now + _SAY_SECONDS
+                self._say(f"refused a connection of {who}, not root or user {os.geteuid()}: {self._rule}", "warning")
         return False
+
+
+def other_user(link: socket.socket) -> str:
+    """Name the user at the other end of a connection; empty if it is root or this process's own.
+
+    Raises:
+        OSError: the connection has just ended.
+    """
+    # To a Unix socket ZeroMQ admits only our own user.
+    user = 0 if link.family == socket.AF_UNIX else owner(_end(link.getpeername()), _end(link.getsockname()))
+    # Users that a user namespace does not map all have the same number, so it identifies none.
+    if user == 0 or (user == os.geteuid() and user != int(_OVERFLOW_USER.read_text())):
+        return ""
+    if link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] != _ESTABLISHED:
+        raise ConnectionAbortedError
+    return "an unknown user" if user is None else f"user {user}"
+
+
+def loopback_user(descriptor: int) -> str:
+    """Do the same for a connection of ZeroMQ; empty if its other end has no loopback address."""
+    with socket.fromfd(descriptor, -1, -1) as link:
+        return other_user(link) if is_loopback(link.getpeername()[0]) else ""
 
 
 def owner(local: _End, remote: _End) -> int | None:
@@ -104,7 +122,11 @@ def _ask(family: int, local: _End, remote: _End) -> int | None:
 
 def _look_up(family: int, local: _End, remote: _End) -> int | None:
     """Look for one socket in the kernel's table."""
-    with suppress(OSError), (_TABLES / ("tcp" if family == socket.AF_INET else "tcp6")).open() as table:
+    # Not without a descriptor for it, which says nothing of the user.
+    with (
+        suppress(FileNotFoundError, PermissionError),
+        (_TABLES / ("tcp" if family == socket.AF_INET else "tcp6")).open() as table,
+    ):
         for line in table:
             fields = line.split()
             if fields[1:4] == [_hexadecimal(local), _hexadecimal(remote), f"{_ESTABLISHED:02X}"] and fields[9] != "0":

@@ -35,6 +35,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     what.add_argument("--keys", metavar="FILE", help="a consumer's key (default: what V2V_KEYS names)")
     what.add_argument(
+        "--insecure", action="store_true", help="without a key, also show another user's server on this host"
+    )
+    what.add_argument(
         "--once", action="store_true", help="show the current state and exit; status 1 if the server does not answer"
     )
     what.add_argument(
@@ -45,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: argparse.Namespace) -> None:
     console = Console()
-    with StatusClient(arguments.connect, arguments.keys) as client:
+    with StatusClient(arguments.connect, arguments.keys, insecure=arguments.insecure) as client:
         state = client.get_status(arguments.timeout_seconds)  # report an absent server at once
         if not console.is_terminal:
             _lines(client, state, arguments)

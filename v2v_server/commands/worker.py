@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import os
+import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
+from v2v_protocol.programs import environment
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_source
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.system.log import GIB, Log, report_errors
-from v2v_server.system.process import die_with_parent
+from v2v_server.system.process import die_with_parent, relayed_output
 from v2v_server.worker.process import run_worker, unshared_name
 from v2v_server.worker.warm_up import warm_up_in_turn
 
@@ -43,14 +46,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     work.add_argument(
         "--keys", metavar="FILE", help="its key file, see v2v-keys (default: the file that V2V_KEYS names)"
     )
+    work.add_argument(
+        "--insecure", action="store_true", help="without a key, also work for another user's server on this host"
+    )
     parser.add_settings(ServeConfig, "cache", "cache_gib", "copies", "copies_gib", "log_format")
     parser.add_argument("--parent-pid", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--logbook-fd", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--arenas-fd", type=int, help=argparse.SUPPRESS)
-    return run_command(parser, report_errors(_run), argv, failures=(V2VError,), interrupted="")
+    return run_command(
+        parser, report_errors(lambda given: _run(given, argv)), argv, failures=(V2VError,), interrupted=""
+    )
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace, argv: Sequence[str]) -> None:
+    if arguments.parent_pid is None and any(map(os.isatty, range(3))):
+        # Apart from the terminal, which a process that a video has taken over could read and steer.
+        sys.exit(
+            subprocess.call(
+                [sys.executable, "-m", "v2v_server.commands.worker", *argv, "--parent-pid", str(os.getpid())],
+                stdin=subprocess.DEVNULL,
+                stdout=relayed_output().fileno(),
+                stderr=subprocess.STDOUT,
+                env=environment(),
+                start_new_session=True,
+            )
+        )
     # A server names its own workers, and recognises them by these names.
     name = arguments.name if arguments.logbook_fd is not None else unshared_name(arguments.name)
     source = open_source(
@@ -66,7 +86,7 @@ def _run(arguments: argparse.Namespace) -> None:
     log = Log(is_json=arguments.log_format == "json")
     run_worker(
         arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log,
-        arguments.arenas_fd,
+        arguments.arenas_fd, insecure=arguments.insecure,
     )  # fmt: skip
 
 

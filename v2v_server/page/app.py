@@ -25,14 +25,16 @@ import argparse
 import asyncio
 import ipaddress
 import json
+import os
 import platform
 import socket
 import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, TypeAlias
 
 import uvicorn
 from prometheus_client import CollectorRegistry
@@ -84,6 +86,10 @@ _HELP = {
 _RULE = "the page serves only root and the server's user; give --insecure to let every user of this host watch"
 STATIC = Path(__file__).parent / "static"
 EVENT_SECONDS = 0.5
+MOST_PAGE_CONNECTIONS = 256
+"""Open connections; a further one is closed at once."""
+_PAUSE_SECONDS = 5.0
+"""Time until connections are accepted again after there were no descriptors for one."""
 MOST_EVENT_STREAMS = 64
 """Browsers that receive every status. One that stops reading occupies its connection and the memory of one status."""
 
@@ -365,16 +371,38 @@ def _said(trouble: str) -> Response:
     return PlainTextResponse(f"{trouble or 'ok'}\n", 503 if trouble else 200)
 
 
-class OwnUserProtocol(H11Protocol):
-    """Close connections of other users of this host before they send a request."""
+class PageServer(uvicorn.Server):
+    """A server that accepts its connections itself. One that may not stay takes nothing but its descriptor until it is
+    closed. asyncio's own loop writes a traceback for each connection that waits while there are no descriptors.
 
-    own_user: ClassVar[OwnUser]
+    Args:
+        admits: whether a connection may stay.
+        say: writes a line.
+    """
 
-    def connection_made(self, transport: Any) -> None:
-        """Check a new connection, see asyncio.Protocol."""
-        super().connection_made(transport)
-        if not self.own_user.admits(transport.get_extra_info("socket")):
-            transport.abort()
+    def __init__(
+        self, config: uvicorn.Config, admits: Callable[[socket.socket], bool], say: Callable[..., object]
+    ) -> None:
+        super().__init__(config)
+        self._admits, self._say, self._protocol = admits, say, partial(H11Protocol, config, self.server_state, {})
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to accept connections, see uvicorn."""
+        await super().startup([])
+        self._accepting = [asyncio.create_task(self._accept(listening)) for listening in sockets or ()]
+
+    async def _accept(self, listening: socket.socket) -> None:
+        while True:
+            try:
+                link, _ = await asyncio.get_running_loop().sock_accept(listening)
+                os.close(os.dup(link.fileno()))  # an error if no descriptor is left to ask for its user
+                if len(self.server_state.connections) < MOST_PAGE_CONNECTIONS and self._admits(link):
+                    await asyncio.get_running_loop().connect_accepted_socket(self._protocol, link)
+                else:
+                    link.close()
+            except OSError as error:
+                self._say(f"the page accepts no connections for {_PAUSE_SECONDS:g} s: {error.strerror}", "warning")
+                await asyncio.sleep(_PAUSE_SECONDS)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -394,9 +422,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     die_with_parent(arguments.parent_pid)
     # No key: this address admits the server's own user, see v2v_server.page.child.
     source = Source(StatusClient(arguments.connect, keys=""))
+    log = Log(is_json=arguments.log_format == "json")
     is_open = arguments.insecure or sys.platform != "linux"
-    if not is_open:
-        OwnUserProtocol.own_user = OwnUser(_RULE, Log(is_json=arguments.log_format == "json").say)
+    admits = (lambda _: True) if is_open else OwnUser(_RULE, log.say).admits
     config = uvicorn.Config(
         make_app(source, filter(None, arguments.names.split(","))),
         log_level="warning",
@@ -405,11 +433,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         lifespan="off",
         ws="none",
         timeout_graceful_shutdown=1,
-        limit_concurrency=256,
-        http=H11Protocol if is_open else OwnUserProtocol,
+        http=H11Protocol,
     )
     with socket.socket(fileno=arguments.fd) as listening:
-        uvicorn.Server(config).run(sockets=[listening])
+        listening.setblocking(False)
+        PageServer(config, admits, log.say).run([listening])
     return 0
 
 

@@ -21,15 +21,16 @@ class StatusClient:
     Args:
         address: where consumers or workers connect, ``tcp://host:port``.
         keys: file of a consumer's key; None: the one that ``V2V_KEYS`` names, "": no key.
+        insecure: see :class:`v2v_protocol.link.dealer.Dealer`.
 
     Raises:
         UsageError: the address is malformed.
         KeyRefused: the key file cannot be used.
     """
 
-    def __init__(self, address: str, keys: str | None = None) -> None:
+    def __init__(self, address: str, keys: str | None = None, *, insecure: bool = False) -> None:
         self._address = address
-        self._link = Dealer(address, keys)
+        self._link = Dealer(address, keys, insecure=insecure)
         try:
             self._link.connect()
         except UsageError:
@@ -50,7 +51,7 @@ class StatusClient:
         Raises:
             ServerLost: there is no answer in this time.
             RemoteError: the server is too busy.
-            KeyRefused: the server does not accept the key.
+            UsageError: the server belongs to another user, or does not accept the key.
             ProtocolError, VersionMismatch: the peer is no such server, or has another version.
         """
         end = time.monotonic() + timeout_seconds

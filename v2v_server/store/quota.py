@@ -1,8 +1,8 @@
 """Fill a folder up to a limit, from many processes.
 
-The number of bytes lies in the file ``used``, behind a lock. Files lie one folder deep (``ab/ab12...``). A file is
-written in ``partial``, which does not count, and renamed once it is complete and fits the limit. Disk space is kept
-free for others.
+The number of bytes lies in the file ``used``, behind a lock (``used.lock``). Files lie one folder deep
+(``ab/ab12...``). A file is written in ``partial``, which does not count, and renamed once it is complete and fits the
+limit. Disk space is kept free for others.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2v_server.system.log import GIB, counter, gauge, text
-from v2v_server.system.process import lock, open_private
+from v2v_server.system.process import locked, open_private
 
 LEAST_FREE_BYTES = GIB
 """Always keep this much disk space free."""
@@ -93,8 +93,10 @@ class QuotaFolder:
             OSError: the file cannot be opened or written.
         """
         path = self.folder / _USED
-        with open(open_private(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW), "r+b") as file:
-            lock(file.fileno(), self._wait_seconds, path)
+        with (
+            locked(path.with_suffix(".lock"), self._wait_seconds),
+            open(open_private(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW), "r+b") as file,
+        ):
             text = file.read(64)
             self._bytes = int(text) if text.isdigit() else count_bytes(self.folder)
             yield

@@ -1,8 +1,8 @@
 """Workers as processes of this host. The process that starts them also reaps them.
 
-Workers are started as programs of their own (never forked), in their own process group so that Ctrl-C in a terminal
-reaches only the server, and die with the server even when it is killed. An actor on another host
-(:mod:`v2v_server.supervise.ray_host`) starts them, and interprets their ends, in the same way.
+Workers are started as programs of their own (never forked), in a session of their own: they have no terminal, Ctrl-C
+reaches only the server, which prints what they write, and they die with the server even when it is killed. An actor on
+another host (:mod:`v2v_server.supervise.ray_host`) starts them, and interprets their ends, in the same way.
 
 Processes may be started before there is work: they import their modules while the server imports its own and opens its
 catalogue. The pool then tells them their arguments, in place of starting other processes.
@@ -29,6 +29,7 @@ from v2v_protocol.programs import environment
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
 from v2v_server.supervise.pool import Exit, ProcessStatus
+from v2v_server.system.process import relayed_output
 from v2v_server.worker.logbook import Logbook
 
 _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
@@ -68,9 +69,11 @@ class WorkerProcess:
             self.process = subprocess.Popen(
                 [*PROGRAM, *told],
                 stdin=subprocess.DEVNULL if address else subprocess.PIPE,
+                stdout=relayed_output().fileno(),
+                stderr=subprocess.STDOUT,
                 pass_fds=handed,
                 env=environment() | _ONE_THREAD,
-                process_group=0,
+                start_new_session=True,
             )
             undo.pop_all()
 

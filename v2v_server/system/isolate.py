@@ -29,7 +29,7 @@ import msgpack
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.persisted import reader, to_plain
-from v2v_server.system.process import die_with_parent, limit_memory
+from v2v_server.system.process import die_with_parent, limit_memory, relayed_output
 from v2v_server.system.sandbox import confine
 
 J = TypeVar("J")
@@ -211,7 +211,7 @@ class _Lane(Generic[J, _R]):
         self._begun = False
         self.socket, other = socketpair()
         self.socket.settimeout(_SEND_SECONDS)
-        given = other, function, os.getpid(), memory_bytes, writable
+        given = other, relayed_output(), function, os.getpid(), memory_bytes, writable
         self._process = multiprocessing.get_context("spawn").Process(target=_serve, args=given, daemon=True)
         # The first process also starts multiprocessing's tracker, which would unblock SIGINT again.
         resource_tracker.ensure_running()
@@ -278,8 +278,8 @@ class _Lane(Generic[J, _R]):
 
 @contextlib.contextmanager
 def _interrupt_held_back() -> Iterator[None]:
-    """Block SIGINT for processes started inside. Ctrl-C in a terminal goes to all of them, and must not strike before
-    :func:`_serve` can ignore it. In this process it takes effect at the end.
+    """Block SIGINT in processes started inside: Ctrl-C in a terminal also goes to those that have not left it yet. In
+    this process it takes effect at the end.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
@@ -290,21 +290,22 @@ def _interrupt_held_back() -> Iterator[None]:
 
 def _serve(
     connection: socket,
+    output: socket,
     function: Callable[[Any], Any],
     parent_pid: int,
     memory_bytes: int,
     writable: Sequence[Path] | None,
 ) -> None:
     die_with_parent(parent_pid)
+    os.setsid()  # no terminal sends it a signal from now on; the parent decides what follows a Ctrl-C
+    for stream in range(3):
+        os.dup2(output.fileno(), stream)
     if memory_bytes:
         limit_memory(memory_bytes)
     # The tracker is not confined, and removes what is named to it.
     os.close(resource_tracker.getfd())  # type: ignore[arg-type]
     if writable is not None:
         confine(writable, network=False)
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # a terminal sends it to all processes; the parent decides what follows
     connection.sendall(_packed(None))  # report that it began: from here on, its end is not a failed start
     read = reader([*_hints(function).values()][-2])
     for job in msgpack.Unpacker(connection.makefile("rb", buffering=0), **_LIMITS):

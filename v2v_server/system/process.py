@@ -1,9 +1,10 @@
-"""Services of the operating system: memory that stays, cores, long time slices, children that die with their parent,
-locks, private files.
+"""Services of the operating system: memory that stays, cores, long time slices, children that die with their parent
+and have no terminal, locks, private files.
 """
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import errno
 import fcntl
@@ -18,17 +19,21 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
+from socket import SHUT_WR, socket, socketpair
+from threading import Thread
 
 from v2v_protocol import arena
 from v2v_protocol.errors import CorpusError
+from v2v_protocol.programs import printable
 
 _PR_SET_PDEATHSIG = 1
 _TURN_SECONDS = 0.1  # the longest time slice that Linux grants
 MOST_CONNECTIONS = 4096 + 256
 _MOST_FILES = 1 << 16  # one connection per consumer and worker, and one logbook per worker
 _SCHED_ATTR_CALLS = {"x86_64": (315, 314), "aarch64": (275, 274)}  # numbers of sched_getattr and sched_setattr
-_LONGEST_PAUSE_SECONDS = 0.05
+_LONGEST_PAUSE_SECONDS, _LOCKED = 0.05, "another process keeps it locked; end that process"
 
 
 def keep_freed_memory() -> bool:
@@ -213,6 +218,27 @@ def die_with_parent(parent_pid: int) -> None:
         os._exit(1)
 
 
+@cache
+def relayed_output() -> socket:
+    """Return what children without a terminal print to. A thread of this process writes each line to standard error,
+    without characters that steer a terminal.
+    """
+    ours, childrens = socketpair()
+    ours.shutdown(SHUT_WR)  # there is nothing to read, where it is standard input too
+
+    def write_lines() -> None:
+        with ours.makefile("rb") as output, suppress(OSError):  # our own standard error is closed
+            while line := output.readline(1 << 14):
+                # Not through sys.stderr: the interpreter could not end while this thread has its lock.
+                os.write(2, f"{printable(os.fsdecode(line.rstrip()))}\n".encode())
+
+    thread = Thread(target=write_lines, name="v2v-output", daemon=True)
+    thread.start()
+    atexit.register(thread.join, 1.0)
+    atexit.register(childrens.close)  # before that
+    return childrens
+
+
 def cache_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
     """Return the folder for this user's indexes and copies: the chosen one, else ``$V2V_CACHE_DIR``, else
     ``$XDG_CACHE_HOME/v2v``, else ``~/.cache/v2v``.
@@ -233,46 +259,54 @@ def cache_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
         ) from error
 
 
-def lock(descriptor: int, wait_seconds: float, file: str | os.PathLike[str]) -> None:
-    """Lock an open file until it is closed.
+@contextmanager
+def locked(file: Path, wait_seconds: float = 0.0) -> Iterator[None]:
+    """Hold a lock, until the end of the body or of this process.
+
+    A file that can be opened can be locked, for reading too, by a confined process or another user. So the file holds
+    nothing else, and only our own user can open it, to write (root can always open it).
 
     Args:
-        descriptor: of the file.
+        file: the lock; created if it is missing.
         wait_seconds: longest wait for another process; 0 tries once.
-        file: its name, for the error.
 
     Raises:
         BlockingIOError: another process keeps it locked.
+        OSError: it cannot be opened, or the file system has no locks.
     """
     pause, end = 0.001, time.monotonic() + wait_seconds
-    while True:
-        try:
-            return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if time.monotonic() >= end:
-                raise BlockingIOError(errno.EAGAIN, "another process keeps it locked; end that process", file) from None
-        time.sleep(pause)
-        pause = min(2 * pause, _LONGEST_PAUSE_SECONDS)
+    with open(open_private(file, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, 0o200), "wb") as held:
+        while True:
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() >= end:
+                    raise BlockingIOError(errno.EAGAIN, _LOCKED, str(file)) from None
+            time.sleep(pause)
+            pause = min(2 * pause, _LONGEST_PAUSE_SECONDS)
+        yield
 
 
-def open_private(path: Path, flags: int) -> int:
-    """Open a regular file of ours with mode 0600, and return its descriptor. Never blocks.
+def open_private(path: Path, flags: int, mode: int = 0o600) -> int:
+    """Open a regular file of ours, and return its descriptor. Never blocks.
 
     Args:
         path: the file. Other users lose access to an existing file, unless it lies behind a symbolic link.
         flags: of ``os.open``; with ``O_CREAT`` a missing file is made.
+        mode: all that its permissions may be.
 
     Raises:
         OSError: the file cannot be opened, or is not a regular one.
     """
-    descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NONBLOCK, 0o600)
+    descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NONBLOCK, mode)
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, "not a regular file", str(path))
-        is_open = stat.S_IMODE(status.st_mode) & 0o077
+        is_open = stat.S_IMODE(status.st_mode) & ~mode
         if status.st_uid == os.geteuid() and is_open and not path.is_symlink():
-            os.fchmod(descriptor, 0o600)
+            os.fchmod(descriptor, mode)
     except BaseException:
         os.close(descriptor)
         raise

@@ -2,12 +2,12 @@
 
 A file that exploits a flaw in the decoder can then read what its user can read, and use memory and time. But it
 
-    starts no program, traces no other process, gains no other rights              seccomp
-    makes no socket, unless the process needs a network                            seccomp
-    writes, creates and removes no file except below the given folders             Landlock
+    starts no process and no program, traces no other process, gains no other rights              seccomp
+    types nothing into a terminal, changes neither limits nor priority of other processes         seccomp
+    makes no socket, unless the process needs a network                                           seccomp
+    writes, creates and removes no file except below the given folders                            Landlock
 
-Both are part of the kernel, need no rights, and are inherited by processes that it starts. Refused calls fail with
-EPERM or EACCES; no process is killed for them.
+Both are part of the kernel, and need no rights. Refused calls fail with EPERM or EACCES; no process is killed for them.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from pathlib import Path
 _PR_SET_NO_NEW_PRIVS = 38
 _SECCOMP_SET_MODE_FILTER, _SECCOMP_GET_ACTION_AVAIL = 1, 2
 _ALL_THREADS, _NO_SLOWDOWN = 1, 4  # flags; the second: without the mitigation that made old kernels' filters expensive
-_ALLOW, _REFUSE = 0x7FFF0000, 0x00050000 | errno.EPERM
-_LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06
+_ALLOW, _SKIP, _REFUSE, _MISSING = 0x7FFF0000, 0x00050000, 0x00050000 | errno.EPERM, 0x00050000 | errno.ENOSYS
+_LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
 _OTHER_ABI = 0x40000000
 """Calls from this number on belong to x86_64's 32-bit variant, which repeats every call."""
 
@@ -40,12 +40,32 @@ _FILE_RIGHTS = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14 | 1 << 15
 
 
 _REFUSED = {
-    "execve": (59, 221), "execveat": (322, 281), "ptrace": (101, 117), "process_vm_readv": (310, 270),
-    "process_vm_writev": (311, 271), "pidfd_getfd": (438, 438), "io_uring_setup": (425, 425), "bpf": (321, 280),
+    "execve": (59, 221), "execveat": (322, 281), "fork": (57, 221), "vfork": (58, 221), "ptrace": (101, 117),
+    "process_vm_readv": (310, 270), "process_vm_writev": (311, 271), "process_madvise": (440, 440),
+    "pidfd_getfd": (438, 438), "kcmp": (312, 272), "io_uring_setup": (425, 425), "bpf": (321, 280),
     "perf_event_open": (298, 241), "userfaultfd": (323, 282), "keyctl": (250, 219), "add_key": (248, 217),
-    "request_key": (249, 218), "mount": (165, 40), "unshare": (272, 97), "setns": (308, 268),
+    "request_key": (249, 218), "unshare": (272, 97), "setns": (308, 268), "chroot": (161, 51), "pivot_root": (155, 41),
+    "mount": (165, 40), "umount2": (166, 39), "open_tree": (428, 428), "move_mount": (429, 429), "fsopen": (430, 430),
+    "fsconfig": (431, 431), "fsmount": (432, 432), "fspick": (433, 433), "mount_setattr": (442, 442),
+    "open_tree_attr": (467, 467), "open_by_handle_at": (304, 265), "setpriority": (141, 140), "ioprio_set": (251, 30),
 }  # fmt: skip
-"""Refused calls, by their numbers on x86_64 and aarch64. io_uring could perform the others without the filter."""
+"""Refused calls, by their numbers on x86_64 and aarch64, which has no fork. io_uring could perform the others without
+the filter.
+"""
+
+_REFUSED_IF = (
+    ((16, 29), 1, _EQUAL, 0x5412, True, _REFUSE),  # ioctl TIOCSTI, which types into a terminal
+    ((16, 29), 1, _EQUAL, 0x541C, True, _REFUSE),  # ioctl TIOCLINUX, which pastes into a console
+    ((56, 220), 0, _ANY_BIT, 0x7E020000, True, _REFUSE),  # clone into any new namespace
+    ((56, 220), 0, _ANY_BIT, 0x00010000, False, _REFUSE),  # clone without CLONE_THREAD: a process
+    # prlimit64, sched_setaffinity, sched_setattr: 0 is the caller itself
+    *((numbers, 0, _AT_LEAST, 1, True, _REFUSE) for numbers in ((302, 261), (203, 122), (314, 274))),
+    # sched_setscheduler, sched_setparam: skipped, as ZeroMQ calls them for its own threads and insists on success
+    *((numbers, 0, _AT_LEAST, 1, True, _SKIP) for numbers in ((144, 119), (142, 118))),
+)
+"""Calls that are refused for an argument: their numbers, which argument, how its lower half is compared with which
+value, the outcome at which the call is refused, and the answer. The kernel reads no more than this half of them.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +73,10 @@ class _Machine:
     architecture: int  # as the kernel reports it to a filter
     seccomp: int
     sockets: tuple[int, ...]  # socket and socketpair
-    refused: tuple[int, ...]
+    column: int  # of the tables above
 
 
-_MACHINES = {
-    "x86_64": _Machine(0xC000003E, 317, (41, 53), tuple(number for number, _ in _REFUSED.values())),
-    "aarch64": _Machine(0xC00000B7, 277, (198, 199), tuple(number for _, number in _REFUSED.values())),
-}
+_MACHINES = {"x86_64": _Machine(0xC000003E, 317, (41, 53), 0), "aarch64": _Machine(0xC00000B7, 277, (198, 199), 1)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,12 +130,20 @@ def confine(writable: Iterable[Path] | None, *, network: bool) -> Confined:
 
 
 def program(machine: _Machine, *, network: bool) -> bytes:
-    """Build the filter over system calls, which allows each call or refuses it with EPERM."""
-    refuse = _instruction(_RETURN, _REFUSE)
-    code = [_instruction(_LOAD, 4), _instruction(_EQUAL, machine.architecture, then=1), refuse, _instruction(_LOAD, 0)]
-    code += [_instruction(_AT_LEAST, _OTHER_ABI, otherwise=1), refuse]
-    for number in (*machine.refused, *(() if network else machine.sockets)):
+    """Build the filter over system calls, which allows each call or refuses it."""
+    refuse, load = _instruction(_RETURN, _REFUSE), _instruction(_LOAD, 0)
+    code = [
+        *(_instruction(_LOAD, 4), _instruction(_EQUAL, machine.architecture, then=1), refuse, load),
+        *(_instruction(_AT_LEAST, _OTHER_ABI, otherwise=1), refuse),
+        # clone3, whose flags a filter does not see; without it, threads are made with clone
+        *(_instruction(_EQUAL, 435, otherwise=1), _instruction(_RETURN, _MISSING)),
+    ]
+    for number in (*(each[machine.column] for each in _REFUSED.values()), *(() if network else machine.sockets)):
         code += [_instruction(_EQUAL, number, otherwise=1), refuse]
+    for calls, argument, comparison, value, at, answer in _REFUSED_IF:
+        # A filter sees arguments from byte 16 on, 8 bytes each, the lower half first.
+        code += [_instruction(_EQUAL, calls[machine.column], otherwise=4), _instruction(_LOAD, 16 + 8 * argument)]
+        code += [_instruction(comparison, value, then=not at, otherwise=at), _instruction(_RETURN, answer), load]
     return b"".join([*code, _instruction(_RETURN, _ALLOW)])
 
 

@@ -329,6 +329,7 @@ class Worker:
         log: log for people.
         arenas: receives the arenas of leases from a server on this host; None opens them by their names. Such a worker
             makes no other socket once it has heard its server, unless the videos come from a network.
+        insecure: see :class:`v2v_protocol.link.dealer.Dealer`.
 
     Raises:
         UsageError: the socket cannot connect to the address.
@@ -345,8 +346,10 @@ class Worker:
         keys: str | None = None,
         log: Log | None = None,
         arenas: socket.socket | None = None,
+        *,
+        insecure: bool = False,
     ) -> None:
-        self._link = Dealer(address, keys, "worker")
+        self._link = Dealer(address, keys, "worker", insecure=insecure)
         self._name = name
         self._log = log or Log()
         self._logbook = logbook
@@ -600,6 +603,8 @@ def run_worker(
     keys: str | None = None,
     log: Log | None = None,
     arenas: int | None = None,
+    *,
+    insecure: bool = False,
 ) -> None:
     """Run one worker in this process until the server stops it.
 
@@ -614,9 +619,10 @@ def run_worker(
         log: log for people.
         arenas: descriptor of its end of the socket pair for arenas if a server started it, see
             :mod:`v2v_server.worker.logbook`; not used for a server on another host.
+        insecure: without a key, also work for a server on loopback that belongs to another user.
 
     Raises:
-        UsageError: the socket cannot connect to the address, or the server rejects the key.
+        UsageError: the socket cannot connect to the address, or the server rejects the key or belongs to another user.
         RemoteError, VersionMismatch: the server rejects this worker.
     """
     if parent_pid is not None:
@@ -639,7 +645,7 @@ def run_worker(
     # The tools for object storage write elsewhere, and a worker of this host without a pool opens arenas itself.
     confines_files = source.is_local and (pool is not None or leaves_host(address))
     confine(written if confines_files else None, network=True)
-    worker = Worker(name or unshared_name(None), source, address, logbook, cache, keys, log, pool)
+    worker = Worker(name or unshared_name(None), source, address, logbook, cache, keys, log, pool, insecure=insecure)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # After ZeroMQ's threads have started, which should run without delay.
     take_long_turns()

@@ -31,7 +31,7 @@ from v2v_server.motion import load as load_motion
 from v2v_server.simulation.pixel import simulate_pixels
 from v2v_server.simulation.precision import Variant, load, warm_up
 from v2v_server.system.compile_cache import sources_digest
-from v2v_server.system.process import die_with_parent, lock
+from v2v_server.system.process import die_with_parent, locked
 from v2v_server.worlds.clip import load as load_worlds
 
 _LONGEST_WAIT_SECONDS = 300.0
@@ -127,8 +127,7 @@ def one_compiles(folder: Path, key: str, longest_wait_seconds: float = _LONGEST_
         if not complete.exists():
             # A folder of another user, a file system without locks, or a wait that is over: compile without one.
             with suppress(OSError):
-                file = turn.enter_context((folder / f"{key}.lock").open("ab"))
-                lock(file.fileno(), longest_wait_seconds, file.name)
+                turn.enter_context(locked(folder / f"{key}.lock", longest_wait_seconds))
         is_first = not complete.exists()
         if not is_first:
             turn.close()

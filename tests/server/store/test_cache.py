@@ -28,6 +28,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.store.cache import Cache, make_cache, piece_frames
 from v2v_server.store.quota import PARTIAL, QuotaFolder, count_bytes, used_bytes
+from v2v_server.system.process import locked
 from v2v_server.worker.process import Clips
 from v2v_server.worker.produce import make_sample
 
@@ -238,8 +239,7 @@ def test_pieces_of_large_pictures_are_short() -> None:
 
 
 def test_a_lock_that_is_never_released_costs_no_sample(source: Path, folder: Path) -> None:
-    with (folder / "used").open("rb") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
+    with locked(folder / "used.lock"):
         cache = Cache(folder, 1 << 30, 0)
         epoch(source, cache)
         assert "locked" in cache.trouble

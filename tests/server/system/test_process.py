@@ -17,9 +17,12 @@ from v2v_protocol.errors import CorpusError
 from v2v_server.commands import prepare as prepare_cli
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
+from v2v_server.quarantine import Quarantine, QuarantineEntry, read_quarantine, write_entry
 from v2v_server.serve import load_catalogue, serve
+from v2v_server.store.quota import QuotaFolder
 from v2v_server.system import process
-from v2v_server.system.process import lock
+from v2v_server.system.process import locked
+from v2v_server.system.sandbox import can_confine
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux only")
 
@@ -213,26 +216,85 @@ def test_what_cataloguing_frees_is_handed_back(monkeypatch: pytest.MonkeyPatch) 
     assert told == ["catalogued", "handed back"]
 
 
-# --- locks on files that processes share ------------------------------------------------------------------------------
+# --- locks between processes ------------------------------------------------------------------------------------------
 
 
 def test_one_holder_at_a_time(tmp_path: Path) -> None:
     path = tmp_path / "lock"
-    with path.open("wb") as first, path.open("wb") as second:
-        lock(first.fileno(), 0.0, path)
-        with pytest.raises(BlockingIOError, match="another process keeps it locked; end that process") as raised:
-            lock(second.fileno(), 0.0, path)
-        assert raised.value.filename == path
-        first.close()
-        lock(second.fileno(), 0.0, path)
+    with locked(path):
+        with (
+            pytest.raises(BlockingIOError, match="another process keeps it locked; end that process") as raised,
+            locked(path),
+        ):
+            pass
+        assert raised.value.filename == str(path)
+    with locked(path):
+        pass
 
 
 def test_a_lock_that_is_released_in_time_is_waited_for(tmp_path: Path) -> None:
-    path = tmp_path / "lock"
-    with path.open("wb") as first, path.open("wb") as second:
-        lock(first.fileno(), 0.0, path)
-        waiter = threading.Thread(target=lock, args=(second.fileno(), 60.0, path))
+    def wait() -> None:
+        with locked(tmp_path / "lock", 60.0):
+            pass
+
+    with locked(tmp_path / "lock"):
+        waiter = threading.Thread(target=wait)
         waiter.start()
-        first.close()
-        waiter.join(60.0)
-        assert not waiter.is_alive()
+    waiter.join(60.0)
+    assert not waiter.is_alive()
+
+
+READER = """
+import fcntl, os, sys
+from pathlib import Path
+from v2v_server.system.sandbox import confine
+
+os.chdir(sys.argv[1])
+if os.geteuid() == 0:  # which may open any file
+    os.setgroups([])
+    os.setgid(12345)
+    os.setuid(12345)
+confine([], network=False)
+for path in sorted(Path(".").iterdir()):
+    for flags in (os.O_RDONLY, os.O_WRONLY, os.O_RDWR):
+        try:
+            fcntl.flock(os.open(path, flags), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            print(path, end=" ")
+        except (PermissionError, IsADirectoryError, BlockingIOError):
+            pass
+print(flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.skipif(not can_confine().files, reason="this kernel has no Landlock")
+@pytest.mark.parametrize("is_earlier", [False, True], ids=["new", "of an earlier version"])
+def test_a_process_that_may_only_read_blocks_no_writer(tmp_path: Path, is_earlier: bool) -> None:
+    """A confined process of the same user locks every file that it can open, and each writer still gets its turn."""
+    folder = tmp_path / "cache"
+    file, entry = folder / "quarantine.jsonl", QuarantineEntry(0, "a.mp4", "", 0, "crash", "")
+    quota = QuotaFolder(folder, 1 << 20, 0.0)
+    quota.make()
+    write_entry(file, entry, Quarantine())
+    locks = [folder / "quarantine.lock", folder / "used.lock", folder / ".v2v-prepare.lock", folder / "key.lock"]
+    for path in locks:
+        with locked(path):
+            pass
+        assert path.stat().st_mode & 0o777 == 0o200
+        if is_earlier:
+            path.chmod(0o644)
+            with locked(path):  # of this version, at its start
+                pass
+    if os.geteuid() == 0:
+        for path in (folder, *folder.iterdir()):
+            os.chown(path, 12345, 12345)
+    command = [sys.executable, "-c", READER, str(folder)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as reader:
+        assert reader.stdout is not None
+        assert reader.stdout.readline().split() == ["partial", "quarantine.jsonl", "used"]
+        for path in locks:
+            with locked(path):
+                pass
+        with quota.locked():
+            pass
+        write_entry(file, entry, read_quarantine(file), 0.0)

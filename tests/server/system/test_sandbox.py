@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,9 @@ from v2v_server.system.sandbox import can_confine
 pytestmark = pytest.mark.skipif(
     not can_confine().calls or not can_confine().files, reason="this kernel has no seccomp or no Landlock"
 )
+
+LEGACY = Path("/proc/sys/dev/tty/legacy_tiocsti")
+"""Whether this kernel lets users type into their terminal; root always may."""
 
 TRY = """
 import errno, os, socket, subprocess, sys, threading
@@ -59,6 +63,93 @@ print(kernel.ptrace(16, os.getppid(), None, None), errno.errorcode[ctypes.get_er
 print(Path("/proc/self/status").read_text().partition("Seccomp:")[2].split()[0])
 """
     assert said(program) == ["True", "False", *["EPERM"] * 6, "-1", "EPERM", "2"]
+
+
+CALLS = """
+import ctypes, platform, resource, signal, struct
+kernel = ctypes.CDLL(None, use_errno=True)
+column = ("x86_64", "aarch64").index(platform.machine())
+
+def call(numbers, *arguments):
+    if kernel.syscall(numbers[column], *map(ctypes.c_long, arguments)) != -1:
+        return "done"
+    return errno.errorcode[ctypes.get_errno()]
+"""
+
+
+def test_it_starts_no_process_enters_no_namespace_and_changes_no_other_process() -> None:
+    """Each call is refused by the filter, with EPERM: as root most of them would succeed, and the others fail in
+    another way.
+    """
+    program = """
+other = int(sys.argv[1])
+limit = ctypes.create_string_buffer(16)
+affinity = ctypes.create_string_buffer(struct.pack("@128x"), 128)
+confine(None, network=True)
+print(tried(os.fork))
+print(tried(lambda: os.posix_spawn("/bin/true", ["true"], {})))
+print(call((435, 435), 0, 0))  # clone3
+parameter = ctypes.create_string_buffer(4)
+print(call((144, 119), other, os.SCHED_BATCH, ctypes.addressof(parameter)), os.sched_getscheduler(other))
+print(call((272, 97), 0x10000000))  # unshare
+for flag in (0x20000, 0x02000000, 0x04000000, 0x08000000, 0x10000000, 0x20000000, 0x40000000):
+    print(call((56, 220), flag | signal.SIGCHLD, 0, 0, 0, 0))
+    print(call((56, 220), flag | 0x10000, 0, 0, 0, 0))  # as a thread
+for numbers in ((165, 40), (428, 428), (429, 429), (430, 430), (431, 431), (432, 432), (433, 433), (442, 442)):
+    print(call(numbers, 0, 0, 0, 0, 0))  # mount and its newer calls
+print(call((302, 261), other, resource.RLIMIT_NOFILE, 0, ctypes.addressof(limit)))
+print(call((203, 122), other, 8, ctypes.addressof(affinity)))
+print(tried(lambda: os.setpriority(os.PRIO_PROCESS, other, 1)))
+print(tried(lambda: os.setpriority(os.PRIO_PROCESS, 0, 1)))
+"""
+    with subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"]) as other:
+        try:
+            found = said(CALLS + program, str(other.pid))
+        finally:
+            other.kill()
+    assert found == ["EPERM", "EPERM", "ENOSYS", "done", str(os.SCHED_OTHER), *["EPERM"] * (len(found) - 5)]
+
+
+def test_zeromq_starts_its_threads() -> None:
+    assert said('confine(None, network=True); import zmq; zmq.Context().socket(zmq.DEALER).close(); print("done")') == [
+        "done"
+    ]
+
+
+def test_its_own_limits_threads_and_affinity_are_left() -> None:
+    program = """
+confine(None, network=False)
+resource.setrlimit(resource.RLIMIT_NOFILE, resource.getrlimit(resource.RLIMIT_NOFILE))
+os.sched_setaffinity(0, os.sched_getaffinity(0))
+ended = []
+thread = threading.Thread(target=lambda: ended.append("done"))
+thread.start()
+thread.join()
+print(*ended)
+"""
+    assert said(CALLS + program) == ["done"]
+
+
+@pytest.mark.parametrize("is_confined", [True, False])
+def test_it_types_nothing_into_a_terminal(is_confined: bool) -> None:
+    """Its own terminal, which this test makes. Without the filter the typed letter arrives, if the kernel allows it."""
+    program = """
+import fcntl, pty, select, termios
+ours, terminal = pty.openpty()
+os.setsid()
+fcntl.ioctl(terminal, termios.TIOCSCTTY, 0)
+if sys.argv[1] == "True":
+    confine(None, network=False)
+for command in (termios.TIOCSTI, 0x541C, termios.TIOCSTI | 1 << 32):
+    argument = ctypes.create_string_buffer(b"x")
+    failed = kernel.ioctl(terminal, ctypes.c_ulong(command), argument) == -1
+    print(errno.errorcode[ctypes.get_errno()] if failed else "typed")
+"""
+    found = said(CALLS + program, str(is_confined))
+    if is_confined:
+        assert found == ["EPERM"] * 3
+    elif os.geteuid() == 0 or (LEGACY.exists() and LEGACY.read_text().strip() == "1"):
+        assert found[0] == found[2] == "typed"
 
 
 def test_with_a_network_only_the_network_is_left() -> None:

@@ -60,7 +60,7 @@ from v2v_server.corpus.sources.source import (
 from v2v_server.store.pixels import PIXEL_KINDS, VideosKind, kind_of, open_pixels
 from v2v_server.store.quota import MOST_GIB, PARTIAL, QuotaFolder
 from v2v_server.store.verified import content_of
-from v2v_server.system.process import cache_folder, lock, make_private, open_private
+from v2v_server.system.process import cache_folder, locked, make_private
 from v2v_server.video.fingerprint import TIMES_ABOVE, check_content, is_same_file
 from v2v_server.video.fingerprint import fingerprint as video_fingerprint
 
@@ -491,18 +491,16 @@ class Copies(VideoSource):
         Raises:
             OSError: other processes hold all of them.
         """
-        end = time.monotonic() + _SLOT_SECONDS
+        end, held = time.monotonic() + _SLOT_SECONDS, contextlib.ExitStack()
         for other in range(_SLOTS):
             slot = self.copies / PARTIAL / f"{(number + other) % _SLOTS:02}"
-            name = slot.with_suffix(".lock")
-            with open(open_private(name, os.O_WRONLY | os.O_CREAT), "wb") as held:
-                try:
-                    lock(held.fileno(), end - time.monotonic(), name)
-                except BlockingIOError:
-                    continue
-                yield slot
-                return
-        raise BlockingIOError(errno.EAGAIN, f"other processes keep all {_SLOTS} of its slots; end them")
+            with contextlib.suppress(BlockingIOError):
+                held.enter_context(locked(slot.with_suffix(".lock"), end - time.monotonic()))
+                break
+        else:
+            raise BlockingIOError(errno.EAGAIN, f"other processes keep all {_SLOTS} of its slots; end them")
+        with held:
+            yield slot
 
     def _fetch(self, id: str, fingerprint: str, slot: Path) -> IO[bytes]:
         try:
