@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +12,8 @@ from pathlib import Path
 
 from trainer.convert.writer import RecordingWriter, Written
 from trainer.evaluation import layout
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.programs import show
 from v2v_recordings.items import ConvertOptions, ReadProgress
 from v2v_recordings.reading import FORMS, read_items, recognise
 
@@ -63,6 +65,7 @@ def convert(
     Raises:
         UsageError: the source is missing, damaged or of an unknown form; or the destination exists or lies in the
             source.
+        V2VError: the destination cannot be written, for instance on a full disk.
     """
     source, destination = Path(source), Path(destination)
     options = options or ConvertOptions()
@@ -87,7 +90,7 @@ def convert(
                 writer.add(item)
     except OSError as error:
         # Readers convert their own errors, so this one comes from writing the destination.
-        raise UsageError(f"{destination}: cannot be written: {error}") from error
+        raise V2VError(f"{destination}: cannot be written: {error.strerror or error}") from error
     if writer.written is None:
         raise RuntimeError("the writer was left without finishing")
     return Converted(source, destination, form, writer.written)
@@ -116,7 +119,9 @@ def in_layout(data: Path, options: ConvertOptions, progress: ReadProgress) -> It
                 (folder / path.name).symlink_to(path.resolve())
         for path in raw:
             if not (folder / default_name(path)).exists():
-                convert(path, folder / default_name(path), options=options, progress=progress)
+                done = convert(path, folder / default_name(path), options=options, progress=progress)
+                for note in done.written.notes:
+                    show(f"{path.name}: {note}", sys.stderr)
         yield folder
 
 
