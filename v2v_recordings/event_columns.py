@@ -130,7 +130,7 @@ class EventColumns:
                 no known meaning.
         """
         assert self.unit is not None
-        if t.dtype.kind in "iu" and t.dtype.itemsize == WRAPPING_BYTES:
+        if len(t) and t.dtype.kind in "iu" and t.dtype.itemsize == WRAPPING_BYTES:
             t = self._unwrapped(t.astype(np.int64))
         t_ns = to_ns(t, self.where, NS_PER_UNIT[self.unit.name], self._offset_ns)
         x, y, p = self._coordinates(x, "x"), self._coordinates(y, "y"), self._polarities.are_brighter(p, self.where)
@@ -150,12 +150,15 @@ class EventColumns:
             yield Note(self._polarities.meaning)
 
     def _unwrapped(self, t: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Continue times of 32 bits, which begin again after 71 minutes in us."""
-        steps = np.diff(t, prepend=t[:1] if self._last_t is None else self._last_t)
-        times = np.cumsum((steps < -LEAST_WRAP).astype(np.int64) - (steps > LEAST_WRAP)) + self._wraps
-        if len(t):
-            self._last_t, self._wraps = int(t[-1]), int(times[-1])
-        return t + (times << 8 * WRAPPING_BYTES)
+        """Continue times of 32 bits, at least one, which begin again after 71 minutes in us."""
+        last = int(t[0]) if self._last_t is None else self._last_t
+        if max(last, t.max()) - min(last, t.min()) >= LEAST_WRAP:
+            steps = np.diff(t, prepend=last)
+            wraps = np.cumsum((steps < -LEAST_WRAP).astype(np.int64) - (steps > LEAST_WRAP)) + self._wraps
+        else:
+            wraps = np.array([self._wraps])
+        self._last_t, self._wraps = int(t[-1]), int(wraps[-1])
+        return t + (wraps << 8 * WRAPPING_BYTES)
 
     def _coordinates(self, values: Numbers, axis: str) -> npt.NDArray[np.integer]:
         is_whole = values.dtype.kind in "iu"
@@ -220,13 +223,13 @@ def to_ns(times: Numbers, where: str, ns_per_unit: float = 1e9, offset_ns: int =
         UsageError: a time is NaN or beyond LARGEST_NS, so its unit or the offset is probably wrong.
     """
     ns = np.rint(times.astype(np.float64) * ns_per_unit)
-    held = np.maximum(np.abs(ns), np.abs(ns + offset_ns)) < LARGEST_NS
-    if not held.all():
+    ends = np.array([ns.min(initial=0), ns.max(initial=0)])
+    if not (np.abs([ends, ends + offset_ns]) < LARGEST_NS).all():
         # A cast would turn all of them into the same number.
         later = f", and {offset_ns * 1e-9:.10g} s are added to it" if offset_ns else ""
         raise UsageError(
-            f"{where}: a time is {ns[~held][0] * 1e-9:.10g} s{later}, which is out of range; give the unit with "
-            "--time-unit"
+            f"{where}: a time is {ends[np.abs(ends).argmax()] * 1e-9:.10g} s{later}, which is out of range; give the "
+            "unit with --time-unit"
         )
     exact = times.astype(np.int64) * int(ns_per_unit) if times.dtype.kind in "iu" else ns.astype(np.int64)
     return exact + offset_ns
