@@ -19,7 +19,6 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings.archive import package, starts_with
-from v2v_recordings.event_columns import EventColumns, TimeUnit
 from v2v_recordings.faery_reader import read_prophesee
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, ReadProgress, SensorSize
 
@@ -63,7 +62,7 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
 
 
 def _read_arrays(messages: Messages, events: str, path: Path) -> Iterator[Item]:
-    size, read = None, EventColumns(str(path), TimeUnit("ns", is_stated=True))
+    size = None
     for topic, message in messages:
         if topic != events:
             yield _picture(message, path)
@@ -76,8 +75,7 @@ def _read_arrays(messages: Messages, events: str, path: Path) -> Iterator[Item]:
             yield size
         records = message.array(RECORD, count)
         t_ns = records["secs"].astype(np.int64) * 1_000_000_000 + records["nsecs"]
-        yield read.part(t_ns, records["x"], records["y"], records["polarity"])
-    yield from read.end()
+        yield EventChunk(t_ns, records["x"], records["y"], records["polarity"] > 0)
 
 
 def _read_packets(messages: Messages, events: str, path: Path) -> Iterator[Item]:

@@ -97,11 +97,11 @@ class TimeUnit:
 
 
 def _is_plausible(events: int, seconds: float, is_stated: bool) -> bool:
-    least, most, most_of_long = (rate * seconds for rate in RATES)
-    if is_stated:
-        return SHORTEST_RECORDING_SECONDS <= seconds <= LONGEST_RECORDING_SECONDS and events <= most_of_long
-    is_short = seconds < USUAL_SECONDS
-    return _is_plausible(events, seconds, True) and least <= events <= (most if is_short else most_of_long)
+    least, most_of_short, most = RATES
+    if not is_stated:
+        most = most_of_short if seconds < USUAL_SECONDS else most
+    lasts = SHORTEST_RECORDING_SECONDS <= seconds <= LONGEST_RECORDING_SECONDS
+    return lasts and (is_stated or least * seconds <= events) and events <= most * seconds
 
 
 class EventColumns:
@@ -115,8 +115,7 @@ class EventColumns:
 
     def __init__(self, where: str, unit: TimeUnit | None = None, offset_ns: int = 0) -> None:
         self.where, self.unit, self._polarities = where, unit, Polarities()
-        self._last_t: int | None = None
-        self._wraps = 0
+        self._last_t: Numbers | None = None
         self._offset_ns, self._count, self._first_ns, self._last_ns = offset_ns, 0, int(LARGEST_NS), -int(LARGEST_NS)
 
     def part(self, t: Numbers, x: Numbers, y: Numbers, p: Numbers) -> EventChunk:
@@ -131,7 +130,9 @@ class EventColumns:
         """
         assert self.unit is not None
         if len(t) and t.dtype.kind in "iu" and t.dtype.itemsize == WRAPPING_BYTES:
-            t = self._unwrapped(t.astype(np.int64))
+            joined = np.append(t[:1] if self._last_t is None else self._last_t, t.astype(np.int64))
+            t = np.unwrap(joined, LEAST_WRAP, period=1 << 8 * WRAPPING_BYTES)[1:]
+            self._last_t = t[-1:]
         t_ns = to_ns(t, self.where, NS_PER_UNIT[self.unit.name], self._offset_ns)
         x, y, p = self._coordinates(x, "x"), self._coordinates(y, "y"), self._polarities.are_brighter(p, self.where)
         self._first_ns, self._last_ns = t_ns.min(initial=self._first_ns), t_ns.max(initial=self._last_ns)
@@ -148,17 +149,6 @@ class EventColumns:
             self.unit.check(self._count, (self._last_ns - self._first_ns) * 1e-9, self.where)
         if self._polarities.meaning:
             yield Note(self._polarities.meaning)
-
-    def _unwrapped(self, t: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Continue times of 32 bits, at least one, which begin again after 71 minutes in us."""
-        last = int(t[0]) if self._last_t is None else self._last_t
-        if max(last, t.max()) - min(last, t.min()) >= LEAST_WRAP:
-            steps = np.diff(t, prepend=last)
-            wraps = np.cumsum((steps < -LEAST_WRAP).astype(np.int64) - (steps > LEAST_WRAP)) + self._wraps
-        else:
-            wraps = np.array([self._wraps])
-        self._last_t, self._wraps = int(t[-1]), int(wraps[-1])
-        return t + (wraps << 8 * WRAPPING_BYTES)
 
     def _coordinates(self, values: Numbers, axis: str) -> npt.NDArray[np.integer]:
         is_whole = values.dtype.kind in "iu"

@@ -19,7 +19,6 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings.archive import package, starts_with
-from v2v_recordings.event_columns import EventColumns, TimeUnit
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, ReadProgress, SensorSize
 
 ES_HEAD_BYTES, ES_EVENT_BYTES, ES_LONGEST_STEP_US = 20, 5, 127
@@ -40,7 +39,6 @@ LATEST_US = 10_000
 """The upper bits may step back by at most this without a reset."""
 LOOKED_THROUGH_WORDS = 1 << 20
 LONGEST_LINE_BYTES = 1 << 12
-_UNIT = TimeUnit("us", is_stated=True)
 _TO_GREY = {"RGB": cv2.COLOR_RGB2GRAY, "RGBA": cv2.COLOR_RGBA2GRAY}
 
 
@@ -71,18 +69,17 @@ def read_aedat4(path: Path, options: ConvertOptions, progress: ReadProgress) -> 
             raise UsageError(f"{path} has no stream of events")
         size = SensorSize(*first["events"].dimensions)
         yield size
-        total, number, read = len(decoder.file_data_definitions()) or None, 0, EventColumns(str(path), _UNIT)
+        total, number = len(decoder.file_data_definitions()) or None, 0
         try:
             for number, (track, packet) in enumerate(decoder, start=1):
                 kind = track.data_type if track.id == first[track.data_type].id else ""
                 if kind in ("events", "frame"):
-                    yield _events(packet, read) if kind == "events" else _frame(packet, size, path)
+                    yield _events(packet) if kind == "events" else _frame(packet, size, path)
                 progress(number, total)
         except RuntimeError as error:
             if not number or CUT_PACKET not in str(error):
                 raise
             yield Note(f"cut: packet {number + 1} is incomplete; the {number} before it are read")
-        yield from read.end()
 
 
 def read_prophesee(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
@@ -110,7 +107,7 @@ def read_prophesee(path: Path, options: ConvertOptions, progress: ReadProgress) 
     # DAT's header ends with two bytes of its own.
     begin = len(header) if is_evt else len(header) + 2
     first_us, resets = _clock(path, word, begin)
-    is_timeless, read = True, EventColumns(str(path), _UNIT)
+    is_timeless = True
     with tempfile.TemporaryDirectory() as folder:
         for part in _parts(path, [begin, *resets], Path(folder)):
             with _errors_of_faery(path), decode(part, fallback, None) as decoder:
@@ -121,8 +118,7 @@ def read_prophesee(path: Path, options: ConvertOptions, progress: ReadProgress) 
                         has_time = events["t"] >= first_us
                         events, is_timeless = events[has_time.argmax() :] if has_time.any() else (), not has_time.any()
                     if len(events):
-                        yield _events(events, read)
-    yield from read.end()
+                        yield _events(events)
     yield from _cut_note(path, begin, word.itemsize)
 
 
@@ -132,19 +128,18 @@ def read_es(path: Path, _options: ConvertOptions, progress: ReadProgress) -> Ite
     Raises:
         UsageError: the file is damaged or holds something else.
     """
-    end, last_us, read = ES_HEAD_BYTES, 0, EventColumns(str(path), _UNIT)
+    end, last_us = ES_HEAD_BYTES, 0
     with _errors_of_faery(path), package("faery", "this form").es.Decoder(path, 0) as decoder:
         if decoder.event_type != "dvs":
             raise UsageError(f"{path} holds {decoder.event_type} events; only dvs can be read")
         yield SensorSize(*decoder.dimensions)
         for events in decoder:
             events["y"] = decoder.dimensions[1] - 1 - events["y"]  # rows are counted from below
-            yield _events(events, read)
+            yield _events(events)
             steps = np.diff(events["t"].astype(np.int64), prepend=last_us)
             end += ES_EVENT_BYTES * len(events) + int((steps // ES_LONGEST_STEP_US).sum())
             last_us = int(events["t"][-1])
             progress(end, path.stat().st_size)
-    yield from read.end()
     yield from _cut_note(path, end, path.stat().st_size)
 
 
@@ -204,9 +199,9 @@ def _parts(path: Path, edges: list[int], folder: Path) -> Iterator[Path]:
         yield part
 
 
-def _events(packet: npt.NDArray[Any], read: EventColumns) -> EventChunk:
+def _events(packet: npt.NDArray[Any]) -> EventChunk:
     polarity = next(name for name in ("payload", "p", "on") if name in (packet.dtype.names or ()))
-    return read.part(packet["t"], packet["x"], packet["y"], packet[polarity])
+    return EventChunk(packet["t"].astype(np.int64) * 1000, packet["x"], packet["y"], packet[polarity] > 0)
 
 
 def _frame(frame: Any, size: SensorSize, path: Path) -> Picture:

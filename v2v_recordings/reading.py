@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings import bag, dsec, faery_reader, hdf5, mvsec, npy_columns, text_events
-from v2v_recordings.event_columns import clock_fault
+from v2v_recordings.event_columns import TimeUnit, clock_fault
 from v2v_recordings.items import (
     ConvertOptions,
     EventChunk,
@@ -142,7 +142,7 @@ def read_items(
         clock.check(item)
         yield item
     yield from clock.pass_on(None)
-    clock.check_pictures()
+    clock.end(options)
 
 
 class _Clock:
@@ -165,9 +165,11 @@ class _Clock:
                 f"{self._path}: {self._reset}, and its pictures may be on either clock: split the recording there"
             )
 
-    def check_pictures(self) -> None:
-        """Refuse pictures and flow fields on another clock than the events."""
+    def end(self, options: ConvertOptions) -> None:
+        """Refuse a recording of impossible duration, and pictures and flow fields on another clock than the events."""
         first, last = self._oldest_ns * 1e-9, self._newest_ns * 1e-9
+        if options.time_unit is None:  # columns were tested in their own unit
+            TimeUnit("us", is_stated=True).check(self._passed, last - first, str(self._path))
         for times in self._others.values() if self._passed else ():
             if fault := clock_fault(times, first, last):
                 raise UsageError(f"{self._path}: {fault}")
