@@ -131,7 +131,9 @@ class EventColumns:
         assert self.unit is not None
         if len(t) and t.dtype.kind in "iu" and t.dtype.itemsize == WRAPPING_BYTES:
             joined = np.append(t[:1] if self._last_t is None else self._last_t, t.astype(np.int64))
-            t = np.unwrap(joined, LEAST_WRAP, period=1 << 8 * WRAPPING_BYTES)[1:]
+            if np.ptp(joined) >= LEAST_WRAP:
+                joined = np.unwrap(joined, LEAST_WRAP, period=1 << 8 * WRAPPING_BYTES)
+            t = joined[1:]
             self._last_t = t[-1:]
         t_ns = to_ns(t, self.where, NS_PER_UNIT[self.unit.name], self._offset_ns)
         x, y, p = self._coordinates(x, "x"), self._coordinates(y, "y"), self._polarities.are_brighter(p, self.where)
