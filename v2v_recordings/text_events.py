@@ -29,7 +29,7 @@ from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture
 BLOCK_BYTES = 1 << 22
 COMMENT = re.compile(rb"^[ \t]*#[^\r\n]*", re.MULTILINE)
 COMMA = re.compile(rb"(?<=[^\s,])[ \t]*,[ \t]*(?=[^\s,])")
-TRUTH = re.compile(rb"\b(false|true)\b", re.IGNORECASE)
+TRUE_OR_FALSE = re.compile(rb"\b(false|true)\b", re.IGNORECASE)
 TIME_WITH_A_FRACTION = re.compile(rb"^[ \t]*[-+\d]*(\.|[eE]-)", re.MULTILINE)
 """Matches a line whose first number has a decimal point, or a negative exponent without one (1e-06)."""
 
@@ -128,7 +128,7 @@ def _numbers(block: bytes) -> npt.NDArray[np.float64] | None:
     try:
         table = np.loadtxt(io.StringIO(block.decode("latin-1")), ndmin=2)
     except ValueError:
-        numbers = TRUTH.sub(lambda word: b"01"[len(word[0]) == 4 :][:1], block)
+        numbers = TRUE_OR_FALSE.sub(lambda word: b"01"[len(word[0]) == 4 :][:1], block)
         return None if numbers == block else _numbers(numbers)
     if table.shape[1] != 4 or not np.isfinite(table).all():
         return None

@@ -7,7 +7,6 @@ before stay), 130 interrupted, by SIGTERM too.
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -40,11 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     out.add_argument("--overwrite", action="store_true", help="replace files that exist")
     parser.add_output("Output", "--json", JSON, "also write a record of each recording to this file")
     interrupted = "interrupted; no incomplete file is left"
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        return run_command(parser, _run, argv, failures=(V2VError,), interrupted=interrupted)
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    return run_command(parser, _run, argv, failures=(V2VError,), interrupted=interrupted)
 
 
 def _run(arguments: argparse.Namespace) -> int:

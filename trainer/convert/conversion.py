@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 import tempfile
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,6 +68,7 @@ def convert(
         UsageError: the source is missing, damaged or of an unknown form; or the destination exists or lies in the
             source.
         V2VError: the destination cannot be written, for instance on a full disk.
+        KeyboardInterrupt: by a Ctrl-C or SIGTERM.
     """
     source, destination = Path(source), Path(destination)
     options = options or ConvertOptions()
@@ -83,10 +86,19 @@ def convert(
         raise UsageError(f"{destination} exists; --overwrite replaces it")
     chosen = FORMS[form]
     try:
-        with RecordingWriter(
-            destination, source=source.name, size=options.size, published_shift=chosen.published_shift
-        ) as writer:
-            for item in read_items(source, form, options, progress):
+        with (
+            _late_signals() as check,
+            RecordingWriter(
+                destination, source=source.name, size=options.size, published_shift=chosen.published_shift
+            ) as writer,
+        ):
+
+            def step(done: int, total: int | None) -> None:
+                check()
+                progress(done, total)
+
+            for item in read_items(source, form, options, step):
+                check()
                 writer.add(item)
     except OSError as error:
         # Readers convert their own errors, so this one comes from writing the destination.
@@ -94,6 +106,29 @@ def convert(
     if writer.written is None:
         raise RuntimeError("the writer was left without finishing")
     return Converted(source, destination, form, writer.written)
+
+
+@contextlib.contextmanager
+def _late_signals() -> Iterator[Callable[[], None]]:
+    """Yield a function that raises KeyboardInterrupt if a Ctrl-C or SIGTERM has come; it comes at no other place.
+
+    Python would raise it in the functions by which HDF5 writes, and HDF5 then ends the process.
+    """
+    came: list[int] = []
+    is_main = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGINT, signal.SIGTERM) if is_main else ()
+    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in numbers}
+
+    def check() -> None:
+        if came:
+            raise KeyboardInterrupt
+
+    try:
+        yield check
+        check()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

@@ -66,21 +66,21 @@ class _Disk(io.FileIO):
     HDF5 keeps what it could not write and tries again when its objects are freed, which ends the process by a signal.
     """
 
-    error: OSError | KeyboardInterrupt | None = None
+    error: OSError | None = None
 
     def write(self, data: Any) -> int:
         rest = memoryview(data).cast("B")
         try:
             while rest and self.error is None:
                 rest = rest[super().write(rest) or 0 :]
-        except (OSError, KeyboardInterrupt) as error:  # HDF5 has to finish what it does
+        except OSError as error:
             self.error = error
         return len(data)
 
     def truncate(self, size: int | None = None) -> int:
         try:
             return super().truncate(size)
-        except (OSError, KeyboardInterrupt) as error:
+        except OSError as error:
             self.error = self.error or error
             return size or 0
 
