@@ -1,6 +1,7 @@
 """Read recordings of event cameras, form by form.
 
 items.py         what readers yield: sensor size, chunks of events, pictures, flow
+event_columns.py what the numbers of events mean, for all forms: polarities, coordinates, units, clocks
 reading.py       the known forms; detects that of a recording, checks its size, puts its events on one clock
 text_events.py   text files of events: IJRR and EVAID-R, with pictures in a zip or folder; or one text file
 mvsec.py         MVSEC: HDF5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import posixpath
 import zipfile
 import zlib
@@ -14,12 +15,17 @@ from typing import IO, Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.programs import name_extra
 from v2v_recordings.items import SensorSize
 
 ZIPS = (".zip", ".npz")
+MOST_TIMES, ALWAYS_BYTES, LARGEST_PIECE = 256, 1 << 24, 1 << 30
+"""What a file states of its content may take this many times the file's size, or ALWAYS_BYTES; a piece of it that is
+unpacked at once, at most LARGEST_PIECE as well. Event data and pictures pack to a hundredth at best.
+"""
 
 
 class Archive:
@@ -120,6 +126,7 @@ class Archive:
     def _open(self, member: str) -> IO[bytes]:
         if self._zip is None:
             return (self.folder / member).open("rb")
+        check_stated_bytes(self.bytes_of[member], self.path, self.where(member))
         try:
             return self._zip.open(member)
         except RuntimeError as error:  # encrypted, or compressed by a method that Python lacks: Windows's Deflate64
@@ -134,8 +141,11 @@ class Archive:
             UsageError: as :meth:`open`, or the member is not a picture.
         """
         with self.open(member) as stream:
-            data = np.frombuffer(stream.read(), np.uint8)
-        pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+            data, pixels = stream.read(), None
+        with contextlib.suppress(OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+            # This reads the head only.
+            SensorSize(*Image.open(io.BytesIO(data)).size).require_usable(self.where(member))
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
         if pixels is None:
             raise UsageError(f"{self.where(member)} is not a readable picture")
         return np.asarray(pixels, np.uint8)
@@ -144,6 +154,26 @@ class Archive:
         """Return the size of a picture; raises as :meth:`picture`."""
         height, width = self.picture(member).shape
         return SensorSize(width, height)
+
+
+def check_stated_bytes(stated: int, path: Path, what: str, *, is_piece: bool = False) -> None:
+    """Check the size that a file states for something in it, before memory is taken for it.
+
+    Args:
+        stated: bytes.
+        path: the file.
+        what: beginning of the error message.
+        is_piece: whether it is unpacked at once, as a chunk of HDF5 is.
+
+    Raises:
+        UsageError: it is larger than MOST_TIMES the file and ALWAYS_BYTES, or than LARGEST_PIECE.
+    """
+    most = min(max(MOST_TIMES * path.stat().st_size, ALWAYS_BYTES), LARGEST_PIECE if is_piece else stated)
+    if stated > most:
+        raise UsageError(
+            f"{what} is stated to be {stated:,} bytes, and at most {most:,} are read of this file: it is damaged, or "
+            "not a recording"
+        )
 
 
 def package(name: str, what: str) -> Any:

@@ -27,6 +27,7 @@ from v2v_protocol.errors import UsageError
 from v2v_recordings import archive as archives
 from v2v_recordings import hdf5
 from v2v_recordings.archive import Archive
+from v2v_recordings.event_columns import TimeUnit
 from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, Note, Picture, ReadProgress, SensorSize
 
 if TYPE_CHECKING:
@@ -81,8 +82,9 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
             if size is not None:
                 yield size
             columns = {name: file.get(f"events/{name}") for name in ("t", "x", "y", "p")}
-            offset_ns = 1000 * int(np.asarray(file.get("t_offset", 0)).reshape(-1)[0])
-            yield from hdf5.events(columns, str(events), progress, ns_per_unit=NS_PER_UNIT["us"], offset_ns=offset_ns)
+            unit = TimeUnit.of(options, "us", hdf5.stated_unit(columns["t"]))
+            offset_ns = int(NS_PER_UNIT[unit.name]) * int(np.asarray(file.get("t_offset", 0)).reshape(-1)[0])
+            yield from hdf5.events(columns, str(events), progress, unit=unit, offset_ns=offset_ns)
         for t_us, member in frames:
             yield Picture(1000 * t_us, archive.picture(member))
 

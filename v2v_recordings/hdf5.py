@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import math
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -24,9 +25,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.archive import package
+from v2v_recordings.archive import check_stated_bytes, package
+from v2v_recordings.event_columns import EventColumns, TimeUnit, to_ns
 from v2v_recordings.items import (
-    NS_PER_UNIT,
     ConvertOptions,
     EventChunk,
     FlowField,
@@ -36,7 +37,6 @@ from v2v_recordings.items import (
     Picture,
     ReadProgress,
     SensorSize,
-    to_ns,
 )
 
 if TYPE_CHECKING:
@@ -87,33 +87,33 @@ A slice has fewer rows than asked for if the file is cut.
 
 
 def events(
-    columns: Mapping[str, Column], where: str, progress: ReadProgress, *, ns_per_unit: float, offset_ns: int = 0
+    columns: Mapping[str, Column], where: str, progress: ReadProgress, *, unit: TimeUnit, offset_ns: int = 0
 ) -> Iterator[EventChunk | Note]:
-    """Yield events whose times, x, y and polarities (above 0 for brighter) are in columns, in this order.
+    """Yield events whose times, x, y and polarities are in columns, in this order.
 
     Raises:
-        UsageError: a column is missing, is not [N] numbers, or has another length.
+        UsageError: a column is missing, is not [N] numbers, or has another length; or see :class:`EventColumns`.
     """
     found = list(columns.values())
     shapes: list[Any] = [getattr(column, "shape", None) or ("no",) for column in found]
     dtypes = [getattr(column, "dtype", np.dtype("V")) for column in found]
-    is_numbers = [dtype.kind in kinds for dtype, kinds in zip(dtypes, ("iufb", "iu", "iu", "iufb"), strict=True)]
+    is_numbers = [dtype.kind in kinds for dtype, kinds in zip(dtypes, ("iufb", "iuf", "iuf", "iufb"), strict=True)]
     if not all(is_numbers) or len(set(shapes)) > 1 or len(shapes[0]) != 1:
         listed = ", ".join(" x ".join(map(str, shape)) for shape in shapes)
         raise UsageError(
             f"{where}: columns of {', '.join(columns)} have {listed} entries of {', '.join(map(str, dtypes))}; they "
             "must be numbers, equally many; x and y must be integers"
         )
-    (count,) = shapes[0]
+    (count,), read = shapes[0], EventColumns(where, unit, offset_ns)
     for start in range(0, count, READ_EVENTS):
         parts = [column[start : start + READ_EVENTS] for column in found]
         end = start + min(map(len, parts))
-        t, x, y, p = (part[: end - start] for part in parts)
-        yield EventChunk(to_ns(t, where, ns_per_unit) + offset_ns, x, y, p > 0)
+        yield read.part(*(part[: end - start] for part in parts))
         progress(end, count)
         if end < min(start + READ_EVENTS, count):
             yield Note(f"cut: {end} of {count} events are there")
-            return
+            break
+    yield from read.end()
 
 
 def pictures(pixels: Column, times: Column, where: str, nearest: Column | None = None) -> Iterator[Picture | Note]:
@@ -128,6 +128,7 @@ def pictures(pixels: Column, times: Column, where: str, nearest: Column | None =
     count, *shape = pixels.shape
     if len(shape) != 2 or pixels.dtype != np.uint8:
         raise UsageError(f"{where} has {count} pictures, {pixels.dtype} {shape}, not uint8 [H, W]")
+    SensorSize(*shape[::-1]).require_usable(where)
     if any(column is not None and column.shape != (count,) for column in (times, nearest)):
         raise UsageError(f"{where}: {count} pictures, but {times.shape[0]} times")
     for number in range(count):
@@ -145,21 +146,49 @@ def sensor_size(shape: Any, path: Path) -> SensorSize:
     Raises:
         UsageError: it is something else.
     """
-    sides = np.asarray(shape).reshape(-1)
+    # A dataset may state any number of entries: no more than three are read.
+    sides = np.asarray(shape[:3] if len(getattr(shape, "shape", ())) == 1 else shape).reshape(-1)
     if len(sides) != 2 or sides.dtype.kind not in "iu":
         raise UsageError(f"{path}: the sensor's size is stated as {shape}, not as height and width")
     return SensorSize(int(sides[1]), int(sides[0]))
 
 
+UNIT_ATTRIBUTES = ("unit", "units", "time_unit", "time_units")
+
+
+def stated_unit(times: Column) -> Any:
+    """Return the unit that an attribute of a column of times, or of its group, states; None if there is none."""
+    attributes = [getattr(holder, "attrs", {}) for holder in (times, getattr(times, "parent", None))]
+    return next((each[name] for each in attributes for name in UNIT_ATTRIBUTES if name in each), None)
+
+
+def layout_unit(file: h5py.File, options: ConvertOptions) -> TimeUnit:
+    """Return the unit of ``events/ts``. A file that v2v-convert wrote states it by ``start_ns``."""
+    own = "s" if "start_ns" in file.attrs else None
+    return TimeUnit.of(options, "s", own or stated_unit(file.get("events/ts")))
+
+
+def event_index(index: Any, events: int, where: str) -> int:
+    """Return the number of the event that the attribute ``event_idx`` of a picture names.
+
+    Raises:
+        UsageError: there are fewer events.
+    """
+    if not 0 <= int(index) <= events:
+        raise UsageError(f"{where}: event_idx is {index}, and there are {events} events: correct the file")
+    return int(index)
+
+
 def require_self_contained(file: h5py.File, path: Path) -> None:
-    """Check that everything in an HDF5 file is stored in that file.
+    """Check that everything in an HDF5 file is stored in that file, and is of a plausible size.
 
     Args:
         file: the open file.
         path: its path, for the error message.
 
     Raises:
-        UsageError: it has an external link, a dataset with external storage or a virtual dataset.
+        UsageError: it has an external link, a dataset with external storage or a virtual dataset; or see
+            :func:`check_stated_bytes`.
         OSError, RuntimeError, KeyError, ValueError: h5py's errors, if the file is damaged.
     """
     import h5py
@@ -182,6 +211,10 @@ def require_self_contained(file: h5py.File, path: Path) -> None:
             elif isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
                 kind = "a virtual dataset" if item.is_virtual else "a dataset with external storage"
                 raise _external_error(path, f"{group.name}/{name}", f"is {kind}")
+            elif isinstance(item, h5py.Dataset):
+                each_bytes, where = item.id.get_type().get_size(), f"{path}: {name}"
+                check_stated_bytes(each_bytes * item.id.get_space().get_simple_extent_npoints(), path, where)
+                check_stated_bytes(each_bytes * math.prod(item.chunks or ()), path, f"{where}: a chunk", is_piece=True)
 
 
 def _external_error(path: Path, name: str, what: str) -> UsageError:
@@ -196,7 +229,7 @@ def recognises_layout(path: Path) -> bool:
     return holds(path, "events/ts")
 
 
-def read_layout(path: Path, _options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
+def read_layout(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
     """Yield the items of a recording.
 
     Raises:
@@ -210,17 +243,15 @@ def read_layout(path: Path, _options: ConvertOptions, progress: ReadProgress) ->
         if stated is not None:
             yield sensor_size(stated, path)
         columns = {name: file.get(f"events/{name}") for name in ("ts", "xs", "ys", "ps")}
-        yield from events(columns, str(path), progress, ns_per_unit=NS_PER_UNIT["s"], offset_ns=origin_ns)
+        yield from events(columns, str(path), progress, unit=layout_unit(file, options), offset_ns=origin_ns)
         for kind in ("images", "flow"):
             for key in sorted(file.get(kind, ())):
-                item = file[f"{kind}/{key}"]
+                item, where, count = file[f"{kind}/{key}"], f"{path}: {kind}/{key}", len(columns["ts"])
                 seconds = item.attrs.get("timestamp")
                 if seconds is None and "event_idx" in item.attrs:
-                    seconds = file["events/ts"][min(int(item.attrs["event_idx"]), len(file["events/ts"]) - 1)]
-                t_ns = int(to_ns(np.array([seconds], np.float64), f"{path}: {kind}/{key}")[0]) + origin_ns
-                if kind == "flow":
-                    yield FlowField(t_ns, item[:].astype(np.float32))
-                elif len(getattr(item, "shape", ())) != 2 or item.dtype != np.uint8:
-                    raise UsageError(f"{path}: images/{key} is {item}, not uint8 [H, W]")
-                else:
-                    yield Picture(t_ns, item[:])
+                    seconds = columns["ts"][min(event_index(item.attrs["event_idx"], count, where), count - 1)]
+                t_ns = int(to_ns(np.array([seconds], np.float64), where, offset_ns=origin_ns)[0])
+                if (item.ndim, kind) != (3, "flow") and (item.ndim, item.dtype) != (2, np.uint8):
+                    raise UsageError(f"{where} is {item}, not uint8 [H, W], or flow [2, H, W]")
+                SensorSize(*item.shape[:-3:-1]).require_usable(where)
+                yield Picture(t_ns, item[:]) if item.ndim == 2 else FlowField(t_ns, item[:].astype(np.float32))

@@ -19,6 +19,7 @@ from v2v_protocol.errors import UsageError
 
 MOST_SENSOR_PIXELS = 1 << 24
 """Limit of a stated sensor's size: 4096 x 4096. Some arrays have an entry for each pixel."""
+NS_PER_UNIT = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 ReadProgress = Callable[[int, int | None], None]
 """Progress callback: called with the amount read so far (bytes or messages), and the total if it is known."""
 
@@ -42,8 +43,6 @@ class EventChunk:
         lengths = {len(self.t_ns), len(self.x), len(self.y), len(self.p)}
         if len(lengths) > 1:
             raise UsageError(f"the columns of events have different lengths: {sorted(lengths)}")
-        if {self.x.dtype.kind, self.y.dtype.kind} - {"i", "u"}:
-            raise UsageError(f"coordinates of events are {self.x.dtype} and {self.y.dtype}: they must be integers")
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -168,8 +167,8 @@ class ConvertOptions:
 
     Attributes:
         size: size of the sensor, if the file does not state it.
-        time_unit: unit "s", "us" or "ns" of the times in text files; None takes s if they have a decimal point, else
-            us.
+        time_unit: unit "s", "ms", "us" or "ns" of the times of events in text, NumPy's files and HDF5; None takes what
+            the file states, else what is usual.
         camera: "left" or "right" of a stereo recording (MVSEC).
         events_topic, images_topic: topics to read from a bag that has several.
         light: of the pictures; None takes what the form or the file states.
@@ -190,7 +189,8 @@ def add_options(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--size", metavar="WxH", help="size of the sensor in px, if a recording does not state it")
     group.add_argument(
         "--time-unit", choices=tuple(NS_PER_UNIT),
-        help="unit of times in text files (default: s if they have a decimal point, else us)",
+        help="unit of the events' times in text, NumPy's files and HDF5 (default: as the file states, else s if they "
+        "have a decimal point, us if not)",
     )  # fmt: skip
     group.add_argument(
         "--camera", choices=("left", "right"), default="left",
@@ -227,28 +227,3 @@ def options_of(arguments: argparse.Namespace) -> ConvertOptions:
         light=None if arguments.light is None else Light.parse(arguments.light),
         frame_offset_ns=offset_ns,
     )
-
-
-LARGEST_NS = 2.0**63
-NS_PER_UNIT = {"s": 1e9, "us": 1e3, "ns": 1.0}
-
-
-def to_ns(times: npt.NDArray[Any], where: str, ns_per_unit: float = 1e9) -> npt.NDArray[np.int64]:
-    """Convert times, [n], to int64 nanoseconds: integers exactly, others as float64, rounded to the nearest.
-
-    Args:
-        where: beginning of the error message.
-        ns_per_unit: nanoseconds per unit of ``times``; the default means seconds.
-
-    Raises:
-        UsageError: a time is NaN or does not fit int64, so its unit is probably wrong.
-    """
-    ns = np.rint(times.astype(np.float64) * ns_per_unit)
-    held = np.abs(ns) < LARGEST_NS
-    if not held.all():
-        # A cast would turn all of them into the same number.
-        raise UsageError(
-            f"{where}: a time is {ns[~held][0] * 1e-9:.10g} s, which is out of range; give the unit of text files with "
-            "--time-unit"
-        )
-    return times.astype(np.int64) * int(ns_per_unit) if times.dtype.kind in "iu" else ns.astype(np.int64)

@@ -26,7 +26,8 @@ import numpy as np
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings import hdf5
-from v2v_recordings.items import ConvertOptions, EventChunk, FlowField, Item, ReadProgress, SensorSize, to_ns
+from v2v_recordings.event_columns import EventColumns, TimeUnit, to_ns
+from v2v_recordings.items import ConvertOptions, FlowField, Item, ReadProgress, SensorSize
 
 if TYPE_CHECKING:
     import h5py
@@ -57,10 +58,12 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
             raise UsageError(f"{path}: {name}/events is {list(events.shape)}, not [N, 4]")
         if pictures is not None:
             yield SensorSize(*pictures.shape[:0:-1])
+        read = EventColumns(str(path), TimeUnit.of(options, "s", hdf5.stated_unit(events)))
         for start in range(0, len(events), hdf5.READ_EVENTS):
             x, y, t, p = events[start : start + hdf5.READ_EVENTS].T
-            yield EventChunk(to_ns(t, str(path)), x.astype(np.int32), y.astype(np.int32), p > 0)
+            yield read.part(t, x, y, p)
             progress(start + len(t), len(events))
+        yield from read.end()
         if pictures is not None:
             nearest = group.get("image_raw_event_inds")
             yield from hdf5.pictures(pictures, group["image_raw_ts"], f"{path}: image_raw", nearest)
@@ -78,6 +81,7 @@ def _flow(file: h5py.File, path: Path, camera: str) -> Iterator[Item]:
     times = group["flow_dist_ts" if "flow_dist_ts" in group else "depth_image_raw_ts"][:]
     if fields.ndim != 4 or fields.shape[1] != 2 or len(times) != len(fields):
         raise UsageError(f"{path}: flow_dist is {list(fields.shape)} with {len(times)} times, not [N, 2, H, W]")
+    SensorSize(*fields.shape[:1:-1]).require_usable(str(path))
     for index, t_ns in enumerate(to_ns(times, str(path))):
         flow = fields[index].astype(np.float32)
         if depth is not None:

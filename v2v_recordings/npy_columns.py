@@ -4,7 +4,7 @@
 |---|---|---|
 | ``events_ts.npy`` | ``t`` | [N] or [N, 1]: s if they are floats, else us (``--time-unit`` overrides) |
 | ``events_xy.npy`` | ``x``, ``y`` | px, [N, 2] or [N] |
-| ``events_p.npy`` | ``p`` | [N] or [N, 1], above 0 for a brightness increase |
+| ``events_p.npy`` | ``p`` | [N] or [N, 1], 0 and 1 or as :data:`~v2v_recordings.event_columns.POLARITY_CODES` |
 | ``images.npy``, ``images_ts.npy`` | | uint8 [M, H, W] or [M, H, W, 1], and their times, s |
 | ``metadata.json``: ``sensor_resolution`` | ``height``, ``width`` | size of the sensor |
 
@@ -26,8 +26,9 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings import hdf5
-from v2v_recordings.archive import Archive, holds
-from v2v_recordings.items import NS_PER_UNIT, ConvertOptions, Item, ReadProgress, SensorSize
+from v2v_recordings.archive import Archive, check_stated_bytes, holds
+from v2v_recordings.event_columns import TimeUnit
+from v2v_recordings.items import ConvertOptions, Item, ReadProgress, SensorSize
 
 FOLDER = ("events_ts.npy", "events_xy.npy", "events_p.npy")
 NPZ = ("t.npy", "x.npy", "y.npy", "p.npy")
@@ -61,16 +62,18 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
             yield _metadata_size(archive, member)
         elif pictures is not None and len(pictures.shape) == 3:
             yield SensorSize(*pictures.shape[:0:-1])
-        is_float = columns["t"].dtype.kind == "f"
-        unit = options.time_unit or ("s" if is_float else "us")
-        yield from hdf5.events(columns, str(path), progress, ns_per_unit=NS_PER_UNIT[unit])
+        unit = TimeUnit.of(options, "s" if columns["t"].dtype.kind == "f" else "us")
+        yield from hdf5.events(columns, str(path), progress, unit=unit)
         if pictures is not None:
             yield from hdf5.pictures(pictures, column(_IMAGE_TIMES), f"{path}: {_IMAGES}")
 
 
 def _column(archive: Archive, files: contextlib.ExitStack, name: str, number: int | None = None) -> _Column:
     member = archive.find(name) or name
-    return _Column(files.enter_context(archive.open(member)), archive.where(member), number)
+    column = _Column(files.enter_context(archive.open(member)), archive.where(member), number)
+    file = archive.path if archive.path.is_file() else archive.folder / member
+    check_stated_bytes(math.prod(column.shape) * column.dtype.itemsize, file, archive.where(member))
+    return column
 
 
 class _Column:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings import bag, dsec, faery_reader, hdf5, mvsec, npy_columns, text_events
+from v2v_recordings.event_columns import TimeUnit, clock_fault
 from v2v_recordings.items import (
     ConvertOptions,
     EventChunk,
@@ -105,6 +106,8 @@ MOST_LATE_EVENTS = 1 << 17
 """A longer run of earlier events is no late packet."""
 FEW_EVENTS = 8
 """At most this many earlier events at the very end of a recording are late ones."""
+MOST_RESETS = 4
+"""A recording in which the times step back more often is not in the order of time."""
 GAP_NS = 1000
 """Time that stands for the unknown one between the last event before a reset and the first one after it."""
 
@@ -120,7 +123,7 @@ def read_items(
 
     Raises:
         UsageError: the recording is missing, damaged or of an unknown form; its sensor is too large; its clock is reset
-            and it has pictures.
+            and it has pictures; or these are on another clock.
     """
     clock, chosen = _Clock(path), FORMS[form or recognise(path)]
     if options.light or chosen.light:
@@ -136,28 +139,40 @@ def read_items(
         elif isinstance(item, Picture):
             SensorSize(*item.pixels.shape[::-1]).require_usable(str(path))
             item = dataclasses.replace(item, t_ns=item.t_ns + options.frame_offset_ns)
-        clock.check(isinstance(item, (Picture, FlowField)))
+        clock.check(item)
         yield item
     yield from clock.pass_on(None)
+    clock.end(options)
 
 
 class _Clock:
-    """Put events after a reset of the sensor's clock behind those before it, and say so."""
+    """Put events after a reset of the sensor's clock behind those before it, and say so; compare that of pictures."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._newest_ns = np.iinfo(np.int64).min // 2
-        self._offset_ns = self._passed = 0
+        self._newest_ns, self._oldest_ns = np.iinfo(np.int64).min // 2, np.iinfo(np.int64).max
+        self._offset_ns = self._passed = self._resets = 0
         self._early: list[EventChunk] = []
-        self._has_others, self._reset = False, ""
+        self._others: dict[type, list[float]] = {}
+        self._reset = ""
 
-    def check(self, is_timed: bool) -> None:
+    def check(self, item: Item | None = None) -> None:
         """Refuse pictures and flow fields in a recording whose clock was reset: they have times too."""
-        self._has_others |= is_timed
-        if self._has_others and self._reset:
+        if isinstance(item, (Picture, FlowField)):
+            self._others.setdefault(type(item), []).append(item.t_ns * 1e-9)
+        if self._others and self._reset:
             raise UsageError(
                 f"{self._path}: {self._reset}, and its pictures may be on either clock: split the recording there"
             )
+
+    def end(self, options: ConvertOptions) -> None:
+        """Refuse a recording of impossible duration, and pictures and flow fields on another clock than the events."""
+        first, last = self._oldest_ns * 1e-9, self._newest_ns * 1e-9
+        if options.time_unit is None:  # columns were tested in their own unit
+            TimeUnit("us", is_stated=True).check(self._passed, last - first, str(self._path))
+        for times in self._others.values() if self._passed else ():
+            if fault := clock_fault(times, first, last):
+                raise UsageError(f"{self._path}: {fault}")
 
     def pass_on(self, chunk: EventChunk | None) -> Iterator[Item]:
         """Yield what is certain once these events are known; None ends the recording."""
@@ -182,13 +197,20 @@ class _Clock:
             if not count:
                 back = f"the times step back by {step_ns * 1e-9:.6g} s: the clock was reset"
                 self._reset = f"at event {self._passed} {back}"
-                self.check(False)
+                self._resets += 1
+                if self._resets > MOST_RESETS:
+                    raise UsageError(
+                        f"{self._path}: {self._reset}, and so {self._resets} times so far: its events are not in the "
+                        "order of time, or these are in another unit: sort it, or give --time-unit"
+                    )
+                self.check()
                 yield Note(f"{self._reset}; a gap of unknown length, after which the events follow those before it")
                 self._offset_ns += step_ns + GAP_NS
                 rest = _later(rest, step_ns + GAP_NS)
                 continue
             yield rest.part(0, count)
             self._newest_ns = int(newest[count - 1])
+            self._oldest_ns = min(self._oldest_ns, int(rest.t_ns[:count].min()))
             self._passed += count
             rest = rest.part(count)
 

@@ -1,6 +1,7 @@
-"""Read text files of events: one ``t x y p`` per line, p in {0, 1} or {-1, 1}; the first line may be ``width height``.
+"""Read text files of events: one ``t x y p`` per line; the first line may be ``width height``.
 
-Spaces, tabs or commas separate values. Lines that begin with ``#`` are comments. A byte order mark is skipped.
+Polarities are 0 and 1, false and true, or as :data:`~v2v_recordings.event_columns.POLARITY_CODES`. Spaces, tabs or
+commas separate values. Lines that begin with ``#`` are comments. A byte order mark is skipped.
 
 IJRR (Mueggler et al. 2017) has such a text, ``events.txt``, in a zip or folder with ``images.txt`` (``t path``) and
 PNGs. A single text file of events is read as well. EVAID-R has ``event/*.txt`` (us), ``gt/*.png``, ``timestamps.txt``
@@ -22,44 +23,38 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings.archive import Archive, holds
-from v2v_recordings.items import (
-    NS_PER_UNIT,
-    ConvertOptions,
-    EventChunk,
-    Item,
-    Note,
-    Picture,
-    ReadProgress,
-    SensorSize,
-    to_ns,
-)
+from v2v_recordings.event_columns import EventColumns, TimeUnit, to_ns
+from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, ReadProgress, SensorSize
 
 BLOCK_BYTES = 1 << 22
 COMMENT = re.compile(rb"^[ \t]*#[^\r\n]*", re.MULTILINE)
 COMMA = re.compile(rb"(?<=[^\s,])[ \t]*,[ \t]*(?=[^\s,])")
+TRUE_OR_FALSE = re.compile(rb"\b(false|true)\b", re.IGNORECASE)
 TIME_WITH_A_FRACTION = re.compile(rb"^[ \t]*[-+\d]*(\.|[eE]-)", re.MULTILINE)
 """Matches a line whose first number has a decimal point, or a negative exponent without one (1e-06)."""
 
 
 def read_texts(
-    archive: Archive, events: list[str], pictures: list[tuple[int, str]], time_unit: str | None, progress: ReadProgress
+    archive: Archive, events: list[str], pictures: list[tuple[int, str]], unit: TimeUnit | None, progress: ReadProgress
 ) -> Iterator[Item]:
     """Yield the events of an archive's texts, one text after the other, then its pictures.
 
     Args:
         pictures: times, ns, and members.
-        time_unit: see :func:`read_text_events`.
+        unit: see :func:`read_text_events`.
 
     Raises:
-        UsageError: a member is missing or malformed.
+        UsageError: a member is missing or malformed; or see :class:`EventColumns`.
     """
+    read = EventColumns("", unit)
     done, total = 0, sum(archive.bytes_of.get(member, 0) for member in (*events, *(name for _, name in pictures)))
     for member in events:
         with archive.open(member) as stream:
-            for item in read_text_events(stream, archive.where(member), time_unit=time_unit):
+            for item in read_text_events(stream, archive.where(member), read):
                 progress(done + stream.tell(), total)
                 yield item
         done += archive.bytes_of[member]
+    yield from read.end()
     for t_ns, member in pictures:
         yield Picture(t_ns, archive.picture(member))
         done += archive.bytes_of[member]
@@ -67,21 +62,21 @@ def read_texts(
 
 
 def read_text_events(
-    stream: IO[bytes], name: str, *, time_unit: str | None = None
+    stream: IO[bytes], name: str, columns: EventColumns | None = None
 ) -> Iterator[SensorSize | EventChunk | Note]:
     """Yield the sensor's size, if the file states it, and chunks of events. A last line that is truncated is left out.
 
     Args:
         stream: the file's bytes; read in blocks of 4 MiB.
         name: name of the file, for messages.
-        time_unit: "s", "us" or "ns"; None takes seconds if any time in the first block has a decimal point, else us.
-            The first time alone is not enough: ``%g`` writes 0 and 1e-06.
+        columns: what earlier texts told. Without a unit it gets seconds if any time in the first block has a decimal
+            point, else us. The first time alone is not enough: ``%g`` writes 0 and 1e-06.
 
     Raises:
-        UsageError: a line is not four numbers (the message gives its number and text), or the times have another unit.
+        UsageError: a line is not four numbers (the message gives its number and text); or see :class:`EventColumns`.
     """
-    if time_unit is not None and time_unit not in NS_PER_UNIT:
-        raise UsageError(f"time unit {time_unit!r}: give one of {', '.join(NS_PER_UNIT)}")
+    columns = columns or EventColumns(name)
+    columns.where = name
     lines_before, rest, has_begun = 0, stream.read(len(codecs.BOM_UTF8)).removeprefix(codecs.BOM_UTF8), False
     while True:
         read = stream.read(BLOCK_BYTES)
@@ -97,15 +92,14 @@ def read_text_events(
                 lines_before += lines - after.count(b"\n")
                 block, lines = after, after.count(b"\n")
         if block.strip():
-            time_unit = time_unit or ("s" if TIME_WITH_A_FRACTION.search(block) else "us")
+            columns.unit = columns.unit or TimeUnit("s" if TIME_WITH_A_FRACTION.search(block) else "us")
             values = _numbers(block)
             if values is None and lines_before and not read:
                 yield Note(f"cut: line {lines_before + 1}, the last, is incomplete ({_shown(block)}) and left out")
                 return
             if values is None:
                 raise UsageError(_first_bad_line(block, name, lines_before))
-            t, x, y, p = values.T
-            yield EventChunk(to_ns(t, name, NS_PER_UNIT[time_unit]), x.astype(np.int32), y.astype(np.int32), p > 0)
+            yield columns.part(*values.T)
         if not read:
             return
         lines_before += lines
@@ -134,11 +128,11 @@ def _numbers(block: bytes) -> npt.NDArray[np.float64] | None:
     try:
         table = np.loadtxt(io.StringIO(block.decode("latin-1")), ndmin=2)
     except ValueError:
-        return None
+        numbers = TRUE_OR_FALSE.sub(lambda word: b"01"[len(word[0]) == 4 :][:1], block)
+        return None if numbers == block else _numbers(numbers)
     if table.shape[1] != 4 or not np.isfinite(table).all():
         return None
-    is_whole = (table[:, 1:3] == np.rint(table[:, 1:3])).all()
-    return table if is_whole and np.isin(table[:, 3], (-1, 0, 1)).all() else None
+    return table if (table[:, 1:3] == np.rint(table[:, 1:3])).all() else None
 
 
 def _shown(line: bytes) -> str:
@@ -148,7 +142,7 @@ def _shown(line: bytes) -> str:
 def _first_bad_line(block: bytes, name: str, lines_before: int) -> str:
     for number, line in enumerate(block.splitlines(), start=lines_before + 1):
         if line.strip() and _numbers(line) is None:
-            return f"{name}, line {number}: {_shown(line)} is not `t x y p` with whole x and y and p of -1, 0 or 1"
+            return f"{name}, line {number}: {_shown(line)} is not `t x y p` with whole x and y"
     return f"{name}: the lines after {lines_before} are not `t x y p`"
 
 
@@ -174,7 +168,8 @@ def read_ijrr(path: Path, options: ConvertOptions, progress: ReadProgress) -> It
         pictures = _listed_pictures(archive)
         if pictures:
             yield archive.size(pictures[0][1])
-        yield from read_texts(archive, [events or _EVENTS], pictures, options.time_unit, progress)
+        unit = None if options.time_unit is None else TimeUnit.of(options, "s")
+        yield from read_texts(archive, [events or _EVENTS], pictures, unit, progress)
 
 
 def _listed_pictures(archive: Archive) -> list[tuple[int, str]]:
@@ -230,7 +225,7 @@ def read_evaid(path: Path, options: ConvertOptions, progress: ReadProgress) -> I
         elif pictures:
             yield archive.size(pictures[0])
         timed = [(1000 * time_us, member) for time_us, member in zip(times_us, pictures, strict=True)]
-        yield from read_texts(archive, events, timed, options.time_unit or "us", progress)
+        yield from read_texts(archive, events, timed, TimeUnit.of(options, "us"), progress)
 
 
 def _evaid_members(archive: Archive, folder: str, suffixes: tuple[str, ...]) -> list[str]:

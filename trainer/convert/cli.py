@@ -1,6 +1,7 @@
 """Run `v2v-convert`.
 
-Exit status: 0 everything was converted, 2 wrong usage or input (recordings converted before stay), 130 interrupted.
+Exit status: 0 everything was converted, 1 a file could not be written, 2 wrong usage or input (recordings converted
+before stay), 130 interrupted, by SIGTERM too.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from pathlib import Path
 from trainer.convert.conversion import Converted, convert, default_name
 from trainer.evaluation import layout
 from v2v_protocol.command import Parser, run_command
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.progress import Progress
 from v2v_protocol.write_aside import JSON, write_json
 from v2v_recordings import items
@@ -38,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     out.add_argument("--overwrite", action="store_true", help="replace files that exist")
     parser.add_output("Output", "--json", JSON, "also write a record of each recording to this file")
     interrupted = "interrupted; no incomplete file is left"
-    return run_command(parser, _run, argv, interrupted=interrupted)
+    return run_command(parser, _run, argv, failures=(V2VError,), interrupted=interrupted)
 
 
 def _run(arguments: argparse.Namespace) -> int:

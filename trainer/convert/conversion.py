@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
+import sys
 import tempfile
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from trainer.convert.writer import RecordingWriter, Written
 from trainer.evaluation import layout
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.programs import show
 from v2v_recordings.items import ConvertOptions, ReadProgress
 from v2v_recordings.reading import FORMS, read_items, recognise
 
@@ -63,6 +67,8 @@ def convert(
     Raises:
         UsageError: the source is missing, damaged or of an unknown form; or the destination exists or lies in the
             source.
+        V2VError: the destination cannot be written, for instance on a full disk.
+        KeyboardInterrupt: by a Ctrl-C or SIGTERM.
     """
     source, destination = Path(source), Path(destination)
     options = options or ConvertOptions()
@@ -80,17 +86,49 @@ def convert(
         raise UsageError(f"{destination} exists; --overwrite replaces it")
     chosen = FORMS[form]
     try:
-        with RecordingWriter(
-            destination, source=source.name, size=options.size, published_shift=chosen.published_shift
-        ) as writer:
-            for item in read_items(source, form, options, progress):
+        with (
+            _late_signals() as check,
+            RecordingWriter(
+                destination, source=source.name, size=options.size, published_shift=chosen.published_shift
+            ) as writer,
+        ):
+
+            def step(done: int, total: int | None) -> None:
+                check()
+                progress(done, total)
+
+            for item in read_items(source, form, options, step):
+                check()
                 writer.add(item)
     except OSError as error:
         # Readers convert their own errors, so this one comes from writing the destination.
-        raise UsageError(f"{destination}: cannot be written: {error}") from error
+        raise V2VError(f"{destination}: cannot be written: {error.strerror or error}") from error
     if writer.written is None:
         raise RuntimeError("the writer was left without finishing")
     return Converted(source, destination, form, writer.written)
+
+
+@contextlib.contextmanager
+def _late_signals() -> Iterator[Callable[[], None]]:
+    """Yield a function that raises KeyboardInterrupt if a Ctrl-C or SIGTERM has come; it comes at no other place.
+
+    Python would raise it in the functions by which HDF5 writes, and HDF5 then ends the process.
+    """
+    came: list[int] = []
+    is_main = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGINT, signal.SIGTERM) if is_main else ()
+    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in numbers}
+
+    def check() -> None:
+        if came:
+            raise KeyboardInterrupt
+
+    try:
+        yield check
+        check()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
@@ -116,7 +154,9 @@ def in_layout(data: Path, options: ConvertOptions, progress: ReadProgress) -> It
                 (folder / path.name).symlink_to(path.resolve())
         for path in raw:
             if not (folder / default_name(path)).exists():
-                convert(path, folder / default_name(path), options=options, progress=progress)
+                done = convert(path, folder / default_name(path), options=options, progress=progress)
+                for note in done.written.notes:
+                    show(f"{path.name}: {note}", sys.stderr)
         yield folder
 
 

@@ -12,6 +12,7 @@ The file has a temporary name until it is complete.
 from __future__ import annotations
 
 import contextlib
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -59,6 +60,35 @@ class Written:
     light: str = ""
 
 
+class _Disk(io.FileIO):
+    """A file that keeps the first error of a write, for :meth:`check`, and drops what is written later.
+
+    HDF5 keeps what it could not write and tries again when its objects are freed, which ends the process by a signal.
+    """
+
+    error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        rest = memoryview(data).cast("B")
+        try:
+            while rest and self.error is None:
+                rest = rest[super().write(rest) or 0 :]
+        except OSError as error:
+            self.error = error
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return size or 0
+
+    def check(self) -> None:
+        if self.error is not None:
+            raise self.error
+
+
 class RecordingWriter:
     """Write a recording inside a ``with`` block. A normal exit completes the file, an exception removes it.
 
@@ -72,6 +102,7 @@ class RecordingWriter:
 
     Raises:
         UsageError: the folder cannot be written to.
+        OSError: in the methods: the file cannot be written further.
     """
 
     def __init__(self, path: Path, *, source: str, size: SensorSize | None = None, published_shift: int = 0) -> None:
@@ -90,7 +121,8 @@ class RecordingWriter:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             partial = self._files.enter_context(write_aside_and_rename(path, durable=True))
-            self._file = self._files.enter_context(h5py.File(partial, "w"))
+            self._disk = self._files.enter_context(_Disk(partial, "w+"))
+            self._file = self._files.enter_context(h5py.File(self._disk, "w"))
         except OSError as error:
             raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
         for name, dtype in _COLUMNS.items():
@@ -109,9 +141,14 @@ class RecordingWriter:
     ) -> None:
         if kind is not None:
             self._files.__exit__(kind, error, trace)
+            self._disk.check()  # what could not be written cannot be read back either
             return
         with self._files:
-            self.written = self._finish()
+            try:
+                self.written = self._finish()
+                self._file.close()
+            finally:
+                self._disk.check()
 
     def add(self, item: Item) -> None:
         """Add the next item of the recording.
@@ -120,6 +157,7 @@ class RecordingWriter:
             UsageError: events are further out of order than the buffer can sort, or outside the sensor; pictures have
                 different sizes; or the recording's size differs from the user's.
         """
+        self._disk.check()
         if isinstance(item, SensorSize):
             if self._size is not None and self._size != item:
                 raise UsageError(

@@ -22,12 +22,12 @@ import numpy.typing as npt
 from trainer.evaluation import layout
 from trainer.evaluation.voxelise import Events
 from v2v_protocol.errors import UsageError
-from v2v_recordings.hdf5 import require_self_contained
-from v2v_recordings.items import Light, SensorSize
+from v2v_recordings.event_columns import CLOCK_SLACK_SECONDS, Polarities, clock_fault
+from v2v_recordings.hdf5 import event_index, layout_unit, require_self_contained
+from v2v_recordings.items import ConvertOptions, Light, SensorSize
 
 BLOCK_EVENTS = 1 << 16
 CACHED_BLOCKS = 64
-CLOCK_SLACK_SECONDS = 1.0
 VIDEO_GAMMA = 2.2
 
 
@@ -127,6 +127,8 @@ class Recording:
                 require_self_contained(self._file, self.path)
                 self._columns = self._check_columns()
                 self.times: Sequence[float] = _Times(self._columns["ts"], self.path)
+                self._polarities = Polarities()
+                self._check_numbers()
                 self.repaired_images = 0
                 self.images = self._list_images(as_published)
                 self.size = self._sensor_size()
@@ -170,6 +172,15 @@ class Recording:
             )
         return columns
 
+    def _check_numbers(self) -> None:
+        """Check the unit of the times and, in the first block, what polarities mean."""
+        unit, (first, last) = layout_unit(self._file, ConvertOptions()), self.span
+        self._polarities.are_brighter(self._columns["ps"][:BLOCK_EVENTS], str(self.path))
+        if unit.name != "s" or self._polarities.meaning:
+            other = self._polarities.meaning or f"times are in {unit.name}"
+            raise UsageError(f"{self.path}: {other}: convert it with v2v-convert")
+        unit.check(len(self), last - first, str(self.path))
+
     def _list_images(self, as_published: bool) -> tuple[RecordedImage, ...]:
         group = self._file.get("images", {})
         keys = sorted(group)
@@ -185,7 +196,7 @@ class Recording:
             stamps.append(attributes.get("timestamp"))
         if any(index is None for index in indices):
             raise UsageError(f"{self.path}: pictures without the attribute event_idx")
-        stored = [int(index) for index in indices]
+        stored = [event_index(index, len(self), str(self.path)) for index in indices]
         if any(stamp is None for stamp in stamps):
             times = [self.times[min(index, len(self) - 1)] for index in stored]
             return self._make_images(keys, times, stored)
@@ -193,23 +204,24 @@ class Recording:
         if as_published:
             return self._make_images(keys, times, stored)
         first, last = self.span
-        if times[-1] < first - CLOCK_SLACK_SECONDS or times[0] > last + CLOCK_SLACK_SECONDS:
-            raise self._clock_error(times)
+        if fault := clock_fault(times, first, last):
+            raise self._clock_error(fault)
         times = self._repair_times(times)
         for time, index in zip(times, stored, strict=True):
             # The time is outside the events' times, but its index has events on both sides: one clock may be in us.
             if (time < first - CLOCK_SLACK_SECONDS and index > 1) or (
                 time > last + CLOCK_SLACK_SECONDS and index < len(self) - 1
             ):
-                raise self._clock_error(times)
+                raise self._clock_error(
+                    f"a picture is at {time:.6f} s, outside of the events' {first:.6f} to {last:.6f} s, and its "
+                    f"event_idx {index} is one of them: they have different clocks"
+                )
         return self._make_images(keys, times, [bisect.bisect_left(self.times, time) for time in times])
 
-    def _clock_error(self, times: Sequence[float]) -> UsageError:
-        first, last = self.span
+    def _clock_error(self, fault: str) -> UsageError:
         return UsageError(
-            f"{self.path}: pictures are from {times[0]:.3f} to {times[-1]:.3f} s, events from {first:.3f} to "
-            f"{last:.3f} s: they have different clocks. Convert the recording again with v2v-convert, or trust its "
-            "event_idx with --as-published"
+            f"{self.path}: {fault}. Convert the recording again with v2v-convert, or trust its event_idx with "
+            "--as-published"
         )
 
     def _make_images(
@@ -245,6 +257,7 @@ class Recording:
             shape = self._file[self.images[0].key].shape
             if len(shape) != 2:
                 raise UsageError(f"{self.path}: {self.images[0].key} is {list(shape)}, not [H, W]")
+            SensorSize(int(shape[1]), int(shape[0])).require_usable(f"{self.path}: {self.images[0].key}")
             return int(shape[0]), int(shape[1])
         if self._given_size is not None:
             return self._given_size
@@ -270,9 +283,10 @@ class Recording:
         """
         assert window.target is not None
         with _reading(self.path):
-            field: npt.NDArray[np.float32] = self._file[window.target.key][:].astype(np.float32)
-        if field.shape != (2, *self.size):
-            raise UsageError(f"{self.path}: {window.target.key} is {list(field.shape)}, not {[2, *self.size]}")
+            dataset = self._file[window.target.key]
+            if dataset.shape != (2, *self.size):
+                raise UsageError(f"{self.path}: {window.target.key} is {list(dataset.shape)}, not {[2, *self.size]}")
+            field: npt.NDArray[np.float32] = dataset[:].astype(np.float32)
         return field
 
     def events(self, window: EventWindow) -> Events:
@@ -287,7 +301,11 @@ class Recording:
                 self._columns["ts"][part].astype(np.float64),
                 self._columns["xs"][part],
                 self._columns["ys"][part],
-                np.where(self._columns["ps"][part] > 0, np.float32(1), np.float32(-1)),
+                np.where(
+                    self._polarities.are_brighter(self._columns["ps"][part], str(self.path)),
+                    np.float32(1),
+                    np.float32(-1),
+                ),
             )
         return _in_order(events, window, self.path)
 
@@ -298,11 +316,12 @@ class Recording:
             UsageError: the picture cannot be read, or has another dtype or size than the first one.
         """
         with _reading(self.path):
-            pixels = self._file[image.key][:]
-        if pixels.dtype != np.uint8 or pixels.shape != self.size:
-            raise UsageError(
-                f"{self.path}: {image.key} is {pixels.dtype} {list(pixels.shape)}, not uint8 {list(self.size)}"
-            )
+            dataset = self._file[image.key]
+            if dataset.dtype != np.uint8 or dataset.shape != self.size:
+                raise UsageError(
+                    f"{self.path}: {image.key} is {dataset.dtype} {list(dataset.shape)}, not uint8 {list(self.size)}"
+                )
+            pixels = dataset[:]
         return np.asarray(pixels if self._table is None else self._table[pixels])
 
     @property

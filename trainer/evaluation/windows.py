@@ -12,8 +12,9 @@ import math
 from collections.abc import Sequence
 
 from trainer.evaluation.data_sets import TimeRange
-from trainer.evaluation.readers import CLOCK_SLACK_SECONDS, EventWindow, RecordedImage, Recording
+from trainer.evaluation.readers import EventWindow, RecordedImage, Recording
 from v2v_protocol.errors import UsageError
+from v2v_recordings.event_columns import CLOCK_SLACK_SECONDS
 
 
 def picture_windows(

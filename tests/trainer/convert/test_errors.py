@@ -126,7 +126,7 @@ def evt21(path: Path, header: bytes) -> Path:
         (lambda path: patched_zip(path, method=9), "images.txt cannot be read: That compression method.*unpack"),
         (lambda path: patched_zip(path, flags=1), "images.txt cannot be read: .*encrypted.*unpack the file"),
         (lambda path: ijrr(path, events=b"0.1 1 2 1\n0.2 1 2\n"), r"line 2: '0.2 1 2' is not `t x y p`"),
-        (lambda path: ijrr(path, events=b"0.1 1 2 1\n0.2 1 2 2\n"), r"line 2: '0.2 1 2 2' is not `t x y p`"),
+        (lambda path: ijrr(path, events=b"0.1 1 2 1\n0.2 1 2 3\n"), r"events.txt: polarities are 1, 3; they must be"),
         (lambda path: ijrr(path, events=b"0.1 1 2 1\n0.2 1 x 0\n"), r"line 2: '0.2 1 x 0' is not"),
         (lambda path: ijrr(path, events=b"0.1 1 2 1\nnan 1 2 0\n"), r"line 2: 'nan 1 2 0' is not"),
         (lambda path: ijrr(path, events=b"a b\n0.2 1 2 1\n"), r"the first line is b'a b'"),

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
@@ -10,10 +14,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from trainer.convert import cli
 from trainer.convert import writer as writer_module
 from trainer.convert.writer import RecordingWriter, Written
 from v2v_protocol.errors import UsageError
 from v2v_recordings.items import EventChunk, Item, Picture, SensorSize
+from v2v_recordings.reading import FORMS, RawForm
 
 
 def chunk(times_ns: list[int], x: int = 0, y: int = 0) -> EventChunk:
@@ -119,3 +125,56 @@ def test_disorder_is_counted(tmp_path: Path) -> None:
 def test_columns_of_different_lengths_are_refused() -> None:
     with pytest.raises(UsageError, match="different lengths"):
         EventChunk(np.zeros(2, np.int64), np.zeros(2, int), np.zeros(1, int), np.zeros(2, bool))
+
+
+LIMITED = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
+from trainer.convert.cli import main
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.parametrize("limit", [1000, 100_000])
+def test_a_full_disk_is_one_line(tmp_path: Path, limit: int) -> None:
+    """A limit of the file's size stands for it, early and late. HDF5 by itself ends the process by a signal."""
+    random, count = np.random.default_rng(0), 100_000
+    t, x, y = np.sort(random.integers(0, 10**6, count)), *random.integers(0, 100, (2, count))
+    np.savez(tmp_path / "a.npz", t=t, x=x, y=y, p=x % 2)
+    command = [
+        sys.executable,
+        "-c",
+        LIMITED,
+        str(limit),
+        str(tmp_path / "a.npz"),
+        "--out",
+        str(tmp_path / "out" / "a.h5"),
+    ]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert ended.stderr == f"v2v-convert: {tmp_path / 'out' / 'a.h5'}: cannot be written: File too large\n"
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_sigterm_leaves_no_incomplete_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def read(*_: object) -> Iterator[Item]:
+        yield chunk([0, 5])
+        assert list(tmp_path.glob("out/.*.partial"))
+        signal.raise_signal(signal.SIGTERM)
+        yield chunk([7])
+
+    def too_late(*_: object) -> None:
+        pytest.fail("the command does not handle SIGTERM")
+
+    (tmp_path / "a.toy").touch()
+    monkeypatch.setitem(FORMS, "toy", RawForm("toy", lambda path: path.suffix == ".toy", read))
+    before = signal.signal(signal.SIGTERM, too_late)
+    try:
+        assert cli.main([str(tmp_path / "a.toy"), "--out", str(tmp_path / "out")]) == 130
+        assert signal.getsignal(signal.SIGTERM) is too_late
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert capsys.readouterr().err == "v2v-convert: interrupted; no incomplete file is left\n"
+    assert list(tmp_path.glob("out/.*")) == []

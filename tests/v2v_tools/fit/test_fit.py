@@ -220,10 +220,17 @@ def test_a_recording_in_files_is_the_recording_in_memory(tmp_path: Path) -> None
     assert len(read.frames) in (len(direct.frames) - 1, len(direct.frames))
 
 
-@pytest.mark.parametrize("line", ["0.1 -1 5 1", "0.1 5 -1 0", "0.1 24 5 1"])
-def test_events_outside_the_sensor_are_refused(tmp_path: Path, line: str) -> None:
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("0.1 -1 5 1", "x of event 1 is -1"),
+        ("0.1 5 -1 0", "y of event 1 is -1"),
+        ("0.1 24 5 1", "an event lies outside 24x20 px"),
+    ],
+)
+def test_events_outside_the_sensor_are_refused(tmp_path: Path, line: str, said: str) -> None:
     (tmp_path / "a.txt").write_text(f"24 20\n0.0 1 1 1\n{line}\n")
-    with pytest.raises(UsageError, match="an event lies outside 24x20 px"):
+    with pytest.raises(UsageError, match=said):
         read_recording(tmp_path / "a.txt", ConvertOptions(size=SensorSize(24, 20)))
 
 
