@@ -14,7 +14,10 @@ SampleHeader message, which a broker passes on unchanged.
 All received data is treated as hostile: sizes are limited before anything is allocated, fields are checked by their
 types (:mod:`v2v_protocol.persisted`; the code that uses a Mapping checks the plain values in it), dtypes come from an
 allow-list, and nothing is ever unpickled. For any bytes, :func:`decode` either returns a message or raises a
-:class:`v2v_protocol.errors.ProtocolError`. Fields that are ``later`` were added within a protocol version.
+:class:`v2v_protocol.errors.ProtocolError`.
+
+Messages grow within a protocol version. What a receiver may ignore is added to :class:`Notes`. What it must heed, such
+as all that changes a sample, is a new field that is ``later``: a receiver that does not know it refuses the message.
 """
 
 from __future__ import annotations
@@ -32,7 +35,7 @@ import numpy.typing as npt
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.errors import LimitExceeded, ProtocolError, VersionMismatch
-from v2v_protocol.persisted import Persisted, add_fields, later, reader, shown
+from v2v_protocol.persisted import Persisted, add_fields, later, read_fields, reader, shown
 from v2v_protocol.sample import Layout
 
 
@@ -48,11 +51,46 @@ class ErrorCode(StrEnum):
     BUSY = "busy"
 
 
+@dataclass(frozen=True, slots=True)
+class Notes(Persisted):
+    """What a message says for information. A receiver drops names that it does not know, so no note changes a sample.
+
+    Attributes:
+        memory_bytes: of a WorkerHello: limit of the worker's memory; 0: not known.
+        reason: of a Goodbye: why a worker cannot work for this server; "": it just leaves.
+    """
+
+    memory_bytes: int = later(0)
+    reason: str = later("")
+
+    @classmethod
+    def from_dict(cls, values: Any) -> Notes:
+        """Return the notes that this release knows.
+
+        Raises:
+            ProtocolError: they are not a map, or a known one has a value of another type.
+        """
+        if isinstance(values, dict):
+            values = {name: values[name] for name in cls.__slots__ if name in values}
+        return read_fields(cls, values)
+
+
+@dataclass(frozen=True, slots=True)
+class Noted(Persisted):
+    """Base of all messages.
+
+    Attributes:
+        notes: what the receiver may ignore.
+    """
+
+    notes: Notes = later(default_factory=Notes, kw_only=True)
+
+
 # --- consumer -> server -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class Hello(Persisted):
+class Hello(Noted):
     """Open a consumer's session, or open it again after a server restart.
 
     Attributes:
@@ -83,7 +121,7 @@ class Hello(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Want(Persisted):
+class Want(Noted):
     """Ask for samples of one epoch; each index uses one unit of credit until it is answered.
 
     An index that is requested again while it is in work is not made twice.
@@ -103,12 +141,12 @@ class Want(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Ping(Persisted):
+class Ping(Noted):
     """Ask for a sign of life. It is sent only after a silence, because any message counts as a sign of life."""
 
 
 @dataclass(frozen=True, slots=True)
-class Goodbye(Persisted):
+class Goodbye(Noted):
     """The sender leaves in an orderly way: forget its session, or give its leases to other workers.
 
     Attributes:
@@ -119,7 +157,7 @@ class Goodbye(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class GetStatus(Persisted):
+class GetStatus(Noted):
     """Ask for the state of the service. It needs no session, and workers' ports accept it too. The answer is the next
     state that is built, a few times a second; several requests before it get one answer.
     """
@@ -129,7 +167,7 @@ class GetStatus(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Welcome(Persisted):
+class Welcome(Noted):
     """Answer to Hello.
 
     Attributes:
@@ -152,7 +190,7 @@ class Welcome(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class SampleHeader(Persisted):
+class SampleHeader(Noted):
     """One sample; the raw bytes of each array follow as frames of their own, C order, little endian.
 
     If ``slot`` is set and no frames follow, the arrays lie in that slot, one after the other. If ``arena`` is set as
@@ -191,7 +229,7 @@ class SampleHeader(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Unavailable(Persisted):
+class Unavailable(Noted):
     """A requested sample cannot be made from any of its candidates; ``text`` lists the reason of each."""
 
     epoch: int
@@ -200,7 +238,7 @@ class Unavailable(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Denied(Persisted):
+class Denied(Noted):
     """A request cannot be granted. ``code`` is an ErrorCode; ``text`` says what to do about it."""
 
     code: str
@@ -208,7 +246,7 @@ class Denied(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Pong(Persisted):
+class Pong(Noted):
     """Answer to Ping.
 
     Attributes:
@@ -219,7 +257,7 @@ class Pong(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Status(Persisted):
+class Status(Noted):
     """Answer to GetStatus.
 
     Attributes:
@@ -233,7 +271,7 @@ class Status(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class WorkerHello(Persisted):
+class WorkerHello(Noted):
     """Offer a worker that accepts ``credit`` leases at a time.
 
     Attributes:
@@ -253,14 +291,14 @@ class WorkerHello(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Begun(Persisted):
+class Begun(Noted):
     """The worker starts on this lease now. Only a lease that was begun can be blamed for what happens next."""
 
     lease: int
 
 
 @dataclass(frozen=True, slots=True)
-class Result(Persisted):
+class Result(Noted):
     """A lease's sample is done; the frames of its SampleHeader message follow, and are passed on unchanged.
 
     Attributes:
@@ -283,7 +321,7 @@ class Result(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class LeaseFailed(Persisted):
+class LeaseFailed(Noted):
     """The lease's video could not be used. ``frame`` and ``reason`` are those of VideoError.
 
     Attributes:
@@ -302,7 +340,7 @@ class LeaseFailed(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Lease(Persisted):
+class Lease(Noted):
     """One clip of one video, and the sample to make from it.
 
     Attributes:
@@ -362,7 +400,7 @@ class Lease(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Stop(Persisted):
+class Stop(Noted):
     """Finish what was begun, say Goodbye and exit."""
 
 
@@ -524,7 +562,12 @@ def decode(header: Buffer, most_bytes: int = LARGEST_HEADER_BYTES) -> Message:
     cls = _TYPES.get(name) if type(name) is str else None
     if cls is None:
         raise ProtocolError(f"unknown message type {shown(name)}")
-    message: Message = cls.from_dict(fields)
+    try:
+        message: Message = cls.from_dict(fields)
+    except ProtocolError as error:
+        if fields.keys() <= cls.__dataclass_fields__.keys():
+            raise
+        raise ProtocolError(f"{error}; its sender is of a later release: update the receiver") from None
     return message
 
 

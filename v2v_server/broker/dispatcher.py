@@ -242,7 +242,12 @@ class Dispatcher(Broker):
         try:
             message = decode(frames[0] if frames else b"")
         except ProtocolError as error:
-            return [ToWorker(identity, self._malformed(error))]
+            # Our workers end when they hear this. What it was about is not known, so others get the leases.
+            denied = ToWorker(identity, self._malformed(error))
+            if identity not in self.registry:
+                return [denied]
+            self.registry.note_unfit(f"sent a malformed message: {error}")
+            return [denied, *self.worker_lost(identity, Loss(Cause.KILLED, "sent a malformed message"), now)]
         if isinstance(message, WorkerHello):
             return self._worker_hello(identity, message, now, user)
         if isinstance(message, GetStatus):
@@ -263,6 +268,7 @@ class Dispatcher(Broker):
             case Ping():
                 return [ToWorker(identity, encode(Pong()))]
             case Goodbye():
+                self.registry.note_unfit(message.notes.reason)
                 return self._take_back(identity, Loss(Cause.KILLED, "left"), now)
             case _:
                 self.counters.malformed += 1

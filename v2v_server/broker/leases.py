@@ -49,6 +49,7 @@ REST_SECONDS = 10.0
 """Time without work for a worker whose host cannot read a video that the server's host can; storage may return."""
 LONGEST_NAME = 100
 """Characters kept of the name that a peer gives itself or its host."""
+_LONGEST_UNFIT = 600
 _MOST_SECONDS = 86_400.0
 
 
@@ -476,9 +477,9 @@ class Member:
     memory_bytes: int = 0
 
 
-def clean_name(text: str) -> str:
-    """Make a name that a peer sent safe to display: short, and without control characters."""
-    return "".join(filter(str.isprintable, text[:LONGEST_NAME]))
+def clean_name(text: str, most: int = LONGEST_NAME) -> str:
+    """Make a name, or another text that a peer sent, safe to display: short, and without control characters."""
+    return "".join(filter(str.isprintable, text[:most]))
 
 
 class Workers:
@@ -495,6 +496,7 @@ class Workers:
         self._leases = leases
         self.members: dict[bytes, Member] = {}
         self._names: dict[str, bytes] = {}
+        self._unfit = ""  # why the last worker left that cannot work for this server, until a worker makes a sample
         self._resting: dict[bytes, float] = {}  # time at which their rest ends
         # With a thousand workers, only those whose load has changed are examined.
         self._changed: set[bytes] = set()
@@ -528,6 +530,10 @@ class Workers:
         self._names[hello.name] = identity
         self._changed.add(identity)
 
+    def note_unfit(self, reason: str) -> None:
+        """Note why a worker leaves that cannot work for this server; "": it leaves for another reason."""
+        self._unfit = clean_name(reason, _LONGEST_UNFIT) or self._unfit
+
     def remove(self, identity: bytes) -> None:
         """Remove a worker that is gone."""
         worker = self.members.pop(identity, None)
@@ -554,7 +560,7 @@ class Workers:
     def can_work(self, identity: bytes) -> None:
         """Note that a worker has made a sample, so its host can read videos."""
         if identity in self.members:
-            self.members[identity].unreadable = ""
+            self.members[identity].unreadable = self._unfit = ""
 
     def trouble(self, expected: int) -> str:
         """Return why no worker can make a sample, and what to do about it; empty if one can, as far as is known.
@@ -562,6 +568,8 @@ class Workers:
         Args:
             expected: number of workers expected.
         """
+        if self._unfit and not self._leases.held:
+            return f"a worker left: it {self._unfit}"
         if not self.members:
             start = f"{expected} should come; see what v2v-serve says of them" if expected else "start v2v-worker"
             return f"no worker is connected to the server: {start}, or v2v-serve with --workers N"

@@ -67,6 +67,7 @@ from v2v_server.system.sandbox import confine
 from v2v_server.worker.conversation import (
     CREDIT,
     Inspect,
+    Leave,
     Listen,
     Load,
     Make,
@@ -383,7 +384,7 @@ class Worker:
 
         Raises:
             RemoteError: the server rejects this worker (another numerics version).
-            VersionMismatch: the server speaks another version of the protocol.
+            ProtocolError: the server speaks another version of the protocol, or a message cannot be read.
             KeyRefused: the server rejects the key.
         """
         try:
@@ -441,8 +442,10 @@ class Worker:
                     return conversation.on_failure(made, now)
                 frames, work = made
                 return conversation.on_sample(frames, now, work)
+            case Leave(reason) if reason:
+                raise ProtocolError(reason)
             case _:
-                return []  # Leave
+                return []
 
     def _inspect(self, lease: Lease) -> Readiness:
         """Return what the work on a lease needs."""
@@ -615,7 +618,8 @@ def run_worker(
 
     Raises:
         UsageError: the socket cannot connect to the address, or the server rejects the key.
-        RemoteError, VersionMismatch: the server rejects this worker.
+        RemoteError: the server rejects this worker.
+        ProtocolError: the server speaks another version of the protocol, or a message cannot be read.
     """
     if parent_pid is not None:
         die_with_parent(parent_pid)
