@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from enum import StrEnum
 from typing import Any, TypeAlias
 
@@ -83,7 +83,8 @@ class Noted(Persisted):
         notes: what the receiver may ignore.
     """
 
-    notes: Notes = later(default_factory=Notes, kw_only=True)
+    _: KW_ONLY
+    notes: Notes = later(default_factory=Notes)
 
 
 # --- consumer -> server -----------------------------------------------------------------------------------------------
