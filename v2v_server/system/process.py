@@ -137,12 +137,18 @@ def usable_cores() -> int:
 
 
 def control_groups(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> Iterator[Path]:
-    """Yield the folders of this process's control group and those above it, the topmost first (Linux, version 2)."""
+    """Yield the folders of this process's control groups and those above them, the topmost first (Linux): that of
+    version 2, and those of each controller of version 1. A container sees only some of them.
+    """
     with suppress(OSError, ValueError):
-        (path,) = (line[3:] for line in own.read_text(encoding="utf-8").splitlines() if line.startswith("0::"))
-        for part in ("", *path.strip("/").split("/")):
-            groups = groups / part
-            yield groups
+        for line in own.read_text(encoding="utf-8").splitlines():
+            _, controllers, path = line.split(":", 2)
+            # A hierarchy of several controllers is mounted under all their names, with a link for each.
+            for name in dict.fromkeys((controllers, *controllers.split(","))):
+                folder = groups / name
+                for part in ("", *path.strip("/").split("/")):
+                    folder = folder / part
+                    yield folder
 
 
 def _granted_cores(*where: Path) -> float:
@@ -157,9 +163,10 @@ def _granted_cores(*where: Path) -> float:
     """
     least = math.inf
     for folder in control_groups(*where):
-        with suppress(OSError, ValueError):  # "max", or the topmost group, which has no limit
-            quota, period = map(int, (folder / "cpu.max").read_text(encoding="utf-8").split())
-            least = min(least, quota / period)
+        for files in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):  # version 2, version 1
+            with suppress(OSError, ValueError):  # "max", or a folder without these files
+                quota, period = (int(word) for file in files for word in (folder / file).read_text("utf-8").split())
+                least = min(least, quota / period if min(quota, period) > 0 else math.inf)  # -1: no limit
     return least
 
 

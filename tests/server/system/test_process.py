@@ -87,6 +87,25 @@ def test_a_container_is_given_processor_time_instead_of_cores(monkeypatch: pytes
         assert process.usable_cores() == cores
 
 
+@pytest.mark.parametrize("mount", ["cpu", "cpu,cpuacct", "cpuacct,cpu"])
+def test_version_1_of_control_groups_limits_processor_time_too(mount: str, tmp_path: Path) -> None:
+    own, top, hidden = tmp_path / "own", tmp_path / "groups" / mount, "docker/of the host"
+    (top / "pod" / "mine").mkdir(parents=True)
+    controllers = "cpu,cpuacct" if mount == "cpu" else mount  # cpu is a link there
+    for folder, quota, path, granted in (
+        (top, -1, hidden, math.inf),
+        (top / "pod" / "mine", 400000, hidden, math.inf),
+        (top / "pod" / "mine", 400000, "pod/mine", 4.0),
+        (top / "pod", 150000, "pod/mine", 1.5),
+        (top / "pod", 0, "pod/mine", 4.0),
+        (top, 50000, hidden, 0.5),  # a container sees its own group as the topmost
+    ):
+        (folder / "cpu.cfs_quota_us").write_text(f"{quota}\n")
+        (folder / "cpu.cfs_period_us").write_text("100000\n")
+        own.write_text(f"4:memory:/\n3:{controllers}:/{path}\n2:name=systemd:/\n0::/\n")
+        assert process._granted_cores(tmp_path / "groups", own) == granted, (folder, quota, path)
+
+
 def test_a_limit_of_memory_only_ever_becomes_lower() -> None:
     said = _in_a_process(
         "import resource\n"
