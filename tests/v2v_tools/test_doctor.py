@@ -24,7 +24,7 @@ from v2v_server.motion.prediction import predict
 from v2v_tools.doctor import command
 from v2v_tools.doctor import corpus as doctor_corpus
 from v2v_tools.doctor import motion as doctor_motion
-from v2v_tools.doctor.command import BAD, NOTE, OK, Finding, control_group_memory
+from v2v_tools.doctor.command import BAD, NOTE, OK, Finding
 from v2v_tools.motion import describe_loss
 
 
@@ -157,19 +157,6 @@ def test_a_gpu_that_torch_does_not_see_is_in_the_way(monkeypatch: pytest.MonkeyP
     assert command._torch().level == OK
     done.stdout = ""
     assert command._torch().level == BAD
-
-
-def test_the_limits_of_memory_are_those_of_all_control_groups(tmp_path: Path) -> None:
-    own, pod = tmp_path / "own", tmp_path / "groups" / "pod"
-    own.write_text("0::/pod/container\n")
-    (pod / "container").mkdir(parents=True)
-    for folder, limit, used in ((pod, "3000", "2500"), (pod / "container", "2000", "100")):
-        (folder / "memory.max").write_text(f"{limit}\n")
-        (folder / "memory.current").write_text(f"{used}\n")
-    assert control_group_memory(tmp_path / "groups", own) == [(3000, 500), (2000, 1900)]
-    (pod / "memory.max").write_text("max\n")
-    assert control_group_memory(tmp_path / "groups", own) == [(2000, 1900)]
-    assert control_group_memory(tmp_path / "groups", tmp_path / "none") == []
 
 
 def test_it_starts_where_nothing_else_is_installed() -> None:

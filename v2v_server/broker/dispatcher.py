@@ -77,6 +77,7 @@ from v2v_server.broker.state import (
     CheckVideo,
     Disconnect,
     GiveUp,
+    LargeClip,
     RefusalPart,
     ReportRefusal,
     SendStatus,
@@ -87,7 +88,15 @@ from v2v_server.broker.state import (
 )
 from v2v_server.corpus.videos import CorpusFacts, VideoEntry
 from v2v_server.quarantine import QuarantineEntry
-from v2v_server.schedule import MOST_CANDIDATES, MOST_CLIP_BYTES, Schedule, SequenceTable, VideoSequence
+from v2v_server.schedule import (
+    LARGEST_MEMORY_BYTES,
+    MOST_CANDIDATES,
+    MOST_CLIP_BYTES,
+    Schedule,
+    SequenceTable,
+    VideoSequence,
+    lease_bytes,
+)
 from v2v_server.sharing import SharedSample
 
 MOST_SESSIONS = 4096
@@ -98,6 +107,9 @@ MOST_CREDIT = 400
 """Less than ``router.MOST_QUEUED``, the number of queued messages at which a consumer is disconnected."""
 MOST_TABLES = 16
 """Sequence tables cached for later consumers. A session keeps its own, which is small."""
+TOO_LARGE_SECONDS = 5.0
+"""Time after which a sample that takes more memory than every worker has is an error."""
+MOST_OUTGROWN = 4096
 LONGEST_REASON = 500
 """Characters kept of a refusal's reason."""
 _DECODE_SECONDS = 5e-8
@@ -135,11 +147,8 @@ class Dispatcher(Broker):
             case Hello():
                 return [self._hello(identity, message, now, user)]
             case Ping():
-                return [
-                    ToConsumer(
-                        identity, encode(Pong(self.blocked_reason or self.registry.trouble(self.expected_workers)))
-                    )
-                ]
+                trouble = self.blocked_reason or self.registry.trouble(self.expected_workers)
+                return [ToConsumer(identity, encode(Pong(trouble or _too_large_for_all(self, identity))))]
             case GetStatus():
                 return [SendStatus(identity)]
             case Goodbye():
@@ -380,11 +389,14 @@ class Dispatcher(Broker):
             self.sessions.queue.charge(*debt)
 
     def _take_back(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
+        limit_bytes = self.registry.members[identity].limit_bytes if identity in self.registry else 0
         self.registry.remove(identity)
         actions: list[Action] = []
         returned = self.leases.lost(identity, loss.lease)
         self.counters.returned_leases += len(returned)
         for request, begun in reversed(returned):
+            if begun and loss.cause is Cause.MEMORY and runs_alone(request):
+                _mark_outgrown(self, request, limit_bytes)
             verdict = judge(request, loss) if begun else request
             if isinstance(verdict, Request):
                 self.sessions.put_back(verdict)
@@ -444,6 +456,7 @@ class Dispatcher(Broker):
             actions.append(GiveUp(identity, f"gave no answer for {self.leases.limit_seconds(identity):g} s"))
         for identity in self.registry.vanished(now):
             actions.append(GiveUp(identity, f"was silent for {SILENCE_SECONDS:g} s"))
+        actions += _fail_too_large(self, now)
         second = _assign_slow(self, now)
         self.counters.second_leases += len(second)
         actions += second
@@ -726,6 +739,7 @@ def _forget_session(broker: Broker, session: bytes) -> None:
     """Drop the requests of a consumer that is gone, and abandon its leases."""
     broker.leases.forget_session(session)
     broker.lone = deque(request for request in broker.lone if request.session != session)
+    broker.large = [clip for clip in broker.large if clip.requests[0].session != session]
     for key, followers in broker.followers.items():
         broker.followers[key] = [request for request in followers if request.session != session]
 
@@ -737,28 +751,52 @@ def _assign(broker: Broker, now: float) -> list[Action]:
     """Give waiting requests to workers until there are no requests or no free workers."""
     actions: list[Action] = []
     _release_followers(broker)
+    for clip in list(broker.large):
+        if clip.needs_bytes <= broker.registry.most_memory and runs_alone(clip.requests[0]):
+            broker.large.remove(clip)
+            broker.lone.extend(clip.requests)
+        elif not broker.blocked_reason and (suited := _worker_for(broker, clip.needs_bytes)):
+            broker.large.remove(clip)
+            actions += _give(broker, clip.requests, suited, now)
     while not broker.blocked_reason:
         if broker.lone:
-            empty = broker.registry.for_lone_request()
+            needs = needed_bytes(broker, broker.lone[0])
+            if needs > broker.registry.most_memory > 0:
+                broker.large.append(LargeClip(needs, [broker.lone.popleft()], now))
+                continue
+            empty = broker.registry.for_lone_request(needs)
             if empty is not None:
                 actions += _give(broker, [broker.lone.popleft()], empty, now)
                 continue
-        worker = broker.registry.for_request(keep_one_empty=bool(broker.lone))
+        worker = _worker_for(broker)
         request = broker.sessions.next_request() if worker is not None else None
         if worker is None or request is None:
             return actions
         if runs_alone(request):
             broker.lone.append(request)
+            continue
+        requests, needs = [request, *broker.sessions.take_siblings(request)], needed_bytes(broker, request)
+        suited = _worker_for(broker, needs)
+        if suited is None:
+            broker.large.append(LargeClip(needs, requests, now))
         else:
-            actions += _give(broker, [request, *broker.sessions.take_siblings(request)], worker, now)
+            actions += _give(broker, requests, suited, now)
     return actions
+
+
+def _worker_for(broker: Broker, needs_bytes: int = 0, other_than: bytes | None = None) -> bytes | None:
+    """Return the worker for a request that needs this much memory; None if none is free."""
+    kept_bytes = needed_bytes(broker, broker.lone[0]) if broker.lone else 0
+    return broker.registry.for_request(
+        keep_one_empty=bool(broker.lone), other_than=other_than, needs_bytes=needs_bytes, kept_bytes=kept_bytes
+    )
 
 
 def _assign_slow(broker: Broker, now: float) -> list[Action]:
     """Give requests that take unusually long to a second worker each."""
     actions: list[Action] = []
     for request, worker in broker.leases.slow(now):
-        second = broker.registry.for_request(keep_one_empty=bool(broker.lone), other_than=worker)
+        second = _worker_for(broker, needed_bytes(broker, request), worker)
         session = broker.sessions.get(request.session)
         if session is not None and second is not None and not runs_alone(request):
             slotless = replace(request, slot=None)  # the first worker may still write to the slot
@@ -832,6 +870,79 @@ def _grant(
             return _refuse(broker, request, None, str(error))
         broker.blocked_reason = f"{error}; retried ten times a second"
         return None
+
+
+# --- memory of workers ------------------------------------------------------------------------------------------------
+
+
+def clip_key(session: Session, request: Request) -> Hashable:
+    """Return a key that is equal for requests whose clips take equal memory."""
+    sequence = session.sequence(request)
+    return session.spec.digest, session.arrays, sequence.video.id, sequence.video.fingerprint, sequence.start_frame
+
+
+def needed_bytes(broker: Broker, request: Request) -> int:
+    """Return the memory that a worker needs for a request, bytes; 0 while every worker has enough for any."""
+    session = broker.sessions.get(request.session)
+    is_limited = broker.registry.least_memory < LARGEST_MEMORY_BYTES
+    if session is None or not (is_limited or broker.outgrown):
+        return 0
+    request = session.current(request)
+    outgrown = broker.outgrown.get(clip_key(session, request), 0)
+    video, arrays = session.sequence(request).video, sum(session.form.sizes)
+    estimate = lease_bytes(video, broker.facts.rows, session.spec, arrays) if is_limited else 0
+    return max(outgrown + 1, min(estimate, LARGEST_MEMORY_BYTES))
+
+
+def _mark_outgrown(broker: Broker, request: Request, limit_bytes: int) -> None:
+    """Note that a clip needs more memory than a worker had, which made nothing else and was killed at its limit.
+
+    It is never put into quarantine: another server may have larger workers.
+    """
+    session = broker.sessions.get(request.session)
+    if session is not None:
+        key = clip_key(session, request)
+        broker.outgrown[key] = max(limit_bytes, broker.outgrown.pop(key, 0))
+        if len(broker.outgrown) > MOST_OUTGROWN:
+            del broker.outgrown[next(iter(broker.outgrown))]
+
+
+def _describe_large(broker: Broker, session: Session, clip: LargeClip) -> str:
+    request = session.current(clip.requests[0])
+    sequence, outgrown = session.sequence(request), broker.outgrown.get(clip_key(session, request), 0)
+    needs = f"more than {outgrown / 1e9:.1f}" if clip.needs_bytes == outgrown + 1 else f"{clip.needs_bytes / 1e9:.1f}"
+    return (
+        f"{sequence.video.id} from frame {sequence.start_frame} needs {needs} GB of memory under this spec, the "
+        f"largest worker has {broker.registry.most_memory / 1e9:.1f}: give a worker more memory, or ask for fewer "
+        "voxels_per_clip, fewer samples_per_decode, a smaller crop or resize_scale 1"
+    )
+
+
+def _too_large_for_all(broker: Broker, identity: bytes) -> str:
+    """Return why no connected worker can make a sample that a consumer waits for; empty if one can."""
+    session, most = broker.sessions.get(identity), broker.registry.most_memory
+    waits = (clip for clip in broker.large if clip.needs_bytes > most and clip.requests[0].session == identity)
+    clip = next(waits, None)
+    return "" if session is None or clip is None else _describe_large(broker, session, clip)
+
+
+def _fail_too_large(broker: Broker, now: float) -> list[Action]:
+    """Fail the requests that no worker can hold, once all expected workers have been there for a while: a larger one
+    may be about to return.
+    """
+    actions: list[Action] = []
+    for clip in list(broker.large):
+        session = broker.sessions.get(clip.requests[0].session)
+        if clip.needs_bytes <= broker.registry.most_memory or len(broker.registry) < max(1, broker.expected_workers):
+            clip.since = now
+        elif session is not None and now - clip.since >= TOO_LARGE_SECONDS:
+            broker.large.remove(clip)
+            actions += [
+                action
+                for each in clip.requests
+                for action in _fail(broker, each, _describe_large(broker, session, clip))
+            ]
+    return actions
 
 
 # --- sharing ----------------------------------------------------------------------------------------------------------

@@ -238,6 +238,21 @@ class RefusalPart:
         return cls(time, short(refusal.video), refusal.frame, short(refusal.reason), str(refusal.kind))
 
 
+@dataclass(slots=True)
+class LargeClip:
+    """Requests of one clip that wait for a worker with enough memory.
+
+    Attributes:
+        needs_bytes: memory that the worker must have.
+        requests: the requests, siblings of the first.
+        since: when a connected worker last had that much.
+    """
+
+    needs_bytes: int
+    requests: list[Request]
+    since: float
+
+
 @dataclass(eq=False)
 class Broker:
     """Consumers, workers, and what passes between them.
@@ -265,6 +280,9 @@ class Broker:
         makers: the request that has the lease of each sample that others may follow, by sharing key.
         followers: requests that wait for the sample of a maker.
         lone: requests that run alone and wait for a worker without leases.
+        large: clips that wait for a worker with more memory than the free ones have.
+        outgrown: memory that was not enough for a clip under a spec, bytes, by :func:`dispatcher.clip_key`. It lasts as
+            long as the server: the next one may have larger workers.
         refusals: the last few, oldest first.
         blocked_reason: why no lease can be granted at the moment; empty if leases can be granted.
         faults: malformed messages and refused specs of connected consumers.
@@ -292,6 +310,8 @@ class Broker:
     makers: dict[Hashable, tuple[bytes, int, int]] = field(init=False, default_factory=dict)
     followers: dict[Hashable, list[Request]] = field(init=False, default_factory=dict)
     lone: deque[Request] = field(init=False, default_factory=deque)
+    large: list[LargeClip] = field(init=False, default_factory=list)
+    outgrown: dict[Hashable, int] = field(init=False, default_factory=dict)
     refusals: deque[RefusalPart] = field(init=False, default_factory=lambda: deque(maxlen=MOST_LATEST))
     blocked_reason: str = field(init=False, default="")
     faults: dict[bytes, int] = field(init=False, default_factory=dict)
@@ -313,7 +333,8 @@ class Broker:
     @property
     def waiting(self) -> int:
         """Return the number of requested samples that are not leased to a worker yet."""
-        return len(self.lone) + sum(len(session.waiting) for session in self.sessions)
+        large = sum(len(clip.requests) for clip in self.large)
+        return len(self.lone) + large + sum(len(session.waiting) for session in self.sessions)
 
     @property
     def waiting_share(self) -> float:

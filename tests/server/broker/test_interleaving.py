@@ -26,6 +26,7 @@ from v2v_protocol.messages import (
     Unavailable,
     decode_map,
 )
+from v2v_server.broker.dispatcher import TOO_LARGE_SECONDS
 from v2v_server.broker.leases import Cause, runs_alone
 
 _HALF_WRITTEN = (-1, -1, -1)
@@ -317,9 +318,13 @@ class Interleaving(RuleBasedStateMachine):
                     self.at.begin(identity)
                     self.answer(identity)
                     self._listen()
+        for _ in range(2):  # what takes more memory than any worker has ends as an error
+            self.at.tick(TOO_LARGE_SECONDS)
+            self._listen()
         assert not any(self.owed.values())
         assert self.at.dispatcher.waiting == 0
         assert not self.at.dispatcher.lone
+        assert not self.at.dispatcher.large
         assert len(self.at.dispatcher.leases) == 0
         assert not self.at.dispatcher.leases.held
         assert not self.at.dispatcher.leases.out

@@ -323,6 +323,8 @@ REFUSED = "a worker did something over it"
         (Cause.UNEXPLAINED, 0, after(1)),
         (Cause.UNEXPLAINED, 1, after(2)),
         (Cause.UNEXPLAINED, 2, REFUSED),
+        (Cause.MEMORY, 0, after(1)),
+        (Cause.MEMORY, 2, after(3)),
         (Cause.KILLED, 0, after(0)),
         (Cause.KILLED, 1, after(1)),
         (Cause.KILLED, 2, after(2)),
