@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections import deque
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -77,7 +76,7 @@ from v2v_server.broker.state import (
     CheckVideo,
     Disconnect,
     GiveUp,
-    LargeClip,
+    ParkedClip,
     RefusalPart,
     ReportRefusal,
     SendStatus,
@@ -109,7 +108,6 @@ MOST_TABLES = 16
 """Sequence tables cached for later consumers. A session keeps its own, which is small."""
 TOO_LARGE_SECONDS = 5.0
 """Time after which a sample that takes more memory than every worker has is an error."""
-MOST_OUTGROWN = 4096
 LONGEST_REASON = 500
 """Characters kept of a refusal's reason."""
 _DECODE_SECONDS = 5e-8
@@ -148,7 +146,10 @@ class Dispatcher(Broker):
                 return [self._hello(identity, message, now, user)]
             case Ping():
                 trouble = self.blocked_reason or self.registry.trouble(self.expected_workers)
-                return [ToConsumer(identity, encode(Pong(trouble or _too_large_for_all(self, identity))))]
+                of_clips = (
+                    clip.trouble for clip in self.parked if clip.trouble and clip.requests[0].session == identity
+                )
+                return [ToConsumer(identity, encode(Pong(trouble or next(of_clips, ""))))]
             case GetStatus():
                 return [SendStatus(identity)]
             case Goodbye():
@@ -456,7 +457,7 @@ class Dispatcher(Broker):
             actions.append(GiveUp(identity, f"gave no answer for {self.leases.limit_seconds(identity):g} s"))
         for identity in self.registry.vanished(now):
             actions.append(GiveUp(identity, f"was silent for {SILENCE_SECONDS:g} s"))
-        actions += _fail_too_large(self, now)
+        actions += _check_parked(self, now)
         second = _assign_slow(self, now)
         self.counters.second_leases += len(second)
         actions += second
@@ -738,8 +739,7 @@ def next_candidate(request: Request, refusal: Refusal) -> Request:
 def _forget_session(broker: Broker, session: bytes) -> None:
     """Drop the requests of a consumer that is gone, and abandon its leases."""
     broker.leases.forget_session(session)
-    broker.lone = deque(request for request in broker.lone if request.session != session)
-    broker.large = [clip for clip in broker.large if clip.requests[0].session != session]
+    broker.parked = [clip for clip in broker.parked if clip.requests[0].session != session]
     for key, followers in broker.followers.items():
         broker.followers[key] = [request for request in followers if request.session != session]
 
@@ -751,52 +751,40 @@ def _assign(broker: Broker, now: float) -> list[Action]:
     """Give waiting requests to workers until there are no requests or no free workers."""
     actions: list[Action] = []
     _release_followers(broker)
-    for clip in list(broker.large):
-        if clip.needs_bytes <= broker.registry.most_memory and runs_alone(clip.requests[0]):
-            broker.large.remove(clip)
-            broker.lone.extend(clip.requests)
-        elif not broker.blocked_reason and (suited := _worker_for(broker, clip.needs_bytes)):
-            broker.large.remove(clip)
-            actions += _give(broker, clip.requests, suited, now)
     while not broker.blocked_reason:
-        if broker.lone:
-            needs = needed_bytes(broker, broker.lone[0])
-            if needs > broker.registry.most_memory > 0:
-                broker.large.append(LargeClip(needs, [broker.lone.popleft()], now))
-                continue
-            empty = broker.registry.for_lone_request(needs)
-            if empty is not None:
-                actions += _give(broker, [broker.lone.popleft()], empty, now)
-                continue
-        worker = _worker_for(broker)
-        request = broker.sessions.next_request() if worker is not None else None
-        if worker is None or request is None:
-            return actions
-        if runs_alone(request):
-            broker.lone.append(request)
+        parked = ((clip, worker) for clip in broker.parked if (worker := _worker_for(broker, clip)) is not None)
+        clip, worker = next(parked, (None, None))
+        if clip is not None and worker is not None:
+            broker.parked.remove(clip)
+            actions += _give(broker, clip.requests, worker, now)
             continue
-        requests, needs = [request, *broker.sessions.take_siblings(request)], needed_bytes(broker, request)
-        suited = _worker_for(broker, needs)
-        if suited is None:
-            broker.large.append(LargeClip(needs, requests, now))
-        else:
-            actions += _give(broker, requests, suited, now)
+        request = broker.sessions.next_request() if broker.registry.for_request(kept_bytes=_kept(broker)) else None
+        if request is None:
+            return actions
+        siblings = [] if runs_alone(request) else broker.sessions.take_siblings(request)
+        broker.parked.append(ParkedClip(needed_bytes(broker, request), [request, *siblings], now))
     return actions
 
 
-def _worker_for(broker: Broker, needs_bytes: int = 0, other_than: bytes | None = None) -> bytes | None:
-    """Return the worker for a request that needs this much memory; None if none is free."""
-    kept_bytes = needed_bytes(broker, broker.lone[0]) if broker.lone else 0
-    return broker.registry.for_request(
-        keep_one_empty=bool(broker.lone), other_than=other_than, needs_bytes=needs_bytes, kept_bytes=kept_bytes
-    )
+def _kept(broker: Broker) -> int | None:
+    """Return the memory of the worker to keep empty for the first request that runs alone; None if none waits."""
+    return next((clip.needs_bytes for clip in broker.parked if runs_alone(clip.requests[0])), None)
+
+
+def _worker_for(broker: Broker, clip: ParkedClip) -> bytes | None:
+    """Return the worker for a clip; None if none that suits it is free."""
+    if runs_alone(clip.requests[0]):
+        return broker.registry.for_lone_request(clip.needs_bytes)
+    return broker.registry.for_request(kept_bytes=_kept(broker), needs_bytes=clip.needs_bytes)
 
 
 def _assign_slow(broker: Broker, now: float) -> list[Action]:
     """Give requests that take unusually long to a second worker each."""
     actions: list[Action] = []
     for request, worker in broker.leases.slow(now):
-        second = _worker_for(broker, needed_bytes(broker, request), worker)
+        second = broker.registry.for_request(
+            kept_bytes=_kept(broker), other_than=worker, needs_bytes=needed_bytes(broker, request)
+        )
         session = broker.sessions.get(request.session)
         if session is not None and second is not None and not runs_alone(request):
             slotless = replace(request, slot=None)  # the first worker may still write to the slot
@@ -902,12 +890,27 @@ def _mark_outgrown(broker: Broker, request: Request, limit_bytes: int) -> None:
     session = broker.sessions.get(request.session)
     if session is not None:
         key = clip_key(session, request)
-        broker.outgrown[key] = max(limit_bytes, broker.outgrown.pop(key, 0))
-        if len(broker.outgrown) > MOST_OUTGROWN:
-            del broker.outgrown[next(iter(broker.outgrown))]
+        broker.outgrown[key] = max(limit_bytes, broker.outgrown.get(key, 0))
 
 
-def _describe_large(broker: Broker, session: Session, clip: LargeClip) -> str:
+def _check_parked(broker: Broker, now: float) -> list[Action]:
+    """Say which clips no worker can hold, and fail them once all expected workers have been there for a while: a larger
+    one may be about to return.
+    """
+    actions: list[Action] = []
+    most, is_complete = broker.registry.most_memory, len(broker.registry) >= max(1, broker.expected_workers)
+    for clip in list(broker.parked):
+        session = broker.sessions.get(clip.requests[0].session)
+        clip.trouble = "" if session is None or clip.needs_bytes <= most else _describe(broker, session, clip)
+        if not clip.trouble or not is_complete:
+            clip.since = now
+        elif now - clip.since >= TOO_LARGE_SECONDS:
+            broker.parked.remove(clip)
+            actions += [action for request in clip.requests for action in _fail(broker, request, clip.trouble)]
+    return actions
+
+
+def _describe(broker: Broker, session: Session, clip: ParkedClip) -> str:
     request = session.current(clip.requests[0])
     sequence, outgrown = session.sequence(request), broker.outgrown.get(clip_key(session, request), 0)
     needs = f"more than {outgrown / 1e9:.1f}" if clip.needs_bytes == outgrown + 1 else f"{clip.needs_bytes / 1e9:.1f}"
@@ -916,33 +919,6 @@ def _describe_large(broker: Broker, session: Session, clip: LargeClip) -> str:
         f"largest worker has {broker.registry.most_memory / 1e9:.1f}: give a worker more memory, or ask for fewer "
         "voxels_per_clip, fewer samples_per_decode, a smaller crop or resize_scale 1"
     )
-
-
-def _too_large_for_all(broker: Broker, identity: bytes) -> str:
-    """Return why no connected worker can make a sample that a consumer waits for; empty if one can."""
-    session, most = broker.sessions.get(identity), broker.registry.most_memory
-    waits = (clip for clip in broker.large if clip.needs_bytes > most and clip.requests[0].session == identity)
-    clip = next(waits, None)
-    return "" if session is None or clip is None else _describe_large(broker, session, clip)
-
-
-def _fail_too_large(broker: Broker, now: float) -> list[Action]:
-    """Fail the requests that no worker can hold, once all expected workers have been there for a while: a larger one
-    may be about to return.
-    """
-    actions: list[Action] = []
-    for clip in list(broker.large):
-        session = broker.sessions.get(clip.requests[0].session)
-        if clip.needs_bytes <= broker.registry.most_memory or len(broker.registry) < max(1, broker.expected_workers):
-            clip.since = now
-        elif session is not None and now - clip.since >= TOO_LARGE_SECONDS:
-            broker.large.remove(clip)
-            actions += [
-                action
-                for each in clip.requests
-                for action in _fail(broker, each, _describe_large(broker, session, clip))
-            ]
-    return actions
 
 
 # --- sharing ----------------------------------------------------------------------------------------------------------

@@ -623,17 +623,17 @@ class Workers:
         )
 
     def for_request(
-        self, *, keep_one_empty: bool, other_than: bytes | None = None, needs_bytes: int = 0, kept_bytes: int = 0
+        self, *, kept_bytes: int | None = None, other_than: bytes | None = None, needs_bytes: int = 0
     ) -> bytes | None:
         """Return the worker that holds the fewest leases and has free credit; None if there is none.
 
         Args:
-            keep_one_empty: a request that runs alone waits, so the worker with the fewest leases gets no new ones.
+            kept_bytes: a request that runs alone waits, so the worker with this much memory and the fewest leases gets
+                no new ones; None: no request waits so.
             other_than: a worker to skip, because it is slow at this request.
             needs_bytes: memory that the worker must have.
-            kept_bytes: memory that the worker which is kept empty must have.
         """
-        kept = self._lightest(kept_bytes) if keep_one_empty else None
+        kept = None if kept_bytes is None else self._lightest(kept_bytes)
         return self._lightest(needs_bytes, kept, other_than)
 
     def for_lone_request(self, needs_bytes: int = 0) -> bytes | None:

@@ -29,6 +29,7 @@ def mixed(*indices: int, expected_workers: int = 0) -> Peers:
 
 
 def trouble(at: Peers) -> str:
+    at.tick(0.1)
     (pong,) = at.consumer_says(b"c", Ping())
     assert isinstance(pong, Pong)
     return pong.trouble
