@@ -90,6 +90,24 @@ def test_a_corpus_is_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "\nbad   corpus        8 videos give no sequence" in said
 
 
+def test_videos_that_take_more_memory_than_a_worker_has_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_clip(tmp_path / "small.mp4", panned_luma(21, 140, 160))
+    write_clip(tmp_path / "large.mp4", panned_luma(21, 600, 800))
+    write_clip(tmp_path / "short.mp4", panned_luma(3, 600, 800))
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("voxels_per_clip: 4\nresize_scale: [0.9, 1.0]\n")
+    flags = ["--videos", str(tmp_path), "--cache-dir", str(tmp_path), "--recipe", str(recipe)]
+    for limit_mib, named in ((1024, None), (270, "large.mp4"), (200, "large.mp4; small.mp4")):
+        monkeypatch.setattr(doctor_corpus, "memory_limit", lambda limit=limit_mib << 20: limit)
+        status, said = told(capsys, *flags)
+        found = re.search(
+            r"samples of \d videos need up to 0.29 GB of memory, a worker of this host may use .*: (.*)", said
+        )
+        assert (status, None if found is None else found[1]) == (int(named is not None), named)
+
+
 def test_a_corpus_that_is_not_there_is_in_the_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, said = told(capsys, "--videos", str(tmp_path / "nowhere"))
     assert status == 1

@@ -253,11 +253,9 @@ class Dispatcher(Broker):
             message = decode(frames[0] if frames else b"")
         except ProtocolError as error:
             # Our workers end when they hear this. What it was about is not known, so others get the leases.
-            denied = ToWorker(identity, self._malformed(error))
-            if identity not in self.registry:
-                return [denied]
-            self.registry.note_unfit(f"sent a malformed message: {error}")
-            return [denied, *self.worker_lost(identity, Loss(Cause.KILLED, "sent a malformed message"), now)]
+            gone = Loss(Cause.KILLED, "sent a malformed message")
+            lost = self.worker_lost(identity, gone, now) if identity in self.registry else []
+            return [ToWorker(identity, self._malformed(error)), *lost]
         if isinstance(message, WorkerHello):
             return self._worker_hello(identity, message, now, user)
         if isinstance(message, GetStatus):
@@ -872,14 +870,12 @@ def clip_key(session: Session, request: Request) -> Hashable:
 def needed_bytes(broker: Broker, request: Request) -> int:
     """Return the memory that a worker needs for a request, bytes; 0 while every worker has enough for any."""
     session = broker.sessions.get(request.session)
-    is_limited = broker.registry.least_memory < LARGEST_MEMORY_BYTES
-    if session is None or not (is_limited or broker.outgrown):
+    if session is None or (broker.registry.least_memory >= LARGEST_MEMORY_BYTES and not broker.outgrown):
         return 0
     request = session.current(request)
-    outgrown = broker.outgrown.get(clip_key(session, request), 0)
     video, arrays = session.sequence(request).video, sum(session.form.sizes)
-    estimate = lease_bytes(video, broker.facts.rows, session.spec, arrays) if is_limited else 0
-    return max(outgrown + 1, min(estimate, LARGEST_MEMORY_BYTES))
+    estimate = min(lease_bytes(video, broker.facts.rows, session.spec, arrays), LARGEST_MEMORY_BYTES)
+    return max(broker.outgrown.get(clip_key(session, request), 0) + 1, estimate)
 
 
 def _mark_outgrown(broker: Broker, request: Request, limit_bytes: int) -> None:
@@ -913,10 +909,10 @@ def _check_parked(broker: Broker, now: float) -> list[Action]:
 def _describe(broker: Broker, session: Session, clip: ParkedClip) -> str:
     request = session.current(clip.requests[0])
     sequence, outgrown = session.sequence(request), broker.outgrown.get(clip_key(session, request), 0)
-    needs = f"more than {outgrown / 1e9:.1f}" if clip.needs_bytes == outgrown + 1 else f"{clip.needs_bytes / 1e9:.1f}"
+    needs = "more than " * (clip.needs_bytes == outgrown + 1) + f"{clip.needs_bytes / 1e9:.2f}"
     return (
         f"{sequence.video.id} from frame {sequence.start_frame} needs {needs} GB of memory under this spec, the "
-        f"largest worker has {broker.registry.most_memory / 1e9:.1f}: give a worker more memory, or ask for fewer "
+        f"largest worker has {broker.registry.most_memory / 1e9:.2f}: give a worker more memory, or ask for fewer "
         "voxels_per_clip, fewer samples_per_decode, a smaller crop or resize_scale 1"
     )
 

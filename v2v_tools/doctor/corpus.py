@@ -93,7 +93,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
         yield level, "corpus", f"{useless} videos give no sequence of the recipe {recipe}: {why}", change
     if not table.count:
         return
-    yield from _memory(catalogue, spec, memory_limit())
+    yield from _memory(catalogue, spec, table, memory_limit())
     remaker = Remaker(catalogue, spec, DEFAULT_ARRAYS)
     try:
         starts = sum(start_events(remaker.made(0, 0, at)) for at in range(min(4, remaker.count)))  # with compiling
@@ -110,17 +110,17 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
     )  # fmt: skip
 
 
-def _memory(catalogue: Catalogue, spec: StreamSpec, limit_bytes: int) -> Iterator[Line]:
+def _memory(catalogue: Catalogue, spec: StreamSpec, table: SequenceTable, limit_bytes: int) -> Iterator[Line]:
     """Name the videos whose samples need more memory than a worker of this host may use."""
     arrays = layout_bytes(array_layout(spec.recipe, spec.voxel_dtype, DEFAULT_ARRAYS))
-    needs = {
-        video.id: lease_bytes(video, catalogue.rows, spec, arrays) for video in islice(catalogue.videos, _VIDEOS_OPENED)
-    }
+    useless = {refusal.video for refusal in table.refusals}
+    shown = (video for video in islice(catalogue.videos, _VIDEOS_OPENED) if video.id not in useless)
+    needs = {video.id: lease_bytes(video, catalogue.rows, spec, arrays) for video in shown}
     large = [id for id, needed in needs.items() if needed > limit_bytes]
     if large:
         text = (
-            f"samples of {len(large)} videos need up to {max(needs.values()) / 1e9:.1f} GB of memory, a worker of this "
-            f"host may use {limit_bytes / 1e9:.1f}: {name_all(large)}"
+            f"samples of {len(large)} videos need up to {max(needs.values()) / 1e9:.2f} GB of memory, a worker of this "
+            f"host may use {limit_bytes / 1e9:.2f}: {name_all(large)}"
         )
         yield "bad", "memory", text, "raise the limit, leave them out, or --set resize_scale=1, fewer voxels_per_clip"
 

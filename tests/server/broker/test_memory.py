@@ -85,7 +85,7 @@ def test_a_clip_that_no_worker_can_hold_is_an_error_of_its_consumer_within_ten_s
     at.join(b"small", memory_bytes=SMALL_WORKER)
     at.work_off(b"small")
     said = (
-        f"big.mp4 from frame 0 needs {NEEDS / 1e9:.1f} GB of memory under this spec, the largest worker has 0.3: give "
+        f"big.mp4 from frame 0 needs {NEEDS / 1e9:.2f} GB of memory under this spec, the largest worker has 0.31: give "
     )
     assert trouble(at).startswith(said)
     at.tick(TOO_LARGE_SECONDS)
@@ -101,7 +101,7 @@ def test_it_waits_for_workers_that_are_to_come_and_says_so_meanwhile() -> None:
     at.join(b"small", memory_bytes=SMALL_WORKER)
     at.tick(4 * TOO_LARGE_SECONDS)
     assert at.unavailable() == []
-    assert "needs 0.5 GB" in trouble(at)
+    assert "needs 0.47 GB" in trouble(at)
     at.join(b"large", memory_bytes=LARGE_WORKER)
     at.tick(TOO_LARGE_SECONDS)
     assert trouble(at) == ""
@@ -138,7 +138,7 @@ def test_a_clip_that_was_underestimated_kills_three_workers_and_is_then_refused(
     for life in range(3):
         at.tick(TOO_LARGE_SECONDS)
         assert len(at.unavailable()) == life + 1
-        assert f"needs more than {(limit or LARGEST_MEMORY_BYTES) / 1e9:.1f} GB" in at.unavailable()[life].text
+        assert f"needs more than {(limit or LARGEST_MEMORY_BYTES) / 1e9:.2f} GB" in at.unavailable()[life].text
         at.hello(shuffle=False)
         at.want(10)
         assert videos(at, b"w") == []

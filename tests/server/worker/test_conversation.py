@@ -49,6 +49,7 @@ from v2v_protocol.sample import Layout, new_arrays
 from v2v_server.commands.worker import main as worker_command
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.simulation.precision import Variant
+from v2v_server.system.process import memory_limit
 from v2v_server.worker import process as worker_module
 from v2v_server.worker.conversation import (
     Inspect,
@@ -379,7 +380,9 @@ def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
         thread = threading.Thread(target=worker.run)
         thread.start()
         try:
-            assert isinstance(at.heard(), WorkerHello)
+            hello = at.heard()
+            assert isinstance(hello, WorkerHello)
+            assert hello.notes.memory_bytes == memory_limit()
             yield at
         finally:
             at.says(Stop())
