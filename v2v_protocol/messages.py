@@ -70,9 +70,8 @@ class Notes(Persisted):
         Raises:
             ProtocolError: they are not a map, or a known one has a value of another type.
         """
-        if isinstance(values, dict):
-            values = {name: values[name] for name in cls.__slots__ if name in values}
-        return read_fields(cls, values)
+        is_map = isinstance(values, dict)
+        return read_fields(cls, {each: values[each] for each in cls.__slots__ if each in values} if is_map else values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -563,12 +562,7 @@ def decode(header: Buffer, most_bytes: int = LARGEST_HEADER_BYTES) -> Message:
     cls = _TYPES.get(name) if type(name) is str else None
     if cls is None:
         raise ProtocolError(f"unknown message type {shown(name)}")
-    try:
-        message: Message = cls.from_dict(fields)
-    except ProtocolError as error:
-        if fields.keys() <= cls.__dataclass_fields__.keys():
-            raise
-        raise ProtocolError(f"{error}; its sender is of a later release: update the receiver") from None
+    message: Message = cls.from_dict(fields)
     return message
 
 

@@ -118,7 +118,7 @@ def read_fields(kind: Callable[..., T], values: Any) -> T:
     except ProtocolError as error:
         raise type(error)(f"{kind.__name__}.{name} {error}") from None
     except KeyError:
-        known = f"{nearest(name, readers)}; its fields are {', '.join(readers)}"
+        known = f"{nearest(name, readers)}; its fields are {', '.join(readers)}; of a later release? Update the reader"
         raise ProtocolError(f"{kind.__name__} has no field {shown(name)}{known}") from None
     try:
         return kind(**read)

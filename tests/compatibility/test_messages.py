@@ -60,7 +60,7 @@ def test_a_note_is_ignored_on_both_sides(name: str) -> None:
 def test_any_other_field_is_refused_on_both_sides(name: str) -> None:
     changed = with_fields(peer_8.MESSAGES[name], rotation=90)
     with pytest.raises(
-        ProtocolError, match=r"has no field 'rotation'.*its sender is of a later release: update the rec"
+        ProtocolError, match=r"has no field 'rotation'.*of a later release. Update the reader"
     ):
         decode(changed)
     with pytest.raises(peer_8.Unreadable, match="has no field rotation"):
