@@ -14,9 +14,14 @@ import yaml
 from tests.server.page.metric_names import metric_names
 from v2v_protocol.errors import UsageError
 from v2v_protocol.link.router import Sockets
+from v2v_protocol.sample import DEFAULT_ARRAYS, array_layout, layout_bytes
+from v2v_protocol.spec import StreamSpec
 from v2v_server.commands.quarantine import main as quarantine
 from v2v_server.commands.serve import main as serve
 from v2v_server.config import ServeConfig
+from v2v_server.corpus.videos import VideoEntry
+from v2v_server.schedule import LARGEST_MEMORY_BYTES, WORKER_BYTES, lease_bytes
+from v2v_server.video.rows import Rows
 
 DEPLOY = Path(__file__).parents[1] / "deploy"
 UNIT = DEPLOY / "systemd" / "v2v-serve.service"
@@ -46,6 +51,26 @@ def test_the_unit_does_not_restart_after_a_mistyped_key(
     assert "did you mean 'videos'" in capsys.readouterr().err
     assert service["Restart"] == "on-failure"
     assert str(status) in service["RestartPreventExitStatus"].split()
+
+
+def test_workers_are_given_the_memory_that_the_largest_usual_clip_needs() -> None:
+    """The paper's 201 frames, resized from 3840 x 2160; `WORKER_BYTES` is the one place for the number."""
+    spec = StreamSpec.from_dict({"recipe": {"preset": "paper", "resize_scale": [0.5, 1.0]}})
+    arrays = layout_bytes(array_layout(spec.recipe, spec.voxel_dtype, DEFAULT_ARRAYS))
+    needed = lease_bytes(VideoEntry("v.mp4", "f", 999, 3840, 2160, 30.0, "hevc"), Rows(), spec, arrays)
+    assert needed <= WORKER_BYTES < 1.1 * needed
+    worker = yaml.safe_load((DEPLOY / "kubernetes" / "workers.yaml").read_text())
+    (container,) = worker["spec"]["template"]["spec"]["containers"]
+    given = [container["resources"][kind]["memory"] for kind in ("requests", "limits")]
+    given += re.findall(r"--mem-per-cpu=(\S+)", (DEPLOY / "slurm" / "train.sbatch").read_text())
+    assert [_bytes(text) for text in given] == 3 * [WORKER_BYTES]
+    unit = (DEPLOY / "systemd" / "v2v-worker@.service").read_text()
+    assert [_bytes(text) for text in re.findall(r"^MemoryMax=(\S+)$", unit, re.M)] == [LARGEST_MEMORY_BYTES]
+
+
+def _bytes(text: str) -> int:
+    number, unit = re.fullmatch(r"(\d+)([MG])i?", text).groups()  # type: ignore[union-attr]
+    return int(number) << {"M": 20, "G": 30}[unit]
 
 
 def test_the_units_example_is_valid_and_its_quarantine_lies_where_it_says(

@@ -14,14 +14,17 @@ SampleHeader message, which a broker passes on unchanged.
 All received data is treated as hostile: sizes are limited before anything is allocated, fields are checked by their
 types (:mod:`v2v_protocol.persisted`; the code that uses a Mapping checks the plain values in it), dtypes come from an
 allow-list, and nothing is ever unpickled. For any bytes, :func:`decode` either returns a message or raises a
-:class:`v2v_protocol.errors.ProtocolError`. Fields that are ``later`` were added within a protocol version.
+:class:`v2v_protocol.errors.ProtocolError`.
+
+Messages grow within a protocol version. What a receiver may ignore is added to :class:`Notes`. What it must heed, such
+as all that changes a sample, is a new field that is ``later``: a receiver that does not know it refuses the message.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from enum import StrEnum
 from typing import Any, TypeAlias
 
@@ -32,7 +35,7 @@ import numpy.typing as npt
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.arena import NO_SLOT
 from v2v_protocol.errors import LimitExceeded, ProtocolError, VersionMismatch
-from v2v_protocol.persisted import Persisted, add_fields, later, reader, shown
+from v2v_protocol.persisted import Persisted, add_fields, later, read_fields, reader, shown
 from v2v_protocol.sample import Layout
 
 
@@ -48,11 +51,49 @@ class ErrorCode(StrEnum):
     BUSY = "busy"
 
 
+@dataclass(frozen=True, slots=True)
+class Notes(Persisted):
+    """What a message says for information. A receiver drops names that it does not know, so no note changes a sample.
+
+    Attributes:
+        memory_bytes: of a WorkerHello: limit of the worker's memory; 0: not known.
+        reason: of a Goodbye: why a worker cannot work for this server; "": it just leaves.
+        state: of a Lease: numbers that the file's size and times had when it was catalogued. A worker whose file has
+            them need not read all of it; empty: not known.
+    """
+
+    memory_bytes: int = later(0)
+    reason: str = later("")
+    state: tuple[int, ...] = later(())
+
+    @classmethod
+    def from_dict(cls, values: Any) -> Notes:
+        """Return the notes that this release knows.
+
+        Raises:
+            ProtocolError: they are not a map, or a known one has a value of another type.
+        """
+        is_map = isinstance(values, dict)
+        return read_fields(cls, {each: values[each] for each in cls.__slots__ if each in values} if is_map else values)
+
+
+@dataclass(frozen=True, slots=True)
+class Noted(Persisted):
+    """Base of all messages.
+
+    Attributes:
+        notes: what the receiver may ignore.
+    """
+
+    _: KW_ONLY
+    notes: Notes = later(default_factory=Notes)
+
+
 # --- consumer -> server -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class Hello(Persisted):
+class Hello(Noted):
     """Open a consumer's session, or open it again after a server restart.
 
     Attributes:
@@ -83,7 +124,7 @@ class Hello(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Want(Persisted):
+class Want(Noted):
     """Ask for samples of one epoch; each index uses one unit of credit until it is answered.
 
     An index that is requested again while it is in work is not made twice.
@@ -103,12 +144,12 @@ class Want(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Ping(Persisted):
+class Ping(Noted):
     """Ask for a sign of life. It is sent only after a silence, because any message counts as a sign of life."""
 
 
 @dataclass(frozen=True, slots=True)
-class Goodbye(Persisted):
+class Goodbye(Noted):
     """The sender leaves in an orderly way: forget its session, or give its leases to other workers.
 
     Attributes:
@@ -119,7 +160,7 @@ class Goodbye(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class GetStatus(Persisted):
+class GetStatus(Noted):
     """Ask for the state of the service. It needs no session, and workers' ports accept it too. The answer is the next
     state that is built, a few times a second; several requests before it get one answer.
     """
@@ -129,7 +170,7 @@ class GetStatus(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Welcome(Persisted):
+class Welcome(Noted):
     """Answer to Hello.
 
     Attributes:
@@ -152,7 +193,7 @@ class Welcome(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class SampleHeader(Persisted):
+class SampleHeader(Noted):
     """One sample; the raw bytes of each array follow as frames of their own, C order, little endian.
 
     If ``slot`` is set and no frames follow, the arrays lie in that slot, one after the other. If ``arena`` is set as
@@ -191,7 +232,7 @@ class SampleHeader(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Unavailable(Persisted):
+class Unavailable(Noted):
     """A requested sample cannot be made from any of its candidates; ``text`` lists the reason of each."""
 
     epoch: int
@@ -200,7 +241,7 @@ class Unavailable(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Denied(Persisted):
+class Denied(Noted):
     """A request cannot be granted. ``code`` is an ErrorCode; ``text`` says what to do about it."""
 
     code: str
@@ -208,7 +249,7 @@ class Denied(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Pong(Persisted):
+class Pong(Noted):
     """Answer to Ping.
 
     Attributes:
@@ -219,7 +260,7 @@ class Pong(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Status(Persisted):
+class Status(Noted):
     """Answer to GetStatus.
 
     Attributes:
@@ -233,7 +274,7 @@ class Status(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class WorkerHello(Persisted):
+class WorkerHello(Noted):
     """Offer a worker that accepts ``credit`` leases at a time.
 
     Attributes:
@@ -253,14 +294,14 @@ class WorkerHello(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Begun(Persisted):
+class Begun(Noted):
     """The worker starts on this lease now. Only a lease that was begun can be blamed for what happens next."""
 
     lease: int
 
 
 @dataclass(frozen=True, slots=True)
-class Result(Persisted):
+class Result(Noted):
     """A lease's sample is done; the frames of its SampleHeader message follow, and are passed on unchanged.
 
     Attributes:
@@ -283,7 +324,7 @@ class Result(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class LeaseFailed(Persisted):
+class LeaseFailed(Noted):
     """The lease's video could not be used. ``frame`` and ``reason`` are those of VideoError.
 
     Attributes:
@@ -302,7 +343,7 @@ class LeaseFailed(Persisted):
 
 
 @dataclass(frozen=True, slots=True)
-class Lease(Persisted):
+class Lease(Noted):
     """One clip of one video, and the sample to make from it.
 
     Attributes:
@@ -331,8 +372,6 @@ class Lease(Persisted):
             out. To workers it may be [fingerprint, part]: bytes, the table of the files of a folder that the clip
             needs; or a text, why the sidecar is not used, perhaps without a fingerprint.
         remark: what of the video is not served, or served with wrong grey levels or times; goes into the provenance.
-        state: numbers that the file's size and times had when it was catalogued: a worker whose file has them need not
-            read all of it; empty if they are not known.
     """
 
     lease: int
@@ -361,11 +400,10 @@ class Lease(Persisted):
     packed: bool = False
     sidecars: Mapping[str, Any] = later(default_factory=dict)
     remark: str = later("")
-    state: tuple[int, ...] = later(())
 
 
 @dataclass(frozen=True, slots=True)
-class Stop(Persisted):
+class Stop(Noted):
     """Finish what was begun, say Goodbye and exit."""
 
 

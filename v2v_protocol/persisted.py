@@ -94,11 +94,12 @@ def add_fields(plain: dict[str, Any], item: Any) -> dict[str, Any]:
     # dataclasses.asdict copies every value, which takes a quarter of a millisecond for a provenance.
     for name in names:
         plain[name] = getattr(item, name)
-    for name in nested:
-        plain[name] = _nested(plain[name])
     for name, default in defaults.items():
         if plain[name] == default:
             del plain[name]
+    for name in nested:
+        if name in plain:
+            plain[name] = _nested(plain[name])
     return plain
 
 
@@ -117,7 +118,7 @@ def read_fields(kind: Callable[..., T], values: Any) -> T:
     except ProtocolError as error:
         raise type(error)(f"{kind.__name__}.{name} {error}") from None
     except KeyError:
-        known = f"{nearest(name, readers)}; its fields are {', '.join(readers)}"
+        known = f"{nearest(name, readers)}; its fields are {', '.join(readers)}; of a later release? Update the reader"
         raise ProtocolError(f"{kind.__name__} has no field {shown(name)}{known}") from None
     try:
         return kind(**read)

@@ -65,6 +65,16 @@ MOST_CLIP_BYTES = 2 << 30
 """Largest size of the decoded frames of one lease without margins, in 8 bits."""
 MOST_LEASE_BYTES = 7 << 30
 """Largest memory that one lease may take, with all that its spec may ask for; a worker has a GiB more."""
+LARGEST_MEMORY_BYTES = MOST_LEASE_BYTES + (1 << 30)
+"""A worker that needs more ends. After three such ends its sample is refused for its spec."""
+WORKER_BYTES = 2 << 30
+"""Memory that the files in ``deploy`` and the Ray engine give a worker: enough for the 201 frames of the paper, resized
+from 3840 x 2160 (:func:`lease_bytes`).
+"""
+_IDLE_BYTES = 256 << 20
+"""A worker without a lease has 182 MiB; the rest is for what grows with neither frames nor pictures."""
+_DECODER_BYTES = 24
+"""For each pixel of a picture. H.264 of 3840 x 2160 took 13 with 8 bits and 29 with 10."""
 _BLOCK = 256
 """Videos whose sequences are counted again for a look-up. Larger blocks take more time, smaller ones more memory."""
 _Videos = Sequence[VideoEntry]
@@ -521,23 +531,50 @@ def _frame_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec) -> tuple[int, 
     and the levels between its frames.
     """
     recipe, samples = spec.recipe, spec.samples_per_decode
+    window, crop, depth = _sizes_of(video, rows, spec)
+    read = window if recipe.resize_scale != (1.0, 1.0) and kind_of(video.id) != "photographs" else crop
+    held = samples + (1 if spec.scene == "off" else samples)
+    seen = 2 * depth + np.dtype(spec.voxel_dtype).itemsize + _level_bytes(spec)
+    return read * samples, depth * window * held + seen * crop
+
+
+def _level_bytes(spec: StreamSpec) -> int:
+    return 2 * (MOST_SUBSTEPS - 1) if spec.substep_px else 0
+
+
+def _sizes_of(video: VideoEntry, rows: Rows, spec: StreamSpec) -> tuple[int, int, int]:
+    """Return the pixels of each frame that are decoded for a sample, those of its crop, and the bytes of a level."""
+    recipe = spec.recipe
     top, bottom = rows.bounds(video.height_px)
     whole, crop = (bottom - top) * video.width_px, recipe.crop_height_px * recipe.crop_width_px
-    read, sides = crop, 2 * max(spec.flow_margin_px, MARGIN_PX if spec.substep_px else 0)
+    if kind_of(video.id) == "photographs":
+        return crop, crop, 2
+    sides = 2 * max(spec.flow_margin_px, MARGIN_PX if spec.substep_px else 0)
     window = min(whole, (recipe.crop_height_px + sides) * (recipe.crop_width_px + sides))
-    is_rendered = kind_of(video.id) == "photographs"
-    if is_rendered:
-        window = crop
-    elif recipe.resize_scale != (1.0, 1.0):
-        read = window = whole
-    elif spec.flow_margin_px < 0:
-        window = whole
-    depth, held = (
-        1 if recipe.light == "sdr" and not is_rendered else 2,
-        samples + (1 if spec.scene == "off" else samples),
-    )
-    seen = 2 * depth + np.dtype(spec.voxel_dtype).itemsize + (2 * (MOST_SUBSTEPS - 1) if spec.substep_px else 0)
-    return read * samples, depth * window * held + seen * crop
+    is_whole = recipe.resize_scale != (1.0, 1.0) or spec.flow_margin_px < 0
+    return whole if is_whole else window, crop, 1 if recipe.light == "sdr" else 2
+
+
+def lease_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec, array_bytes: int) -> int:
+    """Return the memory that a worker needs for one lease, its own included, bytes: an upper bound, by measurements.
+
+    Unlike the limit on sequences, it may change from release to release: it decides which worker makes a sample, and
+    never what is in it.
+
+    Args:
+        video, rows, spec: what the lease is for.
+        array_bytes: size of the arrays of one sample. Those of the sample before may still be on their way.
+    """
+    recipe = spec.recipe
+    window, crop, depth = _sizes_of(video, rows, spec)
+    frames = int(recipe.reach_at(video.frames_per_second)) // recipe.frame_stride + 1
+    # Repeated frames are left out of a copy, and a picture is turned upright in one: phones film upright pictures so.
+    is_copied = (spec.scene != "off" and "duplicates" not in spec.kept_defects) or video.height_px > video.width_px
+    views = (recipe.resize_scale != (1.0, 1.0)) + (2 if recipe.contrast_probability else 1)
+    clips = frames * depth * window * spec.samples_per_decode * (1 + is_copied)
+    decoder = _DECODER_BYTES * video.width_px * video.height_px
+    simulation = frames * crop * (depth * views + _level_bytes(spec)) + array_bytes
+    return _IDLE_BYTES + clips + max(decoder, simulation) + array_bytes
 
 
 def _most_steps(video: VideoEntry, rows: Rows, spec: StreamSpec) -> int:

@@ -27,7 +27,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from typing import Any
 
-from bench.chaos.consumer import log_path, profile
+from bench.chaos.consumer import LARGE, log_path, profile
 from bench.chaos.faults import WEIGHTS, Chaos, Fault
 from bench.chaos.fleet import Fleet
 from bench.corpus import add_source, run_folder
@@ -166,6 +166,9 @@ def add_flags(parser: Parser) -> None:
     parser.add_argument("--cache", action="store_true", help="keep decoded clips, and damage them")
     parser.add_argument("--share", action="store_true", help="make equal samples once for all consumers")
     parser.add_argument("--keys", action="store_true", help="require keys: all connections are encrypted")
+    parser.add_argument(
+        "--large", action="store_true", help="also clips that the further workers, of 1 GiB, cannot hold"
+    )
     add_whole(parser, "--remakes", 300, "samples to make again and compare")
     add_whole(parser, "--seed", 0, "of the faults", least=0)
 
@@ -175,10 +178,14 @@ def measure(asked: argparse.Namespace) -> Report:
     kinds = chosen(asked.faults, WEIGHTS, "--faults")
     with run_folder(asked) as (folder, videos):
         cache = folder / "decoded" if asked.cache else None
+        consumers = max(asked.consumers, LARGE + 1) if asked.large else asked.consumers
         fleet = Fleet(
-            folder / "run", videos, asked.workers, asked.consumers, LEASE_SECONDS, clip_cache=cache,
+            folder / "run", videos, asked.workers, consumers, LEASE_SECONDS, clip_cache=cache,
             keyed=asked.keys, server_flags=("--share-gib", "0.25") if asked.share else (),
+            further_bytes=1 << 30 if asked.large else 0,
         )  # fmt: skip
+        if asked.large:
+            fleet.add_worker()  # it waits for the server
         # Two SIGSEGVs quarantine a video: one video must remain.
         most_segv = sum(bool(id_of(path.name)) for path in videos.rglob("*")) - 1
         return run_fleet(fleet, Chaos(fleet, asked.every, asked.seed, most_segv, kinds), asked)

@@ -43,7 +43,18 @@ PROFILES = (
     ),
     # The stream of the first one in other batches: the samples of the two are compared with each other.
     Profile({"recipe": _SMALL, "max_sequences_per_video": 100}, seed=1, batch_size=5, think_seconds=0.05),
+    # More memory than a worker of 1 GiB has.
+    Profile(
+        {
+            "recipe": {"preset": "paper", "voxels_per_clip": 30, "crop_height_px": 300, "crop_width_px": 580},
+            "substep_px": 0.5,
+        },
+        seed=4,
+        batch_size=1,
+    ),
 )
+LARGE = 4
+"""Number of the profile of large clips."""
 
 
 def profile(number: int) -> Profile:

@@ -22,6 +22,8 @@ import psutil
 
 from bench.chaos.consumer import log_path
 from bench.chaos.hostile import TALLY
+from bench.chaos.limited_worker import MODULE as LIMITED_WORKER
+from bench.chaos.limited_worker import write_limit
 from bench.processes import free_ports, last_in_line, workers_of
 from v2v_protocol.errors import UsageError
 from v2v_protocol.keys import VARIABLE as KEY_VARIABLE
@@ -79,6 +81,7 @@ class Fleet:
         host: address of the server.
         elsewhere: prefix of the commands of consumers and further workers, to run them on another host.
         keyed: whether the server requires keys.
+        further_bytes: limit of a further worker's memory, that of its control group; 0: none.
 
     Attributes:
         failures: processes that ended without a fault.
@@ -97,6 +100,7 @@ class Fleet:
     host: str = "127.0.0.1"
     elsewhere: tuple[str, ...] = ()
     keyed: bool = False
+    further_bytes: int = 0
     failures: list[str] = field(default_factory=list)
     ready_at: list[float] = field(default_factory=list)
     token: str = field(default_factory=lambda: f"{os.getpid()}-{time.monotonic_ns()}")
@@ -209,8 +213,12 @@ class Fleet:
         self._added += 1
         folder = self.folder / name
         folder.mkdir()
+        module = ["v2v_server.commands.worker"]
+        if self.further_bytes:
+            write_limit(folder / "limits", self.further_bytes)
+            module = [LIMITED_WORKER, str(folder / "limits")]
         command = [
-            *(*self.elsewhere, sys.executable, "-m", "v2v_server.commands.worker"),
+            *(*self.elsewhere, sys.executable, "-m", *module),
             *("--connect", self.worker_address, "--videos", str(self.videos), "--name", name),
         ]
         place = Process(f"worker {name}", command, folder, side="worker")

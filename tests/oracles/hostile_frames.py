@@ -25,7 +25,7 @@ import psutil
 
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.errors import ProtocolError
-from v2v_protocol.messages import ARRAY_DTYPES, Frames, Message, SampleHeader, decode, decode_sample, encode
+from v2v_protocol.messages import ARRAY_DTYPES, Frames, Message, Notes, SampleHeader, decode, decode_sample, encode
 
 MOST_GROWTH_MIB = 16.0
 MOST_PEAK_GROWTH_MIB = 64.0
@@ -187,6 +187,8 @@ class FrameFuzzer:
                 return tuple(self._text() for _ in range(self._random.randrange(4)))
             case "Mapping[str, Any]":
                 return {self._text(): self._value(3) for _ in range(self._random.randrange(4))}
+            case "Notes":
+                return Notes(self._random.choice(_EDGES), self._text())
         raise TypeError(f"a message has a field of type {annotation}, which this fuzzer does not know")
 
     def _float(self) -> float:

@@ -105,6 +105,8 @@ def _example(kind: Any) -> Any:
         return (_example(parts[0]), _example(parts[0]))
     if origin is not None:
         return {"key": [1, 2.5, "three", None]}
+    if dataclasses.is_dataclass(kind):
+        return kind()
     return {int: 1, float: 0.5, bool: True, str: "text", bytes: b"bytes"}[kind]
 
 

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from tests.protocol.persisted_values import PLAIN, fits, hints_of, values_of
 from v2v_client.position import ResumeState, StreamIdentity
 from v2v_protocol.errors import ProtocolError, UsageError
+from v2v_protocol.messages import Notes
 from v2v_protocol.persisted import LARGEST_LIST, Int64, reader, to_plain
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, SampleId, SampleParams
@@ -30,7 +31,7 @@ FOUND = [
     (".".join(file.relative_to(ROOT).with_suffix("").parts), name)
     for package in ("v2v_protocol", "v2v_server", "v2v_tools", "v2v_client")
     for file in sorted((ROOT / package).rglob("*.py"))
-    for name in re.findall(r"^class (\w+)\(Persisted\)", file.read_text(), re.MULTILINE)
+    for name in re.findall(r"^class (\w+)\((?:Persisted|Noted)\)", file.read_text(), re.MULTILINE)
 ]
 CLASSES: list[Any] = [getattr(importlib.import_module(module), name) for module, name in FOUND]
 ID = SampleId("s" * 32, "c" * 32, 4, 2**64 - 1, 2**32 - 1, 2**48 - 1)
@@ -47,8 +48,10 @@ EXAMPLES: dict[type[Any], Any] = {
     ResumeState: ResumeState(STREAM, 3, 1, 0, 40, 2, None, 7),
 }
 """Classes whose fields also have to fit each other."""
-OF_OTHER_FORM = (Recipe, StreamSpec, ResumeState)
-"""Classes that read more than they write: presets and parts of a recipe, a stream beside the place in it."""
+OF_OTHER_FORM = (Recipe, StreamSpec, ResumeState, Notes)
+"""Classes that read more than they write: presets and parts of a recipe, a stream beside the place in it, what is
+ignored.
+"""
 WITH_PICTURES = ("Excerpt",)
 """Classes with the index of a real video: tests of isolated processes have them."""
 checked = [cls for cls in CLASSES if cls not in OF_OTHER_FORM and cls.__name__ not in WITH_PICTURES]

@@ -20,6 +20,7 @@ from v2v_protocol.messages import (
     Lease,
     LeaseFailed,
     Message,
+    Notes,
     Result,
     SampleHeader,
     Unavailable,
@@ -220,9 +221,10 @@ class Peers:
     ) -> list[Message]:
         return self.consumer_says(identity, Want(epoch, indices, (arena,) * len(slots), tuple(slots)))
 
-    def join(self, identity: bytes = b"w", credit: int = CREDIT) -> None:
+    def join(self, identity: bytes = b"w", credit: int = CREDIT, memory_bytes: int = 0) -> None:
         self.leases[identity] = deque()
-        self.worker_says(identity, WorkerHello(identity.decode(), NUMERICS_VERSION, credit))
+        notes = Notes(memory_bytes=memory_bytes)
+        self.worker_says(identity, WorkerHello(identity.decode(), NUMERICS_VERSION, credit, notes=notes))
 
     def asked_by(self, lease: Lease) -> bytes:
         """The consumer that a lease's sample is for, which its worker is not told."""

@@ -24,7 +24,7 @@ from v2v_server.motion.prediction import predict
 from v2v_tools.doctor import command
 from v2v_tools.doctor import corpus as doctor_corpus
 from v2v_tools.doctor import motion as doctor_motion
-from v2v_tools.doctor.command import BAD, NOTE, OK, Finding, control_group_memory
+from v2v_tools.doctor.command import BAD, NOTE, OK, Finding
 from v2v_tools.motion import describe_loss
 
 
@@ -88,6 +88,24 @@ def test_a_corpus_is_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str
     status, said = told(capsys, *flags)
     assert status == 1
     assert "\nbad   corpus        8 videos give no sequence" in said
+
+
+def test_videos_that_take_more_memory_than_a_worker_has_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_clip(tmp_path / "small.mp4", panned_luma(21, 140, 160))
+    write_clip(tmp_path / "large.mp4", panned_luma(21, 600, 800))
+    write_clip(tmp_path / "short.mp4", panned_luma(3, 600, 800))
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("voxels_per_clip: 4\nresize_scale: [0.9, 1.0]\n")
+    flags = ["--videos", str(tmp_path), "--cache-dir", str(tmp_path), "--recipe", str(recipe)]
+    for limit_mib, named in ((1024, None), (270, "large.mp4"), (200, "large.mp4; small.mp4")):
+        monkeypatch.setattr(doctor_corpus, "memory_limit", lambda limit=limit_mib << 20: limit)
+        status, said = told(capsys, *flags)
+        found = re.search(
+            r"samples of \d videos need up to 0.29 GB of memory, a worker of this host may use .*: (.*)", said
+        )
+        assert (status, None if found is None else found[1]) == (int(named is not None), named)
 
 
 def test_a_corpus_that_is_not_there_is_in_the_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -157,19 +175,6 @@ def test_a_gpu_that_torch_does_not_see_is_in_the_way(monkeypatch: pytest.MonkeyP
     assert command._torch().level == OK
     done.stdout = ""
     assert command._torch().level == BAD
-
-
-def test_the_limits_of_memory_are_those_of_all_control_groups(tmp_path: Path) -> None:
-    own, pod = tmp_path / "own", tmp_path / "groups" / "pod"
-    own.write_text("0::/pod/container\n")
-    (pod / "container").mkdir(parents=True)
-    for folder, limit, used in ((pod, "3000", "2500"), (pod / "container", "2000", "100")):
-        (folder / "memory.max").write_text(f"{limit}\n")
-        (folder / "memory.current").write_text(f"{used}\n")
-    assert control_group_memory(tmp_path / "groups", own) == [(3000, 500), (2000, 1900)]
-    (pod / "memory.max").write_text("max\n")
-    assert control_group_memory(tmp_path / "groups", own) == [(2000, 1900)]
-    assert control_group_memory(tmp_path / "groups", tmp_path / "none") == []
 
 
 def test_it_starts_where_nothing_else_is_installed() -> None:

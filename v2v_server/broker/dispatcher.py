@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections import deque
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -77,6 +76,7 @@ from v2v_server.broker.state import (
     CheckVideo,
     Disconnect,
     GiveUp,
+    ParkedClip,
     RefusalPart,
     ReportRefusal,
     SendStatus,
@@ -87,7 +87,15 @@ from v2v_server.broker.state import (
 )
 from v2v_server.corpus.videos import CorpusFacts, VideoEntry
 from v2v_server.quarantine import QuarantineEntry
-from v2v_server.schedule import MOST_CANDIDATES, MOST_CLIP_BYTES, Schedule, SequenceTable, VideoSequence
+from v2v_server.schedule import (
+    LARGEST_MEMORY_BYTES,
+    MOST_CANDIDATES,
+    MOST_CLIP_BYTES,
+    Schedule,
+    SequenceTable,
+    VideoSequence,
+    lease_bytes,
+)
 from v2v_server.sharing import SharedSample
 
 MOST_SESSIONS = 4096
@@ -98,6 +106,8 @@ MOST_CREDIT = 400
 """Less than ``router.MOST_QUEUED``, the number of queued messages at which a consumer is disconnected."""
 MOST_TABLES = 16
 """Sequence tables cached for later consumers. A session keeps its own, which is small."""
+TOO_LARGE_SECONDS = 5.0
+"""Time after which a sample that takes more memory than every worker has is an error."""
 LONGEST_REASON = 500
 """Characters kept of a refusal's reason."""
 _DECODE_SECONDS = 5e-8
@@ -135,11 +145,11 @@ class Dispatcher(Broker):
             case Hello():
                 return [self._hello(identity, message, now, user)]
             case Ping():
-                return [
-                    ToConsumer(
-                        identity, encode(Pong(self.blocked_reason or self.registry.trouble(self.expected_workers)))
-                    )
-                ]
+                trouble = self.blocked_reason or self.registry.trouble(self.expected_workers)
+                of_clips = (
+                    clip.trouble for clip in self.parked if clip.trouble and clip.requests[0].session == identity
+                )
+                return [ToConsumer(identity, encode(Pong(trouble or next(of_clips, ""))))]
             case GetStatus():
                 return [SendStatus(identity)]
             case Goodbye():
@@ -242,7 +252,10 @@ class Dispatcher(Broker):
         try:
             message = decode(frames[0] if frames else b"")
         except ProtocolError as error:
-            return [ToWorker(identity, self._malformed(error))]
+            # Our workers end when they hear this. What it was about is not known, so others get the leases.
+            gone = Loss(Cause.KILLED, "sent a malformed message")
+            lost = self.worker_lost(identity, gone, now) if identity in self.registry else []
+            return [ToWorker(identity, self._malformed(error)), *lost]
         if isinstance(message, WorkerHello):
             return self._worker_hello(identity, message, now, user)
         if isinstance(message, GetStatus):
@@ -263,6 +276,7 @@ class Dispatcher(Broker):
             case Ping():
                 return [ToWorker(identity, encode(Pong()))]
             case Goodbye():
+                self.registry.note_unfit(message.notes.reason)
                 return self._take_back(identity, Loss(Cause.KILLED, "left"), now)
             case _:
                 self.counters.malformed += 1
@@ -374,11 +388,14 @@ class Dispatcher(Broker):
             self.sessions.queue.charge(*debt)
 
     def _take_back(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
+        limit_bytes = self.registry.members[identity].limit_bytes if identity in self.registry else 0
         self.registry.remove(identity)
         actions: list[Action] = []
         returned = self.leases.lost(identity, loss.lease)
         self.counters.returned_leases += len(returned)
         for request, begun in reversed(returned):
+            if begun and loss.cause is Cause.MEMORY and runs_alone(request):
+                _mark_outgrown(self, request, limit_bytes)
             verdict = judge(request, loss) if begun else request
             if isinstance(verdict, Request):
                 self.sessions.put_back(verdict)
@@ -438,6 +455,7 @@ class Dispatcher(Broker):
             actions.append(GiveUp(identity, f"gave no answer for {self.leases.limit_seconds(identity):g} s"))
         for identity in self.registry.vanished(now):
             actions.append(GiveUp(identity, f"was silent for {SILENCE_SECONDS:g} s"))
+        actions += _check_parked(self, now)
         second = _assign_slow(self, now)
         self.counters.second_leases += len(second)
         actions += second
@@ -719,7 +737,7 @@ def next_candidate(request: Request, refusal: Refusal) -> Request:
 def _forget_session(broker: Broker, session: bytes) -> None:
     """Drop the requests of a consumer that is gone, and abandon its leases."""
     broker.leases.forget_session(session)
-    broker.lone = deque(request for request in broker.lone if request.session != session)
+    broker.parked = [clip for clip in broker.parked if clip.requests[0].session != session]
     for key, followers in broker.followers.items():
         broker.followers[key] = [request for request in followers if request.session != session]
 
@@ -732,27 +750,39 @@ def _assign(broker: Broker, now: float) -> list[Action]:
     actions: list[Action] = []
     _release_followers(broker)
     while not broker.blocked_reason:
-        if broker.lone:
-            empty = broker.registry.for_lone_request()
-            if empty is not None:
-                actions += _give(broker, [broker.lone.popleft()], empty, now)
-                continue
-        worker = broker.registry.for_request(keep_one_empty=bool(broker.lone))
-        request = broker.sessions.next_request() if worker is not None else None
-        if worker is None or request is None:
+        parked = ((clip, worker) for clip in broker.parked if (worker := _worker_for(broker, clip)) is not None)
+        clip, worker = next(parked, (None, None))
+        if clip is not None and worker is not None:
+            broker.parked.remove(clip)
+            actions += _give(broker, clip.requests, worker, now)
+            continue
+        request = broker.sessions.next_request() if broker.registry.for_request(kept_bytes=_kept(broker)) else None
+        if request is None:
             return actions
-        if runs_alone(request):
-            broker.lone.append(request)
-        else:
-            actions += _give(broker, [request, *broker.sessions.take_siblings(request)], worker, now)
+        siblings = [] if runs_alone(request) else broker.sessions.take_siblings(request)
+        broker.parked.append(ParkedClip(needed_bytes(broker, request), [request, *siblings], now))
     return actions
+
+
+def _kept(broker: Broker) -> int | None:
+    """Return the memory of the worker to keep empty for the first request that runs alone; None if none waits."""
+    return next((clip.needs_bytes for clip in broker.parked if runs_alone(clip.requests[0])), None)
+
+
+def _worker_for(broker: Broker, clip: ParkedClip) -> bytes | None:
+    """Return the worker for a clip; None if none that suits it is free."""
+    if runs_alone(clip.requests[0]):
+        return broker.registry.for_lone_request(clip.needs_bytes)
+    return broker.registry.for_request(kept_bytes=_kept(broker), needs_bytes=clip.needs_bytes)
 
 
 def _assign_slow(broker: Broker, now: float) -> list[Action]:
     """Give requests that take unusually long to a second worker each."""
     actions: list[Action] = []
     for request, worker in broker.leases.slow(now):
-        second = broker.registry.for_request(keep_one_empty=bool(broker.lone), other_than=worker)
+        second = broker.registry.for_request(
+            kept_bytes=_kept(broker), other_than=worker, needs_bytes=needed_bytes(broker, request)
+        )
         session = broker.sessions.get(request.session)
         if session is not None and second is not None and not runs_alone(request):
             slotless = replace(request, slot=None)  # the first worker may still write to the slot
@@ -826,6 +856,65 @@ def _grant(
             return _refuse(broker, request, None, str(error))
         broker.blocked_reason = f"{error}; retried ten times a second"
         return None
+
+
+# --- memory of workers ------------------------------------------------------------------------------------------------
+
+
+def clip_key(session: Session, request: Request) -> Hashable:
+    """Return a key that is equal for requests whose clips take equal memory."""
+    sequence = session.sequence(request)
+    return session.spec.digest, session.arrays, sequence.video.id, sequence.video.fingerprint, sequence.start_frame
+
+
+def needed_bytes(broker: Broker, request: Request) -> int:
+    """Return the memory that a worker needs for a request, bytes; 0 while every worker has enough for any."""
+    session = broker.sessions.get(request.session)
+    if session is None or (broker.registry.least_memory >= LARGEST_MEMORY_BYTES and not broker.outgrown):
+        return 0
+    request = session.current(request)
+    video, arrays = session.sequence(request).video, sum(session.form.sizes)
+    estimate = min(lease_bytes(video, broker.facts.rows, session.spec, arrays), LARGEST_MEMORY_BYTES)
+    return max(broker.outgrown.get(clip_key(session, request), 0) + 1, estimate)
+
+
+def _mark_outgrown(broker: Broker, request: Request, limit_bytes: int) -> None:
+    """Note that a clip needs more memory than a worker had, which made nothing else and was killed at its limit.
+
+    It is never put into quarantine: another server may have larger workers.
+    """
+    session = broker.sessions.get(request.session)
+    if session is not None:
+        key = clip_key(session, request)
+        broker.outgrown[key] = max(limit_bytes, broker.outgrown.get(key, 0))
+
+
+def _check_parked(broker: Broker, now: float) -> list[Action]:
+    """Say which clips no worker can hold, and fail them once all expected workers have been there for a while: a larger
+    one may be about to return.
+    """
+    actions: list[Action] = []
+    most, is_complete = broker.registry.most_memory, len(broker.registry) >= max(1, broker.expected_workers)
+    for clip in list(broker.parked):
+        session = broker.sessions.get(clip.requests[0].session)
+        clip.trouble = "" if session is None or clip.needs_bytes <= most else _describe(broker, session, clip)
+        if not clip.trouble or not is_complete:
+            clip.since = now
+        elif now - clip.since >= TOO_LARGE_SECONDS:
+            broker.parked.remove(clip)
+            actions += [action for request in clip.requests for action in _fail(broker, request, clip.trouble)]
+    return actions
+
+
+def _describe(broker: Broker, session: Session, clip: ParkedClip) -> str:
+    request = session.current(clip.requests[0])
+    sequence, outgrown = session.sequence(request), broker.outgrown.get(clip_key(session, request), 0)
+    needs = "more than " * (clip.needs_bytes == outgrown + 1) + f"{clip.needs_bytes / 1e9:.2f}"
+    return (
+        f"{sequence.video.id} from frame {sequence.start_frame} needs {needs} GB of memory under this spec, the "
+        f"largest worker has {broker.registry.most_memory / 1e9:.2f}: give a worker more memory, or ask for fewer "
+        "voxels_per_clip, fewer samples_per_decode, a smaller crop or resize_scale 1"
+    )
 
 
 # --- sharing ----------------------------------------------------------------------------------------------------------

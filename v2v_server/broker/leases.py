@@ -12,9 +12,11 @@ others is given to a second worker as well; the first answer ends both leases.
 What the loss of a worker says about the sample in work:
 
     crashed, hung                the sample is the cause: its candidate is refused at once and quarantined
-    unexplained                  an exception, no memory, a lost connection, storage that does not answer: the sample is
-                                 tried again; after two such losses it runs alone on its worker, and a third one
-                                 counts like a crash, for its spec only: memory may be what this spec takes
+    unexplained                  an exception, a lost connection, storage that does not answer: the sample is tried
+                                 again; after two such losses it runs alone on its worker, and a third one counts
+                                 like a crash, for its spec only: the spec may be the cause
+    memory                       killed by the kernel at a limit of memory: the same, but the third one says that the
+                                 sample needs more memory than its worker had. A larger worker may make it
     killed                       from outside (pre-emption, an operator): says nothing about any sample
 
 Only the lease that the worker had begun is judged. The leases queued behind it go back unchanged.
@@ -33,6 +35,7 @@ from v2v_protocol.arena import Slot
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import Result, WorkerHello
 from v2v_protocol.sample import Refusal
+from v2v_server.schedule import LARGEST_MEMORY_BYTES
 
 ALONE_AFTER = 2
 """Number of unexplained losses after which a sample runs alone."""
@@ -49,6 +52,7 @@ REST_SECONDS = 10.0
 """Time without work for a worker whose host cannot read a video that the server's host can; storage may return."""
 LONGEST_NAME = 100
 """Characters kept of the name that a peer gives itself or its host."""
+_LONGEST_UNFIT = 600
 _MOST_SECONDS = 86_400.0
 
 
@@ -58,6 +62,7 @@ class Cause(StrEnum):
     CRASHED = "crashed"
     HUNG = "hung"
     UNEXPLAINED = "unexplained"
+    MEMORY = "memory"
     KILLED = "killed"
 
 
@@ -93,7 +98,7 @@ def judge(request: Request, loss: Loss) -> Request | str:
     """
     if loss.cause is Cause.KILLED:
         return request
-    if loss.cause is Cause.UNEXPLAINED and not runs_alone(request):
+    if loss.cause is Cause.MEMORY or (loss.cause is Cause.UNEXPLAINED and not runs_alone(request)):
         return replace(request, deaths=request.deaths + 1)
     return f"a worker {loss.text} over it"
 
@@ -462,6 +467,7 @@ class Member:
         unreadable: why its host could not read the last video; empty once it has made a sample since.
         work: totals of its samples that were wanted.
         memory_bytes: memory of its process as last reported; 0: not known.
+        limit_bytes: limit of its memory, its own or that of its host.
     """
 
     name: str
@@ -474,11 +480,12 @@ class Member:
     unreadable: str = ""
     work: WorkDone = field(default_factory=WorkDone)
     memory_bytes: int = 0
+    limit_bytes: int = LARGEST_MEMORY_BYTES
 
 
-def clean_name(text: str) -> str:
-    """Make a name that a peer sent safe to display: short, and without control characters."""
-    return "".join(filter(str.isprintable, text[:LONGEST_NAME]))
+def clean_name(text: str, most: int = LONGEST_NAME) -> str:
+    """Make a name, or another text that a peer sent, safe to display: short, and without control characters."""
+    return "".join(filter(str.isprintable, text[:most]))
 
 
 class Workers:
@@ -489,12 +496,15 @@ class Workers:
 
     Attributes:
         members: all of them by routing id.
+        least_memory, most_memory: smallest and largest limit of a worker's memory, bytes; 0 without workers.
     """
 
     def __init__(self, leases: LeaseBook) -> None:
+        self.least_memory = self.most_memory = 0
         self._leases = leases
         self.members: dict[bytes, Member] = {}
         self._names: dict[str, bytes] = {}
+        self._unfit = ""  # why the last worker left that cannot work for this server, until a worker makes a sample
         self._resting: dict[bytes, float] = {}  # time at which their rest ends
         # With a thousand workers, only those whose load has changed are examined.
         self._changed: set[bytes] = set()
@@ -524,15 +534,24 @@ class Workers:
         """Add a worker that said hello; none of that routing id or name is there."""
         room = max(1, min(hello.credit, MOST_WORKER_CREDIT))
         liveness = Liveness(now, gone_seconds=SILENCE_SECONDS)
-        self.members[identity] = Member(hello.name, room, liveness, clean_name(hello.host), user, owner)
+        limit_bytes = min(hello.notes.memory_bytes or LARGEST_MEMORY_BYTES, LARGEST_MEMORY_BYTES)
+        self.members[identity] = Member(
+            hello.name, room, liveness, clean_name(hello.host), user, owner, limit_bytes=limit_bytes
+        )
         self._names[hello.name] = identity
+        self._weigh()
         self._changed.add(identity)
+
+    def note_unfit(self, reason: str) -> None:
+        """Note why a worker leaves that cannot work for this server; "": it leaves for another reason."""
+        self._unfit = clean_name(reason, _LONGEST_UNFIT) or self._unfit
 
     def remove(self, identity: bytes) -> None:
         """Remove a worker that is gone."""
         worker = self.members.pop(identity, None)
         if worker is not None:
             del self._names[worker.name]
+            self._weigh()
         self._resting.pop(identity, None)
         self._changed.add(identity)
 
@@ -554,7 +573,7 @@ class Workers:
     def can_work(self, identity: bytes) -> None:
         """Note that a worker has made a sample, so its host can read videos."""
         if identity in self.members:
-            self.members[identity].unreadable = ""
+            self.members[identity].unreadable = self._unfit = ""
 
     def trouble(self, expected: int) -> str:
         """Return why no worker can make a sample, and what to do about it; empty if one can, as far as is known.
@@ -562,6 +581,8 @@ class Workers:
         Args:
             expected: number of workers expected.
         """
+        if self._unfit and not self._leases.held:
+            return f"a worker left: it {self._unfit}"
         if not self.members:
             start = f"{expected} should come; see what v2v-serve says of them" if expected else "start v2v-worker"
             return f"no worker is connected to the server: {start}, or v2v-serve with --workers N"
@@ -601,26 +622,41 @@ class Workers:
             if not self._leases.held_by(identity) and worker.liveness.is_gone(now)
         )
 
-    def for_request(self, *, keep_one_empty: bool, other_than: bytes | None = None) -> bytes | None:
+    def for_request(
+        self, *, kept_bytes: int | None = None, other_than: bytes | None = None, needs_bytes: int = 0
+    ) -> bytes | None:
         """Return the worker that holds the fewest leases and has free credit; None if there is none.
 
         Args:
-            keep_one_empty: a request that runs alone waits, so the worker with the fewest leases gets no new ones.
+            kept_bytes: a request that runs alone waits, so the worker with this much memory and the fewest leases gets
+                no new ones; None: no request waits so.
             other_than: a worker to skip, because it is slow at this request.
+            needs_bytes: memory that the worker must have.
         """
-        lightest = self.with_room()[keep_one_empty : keep_one_empty + 2]
-        return next((identity for _, identity in lightest if identity != other_than), None)
+        kept = None if kept_bytes is None else self._lightest(kept_bytes)
+        return self._lightest(needs_bytes, kept, other_than)
 
-    def for_lone_request(self) -> bytes | None:
-        """Return a worker that holds no lease; None if there is none."""
-        return next((identity for held, identity in self.with_room()[:1] if not held), None)
+    def for_lone_request(self, needs_bytes: int = 0) -> bytes | None:
+        """Return a worker that holds no lease and has that much memory; None if there is none."""
+        lightest = self._lightest(needs_bytes)
+        return None if lightest is None or self._held[lightest] else lightest
+
+    def _lightest(self, needs_bytes: int, *others: bytes | None) -> bytes | None:
+        """Return the worker with that much memory that holds the fewest leases and has free credit, except others."""
+        suited = (each for _, each in self.with_room() if self.members[each].limit_bytes >= needs_bytes)
+        return next((each for each in suited if each not in others), None)
 
     def _give_up(self, found: Iterable[bytes]) -> list[bytes]:
         given_up = [identity for identity in found if not self.members[identity].given_up]
         for identity in given_up:
             self.members[identity].given_up = True
         self._changed.update(given_up)
+        self._weigh()
         return given_up
+
+    def _weigh(self) -> None:
+        limits = [member.limit_bytes for member in self.members.values() if not member.given_up]
+        self.least_memory, self.most_memory = min(limits, default=0), max(limits, default=0)
 
     def with_room(self) -> list[tuple[int, bytes]]:
         """Return (leases held, routing id) of the workers with free credit, fewest leases first; ties by routing id."""

@@ -238,6 +238,23 @@ class RefusalPart:
         return cls(time, short(refusal.video), refusal.frame, short(refusal.reason), str(refusal.kind))
 
 
+@dataclass(slots=True)
+class ParkedClip:
+    """Requests of one clip that wait for a worker with enough memory, or alone for a worker without leases.
+
+    Attributes:
+        needs_bytes: memory that the worker must have.
+        requests: the request, and its siblings.
+        since: when a connected worker last had that much, or when it was parked.
+        trouble: that no connected worker has; empty if one has.
+    """
+
+    needs_bytes: int
+    requests: list[Request]
+    since: float
+    trouble: str = ""
+
+
 @dataclass(eq=False)
 class Broker:
     """Consumers, workers, and what passes between them.
@@ -264,7 +281,9 @@ class Broker:
         ring: finished samples for other consumers; None: equal samples are made for each.
         makers: the request that has the lease of each sample that others may follow, by sharing key.
         followers: requests that wait for the sample of a maker.
-        lone: requests that run alone and wait for a worker without leases.
+        parked: clips that the free workers do not suit, oldest first.
+        outgrown: memory that was not enough for a clip under a spec, bytes, by :func:`dispatcher.clip_key`. It lasts as
+            long as the server: the next one may have larger workers.
         refusals: the last few, oldest first.
         blocked_reason: why no lease can be granted at the moment; empty if leases can be granted.
         faults: malformed messages and refused specs of connected consumers.
@@ -291,7 +310,8 @@ class Broker:
     ring: SampleRing | None = field(init=False)
     makers: dict[Hashable, tuple[bytes, int, int]] = field(init=False, default_factory=dict)
     followers: dict[Hashable, list[Request]] = field(init=False, default_factory=dict)
-    lone: deque[Request] = field(init=False, default_factory=deque)
+    parked: list[ParkedClip] = field(init=False, default_factory=list)
+    outgrown: dict[Hashable, int] = field(init=False, default_factory=dict)
     refusals: deque[RefusalPart] = field(init=False, default_factory=lambda: deque(maxlen=MOST_LATEST))
     blocked_reason: str = field(init=False, default="")
     faults: dict[bytes, int] = field(init=False, default_factory=dict)
@@ -313,7 +333,8 @@ class Broker:
     @property
     def waiting(self) -> int:
         """Return the number of requested samples that are not leased to a worker yet."""
-        return len(self.lone) + sum(len(session.waiting) for session in self.sessions)
+        parked = sum(len(clip.requests) for clip in self.parked)
+        return parked + sum(len(session.waiting) for session in self.sessions)
 
     @property
     def waiting_share(self) -> float:

@@ -509,7 +509,8 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
     state = catalogue.state(video)
     # A message has no number below 0, such as a time before 1970.
     known = catalogue.source.unmarked(video, state) if state is not None and min(state) >= 0 else ()
-    return replace(lease, frame_index=frames, scene=part, sidecars=sidecars, state=known)
+    notes = replace(lease.notes, state=known)
+    return replace(lease, frame_index=frames, scene=part, sidecars=sidecars, notes=notes)
 
 
 def open_catalogue(

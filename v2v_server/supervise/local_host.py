@@ -29,7 +29,7 @@ from v2v_protocol.programs import environment
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
 from v2v_server.supervise.pool import Exit, ProcessStatus
-from v2v_server.system.process import relayed_output
+from v2v_server.system.process import out_of_memory_kills, relayed_output
 from v2v_server.worker.logbook import Logbook
 
 _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
@@ -145,7 +145,7 @@ def _cause(returncode: int, *, short_of_memory: bool) -> Loss:
     if number in _CRASH_SIGNALS:
         return Loss(Cause.CRASHED, f"was ended by {name}")
     if number == signal.SIGKILL and short_of_memory:
-        return Loss(Cause.UNEXPLAINED, f"was ended by {name} while the host ran out of memory")
+        return Loss(Cause.MEMORY, f"was ended by {name} for lack of memory")
     if number in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         return Loss(Cause.KILLED, f"was ended by {name} from outside")
     return Loss(Cause.UNEXPLAINED, f"was ended by {name}")
@@ -167,17 +167,6 @@ def status_of(pid: int) -> str:
         return str(psutil.Process(pid).status())
     except psutil.NoSuchProcess:
         return psutil.STATUS_DEAD
-
-
-def out_of_memory_kills() -> int:
-    """Return how many processes the kernel of this host has killed for lack of memory; 0 if it does not say."""
-    try:
-        for line in Path("/proc/vmstat").read_text(encoding="ascii").splitlines():
-            if line.startswith("oom_kill "):
-                return int(line.split()[1])
-    except OSError:
-        pass
-    return 0
 
 
 def make_host(

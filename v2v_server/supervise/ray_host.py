@@ -29,11 +29,10 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.keys import PeerKey
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
+from v2v_server.schedule import WORKER_BYTES
 from v2v_server.supervise.local_host import LocalHost
 from v2v_server.supervise.pool import Exit, ProcessStatus
 
-WORKER_BYTES = 1 << 30
-"""Memory that Ray reserves for a worker, besides one CPU."""
 _FIRST_STATUS_SECONDS = 1.0
 _AGAIN_SECONDS = 1.0
 _NEWS_SECONDS = 10.0

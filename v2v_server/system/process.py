@@ -34,6 +34,8 @@ MOST_CONNECTIONS = 4096 + 256
 _MOST_FILES = 1 << 16  # one connection per consumer and worker, and one logbook per worker
 _SCHED_ATTR_CALLS = {"x86_64": (315, 314), "aarch64": (275, 274)}  # numbers of sched_getattr and sched_setattr
 _LONGEST_PAUSE_SECONDS, _LOCKED = 0.05, "another process keeps it locked; end that process"
+_NO_LIMIT_BYTES = 1 << 60
+"""Version 1 of control groups states a number above this one in place of no limit."""
 
 
 def keep_freed_memory() -> bool:
@@ -173,6 +175,49 @@ def _granted_cores(*where: Path) -> float:
                 quota, period = (int(word) for file in files for word in (folder / file).read_text("utf-8").split())
                 least = min(least, quota / period if min(quota, period) > 0 else math.inf)  # -1: no limit
     return least
+
+
+def control_group_memory(*where: Path) -> list[tuple[int, int]]:
+    """Return (limit, free), bytes, of each control group of this process that has a limit.
+
+    Args:
+        where: see :func:`control_groups`.
+    """
+    limits = list[tuple[int, int]]()
+    for folder in control_groups(*where):
+        for files in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
+            with suppress(OSError, ValueError):  # "max", or a folder without these files
+                limit, used = (int((folder / file).read_text("ascii")) for file in files)
+                if limit < _NO_LIMIT_BYTES:
+                    limits.append((limit, limit - used))
+    return limits
+
+
+def memory_limit(*where: Path) -> int:
+    """Return the most memory that this process may use, bytes: the strictest limit of its control groups, at most the
+    memory of the host.
+
+    Args:
+        where: see :func:`control_groups`.
+    """
+    host = os.sysconf("SC_PHYS_PAGES") * resource.getpagesize()
+    return min([host, *(limit for limit, _ in control_group_memory(*where))])
+
+
+def out_of_memory_kills(*where: Path, host: Path = Path("/proc/vmstat")) -> int:
+    """Return how many processes the kernel has killed for lack of memory, on this host and in the control groups of
+    this process; 0 if it does not say. A kill may count twice.
+
+    Args:
+        where: see :func:`control_groups`.
+        host: file with the counters of the host.
+    """
+    kills = 0
+    groups = [folder / name for folder in control_groups(*where) for name in ("memory.events", "memory.oom_control")]
+    for file in (host, *groups):
+        with suppress(OSError, ValueError):
+            kills += sum(int(line[9:]) for line in file.read_text("ascii").splitlines() if line.startswith("oom_kill "))
+    return kills
 
 
 @contextmanager

@@ -15,6 +15,8 @@ The worker holds the leases of two clips at a time, so the next one is available
 sample it receives its messages. Then it reports the sample together with the lease that it begins next. Siblings that
 are made quickly and lie in slots are reported together, so server and consumer wake once for all of them.
 
+A worker that cannot read a message, such as a lease of a later release, says so in its Goodbye and leaves.
+
 Only the lease that was last announced as begun can be blamed for the end of a worker. The server sends everything else
 again or gives it to other workers; nothing here has to be undone.
 """
@@ -45,6 +47,7 @@ from v2v_protocol.messages import (
     Lease,
     LeaseFailed,
     Message,
+    Notes,
     Ping,
     Pong,
     Result,
@@ -117,7 +120,13 @@ class Make:
 
 @dataclass(frozen=True, slots=True)
 class Leave:
-    """End the conversation."""
+    """End the conversation.
+
+    Attributes:
+        reason: why this worker cannot work for its server; "": it was told to leave.
+    """
+
+    reason: str = ""
 
 
 WorkerAction: TypeAlias = Send | Reconnect | Say | Listen | Inspect | Load | Make | Leave
@@ -162,6 +171,7 @@ class WorkerConversation:
         self._unsent_since = 0.0
         self._may_wait = False  # the latest of them may wait for its sibling's
         self._stopping = False
+        self._reason = ""  # why it stops by itself
         self.has_server = False
         """Whether the server has answered within the last interval between pings."""
 
@@ -260,7 +270,9 @@ class WorkerConversation:
         except VersionMismatch:
             raise  # a denial in a format of another protocol version
         except ProtocolError as error:
-            return [Say(f"ignored a message from the server: {error}")]
+            # It may be a lease: to ignore it would be to hang, to make it without what it says would be another sample.
+            self._stopping, self._reason = True, f"cannot read a message of the server: {error}"
+            return []
         match message:
             case Lease():
                 self._unheard = False
@@ -312,7 +324,7 @@ class WorkerConversation:
     def _next_actions(self, now: float) -> list[WorkerAction]:
         """Choose the next step; report finished samples unless the next lease may be begun."""
         if self._stopping:
-            return [*self._results(), Send(encode(Goodbye())), Leave()]
+            return [*self._results(), Send(encode(Goodbye(notes=Notes(reason=self._reason)))), Leave(self._reason)]
         if not self._leases:
             return [*self._results(), Listen(min(_PING_SECONDS, self._silence.next_due(now)))]
         return [Inspect(self._leases[0])]

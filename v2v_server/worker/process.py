@@ -46,10 +46,10 @@ from v2v_protocol.arena import (
 from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.keys import key_for, leaves_host
 from v2v_protocol.link.dealer import Dealer
-from v2v_protocol.messages import Buffer, Frames, Lease, Result, WorkerHello, encode_sample
+from v2v_protocol.messages import Buffer, Frames, Lease, Notes, Result, WorkerHello, encode_sample
 from v2v_protocol.sample import Form, Layout, new_arrays
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.schedule import MOST_LEASE_BYTES
+from v2v_server.schedule import LARGEST_MEMORY_BYTES
 from v2v_server.simulation.precision import USUAL
 from v2v_server.store.cache import Cache
 from v2v_server.system.compile_cache import compile_cache
@@ -60,6 +60,7 @@ from v2v_server.system.process import (
     keep_freed_memory,
     limit_memory,
     limit_processor_time,
+    memory_limit,
     resident_bytes,
     take_long_turns,
 )
@@ -67,6 +68,7 @@ from v2v_server.system.sandbox import confine
 from v2v_server.worker.conversation import (
     CREDIT,
     Inspect,
+    Leave,
     Listen,
     Load,
     Make,
@@ -94,8 +96,6 @@ Find: TypeAlias = Callable[[ArenaName, bool], int]
 _Place: TypeAlias = tuple[str, np.dtype[Any], tuple[int, ...], int, int]
 _SOON_FETCHED_BYTES = 32 << 20
 """The worker keeps its leases while it fetches a video up to this size; it returns them for a larger one."""
-LARGEST_MEMORY_BYTES = MOST_LEASE_BYTES + (1 << 30)
-"""A worker that needs more ends. After three such ends its sample is refused for its spec."""
 LONGEST_LEASE_SECONDS = 3600.0
 """Limit of processor time for one lease. The server gives up its own workers sooner, by wall-clock time; this limit
 ends hung workers on other hosts."""
@@ -367,7 +367,14 @@ class Worker:
         self._handover_seconds = 0.0  # not yet reported in a result
         self._memory_bytes, self._weigh_at = 0, -math.inf
         self._conversation = WorkerConversation(
-            WorkerHello(name, NUMERICS_VERSION, CREDIT, socket.gethostname(), secrets.token_bytes(32)),
+            WorkerHello(
+                name,
+                NUMERICS_VERSION,
+                CREDIT,
+                socket.gethostname(),
+                secrets.token_bytes(32),
+                notes=Notes(memory_bytes=memory_limit()),
+            ),
             address,
             is_watched=logbook is not None,
         )
@@ -386,7 +393,7 @@ class Worker:
 
         Raises:
             RemoteError: the server rejects this worker (another numerics version).
-            VersionMismatch: the server speaks another version of the protocol.
+            ProtocolError: the server speaks another version of the protocol, or a message cannot be read.
             KeyRefused: the server rejects the key.
         """
         try:
@@ -445,8 +452,10 @@ class Worker:
                     return conversation.on_failure(made, now)
                 frames, work = made
                 return conversation.on_sample(frames, now, work)
+            case Leave(reason) if reason:
+                raise ProtocolError(reason)
             case _:
-                return []  # Leave
+                return []
 
     def _inspect(self, lease: Lease) -> Readiness:
         """Return what the work on a lease needs."""
@@ -467,7 +476,7 @@ class Worker:
         if self._clips.has(lease):
             return True
         files = _files(lease)
-        self._source.expect(lease.video, lease.state)
+        self._source.expect(lease.video, lease.notes.state)
         return (self._unfetched is not None and self._unfetched[0] == files) or self._source.has(files)
 
     def _fetch(self, lease: Lease) -> None:
@@ -623,7 +632,8 @@ def run_worker(
 
     Raises:
         UsageError: the socket cannot connect to the address, or the server rejects the key or belongs to another user.
-        RemoteError, VersionMismatch: the server rejects this worker.
+        RemoteError: the server rejects this worker.
+        ProtocolError: the server speaks another version of the protocol, or a message cannot be read.
     """
     if parent_pid is not None:
         die_with_parent(parent_pid)

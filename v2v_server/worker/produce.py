@@ -208,7 +208,7 @@ def decode_for(
             tuple((lease.seed, lease.epoch, index) for index in indices),
             tuple(SampleView(plan.spec, plan.params, lease.arrays) for plan in plans),
         )  # fmt: skip
-        source.expect(lease.video, lease.state)
+        source.expect(lease.video, lease.notes.state)
         with source.open_pixels(lease.video, lease.fingerprint) as pixels:
             if cache is not None and not pixels.is_stored:
                 pixels = Cached(pixels, cache, lease.video, lease.fingerprint)

@@ -28,7 +28,7 @@ from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show, version_of
 from v2v_server.store.pixels import PIXEL_KINDS, VideosKind
-from v2v_server.system.process import control_groups, usable_cores
+from v2v_server.system.process import control_group_memory, usable_cores
 from v2v_server.system.sandbox import can_confine
 
 OK, NOTE, BAD = "ok", "note", "bad"
@@ -198,7 +198,7 @@ def _machine() -> Iterator[Finding]:
 
 
 def _memory() -> Finding:
-    limits = control_group_memory()
+    limits: list[tuple[float, int]] = [*control_group_memory()]
     with suppress(OSError):
         found = re.search(r"^MemAvailable: +(\d+) kB", Path("/proc/meminfo").read_text(encoding="ascii"), re.M)
         limits += [(math.inf, 1024 * int(found[1]))] if found else []
@@ -211,20 +211,6 @@ def _memory() -> Finding:
     if free < _LITTLE_MEMORY_BYTES:
         return Finding(BAD, "memory", text, "free memory or raise the limit: a server and one worker need about 1 GiB")
     return Finding(OK, "memory", text)
-
-
-def control_group_memory(*where: Path) -> list[tuple[float, int]]:
-    """Return (limit, free), bytes, of each control group of this process that has a limit.
-
-    Args:
-        where: see :func:`v2v_server.system.process.control_groups`.
-    """
-    limits = list[tuple[float, int]]()
-    for folder in control_groups(*where):
-        with suppress(OSError, ValueError):  # "max", or the topmost group, which has no limit
-            limit, used = (int((folder / f"memory.{name}").read_text(encoding="ascii")) for name in ("max", "current"))
-            limits.append((limit, limit - used))
-    return limits
 
 
 def _sandbox() -> Finding:

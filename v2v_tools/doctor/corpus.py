@@ -16,15 +16,16 @@ import numpy.typing as npt
 from v2v_protocol.errors import CorpusError, V2VError
 from v2v_protocol.programs import counted
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import DEFAULT_ARRAYS
+from v2v_protocol.sample import DEFAULT_ARRAYS, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import look_at_pictures, name_all
 from v2v_server.corpus.sources.source import open_sidecar, sidecar_id
 from v2v_server.labels import READERS
-from v2v_server.schedule import SequenceTable
+from v2v_server.schedule import SequenceTable, lease_bytes
 from v2v_server.store.pixels import VideosKind
+from v2v_server.system.process import memory_limit
 from v2v_server.video.rows import Rows
 from v2v_tools.doctor.motion import look_at_motion
 from v2v_tools.motion import describe_start, start_events
@@ -101,6 +102,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
         )
     if not table.count:
         return
+    yield from _memory(catalogue, spec, table, memory_limit())
     remaker = Remaker(catalogue, spec, DEFAULT_ARRAYS)
     try:
         starts = sum(start_events(remaker.made(0, 0, at)) for at in range(min(4, remaker.count)))  # with compiling
@@ -115,6 +117,21 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
         "ok", "start", f"{describe_start(np.asarray(starts))}; {counted(min(4, remaker.count), 'sample')}",
         "" if spec.recipe.start == "triangular" else "start: triangular begins as a running camera does",
     )  # fmt: skip
+
+
+def _memory(catalogue: Catalogue, spec: StreamSpec, table: SequenceTable, limit_bytes: int) -> Iterator[Line]:
+    """Name the videos whose samples need more memory than a worker of this host may use."""
+    arrays = layout_bytes(array_layout(spec.recipe, spec.voxel_dtype, DEFAULT_ARRAYS))
+    useless = {refusal.video for refusal in table.refusals}
+    shown = (video for video in islice(catalogue.videos, _VIDEOS_OPENED) if video.id not in useless)
+    needs = {video.id: lease_bytes(video, catalogue.rows, spec, arrays) for video in shown}
+    large = [id for id, needed in needs.items() if needed > limit_bytes]
+    if large:
+        text = (
+            f"samples of {len(large)} videos need up to {max(needs.values()) / 1e9:.2f} GB of memory, a worker of this "
+            f"host may use {limit_bytes / 1e9:.2f}: {name_all(large)}"
+        )
+        yield "bad", "memory", text, "raise the limit, leave them out, or --set resize_scale=1, fewer voxels_per_clip"
 
 
 def _rates(rates: npt.NDArray[np.float64], recipe: Recipe) -> Iterator[Line]:

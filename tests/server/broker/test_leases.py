@@ -323,6 +323,8 @@ REFUSED = "a worker did something over it"
         (Cause.UNEXPLAINED, 0, after(1)),
         (Cause.UNEXPLAINED, 1, after(2)),
         (Cause.UNEXPLAINED, 2, REFUSED),
+        (Cause.MEMORY, 0, after(1)),
+        (Cause.MEMORY, 2, after(3)),
         (Cause.KILLED, 0, after(0)),
         (Cause.KILLED, 1, after(1)),
         (Cause.KILLED, 2, after(2)),
@@ -357,7 +359,7 @@ class Table:
         return self.book.grant(Request(session, 0, self.requests, deaths=deaths), name.encode(), now)
 
     def next(self, *, keep_one_empty: bool = False, other_than: bytes | None = None) -> bytes | None:
-        return self.workers.for_request(keep_one_empty=keep_one_empty, other_than=other_than)
+        return self.workers.for_request(kept_bytes=0 if keep_one_empty else None, other_than=other_than)
 
 
 def test_credit_is_at_least_one_and_limited() -> None:

@@ -109,6 +109,35 @@ def test_version_1_of_control_groups_limits_processor_time_too(mount: str, tmp_p
         assert process._granted_cores(tmp_path / "groups", own) == granted, (folder, quota, path)
 
 
+def test_memory_and_kills_are_those_of_all_control_groups_of_both_versions(tmp_path: Path) -> None:
+    own, groups = tmp_path / "own", tmp_path / "groups"
+    where = groups, own
+    host = process.memory_limit(tmp_path / "none", own)
+    assert host == os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    own.write_text("4:cpu,memory:/pod/container\n1:name=systemd:/\n0::/pod/container\n")
+    for folder in ("pod/container", "memory/pod/container"):
+        (groups / folder).mkdir(parents=True)
+    assert process.out_of_memory_kills(*where, host=tmp_path / "none") == 0
+    for file, text, limits, kills in (
+        ("pod/memory.current", "2500", [], 0),
+        ("pod/memory.max", "3000", [(3000, 500)], 0),
+        ("pod/memory.max", "max", [], 0),
+        ("pod/container/memory.current", "100", [], 0),
+        ("pod/container/memory.max", "2000", [(2000, 1900)], 0),
+        ("memory/pod/memory.usage_in_bytes", "400", [(2000, 1900)], 0),
+        ("memory/pod/memory.limit_in_bytes", "9223372036854771712", [(2000, 1900)], 0),  # as version 1 says "none"
+        ("memory/pod/memory.limit_in_bytes", "1500", [(1500, 1100), (2000, 1900)], 0),
+        ("pod/container/memory.events", "low 0\noom 7\noom_kill 2\n", [(1500, 1100), (2000, 1900)], 2),
+        ("memory/pod/memory.oom_control", "under_oom 0\noom_kill 3\n", [(1500, 1100), (2000, 1900)], 5),
+    ):
+        (groups / file).write_text(f"{text}\n")
+        assert process.control_group_memory(*where) == limits, file
+        assert process.memory_limit(*where) == min([host, *(limit for limit, _ in limits)]), file
+        assert process.out_of_memory_kills(*where, host=tmp_path / "none") == kills, file
+    (tmp_path / "vmstat").write_text("pgfault 9\noom_kill 10\n")
+    assert process.out_of_memory_kills(*where, host=tmp_path / "vmstat") == 15
+
+
 def test_a_limit_of_memory_only_ever_becomes_lower() -> None:
     said = _in_a_process(
         "import resource\n"

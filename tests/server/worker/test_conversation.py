@@ -49,6 +49,7 @@ from v2v_protocol.sample import Layout, new_arrays
 from v2v_server.commands.worker import main as worker_command
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.simulation.precision import Variant
+from v2v_server.system.process import memory_limit
 from v2v_server.worker import process as worker_module
 from v2v_server.worker.conversation import (
     Inspect,
@@ -246,11 +247,17 @@ def test_the_time_that_a_sample_takes_is_no_silence() -> None:
     assert talk.told == []
 
 
-def test_what_is_no_message_is_told_and_nothing_more() -> None:
-    talk = at_work(1)
-    talk.makes(1)
-    actions = talk.conversation.on_messages([b"nonsense", encode(lease(2))[0]], talk.now)
-    assert [type(action) for action in actions] == [Say, Inspect]
+def test_a_worker_that_cannot_read_its_server_reports_what_it_made_says_why_and_leaves() -> None:
+    later = msgpack.packb(msgpack.unpackb(encode(lease(2))[0]) | {"rotation": 90})
+    for unreadable, why in ((b"nonsense", "not a message"), (later, "Lease has no field 'rotation'")):
+        talk = at_work(1)
+        talk.makes(1)
+        talk._take(talk.conversation.on_messages([unreadable, encode(lease(3))[0]], talk.now))
+        result, goodbye = talk.said()
+        assert (result, type(goodbye)) == (Result(1, begins=0), Goodbye)
+        assert isinstance(talk.step, Leave)
+        assert talk.step.reason == goodbye.notes.reason
+        assert f"cannot read a message of the server: {why}" in talk.step.reason
 
 
 def test_a_server_of_another_version_ends_the_worker() -> None:
@@ -384,7 +391,9 @@ def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
         thread = threading.Thread(target=worker.run)
         thread.start()
         try:
-            assert isinstance(at.heard(), WorkerHello)
+            hello = at.heard()
+            assert isinstance(hello, WorkerHello)
+            assert hello.notes.memory_bytes == memory_limit()
             yield at
         finally:
             at.says(Stop())
