@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from dataclasses import replace
 from typing import Any
 
 import msgpack
@@ -100,6 +101,21 @@ def test_a_frozen_consumer_and_worker_are_served() -> None:
     old.says(old.consumer.hello)
     old.says(peer_8.write("want", epoch=0, indices=[0, 1, 2], arenas=[], slots=[]))
     assert sorted(old.consumer.samples) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("notes", [Notes(), Notes(memory_bytes=8 << 30)])
+def test_a_lease_has_notes_only_for_a_worker_that_has_some_itself(notes: Notes) -> None:
+    """A release before them refuses them, and would pass over each of its leases."""
+    at = peers()
+    complete = at.dispatcher.complete
+    at.dispatcher.complete = lambda lease, spec: replace(complete(lease, spec), notes=Notes(state=(1, 2)))
+    at.dispatcher.from_consumer(b"c", encode(Hello(SMALL_SPEC.to_dict(), ("voxels",), 4, 0)), 0.0)
+    at.dispatcher.from_consumer(b"c", encode(Want(0, [0])), 0.0)
+    hello = WorkerHello("w", NUMERICS_VERSION, 2, "host", b"s" * 32, notes=notes)
+    actions = at.dispatcher.from_worker(b"w", encode(hello), 0.0)
+    (lease,) = (decode(each.frames[0]) for each in actions if isinstance(each, ToWorker))
+    assert isinstance(lease, Lease)
+    assert lease.notes == (Notes(state=(1, 2)) if notes != Notes() else Notes())
 
 
 def test_a_worker_that_cannot_read_its_leases_leaves_and_the_consumer_is_told() -> None:

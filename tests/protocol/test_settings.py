@@ -138,6 +138,9 @@ def test_a_message_shows_no_page_of_a_value() -> None:
 
 
 class Index:
+    def __repr__(self) -> str:
+        return "Index()"  # its id in each process of a run
+
     def __index__(self) -> int:
         return 2
 

@@ -40,6 +40,7 @@ from v2v_protocol.messages import (
     Lease,
     LeaseFailed,
     Message,
+    Notes,
     Ping,
     Pong,
     Result,
@@ -849,7 +850,10 @@ def _grant(
         packed=session.packed,
     )
     try:
-        return [ToWorker(worker, encode(broker.complete(lease, session.spec)), lease.arena)]
+        lease = broker.complete(lease, session.spec)
+        if not broker.registry.members[worker].takes_notes:
+            lease = replace(lease, notes=Notes())
+        return [ToWorker(worker, encode(lease), lease.arena)]
     except V2VError as error:
         broker.leases.finished(number, worker, now)
         if not isinstance(error, IndexUnreadable):

@@ -33,7 +33,7 @@ from enum import StrEnum
 
 from v2v_protocol.arena import Slot
 from v2v_protocol.liveness import Liveness
-from v2v_protocol.messages import Result, WorkerHello
+from v2v_protocol.messages import Notes, Result, WorkerHello
 from v2v_protocol.sample import Refusal
 from v2v_server.schedule import LARGEST_MEMORY_BYTES
 
@@ -468,6 +468,7 @@ class Member:
         work: totals of its samples that were wanted.
         memory_bytes: memory of its process as last reported; 0: not known.
         limit_bytes: limit of its memory, its own or that of its host.
+        takes_notes: whether its hello has notes; a worker of a release before them refuses a message that has any.
     """
 
     name: str
@@ -481,6 +482,7 @@ class Member:
     work: WorkDone = field(default_factory=WorkDone)
     memory_bytes: int = 0
     limit_bytes: int = LARGEST_MEMORY_BYTES
+    takes_notes: bool = False
 
 
 def clean_name(text: str, most: int = LONGEST_NAME) -> str:
@@ -536,8 +538,9 @@ class Workers:
         liveness = Liveness(now, gone_seconds=SILENCE_SECONDS)
         limit_bytes = min(hello.notes.memory_bytes or LARGEST_MEMORY_BYTES, LARGEST_MEMORY_BYTES)
         self.members[identity] = Member(
-            hello.name, room, liveness, clean_name(hello.host), user, owner, limit_bytes=limit_bytes
-        )
+            hello.name, room, liveness, clean_name(hello.host), user, owner, limit_bytes=limit_bytes,
+            takes_notes=hello.notes != Notes(),
+        )  # fmt: skip
         self._names[hello.name] = identity
         self._weigh()
         self._changed.add(identity)
