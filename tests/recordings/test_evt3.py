@@ -263,7 +263,8 @@ def test_what_is_left_out_is_said(tmp_path: Path, content: bytes, size: SensorSi
 
 
 def test_a_large_file_is_read_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    content = HEAD + FEW + struct.pack("<2H", 0x4FFF, 0x5FFF) * 200
+    content = HEAD + FEW + struct.pack("<2H", 0x4FFF, 0x5FFF) * 100 + struct.pack("<H", 0x8002)
+    content += struct.pack("<3H", 0x6000, 0x3804, 0x4003) + struct.pack("<2H", 0x4FFF, 0x5FFF) * 100
     whole = read(tmp_path / "a.raw", content, None)
     monkeypatch.setattr(evt3, "BLOCK_WORDS", 50)
     parts = [item for item in read(tmp_path / "a.raw", content) if isinstance(item, EventChunk)]
@@ -273,5 +274,5 @@ def test_a_large_file_is_read_in_blocks(tmp_path: Path, monkeypatch: pytest.Monk
     assert (
         [event for part in parts for event in listed(part)]
         == together
-        == slow(struct.unpack("<406H", content[len(HEAD) :]))
+        == slow(struct.unpack("<410H", content[len(HEAD) :]))
     )

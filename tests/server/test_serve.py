@@ -112,7 +112,7 @@ def served(
         check=check, stale=stale, mark_stale=stale.append, source=Folder(folder), part=lambda: CorpusPart("", 0, 0)
     )
     server = Server(
-        ServeConfig.load(None, {"videos": "videos", "workers": 0} | settings),
+        ServeConfig.load(None, {"videos": "videos", "workers": 0, "worker_bind": "tcp://127.0.0.1:*"} | settings),
         cast(Catalogue, catalogue),
         cast(Dispatcher, dispatcher),
         transport or Queues(),

@@ -91,7 +91,7 @@ def test_it_takes_as_videos_what_the_server_takes_and_logs_for_people_or_for_pro
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str
 ) -> None:
     given: list[Any] = []
-    monkeypatch.setattr("v2v_server.commands.worker.run_worker", lambda *each: given.append(each))
+    monkeypatch.setattr("v2v_server.commands.worker.run_worker", lambda *each, **_: given.append(each))
     (tmp_path / "clip.mp4").touch()
     (tmp_path / "list.txt").touch()
     for flags in ([], ["--log-format", "json"]):

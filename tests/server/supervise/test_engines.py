@@ -27,7 +27,7 @@ def test_the_usual_one_is_this_hosts_pool() -> None:
 def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.delitem(sys.modules, "v2v_server.supervise.ray_host", raising=False)
-    with pytest.raises(UsageError, match=r"needs the Python package ray.*pip install '\.\[server,ray\]'"):
+    with pytest.raises(UsageError, match=r"needs the Python package ray.*pip install '\.\[ray\]'"):
         make_pool(ServeConfig(**RAY), Folder(Path("videos")), "w", [])
 
 

@@ -78,6 +78,12 @@ class Terminal:
         return [psutil.Process(self.child.pid), *psutil.Process(self.child.pid).children(recursive=True)]
 
 
+def _take_terminal() -> None:
+    # A shell that runs the tests in the background passes on that SIGINT is ignored.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    ioctl(0, termios.TIOCSCTTY, 0)
+
+
 @contextmanager
 def on_a_terminal(*command: str) -> Iterator[Terminal]:
     """Run a program in a session with a terminal of its own."""
@@ -89,7 +95,7 @@ def on_a_terminal(*command: str) -> Iterator[Terminal]:
         stdout=theirs,
         stderr=theirs,
         start_new_session=True,
-        preexec_fn=lambda: ioctl(0, termios.TIOCSCTTY, 0),
+        preexec_fn=_take_terminal,
     )
     os.close(theirs)
     terminal = Terminal(child, ours)

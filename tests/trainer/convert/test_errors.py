@@ -244,7 +244,7 @@ def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for module in ("faery", "rosbags", "rosbags.rosbag1"):
         if module.startswith(package):
             monkeypatch.setitem(sys.modules, module, None)
-    remedy = rf"needs the package {package}: pip install '\.\[convert\]' in a checkout of v2v-stream$"
+    remedy = rf"needs the Python package {package}, .*: pip install '\.\[convert\]' in a checkout of v2v-stream$"
     with pytest.raises(UsageError, match=remedy):
         convert(source, tmp_path / "a.h5")
 
