@@ -273,7 +273,7 @@ WRONG = [
     ("v2v-loadtest --connect tcp://127.0.0.1:9 --set flow_from=1", "--flow-from 1 instead of --set"),
     ("v2v-serve --videos clips --tolerance 0.1", "'0.1': give 0, or leave it out: it left effects out of clips"),
     ("v2v-serve --videos clips --set tolerance=0.1", "tolerance = 0.1: give 0, or leave it out"),
-    ("v2v-tradeoff --videos clips --vary tolerance=0,0.01", "tolerance = 0.01: give 0, or leave it out"),
+    ("v2v-tradeoff --videos clips --vary tolerance=0.01", "tolerance = 0.01: give 0, or leave it out"),
     ("v2v-fit --check paper --set substep_px=1", "--substep-px 1 instead of --set"),
     ("v2v-tradeoff --videos clips --set shuffle=false", "a setting of the stream"),
     ("v2v-serve --videos clips --preset davis346", "--recipe davis346"),
