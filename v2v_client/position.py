@@ -75,8 +75,18 @@ class StreamIdentity(Persisted):
 
     @property
     def resolved(self) -> StreamSpec:
-        """Return the spec as an object."""
-        return StreamSpec.from_dict(self.spec)
+        """Return the spec as an object.
+
+        Raises:
+            StateMismatch: a value of it, which another release saved, is not one of this release.
+        """
+        try:
+            return StreamSpec.from_dict(self.spec)
+        except UsageError as error:
+            raise StateMismatch(
+                f"the stream of the state cannot be made: {error}; begin a new stream, or resume with the release that "
+                "saved the state"
+            ) from error
 
     def require_same(self, other: StreamIdentity, *, ours: str, theirs: str) -> None:
         """Check that another stream has the same samples.

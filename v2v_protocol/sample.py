@@ -320,7 +320,7 @@ class Provenance(Persisted):
         unlabelled: reason by array, for each requested array that could not be made from the video or its sidecars.
         boxes_dropped: boxes that ``max_boxes`` left out, in all frames of the sample.
         grid_seconds: actual duration of each voxel grid, where the recipe states ``voxel_seconds``.
-        left_out: effects of the draw that were not simulated (``tolerance`` of the spec); the others were.
+        left_out: effects of the draw that were not simulated; only samples of earlier releases have any.
         substeps: parts that the clip's steps were divided into along the motion, undivided steps included; 0: the spec
             states no ``substep_px``, so no motion was used.
         remark: what of the video is not served, or served with wrong grey levels or times; empty for most.

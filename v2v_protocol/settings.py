@@ -42,14 +42,14 @@ class Setting:
             of whole numbers, written LEAST:MOST; one number stands for both.
         default: default value of the field.
         help: one line for people, without a full stop.
-        low, high: limits of a number, inclusive.
+        low, high: limits of a number, inclusive. Equal limits leave one value, and ``help`` then says why.
         off: 0 means "off", although ``low`` is above it; a range may not begin at 0 and end above it.
         words: the choices of a word; a registry is kept by reference, so later additions count.
         unit: unit of a number, such as "px" or "Hz".
         group: heading in help and on the reference page.
         metavar: placeholder for the value in help.
         bare: value of a flag that is given without one; None: a value is required.
-        is_hidden: internal to a program: left out of help and the reference page.
+        is_hidden: internal to a program, or without a use: left out of help and the reference page.
         usual: range of real devices, within the limits. A value outside it is allowed, with a warning.
         mistake: what a value outside ``usual`` (``{0:g}``) means, and the unit that was probably meant.
         is_later: a later release added the field: a record leaves it out at its default, so older digests hold.
@@ -74,6 +74,8 @@ class Setting:
     @property
     def expected(self) -> str:
         """Instruction for an error message: "give a whole number from 1 to 1024"."""
+        if self.low == self.high:
+            return f"give {_limit(self.low)}, or leave it out: {self.help}"
         if self.kind == "word":
             return f"choose one of {', '.join(self.words)}"
         plain = {

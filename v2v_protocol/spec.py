@@ -133,9 +133,9 @@ class StreamSpec(Persisted):
         is_later=True,
     )  # fmt: skip
     tolerance: float = number(
-        0.0, 0.0, 0.5,
-        "largest share of a clip's events that the effects left out of it may change; 0: no effect is left out",
-        group="Effects",
+        0.0, 0.0, 0.0,
+        "it left effects out of clips that they change little, which saved hardly any time; all are simulated",
+        is_hidden=True,
         is_later=True,
     )  # fmt: skip
 
@@ -254,7 +254,9 @@ def _recipe(value: object, base: Recipe) -> Recipe:
         return value
     if isinstance(value, Mapping):
         named = {str(key): item for key, item in value.items()}
-        for key in settings_of(StreamSpec).keys() & named.keys():
+        settings = settings_of(StreamSpec)
+        for key in settings.keys() & named.keys():
+            settings[key].check(f"spec {key}", named[key], RecipeError)
             flag = f"--{key.replace('_', '-')}"
             raise RecipeError(
                 f"recipe key {key!r} is a setting of the stream: give {key}={format_value(named[key])} beside the "

@@ -334,6 +334,18 @@ def test_a_state_of_another_spec_seed_or_nothing_is_refused(server):
             dataset(server).load_state_dict(broken)
 
 
+def test_a_state_of_a_value_that_is_gone_is_refused_with_the_remedy(server):
+    state = next(iter(dataset(server))).resume_state
+    state["spec"] = {**state["spec"], "tolerance": 0.1}
+    said = (
+        r"the stream of the state cannot be made: spec tolerance = 0.1: .* begin a new stream, or resume with the rel"
+    )
+    with pytest.raises(StateMismatch, match=said):
+        dataset(server).load_state_dict(state)
+    state["spec"]["tolerance"] = 0.0
+    dataset(server).load_state_dict(state)
+
+
 @pytest.mark.parametrize("change", [{"catalogue": "catalogue-2"}, {"sequences": 24}])
 def test_another_catalogue_is_refused_naming_both_sides(server, change):
     state = next(iter(dataset(server))).resume_state

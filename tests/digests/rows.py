@@ -112,8 +112,6 @@ PORTABLE: Mapping[str, Row] = {
     "light": Row({"light": "declared"}, ("voxels", "frames", "frames_u16", "frames_all"), count=6),
     "substep_px": Row(FINE, (*_EVENTS, "frames"), {"substep_px": 0.5}, count=6),
     "substep_px of deep light": Row(FINE | {"light": "declared"}, ("voxels",), {"substep_px": 0.25, **AUTO}, count=6),
-    "tolerance": Row("davis346", ("voxels",), {"tolerance": 0.3}, count=9),
-    "tolerance of leak": Row(FINE | {"leak_hz": (0.05, 20.0)}, ("voxels",), {"tolerance": 0.4}, count=9),
     "scene": Row({}, ("voxels", "frames", "frames_rgb", "boxes"), AUTO | {"still_share": 0.5}, count=6),
     "keep_defects": Row({}, spec=AUTO | {"keep_defects": "bars,cuts,duplicates"}, count=6),
     "worlds": Row("worlds", ("voxels", "frames", *_TRUTH), count=6),

@@ -23,7 +23,7 @@ from v2v_server.video.probe import probe
 
 UNCHANGED = {"exact", "fast"}
 """Presets of the number of samples per decode, as "balanced"."""
-SAME_BYTES = {"on_bad_video"}
+SAME_BYTES = {"on_bad_video", "tolerance"}
 
 
 @pytest.fixture(scope="module")

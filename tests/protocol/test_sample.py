@@ -104,6 +104,14 @@ def test_effects_travel_where_there_are_any() -> None:
     assert Provenance.from_dict(packed(provenance)) == provenance
 
 
+def test_what_earlier_releases_left_out_stays_readable() -> None:
+    assert "left_out" not in packed(PROVENANCE)
+    record = packed(PROVENANCE) | {"left_out": ["leak_hz"]}
+    provenance = Provenance.from_dict(record)
+    assert provenance.left_out == ("leak_hz",)
+    assert packed(provenance) == record
+
+
 def test_refusals_read_as_one_line() -> None:
     assert str(Refusal("a.mp4", 17, "cut short")) == "a.mp4 at frame 17: cut short"
     assert str(Refusal("a.mp4", None, "does not open")) == "a.mp4: does not open"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from typing import Any, get_args, get_type_hints
 
 import pytest
@@ -78,7 +79,6 @@ OTHER_SPEC_VALUES: dict[str, Any] = {
     "flow_from": 20,
     "flow_margin_px": -1,
     "substep_px": 1.0,
-    "tolerance": 0.01,
     "scene": "auto",
     "keep_defects": "bars,cuts",
     "still_share": 0.5,
@@ -132,7 +132,7 @@ def test_more_events_than_can_be_counted_are_refused() -> None:
 
 def test_every_field_is_covered() -> None:
     assert OTHER_RECIPE_VALUES.keys() == {field.name for field in dataclasses.fields(Recipe)}
-    assert OTHER_SPEC_VALUES.keys() == {field.name for field in dataclasses.fields(StreamSpec)}
+    assert OTHER_SPEC_VALUES.keys() == {field.name for field in dataclasses.fields(StreamSpec)} - {"tolerance"}
 
 
 def test_the_choices_of_a_field_are_those_of_its_type() -> None:
@@ -187,6 +187,19 @@ def test_whole_numbers_stand_for_floats() -> None:
     assert StreamSpec.from_dict({"recipe": {"gamma": 2, "threshold": 1}}).digest == (
         StreamSpec(Recipe(gamma=2.0, threshold=(1.0, 1.0))).digest
     )
+
+
+@pytest.mark.parametrize("zero", [0, 0.0, -0.0, "0"])
+def test_a_tolerance_of_0_has_the_digest_of_none(zero: object) -> None:
+    assert StreamSpec.from_dict({"tolerance": zero}).canonical() == StreamSpec().canonical()
+
+
+@pytest.mark.parametrize("value", [0.01, 5e-324, -1, 2, "all", math.nan])
+def test_another_tolerance_is_refused_with_the_remedy(value: object) -> None:
+    refused = rf"tolerance = {value!r}: give 0, or leave it out: .* saved hardly any time; all are simulated"
+    for request in ({"tolerance": value}, {"recipe": {"tolerance": value}}):
+        with pytest.raises(UsageError, match=refused):
+            StreamSpec.from_dict(request)
 
 
 # --- what a consumer may ask for --------------------------------------------------------------------------------------

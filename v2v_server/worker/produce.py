@@ -313,16 +313,10 @@ def make_sample(
             dropped={name: count for name, count in dropped.items() if count},
             saturated={name: count for name, count in saturated.items() if count},
             grid_seconds=_grid_seconds(context),
-            left_out=_left_out(plan.params, made),
             substeps=0 if made is None else context.substeps,
             remark=lease.remark,
         ),
     )
-
-
-def _left_out(params: SampleParams, made: Voxels | None) -> tuple[str, ...]:
-    """Return the effects of a draw that a simulation left out."""
-    return () if made is None else tuple(name for name in params.effects if name not in made.given.params.effects)
 
 
 def list_sample_events(lease: Lease, decoded: Decoded) -> EventList:
@@ -398,7 +392,6 @@ def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Vox
             out,
             context.levels,
             context.signal,
-            context.spec.tolerance,
         )
     except UsageError as error:
         # The recipe was checked before, so the values come from the corpus.
@@ -455,9 +448,7 @@ def _variants(
     found = variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds), arrays, levels_per_step)
     if kind == "photographs":
         found = frozenset(variant._replace(is_divided=False, bits=MOST_BITS, is_rendered=True) for variant in found)
-    if not spec.tolerance:
-        return found
-    return found | {variant._replace(is_general=False, is_divided=False) for variant in found}
+    return found
 
 
 @lru_cache(maxsize=16)

@@ -48,7 +48,7 @@ def _parser() -> Parser:
             "v2v-tradeoff --videos clips/ --json tradeoff.json",
             "v2v-tradeoff --videos clips/ --target-rate 20 --vary samples_per_decode=1,2 --preset-out chosen.yaml",
             "v2v-tradeoff --videos clips/ --beside smaller/ --forms 'lossless dense'",
-            "v2v-tradeoff --videos clips/ --recipe my_camera.yaml --vary tolerance=0,0.01 --max-error 0.02",
+            "v2v-tradeoff --videos clips/ --recipe my_camera.yaml --vary substep_px=0,0.5,1 --max-error 0.02",
         ],
         "Exit status: 1 where no setting fulfils --target-rate or --max-error.",
     )  # fmt: skip
@@ -67,8 +67,8 @@ def _parser() -> Parser:
     work = parser.group("Work")
     work.add_argument(
         "--vary", action="append", default=[], metavar="KEY=VALUE,VALUE",
-        help="values to compare of samples_per_decode (default 1,2,4), substep_px (default 0,1), tolerance, or a field "
-        "of the recipe such as voxel_seconds; may be repeated",
+        help="values to compare of samples_per_decode (default 1,2,4), substep_px (default 0,1), or a field of the "
+        "recipe such as voxel_seconds; may be repeated",
     )  # fmt: skip
     work.add_argument(
         "--forms", default=",".join(_DEFAULT_FORMS), metavar="FORM,FORM",
@@ -140,7 +140,7 @@ def _measured(corpus: Mapping[str, Catalogue], compared: Sequence[ServeSetting])
             found.append({
                 "measure": "setting", "name": setting.name, "way": setting.way, "form": setting.form,
                 "samples_per_decode": spec.samples_per_decode, "substep_px": spec.substep_px,
-                "tolerance": spec.tolerance, "bytes_ratio": _nbytes(clips) / _nbytes(source),
+                "bytes_ratio": _nbytes(clips) / _nbytes(source),
                 "bytes_per_video_second": _nbytes(clips) / _seconds(source),
                 "samples_per_core_second": 1.0 / taken, "cpu_seconds_per_sample": taken,
                 "speed_ratio": seconds[compared[0].name] / taken, **error_fields(sums[setting.way]),

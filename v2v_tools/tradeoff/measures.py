@@ -3,10 +3,10 @@
 Everything is measured on the same sequences of the corpus in each form. A lease of each has four views: samples of one
 decode, next to each other.
 
-**Errors.** The full model has exactly decoded frames, all effects of the recipe, and the shortest sub-steps of all
-settings. Both sides are the same camera: the sample's own draw and noise key, with both thresholds set to the value in
-question. Hot pixels are left out: they fire alike on both sides and would make every relative error look small. With V
-the voxels and R those of the full model, summed over all leases, so that a clip weighs as much as it has events:
+**Errors.** The full model has exactly decoded frames and the shortest sub-steps of all settings. Both sides are the
+same camera: the sample's own draw and noise key, with both thresholds set to the value in question. Hot pixels are left
+out: they fire alike on both sides and would make every relative error look small. With V the voxels and R those of the
+full model, summed over all leases, so that a clip weighs as much as it has events:
 
     voxel error    sum |V - R| / sum |R|
     count error    (sum |V| - sum |R|) / sum |R|
@@ -90,7 +90,7 @@ def simulated(context: SampleContext, params: SampleParams) -> npt.NDArray[np.fl
     """Return the voxels of a camera of these parameters, [lead voxels + T, bins, H, W], signed event counts."""
     return simulate_clip(
         context.view, params, context.recipe, "float32", context.step_seconds, levels=context.levels,
-        signal=context.signal, tolerance=context.spec.tolerance,
+        signal=context.signal,
     ).voxels  # fmt: skip
 
 

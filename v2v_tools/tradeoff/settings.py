@@ -32,7 +32,7 @@ STORES = {"lossless dense": "dense", "lossless fast": "fast", "lossless raw": "r
 SAMPLES_PER_DECODE = (1, 2, 4)
 DEFAULT_AXES = {"samples_per_decode": ("1", "2", "4"), "substep_px": ("0", "1")}
 """Values of each field that are compared unless the user names others."""
-_SPEC_FIELDS = ("samples_per_decode", "substep_px", "tolerance")
+_SPEC_FIELDS = ("samples_per_decode", "substep_px")
 Axes = Mapping[str, Sequence[str]]
 
 
@@ -123,10 +123,10 @@ def settings(forms: Sequence[str], spec: StreamSpec, varied: Axes) -> list[Serve
 
 
 def full_model(setting: ServeSetting, compared: Sequence[ServeSetting]) -> ServeSetting:
-    """Return what a setting is judged by: the source, the shortest sub-steps of all that are compared, all effects."""
+    """Return what a setting is judged by: the source, with the shortest sub-steps of all that are compared."""
     finest = min((each.spec.substep_px for each in compared if each.spec.substep_px), default=0.0)
     single = setting.single
-    return ServeSetting(SOURCE, dataclasses.replace(single.spec, substep_px=finest, tolerance=0.0))
+    return ServeSetting(SOURCE, dataclasses.replace(single.spec, substep_px=finest))
 
 
 def _changed(spec: StreamSpec, key: str, value: str) -> StreamSpec:

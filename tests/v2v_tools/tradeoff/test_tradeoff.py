@@ -107,7 +107,7 @@ def test_wishes_that_nothing_fulfils_name_the_nearest() -> None:
 def test_the_choice_is_written_and_a_wish_that_nothing_fulfils_is_status_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    compared = settings([], StreamSpec(), axes(["samples_per_decode=1,2", "tolerance=0.01"]))
+    compared = settings([], StreamSpec(), axes(["samples_per_decode=1,2", "noise_sigma=0.01"]))
     found = [
         {"measure": "setting", "name": setting.name, "samples_per_decode": setting.spec.samples_per_decode,
          "samples_per_core_second": 5.0 * setting.spec.samples_per_decode, "voxel_error_at_0.2": 0.25}
@@ -123,13 +123,13 @@ def test_the_choice_is_written_and_a_wish_that_nothing_fulfils_is_status_1(
     assert ServeConfig.load(str(out), {"videos": "clips"}).spec == compared[2].spec
 
 
-AXES = ["tolerance=0, 0.01,0", "voxel_seconds=0.1,0.2"]
+AXES = ["bins=5, 10,5", "voxel_seconds=0.1,0.2"]
 CAMERA_OF_A_USER = StreamSpec(recipe=Recipe(leak_hz=(0.1, 0.2)))
 EVERY = settings([BESIDE, *STORES], CAMERA_OF_A_USER, axes(AXES))
 
 
 def test_settings_are_all_combinations_under_names_of_their_own() -> None:
-    assert EVERY[0].name == "source, K = 1, substep_px = 0, tolerance = 0, voxel_seconds = 0.1"
+    assert EVERY[0].name == "source, K = 1, substep_px = 0, bins = 5, voxel_seconds = 0.1"
     assert len({setting.name for setting in EVERY}) == len(EVERY) == 3 * 2 * 2 * 2 * (2 + len(STORES))
     assert len({setting.way for setting in EVERY}) == len({setting.single for setting in EVERY}) == len(EVERY) // 3
 
@@ -137,7 +137,7 @@ def test_settings_are_all_combinations_under_names_of_their_own() -> None:
 def test_the_full_model_keeps_the_recipe_and_has_everything_else() -> None:
     for setting in EVERY:
         full = full_model(setting, EVERY)
-        assert (full.form, full.spec.tolerance, full.spec.substep_px, full.spec.samples_per_decode) == (SOURCE, 0, 1, 1)
+        assert (full.form, full.spec.substep_px, full.spec.samples_per_decode) == (SOURCE, 1, 1)
         assert full.spec.recipe == setting.spec.recipe
     plain = settings([], StreamSpec(), axes(["substep_px=0"]))
     assert full_model(plain[0], plain) == plain[0]
@@ -196,7 +196,7 @@ def test_one_lease_alone_has_no_diversity(tmp_path: Path) -> None:
         [],
         ["--clips", "0"], ["--target-rate", "-1"], ["--max-error", "nan"], ["--forms", "h265 1"],
         ["--preset-out", "x.yaml"],
-        ["--set", "gama=1"], ["--rows", "upper"], ["--vary", "tolerance"], ["--vary", "tolerance=2"],
+        ["--set", "gama=1"], ["--rows", "upper"], ["--vary", "substep_px"], ["--vary", "tolerance=0.01"],
         ["--vary", "samples_per_decode=3"],
         ["--vary", "voxel_seconds=0.1,101"], ["--preset-out", "nowhere/x.yaml", "--max-error", "1"],
     ],
@@ -235,20 +235,19 @@ def test_a_short_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         write_clip(smaller / path.name, luma, options={"crf": "40"}, full_range=facts.full_range)
     flags = ["--videos", str(folder), "--beside", str(smaller), "--rows", "full", "--clips", "2"]
     flags += ["--forms", "lossless fast", "--vary", "samples_per_decode=1,4"]
-    flags += ["--vary", "tolerance=0,0.5", "--set", "leak_hz=0.01", "--max-error", "0", "--preset-out", str(chosen)]
+    flags += ["--set", "leak_hz=0.01", "--max-error", "0", "--preset-out", str(chosen)]
     assert tradeoff.main([*flags, *FLAGS, "--json", str(out)]) == 0
     found = records(out)
     by_name = {item["name"]: item for item in found if item["measure"] == "setting"}
     spec = StreamSpec()
-    varied = axes(["samples_per_decode=1,4", "tolerance=0,0.5"])
+    varied = axes(["samples_per_decode=1,4"])
     assert set(by_name) == {setting.name for setting in settings([BESIDE, "lossless fast"], spec, varied)}
     way = {item["way"]: item for item in by_name.values()}
     error = {name: item["voxel_error_at_0.2"] for name, item in way.items()}
     # The full model is among the settings, so it has no error; each thing that it has more of changes something.
-    assert error["source, substep_px = 1, tolerance = 0"] == 0
-    assert 0 < error["source, substep_px = 1, tolerance = 0.5"] <= 0.5
-    assert 0 < error["source, substep_px = 0, tolerance = 0"] < error["beside, substep_px = 0, tolerance = 0"]
-    assert error["lossless fast, substep_px = 1, tolerance = 0"] == 0
+    assert error["source, substep_px = 1"] == 0
+    assert 0 < error["source, substep_px = 0"] < error["beside, substep_px = 0"]
+    assert error["lossless fast, substep_px = 1"] == 0
     assert min(item["voxel_error_at_0.2"] for item in found if item["measure"] == "scale") > 0
     fastest = max((item for item in by_name.values() if not item["voxel_error_at_0.2"]),
                   key=lambda item: item["samples_per_core_second"])  # fmt: skip

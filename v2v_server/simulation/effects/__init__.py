@@ -18,12 +18,6 @@ here, named in :data:`EFFECTS`. The file states the equation, its source, and
     PANEL                     the panel of ``v2v-fit`` that shows it: "rates", "still", "pixels" or "intervals"
     prepare(value, clip)      its tables; for the value 0 they have the same types and switch everything off
 
-If ``tolerance`` of the spec may leave it out (``simulation/clip.py``), it also states
-
-    COST, MARGIN              its processor time, relative to the others; how many times the events that change on real
-                              footage are at most those of its model
-    changed(value, fired)     the model: how many events it changes in a clip (:class:`~.state.Fired`)
-
 and, compiled, any of these functions. Each does nothing if the tables say off:
 
     start(tables, own, block, at)     before the first step of a block of pixels; may change the block's thresholds

@@ -11,22 +11,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.simulation.effects.state import Clip, Fired, hook
+from v2v_server.simulation.effects.state import Clip, hook
 from v2v_server.simulation.pixel import PIXELS_A_BLOCK
 
 FIELD, ROWS = "leak_hz", 0
 NOISE, PANEL = True, "still"
-COST, MARGIN = 1, 6.0
 
 
 def prepare(value: float, clip: Clip) -> npt.NDArray[Any]:
     """Return the leak of each step in thresholds, [steps] real; empty for none."""
     return (value * clip.step_seconds).astype(clip.real) if value > 0.0 else np.empty(0, clip.real)
-
-
-def changed(value: float, fired: Fired) -> float:
-    """Return the events of the leak, and 2 x what has leaked before in each step with events."""
-    return value * (fired.pixel_seconds + 2.0 * fired.later)
 
 
 @hook

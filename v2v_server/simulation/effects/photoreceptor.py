@@ -13,18 +13,16 @@ are those of the net change, at even distances. Where P turns in a segment, even
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
-from v2v_server.simulation.effects.state import UNITS, Clip, Fired, hook
+from v2v_server.simulation.effects.state import Clip, hook
 from v2v_server.simulation.intensity import Doubles, exponential
 from v2v_server.simulation.pixel import PIXELS_A_BLOCK, look_up
 
 FIELD, ROWS = "photoreceptor_hz", 3
 NOISE, PANEL = False, "rates"
-COST, MARGIN = 7, 2.0
 DARKEST = 20 / 255
 """v2e's offset of the light that sets the bandwidth: no pixel is slower than 1/14 of a white one."""
 
@@ -33,13 +31,6 @@ def prepare(value: float, clip: Clip) -> tuple[Any, Any]:
     """Return a and b by grey level, real [tables, 2, levels], no table without low-pass; and which a step has."""
     durations = clip.durations if value > 0.0 else clip.durations[:0]
     return low_pass_tables(value, clip.light, durations).astype(clip.real), clip.table_of_step
-
-
-def changed(value: float, fired: Fired) -> float:
-    """Return 2 sum |dL| / c x lag / T: a low-pass lags by 1 / (2 pi f), f by grey level."""
-    lag = np.rint((1.0 + DARKEST) / (2.0 * np.pi * value * (fired.light + DARKEST)) * UNITS**2).astype(np.int64)
-    lagged = (fired.change * (lag >> 20)[fired.grey[1:]]).sum(axis=1)
-    return 2.0 * math.fsum(lagged * fired.pace) / UNITS**2
 
 
 def low_pass_tables(photoreceptor_hz: float, light: Doubles, seconds: Doubles) -> Doubles:

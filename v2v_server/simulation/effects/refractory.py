@@ -12,27 +12,16 @@ from typing import Any
 import numba
 import numpy as np
 
-from v2v_server.simulation.effects.state import UNITS, Clip, Fired, hook
+from v2v_server.simulation.effects.state import Clip, hook
 from v2v_server.simulation.pixel import PIXELS_A_BLOCK
 
 FIELD, ROWS = "refractory_seconds", 1
 NOISE, PANEL = False, "intervals"
-COST, MARGIN = 8, 4.0
 
 
 def prepare(value: float, clip: Clip) -> tuple[Any, Any]:
     """Return the period, real, and the duration of each step, [steps] real."""
     return clip.real(value), clip.step_seconds.astype(clip.real)
-
-
-def changed(value: float, fired: Fired) -> float:
-    """Return what is lost, sum n |dL| / c x t / T, and 2 |what was lost before, rising less falling| in each step with
-    events, n; and what noise and hot drift lose.
-    """
-    lost = np.rint((fired.events * fired.change).astype(np.float64) * (value * fired.pace)[:, None]).astype(np.int64)
-    before = np.abs(np.cumsum(lost, axis=0) - lost)
-    changed = np.abs(lost) + 2 * np.minimum(before, UNITS) * (fired.events != 0)
-    return float(int(changed.sum()) / UNITS + fired.grey.shape[1] * fired.noise_events(value))
 
 
 @numba.njit(nogil=True, error_model="numpy")

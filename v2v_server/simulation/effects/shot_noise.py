@@ -7,7 +7,6 @@ brightness: its residual becomes 0 (v2e).
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,14 +14,13 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_server.simulation import noise
-from v2v_server.simulation.effects.state import Clip, Fired, compiled, hook
+from v2v_server.simulation.effects.state import Clip, compiled, hook
 from v2v_server.simulation.intensity import Doubles, exponential
 from v2v_server.simulation.pixel import PIXELS_A_BLOCK, folds_of, look_up, word
 from v2v_server.simulation.vectors import bits_of_float, use_widest_vectors
 
 FIELD, ROWS = "shot_noise_hz", 0
 NOISE, PANEL = True, "still"
-COST, MARGIN = 10, 2.0
 PIXEL_POS, PIXEL_NEG, STEP_POS, STEP_NEG = range(11, 15)
 """Purposes of the noise's words (``noise.py``)."""
 WHITE_SHOT_NOISE = 0.25
@@ -57,13 +55,6 @@ def prepare(value: float, clip: Clip) -> Tables:
         shot = shot_table(shot_means(value, clip.light, clip.durations))
     drawn, of_steps = np.empty((4, PIXELS_A_BLOCK), np.uint32), np.empty((2, len(clip.table_of_step)), np.uint32)
     return Tables(shot.view(np.float32), shot.max(axis=2, initial=0), clip.table_of_step, of_steps, drawn)
-
-
-def changed(value: float, fired: Fired) -> float:
-    """Return the shot events, and one more in each later step with events, since they clear the residual."""
-    shown = np.bincount(fired.grey.ravel(), minlength=len(fired.light))
-    rate = value * math.fsum(shown * (1.0 - (1.0 - WHITE_SHOT_NOISE) * fired.light)) / fired.grey.size
-    return rate * (fired.pixel_seconds + fired.later)
 
 
 def shot_means(shot_noise_hz: float, light: Doubles, durations: Doubles) -> Doubles:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numba
@@ -46,40 +45,6 @@ class Clip(NamedTuple):
     pixels: int
     real: Real
     key: noise.NoiseKey
-
-
-UNITS = 2**20
-"""Parts of a log unit that changes are counted in: sums of whole numbers are the same on every host."""
-
-
-class Fired(NamedTuple):
-    """What the paper's pixel without noise fires in a clip, at P pixels: every eighth row and column.
-
-    Attributes:
-        grey: [n, P] levels of the frames.
-        light: [levels] float64, as in :class:`Clip`.
-        change: [n - 1, P] int64, change of log intensity from frame to frame without its sign, 1/UNITS log units.
-        events: [n - 1, P] int64, signed events of the steps that show another frame.
-        pace: [n - 1] float64, thresholds in a log unit, per second of each of these steps: 1 / (c T).
-        later: the time before each of these steps, once for each pixel that fires in it, s.
-        seconds: duration of the clip.
-        noise_events: mean number of thresholds that noise and hot drift cross in a pixel while it is blind, for a
-            refractory period.
-    """
-
-    grey: npt.NDArray[np.unsignedinteger[Any]]
-    light: npt.NDArray[np.float64]
-    change: npt.NDArray[np.int64]
-    events: npt.NDArray[np.int64]
-    pace: npt.NDArray[np.float64]
-    later: float
-    seconds: float
-    noise_events: Callable[[float], float]
-
-    @property
-    def pixel_seconds(self) -> float:
-        """Return the duration of the clip, once for each pixel."""
-        return float(self.grey.shape[1] * self.seconds)
 
 
 class Block(NamedTuple):
