@@ -77,7 +77,10 @@ def measure(pictures: FrameArray) -> MeasuredMotion:
         places = np.rint(np.hypot(*moved[:, changed & moves]) * (_FINEST / UNITS_PER_PX)).astype(np.int64)
         speeds += np.bincount(np.minimum(places, len(speeds) - 1), minlength=len(speeds))
         along = (moved * last).sum(axis=0)
-        counts += [np.count_nonzero(each) for each in (changed, lost, uncovered, along, along < 0)]
+        found = np.array([np.count_nonzero(each) for each in (changed, lost, uncovered, along, along < 0)])
+        # A thing shows at its front what it uncovers behind: beyond that, noise was followed by chance.
+        excess = max(2 * found[2] + found[1] - found[0], 0)
+        counts += found + np.array([0, excess, -excess, 0, 0])
         last = moved if moves.any() else last  # a repeated frame is no change of the motion
     return MeasuredMotion(tuple(speeds.tolist()), *counts.tolist())
 
