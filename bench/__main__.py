@@ -38,7 +38,6 @@ BENCHES = {
     "physics": "accuracy.physics",
     "motion": "speed.motion",
     "substeps": "accuracy.substeps",
-    "loss": "accuracy.loss",
     "fit": "accuracy.fit",
     "sensor": "accuracy.sensor",
     "scene": "accuracy.scene",

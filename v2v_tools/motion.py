@@ -17,7 +17,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import CHANGES, Defect, hides_motion
-from v2v_server.motion.prediction import SUBSTEP_PX, Prediction, predict
+from v2v_server.motion.measure import MeasuredMotion, measure
 from v2v_server.schedule import VideoSequence
 from v2v_server.simulation.effects import NOISE
 from v2v_server.simulation.intensity import eight_bits
@@ -38,6 +38,9 @@ _MOST_CLIPS = 4
 """Clips that are decoded for it."""
 _ENOUGH = 0.25
 """A camera is worth showing that has this share of the events of the best one."""
+MOST_LOST = 0.2
+"""Share of the changed pixels that no block follows, above which sub-steps do not help."""
+JUDGE = "v2v-tradeoff --videos DIR --rows full --vary substep_px=0,1"
 _NOISE = ("noise_sigma", "hot_pixel_share", *NOISE)
 
 
@@ -80,39 +83,35 @@ def describe_start(events: npt.NDArray[np.float64]) -> str:
     return f"the start of a clip makes {share:.0%} of its events without noise"
 
 
-def predicted_loss(made: RemadeSample) -> Prediction:
-    """Predict what a sample loses between its frames; nothing where they are rendered, whose motion is known."""
+def measured_motion(made: RemadeSample) -> MeasuredMotion:
+    """Measure what moves in the frames of a sample; nothing where they are rendered."""
     if made.decoded.clip.is_view:
-        return Prediction()
+        return MeasuredMotion()
     plan, recipe = made.decoded.plan, made.decoded.plan.spec.recipe
     frames = eight_bits(made.decoded.clip.frames, made.decoded.clip.signal)
-    return predict(apply_view(without_margin(frames, plan.params, recipe, plan.margin_px), plan.params, recipe))
+    return measure(apply_view(without_margin(frames, plan.params, recipe, plan.margin_px), plan.params, recipe))
 
 
-def describe_loss(found: Prediction, defects: Sequence[Defect] = ()) -> str:
-    """Return one line for the user about what the motion between frames costs and whether sub-steps help.
+def describe_motion(found: MeasuredMotion, defects: Sequence[Defect] = ()) -> tuple[str, str]:
+    """Return one line for the user about what moves between frames, and what to do; "" where nothing is to be done.
 
     Args:
         defects: of the videos. Where they are what changes, motion is not.
     """
-    if hides_motion(defects, found.can_be_followed):
+    turned = found.turned / max(found.paired, 1)
+    lost, uncovered = (each / max(found.changed, 1) for each in (found.lost, found.uncovered))
+    if hides_motion(defects, lost <= MOST_LOST):
         causes = dict.fromkeys(f"{each.text}: {CHANGES[each.kind]}" for each in defects if each.kind in CHANGES)
-        return f"changes that motion does not explain: {'; '.join(causes)}"
-    if found.is_slow:
-        return f"motion: {found.px_per_frame:.2g} px a frame where something moves; substep_px would change little"
-    if not found.can_be_followed:
-        return (
-            "fast changes that motion does not explain, such as flicker or vibration: events between frames are lost, "
-            "and substep_px restores few of them; take videos with more frames a second"
-        )
-    (low, off, high), (least, on, most) = (
-        [round(100 * share) for share in found.loss(divided=divided)] for divided in (False, True)
+        return f"changes that motion does not explain: {'; '.join(causes)}", ""
+    median, fast = (found.px_per_frame(share) for share in (0.5, 0.9))
+    text = (
+        f"{median:g} px a frame where something moves ({fast:g} px and more in the fastest tenth), {turned:.0%} of it "
+        f"turns back from frame to frame; of the pixels that change, {uncovered:.0%} are uncovered background, and no "
+        f"block follows {lost:.0%}"
     )
-    return (
-        f"fast motion: {found.px_per_frame:.2g} px a frame where something moves; about {off} % ({low} to {high} %) of "
-        f"the events are lost between frames, {on} % with --substep-px {SUBSTEP_PX:g} ({least} to {most} %)"
-        + ("; it makes false events where something moves over a still picture" if found.uncovers else "")
-    )
+    if lost > MOST_LOST:
+        return text, "something small or fast moves, or flickers, or is noise: sub-steps do not help"
+    return text, f"{JUDGE} tells the error without and with sub-steps" if fast > 1.0 else ""
 
 
 @dataclass(frozen=True, slots=True)

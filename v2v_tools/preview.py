@@ -34,7 +34,7 @@ from v2v_protocol.write_aside import check_output, write_file
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import defects_of_video
-from v2v_server.motion.prediction import Prediction
+from v2v_server.motion.measure import MeasuredMotion, together
 from v2v_server.schedule import SequenceTable, VideoSequence
 from v2v_server.simulation.intensity import tone_table
 from v2v_server.store.pixels import VIDEOS, VideosKind, signal_of
@@ -43,10 +43,10 @@ from v2v_server.video.picture import SDR
 from v2v_server.video.probe import DOLBY_VISION
 from v2v_tools.motion import (
     WholePictures,
-    describe_loss,
+    describe_motion,
     describe_start,
+    measured_motion,
     moving_seeds,
-    predicted_loss,
     quiet_voxels,
     start_events,
 )
@@ -115,7 +115,7 @@ def preview(
     scene = StreamSpec.from_dict({**spec, "recipe": wanted[0].recipe}).scene != "off"
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir, kind=kind)
     cameras: list[Camera] = []
-    loss, started, notes = Prediction(), np.zeros(2), dict[str, list[str]]()
+    moving, started, notes = list[MeasuredMotion](), np.zeros(2), dict[str, list[str]]()
     for note in catalogue.notes:
         say(note)
     try:
@@ -126,9 +126,9 @@ def preview(
             say(note)
         with Progress("simulating", "cameras") as progress:
             for each in wanted:
-                camera, lost, events = _camera(catalogue, each, spec, with_flow, notes)
+                camera, motion, events = _camera(catalogue, each, spec, with_flow, notes)
                 cameras.append(camera)
-                loss += lost
+                moving.append(motion)
                 started = started + events
                 progress(len(cameras), len(wanted))  # the first may include compiling; the estimate begins after it
         # A photograph stands still, apart from what each camera sees of it.
@@ -143,7 +143,7 @@ def preview(
         say(f"{', '.join(titles) if len(titles) < len(wanted) else 'all cameras'}: {note}")
     say(f"{describe_start(started)} (recipe field start)")
     if not kind.is_rendered:
-        say(describe_loss(loss, defects))
+        say(f"motion: {'; '.join(filter(None, describe_motion(together(moving), defects)))}")
     write_file(out, _content(out.suffix.lower(), whole, cameras, title, moments))
     say(f"{out}: {counted(len(cameras), 'camera')}")
 
@@ -205,8 +205,8 @@ def _content(kind: str, whole: Camera | None, cameras: Sequence[Camera], title: 
 
 def _camera(
     catalogue: Catalogue, wanted: PreviewCamera, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
-) -> tuple[Camera, Prediction, npt.NDArray[np.float64]]:
-    """Make one camera's clip; predict what it loses between frames, and count what its start makes.
+) -> tuple[Camera, MeasuredMotion, npt.NDArray[np.float64]]:
+    """Make one camera's clip; measure what moves in it, and count what its start makes.
 
     Adds the titles of the cameras that a note is about to ``notes``, by its text.
     """
@@ -236,7 +236,7 @@ def _camera(
     quiet = dataclasses.replace(camera, voxels=quiet_grids[camera.lead_voxels :])
     rate = _sequence_of(catalogue, provenance).video.frames_per_second
     timed = dataclasses.replace(camera, quiet=quiet.rates, step_seconds=stream.recipe.frame_stride / rate)
-    return timed, predicted_loss(made), start_events(made)
+    return timed, measured_motion(made), start_events(made)
 
 
 def _signal_note(catalogue: Catalogue, provenance: Provenance, recipe: Recipe) -> str:

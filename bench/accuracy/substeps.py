@@ -39,13 +39,12 @@ from tests.oracles.rendered import (
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_server.motion import levels_between, motions
-from v2v_server.motion.prediction import SUBSTEP_PX
 from v2v_server.simulation.voxel import FINE_STEPS, Levels
 from v2v_server.video.probe import probe
 
 Records = list[dict[str, Any]]
 Frames = npt.NDArray[np.uint8]
-THRESHOLD, FRAMES_PER_SECOND, BIN_SECONDS = 0.2, 30.0, 0.01
+SUBSTEP_PX, THRESHOLD, FRAMES_PER_SECOND, BIN_SECONDS = 1.0, 0.2, 30.0, 0.01
 SPEEDS_PX = (0.3, 0.8, 2.0, 4.0, 4.8, 10.0, 12.0)
 OTHER_SPEEDS_PX = (1.5, 6.0)
 BARS = {

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage  # type: ignore[import-untyped]
@@ -30,8 +29,6 @@ OTHERS = ("gravel", "parallax", "occlusion", "rotation", "zoom", "plain", "thin"
 NAMES = (*PHOTOGRAPHS, *OTHERS)
 _LONGEST_SECONDS, _PATH_HZ = 4.0, 9600
 _FLICKER_HZ, _FLICKER_SHARE = 10.0, 0.3
-_EXPOSED = 16
-_LEAVES, _LEAVES_SIDE_PX, _LEAST_LEAF_PX, _LARGEST_LEAF_PX = 12_000, 512, 1.5, 60.0
 
 
 class Counts(NamedTuple):
@@ -57,24 +54,15 @@ class RenderedScene:
     Attributes:
         name: of NAMES.
         light: the picture [height, width], 0 .. 1, of a time in seconds (0 .. 4).
-        exposure: part of the time between two frames that a frame collects light in, around its own moment.
     """
 
     name: str
     light: Callable[[float], Reals]
-    exposure: float = 0.0
 
     def frames(self, frames_per_second: float, count: int) -> npt.NDArray[np.uint8]:
         """Return the first frames of a video: [count, height, width]."""
-        seen = np.stack([self._exposed(n / frames_per_second, self.exposure / frames_per_second) for n in range(count)])
+        seen = np.stack([self.light(n / frames_per_second) for n in range(count)])
         return np.rint(255.0 * seen).astype(np.uint8)
-
-    def _exposed(self, seconds: float, lasting: float) -> Reals:
-        if not lasting:
-            return self.light(seconds)
-        moments = seconds + lasting * np.linspace(-0.5, 0.5, _EXPOSED)
-        mean: Reals = np.mean([self.light(moment) ** GAMMA for moment in moments], axis=0)
-        return mean ** (1.0 / GAMMA)
 
     def counts(self, edges_seconds: Reals, threshold: float, rendered_hz: float) -> Counts:
         """Return the true events between the edges of bins, from levels at ``rendered_hz``, linear in between."""
@@ -196,22 +184,8 @@ def _path_table() -> Reals:
 
 @lru_cache(maxsize=8)
 def _spline(name: str) -> Reals:
-    picture = dead_leaves(int(name.removeprefix("leaves"))) if name.startswith("leaves") else photograph(name) / 255.0
-    spline: Reals = ndimage.spline_filter(picture, mode="mirror")
+    spline: Reals = ndimage.spline_filter(photograph(name) / 255.0, mode="mirror")
     return spline
-
-
-def dead_leaves(seed: int) -> Reals:
-    """Return opaque discs that lie on each other, as many of each size as in photographs (r ** -3): 0 .. 1."""
-    rng, finer = np.random.default_rng(seed), 4
-    canvas = np.full((finer * _LEAVES_SIDE_PX,) * 2, 128, np.uint8)
-    low, high = _LEAST_LEAF_PX**-2, _LARGEST_LEAF_PX**-2
-    for radius in (low + rng.random(_LEAVES) * (high - low)) ** -0.5:
-        x, y = rng.integers(0, finer * _LEAVES_SIDE_PX, 2).tolist()
-        cv2.circle(canvas, (x, y), round(finer * radius), int(rng.integers(13, 243)), -1)
-    fine = canvas.reshape(_LEAVES_SIDE_PX, finer, _LEAVES_SIDE_PX, finer) / 255.0
-    picture: Reals = fine.mean(axis=(1, 3))
-    return picture
 
 
 def photo(name: str, y: Reals, x: Reals) -> Reals:

@@ -20,12 +20,12 @@ from v2v_protocol.recipe import Recipe
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.scenes import picture_check
 from v2v_server.corpus.scenes.picture_check import COMBED, DUPLICATES, defects_of_video
-from v2v_server.motion.prediction import predict
+from v2v_server.motion.measure import measure
 from v2v_tools.doctor import command
 from v2v_tools.doctor import corpus as doctor_corpus
 from v2v_tools.doctor import motion as doctor_motion
 from v2v_tools.doctor.command import BAD, NOTE, OK, Finding
-from v2v_tools.motion import describe_loss
+from v2v_tools.motion import describe_motion
 
 
 @pytest.fixture(autouse=True)
@@ -229,15 +229,18 @@ def test_defects_of_pictures_are_said_with_what_can_be_done(tmp_path: Path, caps
     assert "have bars at the sides of the picture (boxed.mp4: 100% of the frames have bars: left 10 px" in said
 
 
-def test_the_loss_of_fast_motion_is_predicted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_moves_is_measured_and_the_command_that_tells_the_error_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_clip(tmp_path / "slow.mp4", panned_luma(21, 140, 160, step=(0, 0)))
     flags = ["--videos", str(tmp_path), "--cache-dir", str(tmp_path)]
     _, said = told(capsys, *flags)
-    assert re.search(r"\nok    motion        0 px .*substep_px would change little; .* middle of 1 video\n", said)
+    assert re.search(r"\nok    motion        0 px a frame .*; 33 frames in the middle of 1 video\n(?! +->)", said)
     write_clip(tmp_path / "fast.mp4", panned_luma(21, 140, 160, step=(3, 4)))
     _, said = told(capsys, *flags)
-    assert re.search(r"\nnote  motion        fast motion: 5.* px a frame .* lost between frames, .* 2 videos\n", said)
-    assert "so does substep_px: 1 in the spec" in said
+    assert re.search(
+        r"\nnote  motion        5 px a frame .*, 0% of it turns back .* 2 videos\n +-> v2v-tradeoff ", said
+    )
 
 
 @pytest.mark.parametrize(
@@ -286,7 +289,7 @@ def test_preview_and_doctor_agree_on_what_changes(
     _, said = told(capsys, "--videos", str(tmp_path / "videos"), "--cache-dir", str(tmp_path))
     with closing(open_catalogue(tmp_path / "videos", cache_dir=tmp_path / "index", processes=0)) as catalogue:
         defects = defects_of_video(catalogue, "clip.mkv")
-    text = describe_loss(predict(luma), defects)
+    text, _ = describe_motion(measure(luma), defects)
     assert "flicker" not in text
     change = picture_check.CHANGES[DUPLICATES if kind == "twos" else COMBED]
     assert text.startswith("changes that motion does not explain: ")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,23 @@ from tests.oracles.decoded import stream_luma
 from v2v_pictures.camera import Camera
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.scenes.picture_check import BARS, COMBED, CUTS, DUPLICATES, FADES, Defect
+from v2v_server.motion.measure import MeasuredMotion
 from v2v_server.simulation import simulate
 from v2v_server.video.rows import Rows
 from v2v_tools import motion
 from v2v_tools import preview as command
-from v2v_tools.motion import WholePictures, describe_start, moving_seeds, noise_rate, quiet_voxels, start_events
+from v2v_tools.motion import (
+    WholePictures,
+    describe_motion,
+    describe_start,
+    moving_seeds,
+    noise_rate,
+    quiet_voxels,
+    start_events,
+)
 from v2v_tools.remake import Remaker
+from v2v_tools.tradeoff import command as tradeoff
 
 RECIPE = {"voxels_per_clip": 3, "bins": 2, "crop_height_px": 48, "crop_width_px": 48, "frame_stride": 2}
 
@@ -159,3 +171,45 @@ def test_the_start_makes_the_events_of_a_still_clip_and_none_if_it_is_zero(tmp_p
     assert all(events[1] == 0 for events in shares.values())
     assert "makes 100% of its events" in describe_start(shares["uniform"])
     assert "makes 0% of its events" in describe_start(shares["zero"])
+
+
+QUIET = MeasuredMotion(
+    changed=1000, lost=30, uncovered=120, paired=100, turned=7, speeds=(0,) * 4 + (600,) + (0,) * 252
+)
+FAST = QUIET._replace(speeds=(0,) * 12 + (500,) + (0,) * 7 + (100,) + (0,) * 236)
+SMALL = FAST._replace(lost=210)
+
+
+@pytest.mark.parametrize(
+    ("found", "numbers", "change"),
+    [
+        (MeasuredMotion(), ("0 px", "0 px", "0%", "0%", "0%"), ""),
+        (QUIET, ("1 px", "1 px", "7%", "12%", "3%"), ""),
+        (FAST, ("3 px", "5 px", "7%", "12%", "3%"), f"{motion.JUDGE} tells the error without and with sub-steps"),
+        (SMALL, ("3 px", "5 px", "7%", "12%", "21%"), "something small or fast moves, or flickers, or is noise: "
+         "sub-steps do not help"),
+    ],
+)  # fmt: skip
+def test_what_moves_is_said_in_words(found: MeasuredMotion, numbers: tuple[str, ...], change: str) -> None:
+    text = (
+        "{} a frame where something moves ({} and more in the fastest tenth), {} of it turns back from frame to frame; "
+        "of the pixels that change, {} are uncovered background, and no block follows {}"
+    )
+    assert describe_motion(found) == (text.format(*numbers), change)
+
+
+def test_the_command_that_is_named_can_be_typed() -> None:
+    name, *arguments = shlex.split(motion.JUDGE)
+    parser = tradeoff._parser()
+    assert parser.prog == name
+    assert parser.parse_args(arguments).vary == ["substep_px=0,1"]
+
+
+@pytest.mark.parametrize(("kind", "lost", "hidden"), [
+    (CUTS, 0, False), (CUTS, 500, True), (FADES, 500, True), (DUPLICATES, 0, True), (COMBED, 0, True),
+    (BARS, 500, False),
+])  # fmt: skip
+def test_defects_are_named_in_place_of_motion_where_they_are_what_changes(kind: str, lost: int, hidden: bool) -> None:
+    text, change = describe_motion(FAST._replace(lost=lost), [Defect(kind, ((0, 2),), 10, "some frames")])
+    assert text.startswith("changes that motion does not explain: some frames: ") == hidden
+    assert bool(change) != hidden

@@ -2,5 +2,5 @@
 
 command         the command line; the installation and the machine
 corpus          the videos and their labels
-motion          what a corpus loses between its frames
+motion          what moves between its frames
 """

@@ -191,7 +191,7 @@ def name_all(items: Sequence[object]) -> str:
 
 
 def hides_motion(defects: Iterable[Defect], can_be_followed: bool = True) -> bool:
-    """Return whether defects are what changes between frames, so that a prediction from motion says nothing.
+    """Return whether defects are what changes between frames, so that what moves cannot be told.
 
     Args:
         can_be_followed: whether motion explains the frames all the same.
