@@ -36,8 +36,10 @@ ANY_DURATION_EVENTS = 1000
 SHORTEST_RECORDING_SECONDS, USUAL_SECONDS, LIKELY_SECONDS, LONGEST_RECORDING_SECONDS = 1e-3, 10e-3, 10.0, 86_400.0
 RATES = 100.0, 2e6, 1e10
 """Events a second: at least, at most below USUAL_SECONDS, at most. The first two only where the unit is a guess."""
+FEW_HZ = 1000.0
+"""Fewer events a second are questioned where the unit is a guess."""
 CLOCK_SLACK_SECONDS = 1.0
-"""Pictures may be outside of the time of the events by at most this, and by at most the time between two of them."""
+"""One or two pictures may be outside of the time of the events by this, and by at most the time between the two."""
 MANY_TIMES = 300
 """Pictures that last more than this many times as long as the events are in another unit."""
 LEAST_PERIOD_SECONDS = 50e-6
@@ -142,13 +144,20 @@ class EventColumns:
         return EventChunk(t_ns, x, y, p)
 
     def end(self) -> Iterator[Note]:
-        """Check the duration, and yield how the polarities were taken if that is not usual.
+        """Check the duration, and yield how times and polarities were taken if that is not usual.
 
         Raises:
             UsageError: see :meth:`TimeUnit.check`.
         """
+        seconds = (self._last_ns - self._first_ns) * 1e-9
         if self.unit is not None:
-            self.unit.check(self._count, (self._last_ns - self._first_ns) * 1e-9, self.where)
+            self.unit.check(self._count, seconds, self.where)
+            is_guess = not (self.unit.is_stated or self.unit.is_given) and self._count > ANY_DURATION_EVENTS
+            if is_guess and self._count < FEW_HZ * seconds:
+                yield Note(
+                    f"times are taken for {self.unit.name}, {self._count / seconds:.4g} events a second: if these are "
+                    "few for this camera, give --time-unit"
+                )
         if self._polarities.meaning:
             yield Note(self._polarities.meaning)
 
@@ -240,7 +249,8 @@ def clock_fault(times: Sequence[float], first: float, last: float) -> str:
     among = sum(first - slack <= time <= last + slack for time in times)
     is_long = among < 2 < len(times) and end - begin > MANY_TIMES * (last - first)
     is_dense = len(times) > 2 and period < LEAST_PERIOD_SECONDS and end - begin < last - first
-    if among and not (is_long or is_dense):
+    is_apart = len(times) > 2 and (end < first or last < begin)
+    if among and not (is_long or is_dense or is_apart):
         return ""
     cure = (
         "in different units: correct those of the pictures"

@@ -237,6 +237,14 @@ def test_limits_of_a_recording(count: int, seconds: float, unit: str, is_stated:
     TimeUnit(unit, is_given=True).check(count, seconds, "a")
 
 
+@pytest.mark.parametrize(("per_us", "unit", "is_said"), [(1, "us", False), (10, "us", True), (1000, "ns", False)])
+def test_a_guess_that_gives_few_events_is_said(tmp_path: Path, per_us: int, unit: str, is_said: bool) -> None:
+    path = write_npz(tmp_path, columns(t=columns()["t"] * per_us))
+    _, notes = read(path, time_unit=None if unit == "us" else unit)
+    assert any("times are taken for us, 333" in note and "--time-unit" in note for note in notes) == is_said
+    assert not read(path, time_unit=unit)[1]
+
+
 def test_a_file_of_this_project_states_its_unit(tmp_path: Path) -> None:
     """A burst of 1.2 ms may be one in ms; in what v2v-convert wrote it is certain."""
     path = written(tmp_path, "text", t=columns()["t"] // 1000)
@@ -312,6 +320,8 @@ CLOCKS = {
     "hours later": ([7200.1, 7200.9, 7201.7], r"--frame-offset -7200100\.000"),
     "since 1970": ([1.7e9, 1.7e9 + 1], "--frame-offset -1700000000000"),
     "from the camera's start": ([4.1, 4.9, 5.7], r"--frame-offset -4100\.000"),
+    "from the last event on": ([1.3, 2.1, 2.9], r"--frame-offset -1300\.000"),
+    "up to the first event": ([-1.7, -0.9, -0.1], r"--frame-offset 1700\.000"),
     "microseconds": ([1e5, 9e5, 17e5], "in different units"),
     "milliseconds from the first": ([0.0, 800.0, 1600.0], "in different units"),
     "too dense": ([1e-7, 9e-7, 17e-7], "in different units"),

@@ -6,9 +6,9 @@ These are Pillow's, where it keeps all bits. Which one decodes is a matter of ta
 FFmpeg also decodes damaged pictures without a word. While a catalogue is made, a second reader checks each one:
 
     JPEG        libjpeg, by OpenCV: it warns of damage on standard error, which Pillow suppresses
-    PNG         zlib: the data of all rows is there
+    PNG         zlib: the data of all rows is there, and their filters are known
     TIFF, BMP   Pillow, which fails where libtiff does; grey levels are equal (OpenCV returns damaged TIFF pictures)
-    WebP        none: FFmpeg itself refuses what is cut
+    WebP        libwebp, by Pillow: FFmpeg fills up what lossy data does not hold
 """
 
 from __future__ import annotations
@@ -45,6 +45,8 @@ _UPRIGHT = {
 }  # fmt: skip
 """What turns a picture upright, by its Exif orientation."""
 _WIDTH, _HEIGHT, _BITS, _COMPRESSION, _PHOTOMETRIC, _ORIENTATION, _EXTRA_SAMPLES = 256, 257, 258, 259, 262, 274, 338
+_SAMPLE_FORMAT, _UNSIGNED = 339, frozenset({1, 4})
+"""Tag of what the numbers of a TIFF picture are, and those that no decoder takes for others: 4 is "not stated"."""
 _STRIPS, _TILES = (273, 279), (324, 325)
 """Tags of their places and sizes, bytes."""
 _BLACK_IS_ZERO, _PREMULTIPLIED, _BIG_TIFF = 1, 1, b"II+\0"
@@ -60,6 +62,7 @@ _DAMAGE = re.compile(
 """What libjpeg says of damage. Bytes between the segments of a head spoil no pixel."""
 _PNG_SAMPLES = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """Samples of a pixel, by the type of colour."""
+_LAST_PNG_FILTER = 4
 _ADAM7 = ((0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1))
 """First row and column, and steps from row to row and column to column, of each pass of an interlaced PNG picture."""
 
@@ -136,6 +139,10 @@ def decode_picture(data: bytes) -> tuple[VideoFrame, str]:
     codec = codec_of(data) or "png"
     if codec == "tiff":
         with _opened(data) as picture:
+            if not _UNSIGNED.issuperset(formats := picture.tag_v2.get(_SAMPLE_FORMAT, (1,))):
+                raise ValueError(
+                    f"has numbers of TIFF's sample format {formats[0]}, signed or real: write levels from 0 on"
+                )
             if _is_left_to_pillow(picture, data):
                 stored = picture.tag_v2.get(_COMPRESSION)
                 if (frame := _frame_of(picture)) is None:
@@ -168,16 +175,16 @@ def check_picture(data: bytes, head: PictureHead) -> None:
     with _diverted_stderr() as said:
         if codec == "mjpeg" and (warning := _warning_of_libjpeg(data, head, said)):
             raise ValueError(f"is truncated or damaged: libjpeg says {warning!r}")
-        if frame is None:
+        if head.form not in ("TIFF", "BMP", "WEBP"):
             return
         with _opened(data) as picture:
             if head.form == "TIFF" and picture.tag_v2.get(_COMPRESSION) in _DEFLATES:
                 spans = (picture.tag_v2[tag] for tag in (_TILES if _TILES[0] in picture.tag_v2 else _STRIPS))
                 for at, size in zip(*spans, strict=True):
                     zlib.decompressobj().decompress(data[at : at + size])  # compares the checksum, as libtiff does not
-            picture.load()  # libtiff fails where a strip is damaged
+            picture.load()  # libtiff fails where a strip is damaged, libwebp where the coded data ends elsewhere
             other = _frame_of(picture)
-    if other is not None:
+    if frame is not None and other is not None:
         levels, expected = (each.reformat(format="gray").to_ndarray().astype(np.int16) for each in (frame, other))
         levels = _UPRIGHT.get(head.exif, Orientation()).upright(levels[None])[0]
         if levels.shape != expected.shape or abs(levels - expected).max() > _TOLERANCE:
@@ -241,21 +248,26 @@ def _warning_of_libjpeg(data: bytes, head: PictureHead, said: BinaryIO) -> str:
 
 
 def check_rows(data: bytes) -> None:
-    """Check that a PNG picture has the data of all its rows. Decoders leave the others black.
+    """Check that a PNG picture has the data of all its rows, by known filters. Decoders fill the others with anything.
 
     Raises:
         ValueError: it has not.
         zlib.error: the data is damaged.
     """
     width, height, depth, colour, _, _, is_interlaced = struct.unpack_from(">2I5B", data, 16)
-    bits, wanted = depth * _PNG_SAMPLES[colour], 0
+    bits, passes, wanted = depth * _PNG_SAMPLES[colour], list[slice](), 0
     for top, left, down, across in _ADAM7 if is_interlaced else ((0, 0, 1, 1),):
         rows, columns = -((top - height) // down), -((left - width) // across)
-        wanted += rows * (1 + (columns * bits + 7) // 8) * (columns > 0)  # each row begins with its filter
+        stride, begin = 1 + (columns * bits + 7) // 8, wanted  # each row begins with its filter
+        wanted += rows * stride * (columns > 0)
+        passes.append(slice(begin, wanted, stride))
     parts, at = list[bytes](), 8
     while at + 8 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
         parts += [data[at + 8 : at + 8 + length]] * (kind == b"IDAT")
         at += 12 + length
-    if (found := len(zlib.decompressobj().decompress(b"".join(parts), wanted))) < wanted:
-        raise ValueError(f"is truncated or damaged: it has {found} of {wanted} bytes of its rows")
+    found = zlib.decompressobj().decompress(b"".join(parts), wanted)
+    if len(found) < wanted:
+        raise ValueError(f"is truncated or damaged: it has {len(found)} of {wanted} bytes of its rows")
+    if (last := max(max(found[rows], default=0) for rows in passes)) > _LAST_PNG_FILTER:
+        raise ValueError(f"is damaged: a row has the filter {last}, and PNG has 0 to {_LAST_PNG_FILTER}")

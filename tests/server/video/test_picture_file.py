@@ -105,6 +105,16 @@ def test_tiles_that_pillow_reads_wrong_are_refused(tmp_path: Path, changed: dict
     assert why in found
 
 
+@pytest.mark.parametrize("tile", [0, 64])
+@pytest.mark.parametrize("kind", ["grey", "grey16"])
+def test_signed_and_real_numbers_of_tiff_are_refused(kind: str, tile: int) -> None:
+    """Decoders take signed numbers for levels from 0 on, which turns dark into bright."""
+    assert abs(grey_of(tiff(PIXELS[kind], tile, t339=1)) - GREY).max() <= 1
+    for data in tiff(PIXELS[kind], tile, t339=2), encoded(PIXELS[kind].astype(np.float32), "tiff"):
+        with pytest.raises(ValueError, match=r"sample format [23], .*: write levels from 0 on"):
+            decode_picture(data)
+
+
 def test_tiff_that_ffmpeg_reads_alone_is_kept(tmp_path: Path) -> None:
     """Pillow leaves these levels as they are stored, and FFmpeg does not."""
     inverse = tiff(65535 - PIXELS["grey16"], t262=0)
@@ -137,6 +147,30 @@ def test_png_with_too_few_rows_is_refused(tmp_path: Path, pixel_format: str, int
     for share in (0.999, 0.34, 0.0):
         (why,) = why_refused(tmp_path, shortened(data, lambda length, kept=share: int(length * kept)), "png")
         assert "bytes of its rows" in why
+
+
+@pytest.mark.parametrize("interlaced", [False, True])
+def test_png_with_an_unknown_filter_is_refused(interlaced: bool) -> None:
+    """FFmpeg takes it for another filter, and the rows below are wrong."""
+    data = png_of_ffmpeg("gray", interlaced, HEIGHT, WIDTH)
+    rows = bytearray(zlib.decompress(b"".join(content for kind, content in png_parts(data) if kind == b"IDAT")))
+    rows[-WIDTH - 1] = 9  # of the last row, also of the last pass
+    parts = [(b"IHDR", png_parts(data)[0][1]), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
+    with pytest.raises(ValueError, match="is damaged: a row has the filter 9, and PNG has 0 to 4"):
+        check_rows(data[:8] + b"".join(chunk(*part) for part in parts))
+
+
+def test_damaged_webp_is_refused() -> None:
+    """Lossless data has no redundancy: much of its damage is not seen."""
+    sound = encoded(RGB, "webp", quality=90)
+    check_picture(sound, read_head(sound))
+    for seed in range(20):
+        random, damaged = np.random.default_rng(seed), bytearray(sound)
+        at = int(random.integers(100, len(sound) - 60))
+        damaged[at : at + 4] = random.bytes(4)
+        decode_picture(bytes(damaged))  # without a word
+        with pytest.raises(OSError, match=r"."):
+            check_picture(bytes(damaged), read_head(sound))
 
 
 @pytest.mark.parametrize("form", ["tiff", "bmp", "webp", "jpeg", "png"])
