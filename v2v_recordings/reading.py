@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings import bag, dsec, faery_reader, hdf5, mvsec, npy_columns, text_events
+from v2v_recordings import bag, dsec, faery_reader, hdf5, mvsec, npy_columns, prophesee, text_events
 from v2v_recordings.event_columns import TimeUnit, clock_fault
 from v2v_recordings.items import (
     ConvertOptions,
@@ -78,7 +78,7 @@ FORMS = {
     "bag": RawForm("ROS 1 bag (HQF, IJRR, MVSEC)", bag.recognises, bag.read, published_shift=1),
     "aedat4": RawForm("aedat4 of a DAVIS", faery_reader.recognises_aedat4, faery_reader.read_aedat4, light="linear"),
     "es": RawForm("Event Stream (.es)", faery_reader.recognises_es, faery_reader.read_es),
-    "prophesee": RawForm("EVT 2, 3 (.raw), DAT", faery_reader.recognises_prophesee, faery_reader.read_prophesee),
+    "prophesee": RawForm("EVT 2, 3 (.raw), DAT", prophesee.recognises, prophesee.read),
 }
 
 
