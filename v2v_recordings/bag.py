@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_recordings import prophesee
-from v2v_recordings.archive import package, starts_with
+from v2v_recordings.archive import package
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, ReadProgress, SensorSize
 
 _EVENT_TYPES = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
@@ -30,11 +30,6 @@ EVT_HEADERS = {"evt2": "% evt 2.0", "evt3": "% evt 3.0"}
 DAMAGE = (EOFError, RuntimeError, ValueError, LookupError, AssertionError)
 """Errors that rosbags and its decompressors raise on damaged files, in addition to their own classes."""
 COLOURS = {"bgr8": cv2.COLOR_BGR2GRAY, "rgb8": cv2.COLOR_RGB2GRAY}
-
-
-def recognises(path: Path) -> bool:
-    """Return whether the file starts with a bag's first bytes."""
-    return starts_with(path, b"#ROSBAG V")
 
 
 def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:

@@ -117,7 +117,7 @@ class Rounds:
         """Return the next times, [n], with the rounds before them."""
         joined, before = np.append(self._last, times.astype(np.int64)), len(self._last)
         if len(joined) and np.ptp(joined) >= 3 * self._period // 4:
-            joined = np.unwrap(joined, 3 * self._period // 4, period=self._period)
+            joined = np.unwrap(joined, 3 * self._period // 4, period=self._period).astype(np.int64)
         self._last = joined[-1:]
         return joined[before:]
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.archive import package, starts_with
+from v2v_recordings.archive import package
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, ReadProgress, SensorSize
 
 ES_HEAD_BYTES, ES_EVENT_BYTES, ES_LONGEST_STEP_US = 20, 5, 127
@@ -23,16 +23,6 @@ ES_HEAD_BYTES, ES_EVENT_BYTES, ES_LONGEST_STEP_US = 20, 5, 127
 CUT_PACKET = "failed to fill whole buffer"
 """Error of faery where a packet of aedat4 is longer than the file."""
 _TO_GREY = {"RGB": cv2.COLOR_RGB2GRAY, "RGBA": cv2.COLOR_RGBA2GRAY}
-
-
-def recognises_aedat4(path: Path) -> bool:
-    """Return whether the file starts with aedat4's first bytes."""
-    return starts_with(path, b"#!AER-DAT4")
-
-
-def recognises_es(path: Path) -> bool:
-    """Return whether the file starts with Event Stream's first bytes."""
-    return starts_with(path, b"Event Stream")
 
 
 def read_aedat4(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
@@ -83,8 +73,8 @@ def read_es(path: Path, _options: ConvertOptions, progress: ReadProgress) -> Ite
 
 
 def _events(packet: npt.NDArray[Any]) -> EventChunk:
-    polarity = next(name for name in ("payload", "p", "on") if name in (packet.dtype.names or ()))
-    return EventChunk(packet["t"].astype(np.int64) * 1000, packet["x"], packet["y"], packet[polarity] > 0)
+    t, x, y, polarity = (packet[name] for name in packet.dtype.names or ())
+    return EventChunk(t.astype(np.int64) * 1000, x, y, polarity > 0)
 
 
 def _frame(frame: Any, size: SensorSize, path: Path) -> Picture:
@@ -108,5 +98,4 @@ def _errors_of_faery(path: Path) -> Iterator[None]:
         is_panic = type(error).__name__ == "PanicException"
         if not is_panic and not isinstance(error, (RuntimeError, OSError, ValueError, IndexError)):
             raise
-        hint = "; give --size WIDTHxHEIGHT" if "size" in str(error) else ""
-        raise UsageError(f"{path} cannot be decoded: {error}{hint}") from error
+        raise UsageError(f"{path} cannot be decoded: {error}") from error

@@ -66,7 +66,7 @@ def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterato
         if is_dat and (kind := file.read(2)) not in DAT_EVENTS:
             raise UsageError(f"{path}: its events are of type and size {kind.hex(' ')}; 00 08 and 0c 08 can be read")
         begin, total = file.tell(), path.stat().st_size
-        decoder = _Dat(header) if is_dat else _Evt2() if form == "EVT 2" else evt3.Decoder()
+        decoder: Any = _Dat(header) if is_dat else _Evt2() if form == "EVT 2" else evt3.Decoder()
         while len(words := np.fromfile(file, decoder.word, evt3.BLOCK_WORDS)):
             try:
                 yield decoder.decode(words)
