@@ -57,7 +57,7 @@ class EventChunk:
         return self.take(slice(first, last))
 
     def take(self, chosen: slice | npt.NDArray[np.intp]) -> EventChunk:
-        """Return the events of these places."""
+        """Return the events of these places, a slice or [n]."""
         return EventChunk(self.t_ns[chosen], self.x[chosen], self.y[chosen], self.p[chosen])
 
 
