@@ -8,8 +8,9 @@ mvsec.py         MVSEC: HDF5
 dsec.py          DSEC and v2v-simulate: HDF5, with frames in a folder
 npy_columns.py   EVREAL's folders, and .npz
 bag.py           ROS 1 bags
-faery_reader.py  aedat4, EVT 2, DAT, Event Stream, by the package faery
-evt3.py          EVT 3: words decoded and encoded
+faery_reader.py  aedat4, Event Stream, by the package faery
+prophesee.py     EVT 2, EVT 3, DAT
+evt3.py          words of EVT 3 decoded and encoded
 limits.py        sizes and times that each form can hold
 time_stamps.py   times of pictures in a text, whose unit may be open
 archive.py       a zip file, a folder or a single file, through one interface

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.archive import package, starts_with
-from v2v_recordings.faery_reader import read_prophesee
+from v2v_recordings import prophesee
+from v2v_recordings.archive import package
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Picture, ReadProgress, SensorSize
 
 _EVENT_TYPES = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
@@ -30,11 +30,6 @@ EVT_HEADERS = {"evt2": "% evt 2.0", "evt3": "% evt 3.0"}
 DAMAGE = (EOFError, RuntimeError, ValueError, LookupError, AssertionError)
 """Errors that rosbags and its decompressors raise on damaged files, in addition to their own classes."""
 COLOURS = {"bgr8": cv2.COLOR_BGR2GRAY, "rgb8": cv2.COLOR_RGB2GRAY}
-
-
-def recognises(path: Path) -> bool:
-    """Return whether the file starts with a bag's first bytes."""
-    return starts_with(path, b"#ROSBAG V")
 
 
 def read(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
@@ -102,7 +97,7 @@ def _read_packets(messages: Messages, events: str, path: Path) -> Iterator[Item]
                     first_stamp_ns, encoding = stamp_ns, this_encoding
                     stream.write(f"{EVT_HEADERS[encoding]}\n% geometry {width}x{height}\n% end\n".encode())
                 stream.write(message.array(np.dtype("u1"), count).tobytes())
-        for item in read_prophesee(raw_file, ConvertOptions(), lambda _done, _total: None):
+        for item in prophesee.read(raw_file, ConvertOptions(), lambda _done, _total: None):
             if isinstance(item, EventChunk) and len(item):
                 if offset_ns is None:
                     offset_ns = (first_stamp_ns or 0) - int(item.t_ns[0])

@@ -28,8 +28,8 @@ POLARITY_CODES = {
 LARGEST_COORDINATE = np.iinfo(np.uint16).max
 LARGEST_NS = 2.0**62
 """Limit of times: 146 years. Differences of two fit int64."""
-WRAPPING_BYTES, LEAST_WRAP = 4, 3 << 30
-"""Times of 32 bits that step back by at least this have begun again."""
+WRAPPING_BYTES = 4
+"""Size of times that may go round."""
 SHOWN_CODES = 6
 ANY_DURATION_EVENTS = 1000
 """At most this many events may have any duration."""
@@ -106,6 +106,24 @@ def _is_plausible(events: int, seconds: float, is_stated: bool) -> bool:
     return lasts and (is_stated or least * seconds <= events) and events <= most * seconds
 
 
+class Rounds:
+    """Tell times that go round by a clock of some bits, part by part.
+
+    A step back by at least three quarters of the range begins a new round; any other is a late event, or a reset clock.
+    """
+
+    def __init__(self, bits: int) -> None:
+        self._period, self._last = 1 << bits, np.empty(0, np.int64)
+
+    def unwrap(self, times: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
+        """Return the next times, [n], with the rounds before them."""
+        joined, before = np.append(self._last, times.astype(np.int64)), len(self._last)
+        if len(joined) and np.ptp(joined) >= 3 * self._period // 4:
+            joined = np.unwrap(joined, 3 * self._period // 4, period=self._period).astype(np.int64)
+        self._last = joined[-1:]
+        return joined[before:]
+
+
 class EventColumns:
     """Turn the columns of a recording, part by part, into chunks of events.
 
@@ -117,7 +135,7 @@ class EventColumns:
 
     def __init__(self, where: str, unit: TimeUnit | None = None, offset_ns: int = 0) -> None:
         self.where, self.unit, self._polarities = where, unit, Polarities()
-        self._last_t: Numbers | None = None
+        self._rounds = Rounds(8 * WRAPPING_BYTES)
         self._offset_ns, self._count, self._first_ns, self._last_ns = offset_ns, 0, int(LARGEST_NS), -int(LARGEST_NS)
 
     def part(self, t: Numbers, x: Numbers, y: Numbers, p: Numbers) -> EventChunk:
@@ -131,12 +149,8 @@ class EventColumns:
                 no known meaning.
         """
         assert self.unit is not None
-        if len(t) and t.dtype.kind in "iu" and t.dtype.itemsize == WRAPPING_BYTES:
-            joined = np.append(t[:1] if self._last_t is None else self._last_t, t.astype(np.int64))
-            if np.ptp(joined) >= LEAST_WRAP:
-                joined = np.unwrap(joined, LEAST_WRAP, period=1 << 8 * WRAPPING_BYTES)
-            t = joined[1:]
-            self._last_t = t[-1:]
+        if t.dtype.kind in "iu" and t.dtype.itemsize == WRAPPING_BYTES:
+            t = self._rounds.unwrap(t)
         t_ns = to_ns(t, self.where, NS_PER_UNIT[self.unit.name], self._offset_ns)
         x, y, p = self._coordinates(x, "x"), self._coordinates(y, "y"), self._polarities.are_brighter(p, self.where)
         self._first_ns, self._last_ns = t_ns.min(initial=self._first_ns), t_ns.max(initial=self._last_ns)

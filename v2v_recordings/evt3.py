@@ -15,24 +15,19 @@ step back is a new round if it is a quarter of a round forward or less.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, ReadProgress, SensorSize
-from v2v_recordings.limits import FORM_LIMITS, LARGER, check_size
+from v2v_recordings.items import EventChunk, Note
+from v2v_recordings.limits import FORM_LIMITS
 
 Longs = npt.NDArray[np.int64]
 Uint16s = npt.NDArray[np.uint16]
 WORD = np.dtype("<u2")
-GEOMETRY = re.compile(rb"(?im)^% *geometry +(\d{1,9}) *x *(\d{1,9})")
-WIDTH, HEIGHT = (re.compile(rb"(?im)^%% .*?\b%b[ =](\d{1,9})" % name) for name in (b"width", b"height"))
-"""Where the lines of a header state the size: ``geometry 1280x720``, ``format EVT3;height=720;width=1280``."""
 BLOCK_WORDS = 1 << 17
 """Words that are decoded at once; a word holds at most 12 events, which take 100 bytes each while they are decoded."""
 ROUND, HIGH_US = 1 << 12, 1 << 12
@@ -57,6 +52,8 @@ class Decoder:
         words, reserved: number of words, and of those that have reserved types.
         foreign: number of rows of a second camera. Their events are left out.
     """
+
+    word = WORD
 
     def __init__(self) -> None:
         self.words = self.reserved = self.foreign = 0
@@ -104,6 +101,13 @@ class Decoder:
         flat &= 15
         return EventChunk(t_ns[which], x[which] + flat, row[which], p[which])
 
+    def notes(self) -> Iterator[Note]:
+        """Yield what was left out."""
+        if self.reserved:
+            yield Note(f"{self.reserved} words of types that EVT 3 reserves are passed over")
+        if self.foreign:
+            yield Note(f"the events of a second camera, in {self.foreign} rows, are left out")
+
     def _held(self, name: str, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return what is in force after each number of words that set it, [1 + S]: the last value before, and these."""
         values = np.concatenate([np.array([self._last[name]], values.dtype), values])
@@ -142,40 +146,6 @@ class Decoder:
         changes[repeated] = False
         kinds[places[repeated]] = 0xF
         return low[np.flatnonzero(changes)] * 1000
-
-
-def read(path: Path, header: bytes, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
-    """Yield the sensor's size and the events of a file, and notes on what is left out.
-
-    Args:
-        path: the file, which begins with ``header``.
-
-    Raises:
-        UsageError: the words are not those of EVT 3; the size is not stated, stated twice, or beyond the coordinates.
-    """
-    stated = {*GEOMETRY.findall(header), *zip(WIDTH.findall(header), HEIGHT.findall(header), strict=False)}
-    sizes = {SensorSize(int(width), int(height)) for width, height in stated}
-    if options.size is not None and (not sizes or options.size in sizes):
-        sizes = {options.size}
-    if len(sizes) != 1:
-        count = "several sizes" if sizes else "no size"
-        raise UsageError(f"{path}: its header states {count} of the sensor; give --size WIDTHxHEIGHT")
-    size = sizes.pop()
-    yield size
-    check_size(str(path), "EVT 3", size.width, size.height, LARGER)
-    decoder, total = Decoder(), path.stat().st_size
-    with path.open("rb") as file:
-        file.seek(len(header))
-        while len(words := np.fromfile(file, WORD, BLOCK_WORDS)):
-            try:
-                yield decoder.decode(words)
-            except UsageError as error:
-                raise UsageError(f"{path}: {error}") from error
-            progress(len(header) + decoder.words * WORD.itemsize, total)
-    if decoder.reserved:
-        yield Note(f"{decoder.reserved} words of types that EVT 3 reserves are passed over")
-    if decoder.foreign:
-        yield Note(f"the events of a second camera, in {decoder.foreign} rows, are left out")
 
 
 def header_of(width_px: int, height_px: int) -> bytes:

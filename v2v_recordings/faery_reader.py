@@ -1,6 +1,4 @@
-"""Read files with the faery package: aedat4 of DAVIS cameras; Prophesee's EVT 2 (.raw) and DAT; Event Stream.
-
-Prophesee's EVT 3 is told apart by the header, and read without faery.
+"""Read files with the faery package: aedat4 of DAVIS cameras, and Event Stream.
 
 A file that ends within an event or packet is read up to it.
 """
@@ -8,9 +6,6 @@ A file that ends within an event or packet is read up to it.
 from __future__ import annotations
 
 import contextlib
-import itertools
-import re
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,46 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings import evt3
-from v2v_recordings.archive import package, starts_with
+from v2v_recordings.archive import package
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, ReadProgress, SensorSize
-from v2v_recordings.limits import LARGER, check_size
 
 ES_HEAD_BYTES, ES_EVENT_BYTES, ES_LONGEST_STEP_US = 20, 5, 127
 """Bytes before the first event and of an event; a longer time between two events is bytes of 0xff of this length."""
 CUT_PACKET = "failed to fill whole buffer"
 """Error of faery where a packet of aedat4 is longer than the file."""
-HEADER_LINE = re.compile(rb"%( .*|[\t\x20-\x7e]*)\r?\n?")
-"""Words may begin like such a line, but not with a space after it or like text."""
-VERSIONS = re.compile(rb"(?im)^% *format +EVT(\d)"), re.compile(rb"(?im)^% *evt +(\d)")
-"""Lines with the version of EVT; the first decides where a header has both."""
-EVT2_WORD = np.dtype("<u4")
-DAT_WORD = np.dtype("<u8")
-"""An event of DAT; the lower half is its time, us."""
-TIME_HIGH = 0x8
-"""Value of the four upper bits of a word whose other bits are the upper bits of a time."""
-TIME_HIGH_US = {8: 1, 4: 64}
-"""Unit of the upper bits, by the bytes of a word; DAT's words hold a whole time."""
-LATEST_US = 10_000
-"""The upper bits may step back by at most this without a reset."""
-LOOKED_THROUGH_WORDS = 1 << 20
-LONGEST_LINE_BYTES = 1 << 12
 _TO_GREY = {"RGB": cv2.COLOR_RGB2GRAY, "RGBA": cv2.COLOR_RGBA2GRAY}
-
-
-def recognises_aedat4(path: Path) -> bool:
-    """Return whether the file starts with aedat4's first bytes."""
-    return starts_with(path, b"#!AER-DAT4")
-
-
-def recognises_prophesee(path: Path) -> bool:
-    """Return whether the path is a ``.raw`` or ``.dat`` file whose header lines begin with %."""
-    return path.suffix.lower() in (".raw", ".dat") and starts_with(path, b"%")
-
-
-def recognises_es(path: Path) -> bool:
-    """Return whether the file starts with Event Stream's first bytes."""
-    return starts_with(path, b"Event Stream")
 
 
 def read_aedat4(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
@@ -87,53 +50,6 @@ def read_aedat4(path: Path, options: ConvertOptions, progress: ReadProgress) -> 
             yield Note(f"cut: packet {number + 1} is incomplete; the {number} before it are read")
 
 
-def read_prophesee(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
-    """Yield events of a file. The sensor's size is in its header or in ``options``.
-
-    Event words of EVT hold only the lower bits of a time; the upper bits are words of their own, many per millisecond.
-    If a recording begins in the middle of the sensor's stream, events before the first upper bits have no time, and
-    are dropped.
-
-    Raises:
-        UsageError: the file is damaged, does not state the size or one beyond its coordinates, or is EVT 2.1.
-    """
-    header = _header(path)
-    version = next((found[1] for line in VERSIONS if (found := line.search(header))), b"")
-    if version == b"3":
-        yield from evt3.read(path, header, options, progress)
-        yield from _cut_note(path, len(header), evt3.WORD.itemsize)
-        return
-    fallback = None if options.size is None else (options.size.width, options.size.height)
-    is_evt = path.suffix.lower() != ".dat" or version != b""
-    faery = package("faery", "this form")
-    decode = faery.evt.Decoder if is_evt else faery.dat.Decoder
-    with _errors_of_faery(path), decode(path, fallback, None) as decoder:
-        if is_evt and decoder.version != "evt2":  # for EVT 2.1, faery up to 0.7.1 panics
-            raise UsageError(f"{path} is in EVT 2.1, which is not supported; EVT 2, EVT 3 and DAT are")
-        if decoder.dimensions is None:
-            raise UsageError(f"{path}: its header states no size of the sensor; give --size")
-        width, height = decoder.dimensions
-        yield SensorSize(width, height)
-        check_size(str(path), "EVT 2" if is_evt else "DAT", width, height, LARGER)
-    word: np.dtype[Any] = EVT2_WORD if is_evt else DAT_WORD
-    # DAT's header ends with two bytes of its own.
-    begin = len(header) if is_evt else len(header) + 2
-    first_us, resets = _clock(path, word, begin)
-    is_timeless = True
-    with tempfile.TemporaryDirectory() as folder:
-        for part in _parts(path, [begin, *resets], Path(folder)):
-            with _errors_of_faery(path), decode(part, fallback, None) as decoder:
-                for packet in decoder:
-                    progress(0, None)
-                    events = packet.get("events", ()) if isinstance(packet, dict) else packet
-                    if is_timeless and len(events):
-                        has_time = events["t"] >= first_us
-                        events, is_timeless = events[has_time.argmax() :] if has_time.any() else (), not has_time.any()
-                    if len(events):
-                        yield _events(events)
-    yield from _cut_note(path, begin, word.itemsize)
-
-
 def read_es(path: Path, _options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:
     """Yield events of an Event Stream file of a camera without grey levels.
 
@@ -152,68 +68,13 @@ def read_es(path: Path, _options: ConvertOptions, progress: ReadProgress) -> Ite
             end += ES_EVENT_BYTES * len(events) + int((steps // ES_LONGEST_STEP_US).sum())
             last_us = int(events["t"][-1])
             progress(end, path.stat().st_size)
-    yield from _cut_note(path, end, path.stat().st_size)
-
-
-def _cut_note(path: Path, begin: int, item_bytes: int) -> Iterator[Item]:
-    """Yield a note if the bytes from ``begin`` on are no whole number of items."""
-    over = (path.stat().st_size - begin) % item_bytes
-    if over:
+    if over := path.stat().st_size - end:
         yield Note(f"cut: the last {over} bytes are an incomplete event and left out")
 
 
-def _header(path: Path) -> bytes:
-    """Return the lines of the header, which begin with %; the last one may be ``% end``."""
-    header = b""
-    with path.open("rb") as file:
-        while HEADER_LINE.fullmatch(line := file.readline(LONGEST_LINE_BYTES)):
-            header += line
-            if line.strip(b"% \t\r\n").lower() == b"end":
-                break
-    return header
-
-
-def _clock(path: Path, word: np.dtype[Any], begin: int) -> tuple[int, list[int]]:
-    """Return the first (upper bits of a) time, us, and the bytes at which it steps back without wrapping around."""
-    bits = 32 if word == DAT_WORD else 8 * word.itemsize - 4
-    unit_us, first, last, resets = TIME_HIGH_US[word.itemsize], 0, None, list[int]()
-    for start in range(begin, path.stat().st_size, LOOKED_THROUGH_WORDS * word.itemsize):
-        words = np.fromfile(path, word, LOOKED_THROUGH_WORDS, offset=start)
-        times = np.flatnonzero((words >> bits == TIME_HIGH) | (word == DAT_WORD))
-        if not len(times):
-            continue
-        highs = (words[times] & ((1 << bits) - 1)).astype(np.int64)
-        if last is None:
-            first = last = int(highs[0])
-        steps = np.diff(highs, prepend=last)
-        is_back = (-steps * unit_us > LATEST_US) & (steps % (1 << bits) > 1 << (bits - 2))
-        resets += (start + word.itemsize * times[is_back]).tolist()
-        last = int(highs[-1])
-    return first * unit_us, resets
-
-
-def _parts(path: Path, edges: list[int], folder: Path) -> Iterator[Path]:
-    """Yield the file; or, if the sensor's clock is reset in it, a file in ``folder`` for each stretch of one clock.
-
-    faery takes a clock that steps back for one that wrapped around.
-
-    Args:
-        edges: bytes at which the stretches begin; the header is before the first.
-    """
-    if len(edges) == 1:
-        yield path
-        return
-    content, part = np.memmap(path, np.uint8, "r"), folder / "part.raw"
-    for begin, end in itertools.pairwise([*edges, len(content)]):
-        with part.open("wb") as copy:
-            copy.write(content[: edges[0]].data)
-            copy.write(content[begin:end].data)
-        yield part
-
-
 def _events(packet: npt.NDArray[Any]) -> EventChunk:
-    polarity = next(name for name in ("payload", "p", "on") if name in (packet.dtype.names or ()))
-    return EventChunk(packet["t"].astype(np.int64) * 1000, packet["x"], packet["y"], packet[polarity] > 0)
+    t, x, y, polarity = (packet[name] for name in packet.dtype.names or ())
+    return EventChunk(t.astype(np.int64) * 1000, x, y, polarity > 0)
 
 
 def _frame(frame: Any, size: SensorSize, path: Path) -> Picture:
@@ -237,5 +98,4 @@ def _errors_of_faery(path: Path) -> Iterator[None]:
         is_panic = type(error).__name__ == "PanicException"
         if not is_panic and not isinstance(error, (RuntimeError, OSError, ValueError, IndexError)):
             raise
-        hint = "; give --size WIDTHxHEIGHT" if "size" in str(error) else ""
-        raise UsageError(f"{path} cannot be decoded: {error}{hint}") from error
+        raise UsageError(f"{path} cannot be decoded: {error}") from error

@@ -153,6 +153,7 @@ def sensor_size(shape: Any, path: Path) -> SensorSize:
     return SensorSize(int(sides[1]), int(sides[0]))
 
 
+_CURE = "and only data inside the file is read: make the file self-contained with h5repack or h5copy -f ext"
 UNIT_ATTRIBUTES = ("unit", "units", "time_unit", "time_units")
 
 
@@ -197,36 +198,24 @@ def require_self_contained(file: h5py.File, path: Path) -> None:
     while groups:
         group = groups.pop()
         for name in group:
-            link = group.get(name, getlink=True)
-            if isinstance(link, h5py.ExternalLink):
-                raise _external_error(path, f"{group.name}/{name}", f"links to {link.filename}")
+            link, where = group.get(name, getlink=True), f"{path}: {group.name}/{name}".replace("//", "/")
             if isinstance(link, h5py.SoftLink):  # within this file: its target is visited by itself
                 continue
+            if isinstance(link, h5py.ExternalLink):
+                raise UsageError(f"{where} links to {link.filename}, {_CURE}")
             item = group[name]
             if isinstance(item, h5py.Group):
                 address = h5py.h5o.get_info(item.id).addr  # a group may have several names, its own child's among them
                 if address not in seen:
                     seen.add(address)
                     groups.append(item)
-            elif isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
-                kind = "a virtual dataset" if item.is_virtual else "a dataset with external storage"
-                raise _external_error(path, f"{group.name}/{name}", f"is {kind}")
             elif isinstance(item, h5py.Dataset):
-                each_bytes, where = item.id.get_type().get_size(), f"{path}: {name}"
+                if item.external or item.is_virtual:
+                    kind = "a virtual dataset" if item.is_virtual else "a dataset with external storage"
+                    raise UsageError(f"{where} is {kind}, {_CURE}")
+                each_bytes = item.id.get_type().get_size()
                 check_stated_bytes(each_bytes * item.id.get_space().get_simple_extent_npoints(), path, where)
                 check_stated_bytes(each_bytes * math.prod(item.chunks or ()), path, f"{where}: a chunk", is_piece=True)
-
-
-def _external_error(path: Path, name: str, what: str) -> UsageError:
-    return UsageError(
-        f"{path}: {name.replace('//', '/')} {what}, and only data inside the file is read: make the file "
-        "self-contained with h5repack or h5copy -f ext"
-    )
-
-
-def recognises_layout(path: Path) -> bool:
-    """Return whether the path is an HDF5 file with ``events/ts``."""
-    return holds(path, "events/ts")
 
 
 def read_layout(path: Path, options: ConvertOptions, progress: ReadProgress) -> Iterator[Item]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,9 +47,17 @@ class EventChunk:
     def __len__(self) -> int:
         return len(self.t_ns)
 
+    @classmethod
+    def join(cls, chunks: Iterable[EventChunk]) -> EventChunk:
+        """Return the events of chunks, at least one, in one."""
+        return cls(*map(np.concatenate, zip(*((each.t_ns, each.x, each.y, each.p) for each in chunks), strict=True)))
+
     def part(self, first: int, last: int | None = None) -> EventChunk:
-        """Return the events ``first:last``."""
-        chosen = slice(first, last)
+        """Return the events ``first:last``, as a view."""
+        return self.take(slice(first, last))
+
+    def take(self, chosen: slice | npt.NDArray[np.intp]) -> EventChunk:
+        """Return the events of these places, a slice or [n]."""
         return EventChunk(self.t_ns[chosen], self.x[chosen], self.y[chosen], self.p[chosen])
 
 

@@ -10,13 +10,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_recordings import bag, dsec, faery_reader, hdf5, mvsec, npy_columns, text_events
+from v2v_recordings import bag, dsec, faery_reader, hdf5, mvsec, npy_columns, prophesee, text_events
+from v2v_recordings.archive import starts_with
 from v2v_recordings.event_columns import TimeUnit, clock_fault
 from v2v_recordings.items import (
     ConvertOptions,
@@ -73,12 +75,16 @@ FORMS = {
         npy_columns.recognises,
         npy_columns.read,
     ),
-    "h5": RawForm("the layout that v2v-convert writes", hdf5.recognises_layout, hdf5.read_layout),
+    "h5": RawForm("the layout that v2v-convert writes", lambda path: hdf5.holds(path, "events/ts"), hdf5.read_layout),
     "mvsec": RawForm("MVSEC: *_data.hdf5", mvsec.recognises, mvsec.read, light="linear"),
-    "bag": RawForm("ROS 1 bag (HQF, IJRR, MVSEC)", bag.recognises, bag.read, published_shift=1),
-    "aedat4": RawForm("aedat4 of a DAVIS", faery_reader.recognises_aedat4, faery_reader.read_aedat4, light="linear"),
-    "es": RawForm("Event Stream (.es)", faery_reader.recognises_es, faery_reader.read_es),
-    "prophesee": RawForm("EVT 2, 3 (.raw), DAT", faery_reader.recognises_prophesee, faery_reader.read_prophesee),
+    "bag": RawForm(
+        "ROS 1 bag (HQF, IJRR, MVSEC)", partial(starts_with, magic=b"#ROSBAG V"), bag.read, published_shift=1
+    ),
+    "aedat4": RawForm(
+        "aedat4 of a DAVIS", partial(starts_with, magic=b"#!AER-DAT4"), faery_reader.read_aedat4, light="linear"
+    ),
+    "es": RawForm("Event Stream (.es)", partial(starts_with, magic=b"Event Stream"), faery_reader.read_es),
+    "prophesee": RawForm("EVT 2, 3 (.raw), DAT", prophesee.recognises, prophesee.read),
 }
 
 
@@ -179,9 +185,7 @@ class _Clock:
         chunks = self._early if chunk is None else [*self._early, _later(chunk, self._offset_ns)]
         if not chunks:
             return
-        columns = ("t_ns", "x", "y", "p")
-        rest = EventChunk(*(np.concatenate([getattr(each, name) for each in chunks]) for name in columns))
-        self._early = []
+        rest, self._early = EventChunk.join(chunks), []
         while len(rest):
             newest = np.maximum.accumulate(np.maximum(rest.t_ns, self._newest_ns))
             count = _first(rest.t_ns < newest - LATE_NS)

@@ -22,9 +22,9 @@ import numpy as np
 
 from bench.frame import Column, Report, add_whole, beyond, medians, ratios
 from v2v_protocol.command import Parser
+from v2v_recordings import prophesee
 from v2v_recordings.archive import package
 from v2v_recordings.evt3 import WORD, Uint16s, header_of
-from v2v_recordings.faery_reader import read_prophesee
 from v2v_recordings.items import ConvertOptions, EventChunk
 
 WIDTH, HEIGHT, BAR = 1280, 720, 3.0
@@ -56,7 +56,7 @@ def words_of(kind: str, rows: int) -> Uint16s:
 
 def by_us(path: Path) -> Iterator[int]:
     """Yield the number of events of each block."""
-    items = read_prophesee(path, ConvertOptions(), lambda _done, _total: None)
+    items = prophesee.read(path, ConvertOptions(), lambda _done, _total: None)
     yield from (len(item) for item in items if isinstance(item, EventChunk))
 
 

@@ -20,7 +20,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
 from trainer.evaluation import layout
 from v2v_protocol.errors import UsageError
@@ -206,35 +205,23 @@ class RecordingWriter:
 
     def _flush(self, keep: int) -> None:
         """Write all pending events except the last ``keep``."""
-        t_ns, x, y, p = (
-            np.concatenate([getattr(chunk, name) for chunk in self._pending]) for name in ("t_ns", "x", "y", "p")
-        )
-        backward = int(np.count_nonzero(np.diff(t_ns) < 0))
-        if backward:
-            order = np.argsort(t_ns, kind="stable")
-            t_ns, x, y, p = t_ns[order], x[order], y[order], p[order]
-        if self._last_ns is not None and t_ns[0] < self._last_ns:
-            seconds = (self._last_ns - t_ns[0]) * 1e-9
+        events = EventChunk.join(self._pending)
+        if backward := int(np.count_nonzero(np.diff(events.t_ns) < 0)):
+            events = events.take(np.argsort(events.t_ns, kind="stable"))
+        if self._last_ns is not None and events.t_ns[0] < self._last_ns:
+            seconds = (self._last_ns - events.t_ns[0]) * 1e-9
             raise UsageError(
                 f"{self._source}: near event {self._events} the time goes back by {seconds:.6f} s over more than "
                 f"{REORDER_EVENTS} events; sort the recording, or split it there"
             )
         self._reordered += backward
-        count = len(t_ns) - keep
-        self._append(t_ns[:count], x[:count], y[:count], p[:count])
-        # Copies: a view would keep the whole buffer alive.
-        rest = EventChunk(t_ns[count:].copy(), x[count:].copy(), y[count:].copy(), p[count:].copy())
-        self._pending, self._pending_events = [rest], keep
+        count = len(events) - keep
+        self._append(events.part(0, count))
+        # A copy: a view would keep the whole buffer alive.
+        self._pending, self._pending_events = [events.take(np.arange(count, len(events)))], keep
 
-    def _append(
-        self,
-        t_ns: npt.NDArray[np.int64],
-        x: npt.NDArray[np.integer],
-        y: npt.NDArray[np.integer],
-        p: npt.NDArray[np.bool_],
-    ) -> None:
-        if not len(t_ns):
-            return
+    def _append(self, events: EventChunk) -> None:
+        x, y = events.x, events.y
         if min(x.min(), y.min()) < 0 or max(x.max(), y.max()) > np.iinfo(np.uint16).max:
             raise UsageError(
                 f"{self._source}: events at x {x.min()} .. {x.max()}, y {y.min()} .. {y.max()}; coordinates must be "
@@ -243,13 +230,12 @@ class RecordingWriter:
         self._largest = SensorSize(
             max(self._largest.width, int(x.max()) + 1), max(self._largest.height, int(y.max()) + 1)
         )
-        columns: dict[str, npt.NDArray[Any]] = {"ts": (t_ns - (self._origin_ns or 0)) * 1e-9, "xs": x, "ys": y, "ps": p}
-        for name, values in columns.items():
+        for name, values in zip(_COLUMNS, ((events.t_ns - (self._origin_ns or 0)) * 1e-9, x, y, events.p), strict=True):
             dataset = self._file[f"events/{name}"]
-            dataset.resize(self._events + len(t_ns), axis=0)
+            dataset.resize(self._events + len(events), axis=0)
             dataset[self._events :] = values
-        self._events += len(t_ns)
-        self._last_ns = int(t_ns[-1])
+        self._events += len(events)
+        self._last_ns = int(events.t_ns[-1])
 
     def _finish(self) -> Written:
         if self._pending:

@@ -162,7 +162,7 @@ def evt21(path: Path, header: bytes) -> Path:
         (short_aedat4, "cannot be decoded"),
         (evt2_without_size, "give --size WIDTHxHEIGHT"),
         (lambda path: evt21(path, b"% evt 2.1"), "a.raw is in EVT 2.1, which is not supported"),
-        (lambda path: evt21(path, b"% evt 2.1\n% format EVT21;height=18;width=24"), 'decoded: unknown version "EVT21"'),
+        (lambda path: evt21(path, b"% evt 2.1\n% format EVT21;height=18;width=24"), "is in EVT 2.1, which is not"),
     ],
 )
 def test_errors_name_the_fault(tmp_path: Path, make: object, message: str) -> None:
@@ -239,8 +239,8 @@ def test_a_guessed_size_is_reported(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 @pytest.mark.parametrize("package", ["faery", "rosbags"])
 def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str) -> None:
-    source = tmp_path / ("a.raw" if package == "faery" else "a.bag")
-    (raw_forms.write_evt2 if package == "faery" else raw_forms.write_bag)(source, scene())
+    source = tmp_path / ("a.aedat4" if package == "faery" else "a.bag")
+    (write_aedat4 if package == "faery" else raw_forms.write_bag)(source, scene())
     for module in ("faery", "rosbags", "rosbags.rosbag1"):
         if module.startswith(package):
             monkeypatch.setitem(sys.modules, module, None)
