@@ -28,7 +28,8 @@ from tests.clips import panned_luma, write_clip
 from tests.test_commands import MODULES, ROOT, flags_of
 from trainer.config import StreamConfig
 from trainer.run.checkpoint import require_writable
-from v2v_client import Batch, V2VStreamDataset
+from v2v_client import Batch, V2VDataset, V2VStreamDataset
+from v2v_client.in_process import ShownSample
 from v2v_client.options import Options
 from v2v_pictures.files import write_png
 from v2v_protocol.errors import ServerLost, UsageError
@@ -41,6 +42,8 @@ from v2v_protocol.write_aside import write_json
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import list_corpus
 from v2v_server.corpus.sources.source import SourceOptions, open_source
+from v2v_server.simulation.clip import simulate
+from v2v_server.simulation.kernels import Voxels
 from v2v_server.store.cache import make_cache
 from v2v_server.video.rows import Rows
 from v2v_tools.event_files import EVENT_WRITERS, write_events
@@ -325,6 +328,8 @@ WRONG = [
     ("v2v-preview a.mp4 --out x.png --set bins 3", "--set bins 3: write --set bins=3"),
     ("v2v-preview a.mp4 --out x.png --set bins = 3", "write --set bins=3"),
     ("v2v-preview a.mp4 --out x.png --set bins =3", "write --set bins=3"),
+    ("v2v-preview a.mp4 --out x.png --set bins=3 gamma=2", "--set bins=3 gamma=2: write --set bins=3 --set gamma=2;"),
+    ("v2v-serve --videos clips --rows top 0.54", "--rows top 0.54: write --rows top:0.54, without a space"),
     ("v2v-simulate a.mp4 --out x.npz --arrays voxels flow", "write --arrays voxels,flow"),
     ("v2v-simulate a.mp4 --out x.npz --arrays voxels, flow", "write --arrays voxels,flow"),
     # numbers and addresses
@@ -362,7 +367,7 @@ IN_PYTHON: list[tuple[Callable[[], object], str]] = [
     (lambda: dataset().load_state_dict("last.pt"), r"'last.pt', .* Batch.resume_state itself"),  # type: ignore[arg-type]
     (lambda: dataset().load_state_dict({"network": {}}), r"version None, expected version \d+. Give the saved"),
     (lambda: dataset(workers=3), r"V2VStreamDataset.local\(..., workers=N\)"),
-    (lambda: dataset(num_workers=3), r"DataLoader\(dataset, batch_size=None, num_workers=N\)"),
+    (lambda: dataset(num_workers=3), r"DataLoader\(dataset, ..., num_workers=N\)"),
     (lambda: dataset(videos="clips"), r"V2VStreamDataset.local\(videos\) starts a server"),
     (lambda: dataset(pin_memory=True), r"DataLoader\(..., pin_memory=True\)"),
     (lambda: dataset(recipe={"pos_thres": 0.2}), r"did you mean 'threshold'"),
@@ -377,12 +382,33 @@ IN_PYTHON: list[tuple[Callable[[], object], str]] = [
     (lambda: dataset(arrays="voxel"), r"voxels"),
     (lambda: batch().voxel, r"a Batch has no 'voxel' \(did you mean 'voxels'\?\)"),
     (lambda: batch()["frame"], r"this batch has voxels"),
+    (lambda: simulated(pos_thres=0.2), r"'pos_thres' \(did you mean 'threshold_pos'\?\)"),
+    (lambda: simulated(cn=0.2), r"'cn' \(did you mean 'threshold_neg'\?\)"),
+    (lambda: simulated(threshold=0.2), r"'threshold' \(did you mean 'threshold_pos'\?\)"),
+    (lambda: simulated(frobnicate=1), r"'frobnicate'; known: .*leak_hz"),
+    (lambda: dataset(voxel_dtype=np.int8), r"voxel_dtype = .*int8.*: choose one of int8, int16"),
+    (lambda: V2VStreamDataset(5555), r"address 5555: give tcp://host:port"),  # type: ignore[arg-type]
+    (lambda: V2VStreamDataset(None), r"address None: give tcp://host:port"),  # type: ignore[arg-type]
+    (lambda: V2VDataset(["a.mp4"]), r"videos = \['a.mp4'\]: give one folder"),  # type: ignore[arg-type]
+    (lambda: V2VDataset("clips", batch_size=2), r"DataLoader\(V2VDataset\(...\), batch_size=N\)"),
+    (lambda: V2VStreamDataset.local(None), r"videos = None: give one folder"),  # type: ignore[arg-type]
+    (lambda: sample().to("cpu"), r"a Sample has no 'to'; its arrays are NumPy's: torch.from_numpy"),
+    (lambda: sample().cuda(), r"a Sample has no 'cuda'; its arrays are NumPy's"),
+    (lambda: batch().cuda(), r"a Batch has no 'cuda'; write .to"),
     (lambda: batch().flow, r"create the dataset with arrays=\('voxels', 'flow'\)"),
 ]
 
 
 def dataset(**options: Any) -> V2VStreamDataset:
     return V2VStreamDataset("tcp://127.0.0.1:9", **options)
+
+
+def simulated(**arguments: Any) -> Voxels:
+    return simulate(np.zeros((11, 8, 8), np.uint8), threshold_pos=0.2, **arguments)
+
+
+def sample() -> ShownSample:
+    return ShownSample({"voxels": np.zeros((1, 1, 2, 2), np.int8)}, None, Recipe(), "")  # type: ignore[arg-type]
 
 
 def batch() -> Batch:
@@ -394,6 +420,14 @@ def test_mistakes_in_python_are_named(number: int) -> None:
     mistake, words = IN_PYTHON[number]
     with pytest.raises((UsageError, AttributeError, KeyError), match=words):
         mistake()
+
+
+def test_numbers_of_any_library_are_numbers_and_a_dtype_may_come_alone() -> None:
+    frames = np.random.default_rng(0).integers(0, 255, (11, 8, 8), np.uint8)
+    plain, *others = (simulate(frames, threshold_pos=each) for each in (0.25, torch.tensor(0.25), np.float32(0.25)))
+    for other in others:
+        np.testing.assert_array_equal(other.array("voxels"), plain.array("voxels"))
+    assert batch().to(dtype=torch.float16).voxels.dtype == torch.float16
 
 
 def test_a_batch_is_copied_and_pickled_although_it_names_unknown_attributes() -> None:

@@ -30,6 +30,7 @@ _SHOWN = 3
 _OF_TENSORS = {
     "cuda": '; write .to("cuda")', "cpu": '; write .to("cpu")', "device": "; each array has its own",
     "half": "; write .to(torch.float16)", "float": "; write .to(torch.float32)", "size": "; write .voxels.shape",
+    "to": "; its arrays are NumPy's: torch.from_numpy(sample.voxels), or a DataLoader, which makes batches of tensors",
     "shape": "; write .voxels.shape", "dtype": "; write .voxels.dtype", "values": "; write .arrays.values()",
 }  # fmt: skip
 """Answers to names of PyTorch and of mappings."""
@@ -77,7 +78,10 @@ class Drawn:
             AttributeError: there is no such array; the message names the nearest attribute.
         """
         if name not in ARRAYS:
-            hint = _OF_TENSORS.get(name) or nearest(name, (*ARRAYS, *dir(type(self))))
+            answer = _OF_TENSORS.get(name, "")
+            if ".to(" in answer and not hasattr(type(self), "to"):
+                answer = _OF_TENSORS["to"]
+            hint = answer or nearest(name, (*ARRAYS, *dir(type(self))))
             raise AttributeError(f"a {self._KIND.title()} has no {name!r}{hint}")
         return self._array(name)
 
@@ -248,7 +252,11 @@ class Batch(Drawn):
         return dataclasses.replace(self, arrays={name: tensor.pin_memory() for name, tensor in self.arrays.items()})
 
     def to(
-        self, device: torch.device | str | torch.dtype, dtype: torch.dtype | None = None, *, non_blocking: bool = False
+        self,
+        device: torch.device | str | torch.dtype | None = None,
+        dtype: torch.dtype | None = None,
+        *,
+        non_blocking: bool = False,
     ) -> Batch:
         """Return this batch with its tensors on ``device``, converted to ``dtype``. Either one may come alone.
 

@@ -362,8 +362,8 @@ def addresses(given: str | Sequence[str]) -> tuple[str, ...]:
     Raises:
         UsageError: there is no address, or one occurs twice.
     """
-    texts = given.split(",") if isinstance(given, str) else given
-    found = tuple(text.strip() for text in texts)
+    texts = given.split(",") if isinstance(given, str) else given if isinstance(given, Sequence) else ()
+    found = tuple(str(text).strip() for text in texts)
     if not found or not all(found):
         raise UsageError(f"address {given!r}: give tcp://host:port, or several of them")
     if len(set(found)) < len(found):

@@ -19,7 +19,7 @@ from torch.utils.data import Dataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from v2v_client.batch import Batch, Drawn, draw_samples, refuse
-from v2v_client.options import Fixed, Labels, check_labels, require_arguments, require_labels
+from v2v_client.options import Fixed, Labels, check_labels, require_arguments, require_labels, require_videos
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
 from v2v_protocol.programs import counted, name_extra
@@ -105,7 +105,7 @@ class V2VDataset(Fixed, Dataset[Sample]):
         self.spec = StreamSpec.from_dict({**options, "recipe": read_recipe(recipe)})
         self.spec.recipe.warn()
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
-        self._videos, self._kind = os.fspath(videos), (videos_kind, rate, photograph_seconds, picture_bits)
+        self._videos, self._kind = require_videos(videos), (videos_kind, rate, photograph_seconds, picture_bits)
         self._source = {"rows": rows, "list_file": list_file, "cache_dir": cache_dir}
         self._maker: Any = None
         self._process = 0

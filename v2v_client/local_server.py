@@ -15,6 +15,7 @@ from typing import IO, Any
 
 import psutil
 
+from v2v_client.options import require_videos
 from v2v_protocol.errors import ServerLost, UsageError
 from v2v_protocol.programs import environment
 from v2v_protocol.recipe import Recipe
@@ -57,7 +58,7 @@ class LocalServer:
         stop_seconds: float = 15.0,
     ) -> None:
         bind = ["--bind", "tcp://127.0.0.1:*"] if "--bind" not in flags else []
-        self._arguments = ["--videos", os.fspath(videos), "--workers", str(workers), *bind, *flags]
+        self._arguments = ["--videos", require_videos(videos), "--workers", str(workers), *bind, *flags]
         self._start_seconds = start_seconds
         self._stop_seconds = stop_seconds
         self._process: subprocess.Popen[bytes] | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -130,6 +131,17 @@ def require_arguments(function: Callable[..., Any], options: Mapping[str, Any]) 
         if name not in SPEC_KEYS:
             hint = f": it belongs to the recipe, recipe={{{name!r}: ...}}" if name in settings_of(Recipe) else ""
             raise UsageError(f"no argument {name!r}{hint or nearest(name, known)}; known: {', '.join(known)}")
+
+
+def require_videos(videos: str | os.PathLike[str]) -> str:
+    """Return the path of the videos.
+
+    Raises:
+        UsageError: it is no path.
+    """
+    if not isinstance(videos, str | os.PathLike):
+        raise UsageError(f"videos = {format_value(videos)}: give one folder, video, or list file with a path a line")
+    return os.fspath(videos)
 
 
 def check_labels(labels: str) -> bool:

@@ -132,9 +132,12 @@ class Parser(argparse.ArgumentParser):
     def _joined(self, words: Sequence[str]) -> str:
         """Return an error that names the sign to write in place of the space before words; "" if there is none."""
         at = self._given.index(words[0]) if words[0] in self._given else 0
-        for flag, sign in (("--set", "="), *((flag, ",") for flag in _LISTS)):
+        sign_of = {"--rows": ":", "--set": "=", **dict.fromkeys(_LISTS, ",")}
+        for flag, sign in sign_of.items():
             if at >= 2 and self._given[at - 2] == flag:
                 parts = [self._given[at - 1], *words]
+                if sign == "=" and all(sign in part for part in parts):
+                    return f"{flag} {' '.join(parts)}: write {' '.join(f'{flag} {part}' for part in parts)}"
                 joined = sign.join(filter(None, (part.strip(sign) for part in parts)))
                 return f"{flag} {' '.join(parts)}: write {flag} {joined}, without a space"
         return ""

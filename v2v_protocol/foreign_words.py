@@ -6,7 +6,10 @@ from collections.abc import Mapping
 
 _NO_FLAG = "give the input without a flag"
 _DEVICE = "samples are made on processor cores; a training chooses it, v2v-train --set compute.device=cuda"
-_BATCH = "the consumer chooses it: V2VStreamDataset(..., batch_size=N), v2v-train --set stream.batch_size=N"
+_BATCH = (
+    "the consumer chooses it: V2VStreamDataset(..., batch_size=N), DataLoader(V2VDataset(...), batch_size=N), "
+    "v2v-train --set stream.batch_size=N"
+)
 _SERVER = "a server has workers: v2v-serve --workers N, V2VStreamDataset.local(..., workers=N)"
 _MEANT = {
     # flags of sister commands
@@ -27,8 +30,10 @@ _MEANT = {
     "output o output_folder output_path output_file output_dir": ("out",),
     "dvs_h5 dvs_aedat2 dvs_aedat4 dvs_text": ("events", "out"),
     # cameras of v2e, ESIM and OpenEB
-    "pos_thres neg_thres cp cn threshold_pos threshold_neg positive_threshold negative_threshold": ("threshold",),
-    "contrast_threshold contrast_threshold_positive contrast_threshold_negative contrast_thresholds": ("threshold",),
+    "threshold_pos threshold_neg": ("threshold",),
+    "threshold pos_thres cp positive_threshold contrast_threshold_positive": ("threshold", "threshold_pos"),
+    "neg_thres cn negative_threshold contrast_threshold_negative": ("threshold", "threshold_neg"),
+    "contrast_threshold contrast_thresholds": ("threshold", "threshold_pos"),
     "sigma_thres contrast_threshold_sigma sigma_threshold": ("threshold_mismatch_sigma",),
     "cutoff_hz": ("photoreceptor_hz",),
     "leak_rate_hz": ("leak_hz",),
@@ -39,7 +44,7 @@ _MEANT = {
     "output_height height": ("crop_height_px",),
     "num_bins n_bins num_time_bins time_bins": ("bins",),
     # Python and PyTorch
-    "num_workers n_workers": ("workers", "DataLoader(dataset, batch_size=None, num_workers=N)"),
+    "num_workers n_workers": ("workers", "DataLoader(dataset, ..., num_workers=N)"),
     "workers jobs j threads processes nproc": ("workers", _SERVER),
     "videos": ("data", "V2VStreamDataset.local(videos) starts a server for them"),
     "transform transforms": ("apply it to the batch",),

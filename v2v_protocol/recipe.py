@@ -225,6 +225,7 @@ class Recipe(Persisted):
         "are equal parts of its time",
         unit="s", off=True, is_later=True,
         usual=(1e-4, 2.0), mistake="A grid would hold {0:g} s of events. Divide milliseconds by 1000.",
+        too_low="A grid would hold {0:g} s of events. It is in seconds.",
     )  # fmt: skip
     lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
     lead_voxels: int = whole(0, 0, 1, "1 adds one voxel grid before the first (ERAFT)")
@@ -268,6 +269,7 @@ class Recipe(Persisted):
         "epsilon inside the logarithm: the dark current as a share of white's photocurrent",
         usual=(1e-6, 0.5),
         mistake="It is a share of white's photocurrent: of 8-bit grey levels, divide by 255.",
+        too_low="Black pixels would fire at the least change. It is a share of white's photocurrent.",
     )
     light: str = word(
         "sdr", ("sdr", "declared"),
@@ -285,6 +287,7 @@ class Recipe(Persisted):
         group="Pixel",
         usual=(0.01, 5.0),
         mistake="An event would need a brightness e^{0:g} times as high. Divide percent by 100.",
+        too_low="Every change of a level would make many events. It is a difference of natural logarithms.",
     )
     threshold_ratio: Range = span(
         (1.0, 1.5),
@@ -293,6 +296,7 @@ class Recipe(Persisted):
         "the larger threshold as a multiple of the smaller; which of them is positive is random",
         usual=(0.1, 10.0),
         mistake="One polarity would hardly fire. It is a multiple: divide percent by 100.",
+        too_low="One polarity would hardly fire. It is a multiple of the smaller threshold.",
     )
     threshold_source: str = word(
         "sample", ("sample", "video"),

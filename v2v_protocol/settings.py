@@ -52,6 +52,7 @@ class Setting:
         is_hidden: internal to a program, or without a use: left out of help and the reference page.
         usual: range of real devices, within the limits. A value outside it is allowed, with a warning.
         mistake: what a value outside ``usual`` (``{0:g}``) means, and the unit that was probably meant.
+        too_low: the same for a value below ``usual``, where that is another mistake.
         is_later: a later release added the field: a record leaves it out at its default, so older digests hold.
     """
 
@@ -70,6 +71,7 @@ class Setting:
     is_later: bool = False
     usual: tuple[float, float] = (-math.inf, math.inf)
     mistake: str = ""
+    too_low: str = ""
 
     @property
     def expected(self) -> str:
@@ -99,7 +101,8 @@ class Setting:
         for end in value if isinstance(value, tuple) else (value,):
             if self.mistake and not low <= end <= high and not (self.off and end == 0):
                 span = f"{low:g} to {high:g} {self.unit}".rstrip()
-                return f"{name} = {end:g}: real cameras have {span}. {self.mistake.format(end)}"
+                meaning = self.too_low if end < low and self.too_low else self.mistake
+                return f"{name} = {end:g}: real cameras have {span}. {meaning.format(end)}"
         return ""
 
     def check(self, name: str, value: object, error: type[UsageError] = UsageError) -> Any:
@@ -278,7 +281,7 @@ def plain(value: Any) -> Any:
         return type(value)(map(plain, value))
     if isinstance(value, Mapping):
         return {key: plain(each) for key, each in value.items()}
-    return value.tolist() if hasattr(value, "tolist") else value
+    return value.tolist() if hasattr(value, "tolist") and not isinstance(value, type) else value
 
 
 def as_whole(value: Any) -> int | None:

@@ -215,8 +215,11 @@ def test_the_frames_of_a_sample_are_limited() -> None:
 MISTAKEN = [
     ({"threshold": 20}, "e^20 times as high. Divide percent"),
     ({"threshold": (0.2, 15)}, "threshold = 15"),
-    ({"threshold": 1e-3}, "threshold = 0.001: real cameras have 0.01 to 5 log units"),
+    ({"threshold": 1e-3}, "threshold = 0.001: real cameras have 0.01 to 5 log units. Every change of a level would"),
     ({"threshold_ratio": 120}, "Divide percent".lower()),
+    ({"threshold_ratio": 0.01}, "a multiple of the smaller threshold"),
+    ({"log_eps": 1e-9}, "fire at the least change"),
+    ({"voxel_seconds": 1e-5}, "1e-05 s of events. It is in seconds"),
     ({"refractory_seconds": 1}, "blind for 1 s after each event. Divide milliseconds by 1000"),
     ({"refractory_seconds": 0.5}, "real cameras have 0 to 0.02 s"),
     ({"photoreceptor_hz": 0.05}, "no change faster than 0.05 Hz. A time constant"),

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import STARTS, TIME_UNITS, Recipe, effect_settings, most_events, pixel_thresholds
 from v2v_protocol.sample import SampleParams, needs_of
-from v2v_protocol.settings import nearest, require_known
+from v2v_protocol.settings import nearest, plain, require_known
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.intensity import Intensity, log_table_float64
 from v2v_server.simulation.kernels import KernelInput, Voxels
@@ -94,7 +94,8 @@ def simulate(
     known = effect_settings()
     arguments = [name for name in inspect.signature(simulate).parameters if name != "effects"]
     for name in effects.keys() - known.keys():
-        if not nearest(name, known) and (close := nearest(name, arguments)):
+        close = nearest(name, [*arguments, *known])
+        if any(repr(argument) in close for argument in arguments):
             raise UsageError(f"no argument {name!r}{close}")
     require_known(effects, known, "effect")
     effects = {name: value for name in effects if (value := known[name].single.check(name, effects[name])) > 0.0}
@@ -363,7 +364,7 @@ def _log_ends(intensity: Intensity) -> tuple[float, float]:
 
 
 def _check_number(name: str, value: float, *, positive: bool = False) -> None:
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    number = isinstance(plain(value), int | float) and not isinstance(plain(value), bool)
     if not number or not math.isfinite(value) or value < 0 or (positive and value == 0):
         raise UsageError(f"{name} = {value!r}: give a finite number {'above' if positive else 'of at least'} 0")
 

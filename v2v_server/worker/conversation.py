@@ -306,7 +306,12 @@ class WorkerConversation:
         if self._silence.silence(now) >= _TOLD_SECONDS and not self._silence_reported:
             self._silence_reported = True
             if not self._is_watched:  # a server sees the state of its own workers
-                actions.append(Say(f"{self._address} has not answered for {_TOLD_SECONDS:g} s; waiting"))
+                actions.append(
+                    Say(
+                        f"{self._address} has not answered for {_TOLD_SECONDS:g} s; waiting. Is v2v-serve running "
+                        "there? Without keys it serves only root and its own user"
+                    )
+                )
         return actions
 
     def _restart_silence(self, now: float) -> None:
