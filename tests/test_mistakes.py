@@ -7,6 +7,7 @@ import copy
 import hashlib
 import os
 import pickle
+import re
 import resource
 import shlex
 import socket
@@ -477,14 +478,24 @@ def test_an_address_without_a_server_is_explained_in_the_log_and_in_the_error(
 
 
 @pytest.mark.slow
-def test_a_script_without_a_main_guard_gets_one_short_message_the_first_time_too(desk: Path) -> None:
-    (desk / "script.py").write_text("from v2v_client import V2VDataset\nV2VDataset('clips')\n")
+@pytest.mark.parametrize("command", ["script.py", "-", "-i"])
+def test_a_script_needs_no_main_guard_the_first_time_either(desk: Path, command: str) -> None:
+    """A file, standard input, and an interactive session."""
+    small = {"voxels_per_clip": 4, "crop_height_px": 16, "crop_width_px": 16}
+    made = "V2VDataset('clips', cache_dir='new cache', recipe=small)"
+    script = f"from v2v_client import V2VDataset\nsmall = {small}\nprint(repr({made}))\n"
+    (desk / "script.py").write_text(script)
     done = subprocess.run(
-        [sys.executable, "script.py"], env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+        [sys.executable, command],
+        cwd=desk,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        input="" if command == "script.py" else script,
+        capture_output=True,
+        text=True,
     )
-    assert done.returncode == 1
-    assert done.stderr.count("Traceback") == 1
-    assert 'below `if __name__ == "__main__":`' in done.stderr
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(r"V2VDataset\('clips', \d+ samples, seed 0, epoch 0\)\n", done.stdout), done.stderr
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -168,7 +168,8 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
         if config.cache:
             worker_flags += ["--cache", str(Path(config.cache).absolute()), "--cache-gib", str(config.cache_gib)]
         worker_flags += ["--debug"] * debug + ["--insecure"] * config.insecure
-        worker_flags += catalogue.source.worker_flags()
+        copies, gib = catalogue.source.copies_options
+        worker_flags += ["--copies", str(copies), "--copies-gib", str(gib)] if copies else []
         stop = threading.Event()
         sockets.has_session = dispatcher.has_session
         signals = opened.enter_context(stop_on_signals(stop))

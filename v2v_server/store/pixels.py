@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.persisted import Persisted
 
 if TYPE_CHECKING:  # a server's command line, which names the kinds, starts without the decoder
     from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture
@@ -36,7 +37,7 @@ LONGEST_PHOTOGRAPH_FRAMES = 2**17
 
 
 @dataclass(frozen=True, slots=True)
-class VideosKind:
+class VideosKind(Persisted):
     """What a video of a corpus is.
 
     Attributes:

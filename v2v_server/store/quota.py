@@ -42,7 +42,7 @@ MOST_GIB = 1e6
 
 
 class QuotaFolder:
-    """A folder with a limit. Can be pickled.
+    """A folder with a limit.
 
     Args:
         folder: the folder. Only :meth:`make` creates it, so that an unmounted disk does not fill the disk below.

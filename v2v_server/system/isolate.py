@@ -1,7 +1,7 @@
 """Apply a function to many jobs in separate processes, so that a crash costs only the job that caused it.
 
-It uses spawned processes and socket pairs only. Locks, queues and shared memory need a writable ``/dev/shm``, which
-some containers do not have.
+It uses programs of its own and socket pairs only. :mod:`multiprocessing` would run the user's script again in each
+process, and its locks, queues and shared memory need a writable ``/dev/shm``, which some containers do not have.
 
 A process that a hostile video has taken over costs only its job too. Jobs and results travel as msgpack, which executes
 nothing (:mod:`v2v_protocol.persisted`). The function's annotations say which types they have. A result of another type
@@ -10,19 +10,21 @@ or size counts as the death of its process, and waiting for the rest of a messag
 
 from __future__ import annotations
 
-import contextlib
 import math
-import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import resource_tracker
+from importlib import import_module
 from multiprocessing.connection import wait
+from operator import attrgetter
 from pathlib import Path
-from socket import socket, socketpair
+from socket import MSG_WAITALL, socket, socketpair
 from typing import Any, Generic, TypeVar, get_type_hints
 
 import msgpack
@@ -37,6 +39,10 @@ _R = TypeVar("_R")
 
 LARGEST_MESSAGE_BYTES = 64 << 20
 """Size limit of a job or result. The largest in use holds the frame index of a video of 2**24 frames."""
+_PROGRAM = (
+    "import sys; sys.path[:] = sys.argv[2:]; from v2v_server.system.isolate import serve; serve(int(sys.argv[1]))"
+)
+"""What a process runs. Its arguments are its end of the socket pair, and where this process finds modules."""
 _LIMITS: Mapping[str, Any] = {
     "max_buffer_size": LARGEST_MESSAGE_BYTES,
     "max_str_len": 1 << 16,
@@ -47,13 +53,18 @@ _LIMITS: Mapping[str, Any] = {
 }
 """What is unpacked takes at most thirty times the memory of its message."""
 _CHUNK_BYTES = 1 << 18
+_LENGTH_BYTES = 8
+"""Before a process's first message, which may have any size: its length."""
+_SETUP = tuple[str, str, tuple[bytes, ...], int, int, tuple[Path, ...] | None]
+"""What a process is told first: module and name of its function, the function's first arguments, each packed, the id
+of its parent, and ``memory_bytes`` and ``writable`` of :func:`run_isolated`."""
 _SEND_SECONDS = 60.0
 _EXIT_SECONDS = 5.0
 _LONGEST_WAIT_SECONDS = 10.0
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 _NO_START = (
-    "a process that reads videos ended during its start ({how}). In a script, open "
-    'videos below `if __name__ == "__main__":`, because each such process imports the script again'
+    "a process that reads videos ended during its start ({how}): every other one would too. What it printed before "
+    "says why; v2v-doctor checks the installation"
 )
 
 
@@ -62,7 +73,7 @@ class Died:
     """Result of a job whose process died.
 
     Attributes:
-        exitcode: as in ``multiprocessing``: the exit status, or minus the number of a signal.
+        exitcode: the exit status, or minus the number of a signal.
         overdue_seconds: time after which it was ended here; 0 if it died by itself.
         begun: whether the process had started when it died, so that it was working on the job.
         is_malformed: whether it was ended here because its result was malformed or too large.
@@ -111,11 +122,12 @@ def run_isolated(
     with this process, however it ends. Ctrl-C reaches only this process.
 
     Args:
-        function: must be picklable, and return rather than raise: an exception counts as its process's death. The
-            annotations of its last parameter and its result are the types of jobs and results: those that
+        function: of a module that can be imported, or a ``partial`` of one with positional arguments. It must return
+            rather than raise: an exception counts as its process's death. The annotations of its parameters and its
+            result are the types of arguments, jobs (the last parameter) and results: those that
             :mod:`v2v_protocol.persisted` reads.
         jobs: drawn as processes become free.
-        processes: number of spawned processes; 0 runs the jobs in this process, unprotected.
+        processes: number of processes; 0 runs the jobs in this process, unprotected.
         deadline_seconds: time limit of a job, including its process's start, before the process is killed; None: no
             limit. Only time spent waiting here counts, so no job is overdue because the whole program was stopped.
         memory_bytes: limit of a process's allocations; 0 sets no limit.
@@ -129,8 +141,6 @@ def run_isolated(
     if processes == 0:
         yield from ((job, function(job)) for job in jobs)
         return
-    if getattr(multiprocessing.current_process(), "_inheriting", False):
-        raise SystemExit(1)  # this is such a process, and imports a script without a main guard: its parent says so
     left = iter(jobs)
     lanes: list[_Lane[J, _R]] = []
     try:
@@ -209,15 +219,22 @@ class _Lane(Generic[J, _R]):
         self._function = function
         self.patience = math.inf
         self._begun = False
+        called: Any = getattr(function, "func", function)
+        bound = tuple(map(_packed, getattr(function, "args", ())))
+        folders = None if writable is None else tuple(writable)
+        setup = _packed((called.__module__, called.__qualname__, bound, os.getpid(), memory_bytes, folders))
+        self._unsent = len(setup).to_bytes(_LENGTH_BYTES) + setup
         self.socket, other = socketpair()
         self.socket.settimeout(_SEND_SECONDS)
-        given = other, relayed_output(), function, os.getpid(), memory_bytes, writable
-        self._process = multiprocessing.get_context("spawn").Process(target=_serve, args=given, daemon=True)
-        # The first process also starts multiprocessing's tracker, which would unblock SIGINT again.
-        resource_tracker.ensure_running()
         try:
-            with _interrupt_held_back():
-                self._process.start()
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _PROGRAM, str(other.fileno()), *sys.path],
+                stdin=subprocess.DEVNULL,
+                stdout=relayed_output().fileno(),
+                stderr=subprocess.STDOUT,
+                pass_fds=[other.fileno()],
+                start_new_session=True,  # no terminal sends it a signal; this process decides what follows a Ctrl-C
+            )
         except BaseException:
             self.socket.close()
             raise
@@ -229,9 +246,10 @@ class _Lane(Generic[J, _R]):
         self._allowed = self.patience = math.inf if self._deadline_seconds is None else self._deadline_seconds(job)
         self._unpacker = msgpack.Unpacker(**_LIMITS)
         try:
-            self.socket.sendall(_packed(job))
+            self.socket.sendall(self._unsent + _packed(job))
         except OSError:
             self._process.kill()  # it has died, or does not read: receive() finds the end
+        self._unsent = b""
 
     def receive(self) -> tuple[J, _R | Died] | None:
         """Return the job and its result if the rest of it has arrived; None otherwise."""
@@ -240,7 +258,7 @@ class _Lane(Generic[J, _R]):
         except OSError:
             data = b""
         if not data:
-            self._process.join(_EXIT_SECONDS)
+            self._wait()
             death = self._kill()
             if not self._begun and death.exitcode >= 0:
                 raise UsageError(_NO_START.format(how=death.how))
@@ -263,53 +281,42 @@ class _Lane(Generic[J, _R]):
 
     def _kill(self) -> Died:
         self._process.kill()
-        self._process.join(_EXIT_SECONDS)
-        return Died(self._process.exitcode or 0, begun=self._begun)
+        self._wait()
+        return Died(self._process.returncode or 0, begun=self._begun)
+
+    def _wait(self) -> None:
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_EXIT_SECONDS)
 
     def end(self) -> None:
+        self._process.kill()
+        self._process.wait()
         self.socket.close()
-        self._process.terminate()
-        self._process.join(_EXIT_SECONDS)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
-        self._process.close()
 
 
-@contextlib.contextmanager
-def _interrupt_held_back() -> Iterator[None]:
-    """Block SIGINT in processes started inside: Ctrl-C in a terminal also goes to those that have not left it yet. In
-    this process it takes effect at the end.
+def serve(descriptor: int) -> None:
+    """Do jobs for the process that started this one, until it closes the connection.
+
+    Args:
+        descriptor: of this end of the connection.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _serve(
-    connection: socket,
-    output: socket,
-    function: Callable[[Any], Any],
-    parent_pid: int,
-    memory_bytes: int,
-    writable: Sequence[Path] | None,
-) -> None:
+    connection = socket(fileno=descriptor)
+    size = int.from_bytes(connection.recv(_LENGTH_BYTES, MSG_WAITALL))
+    if not size:
+        return  # the parent has ended
+    setup = msgpack.unpackb(connection.recv(size, MSG_WAITALL))
+    module, name, packed, parent_pid, memory_bytes, writable = reader(_SETUP)(setup)
     die_with_parent(parent_pid)
-    os.setsid()  # no terminal sends it a signal from now on; the parent decides what follows a Ctrl-C
-    for stream in range(3):
-        os.dup2(output.fileno(), stream)
+    function = attrgetter(name)(import_module(module))
+    *kinds, job_kind, _ = _hints(function).values()
+    bound = [reader(kind)(msgpack.unpackb(value)) for kind, value in zip(kinds, packed, strict=True)]
     if memory_bytes:
         limit_memory(memory_bytes)
-    # The tracker is not confined, and removes what is named to it.
-    os.close(resource_tracker.getfd())  # type: ignore[arg-type]
     if writable is not None:
         confine(writable, network=False)
     connection.sendall(_packed(None))  # report that it began: from here on, its end is not a failed start
-    read = reader([*_hints(function).values()][-2])
     for job in msgpack.Unpacker(connection.makefile("rb", buffering=0), **_LIMITS):
-        connection.sendall(_packed(function(read(job))))
+        connection.sendall(_packed(function(*bound, reader(job_kind)(job))))
 
 
 def _hints(function: Callable[..., Any]) -> dict[str, Any]:

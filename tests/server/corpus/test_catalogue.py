@@ -7,7 +7,6 @@ import os
 import pwd
 import shutil
 import sqlite3
-import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
@@ -378,14 +377,14 @@ def test_a_file_is_not_blamed_for_a_process_killed_from_outside(corpus: Path) ->
     assert record.size_bytes == -1  # which no file has: the next start tries again
 
 
-def test_a_script_without_a_guard_poisons_no_index(corpus: Path, opener: Opener, tmp_path: Path) -> None:
-    script = tmp_path / "unguarded.py"
-    script.write_text(
-        "from v2v_server.corpus.catalogue import open_catalogue\n"
-        f"open_catalogue({str(corpus)!r}, cache_dir={str(opener.cache)!r}, processes=1)\n"
-    )
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
-    assert '`if __name__ == "__main__":`' in done.stderr
+def test_processes_that_cannot_start_poison_no_index(
+    corpus: Path, opener: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    python = sys.executable
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(UsageError, match="ended during its start"):
+        open_catalogue(corpus, cache_dir=opener.cache, processes=1)
+    monkeypatch.setattr(sys, "executable", python)
     assert len(opener(corpus).videos) == 3
 
 

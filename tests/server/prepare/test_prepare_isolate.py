@@ -7,18 +7,20 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import importlib
 import os
 import pickle
 import signal
 import socket
+import sys
 from collections.abc import Iterator
-from multiprocessing import resource_tracker
 from pathlib import Path
 
 import msgpack
 import psutil
 import pytest
 
+from v2v_protocol.errors import UsageError
 from v2v_server.system.isolate import LARGEST_MESSAGE_BYTES, Died, run_isolated
 
 
@@ -34,7 +36,7 @@ def children() -> list[psutil.Process]:
     return [process for process in below if "resource_tracker" not in " ".join(process.cmdline())]
 
 
-MASK_AT_IMPORT = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+LED_ITS_SESSION_AT_IMPORT = os.getsid(0) == os.getpid()
 
 
 def square_or_die(number: int) -> int:
@@ -155,14 +157,16 @@ def test_half_a_result_costs_one_job() -> None:
     assert [results[number, ""] for number in (1, 3, 5)] == [1, 9, 25]
 
 
-def test_a_process_cannot_have_files_removed_by_the_tracker() -> None:
-    pipe = os.readlink(f"/proc/self/fd/{resource_tracker.getfd()}")
-    assert dict(run_isolated(ends_of, [pipe], processes=1)) == {pipe: 0}
+def test_a_process_has_nothing_of_its_parent_but_the_connection_and_its_output() -> None:
+    with open(os.devnull) as file:
+        os.set_inheritable(file.fileno(), True)
+        assert dict(run_isolated(kinds_of_descriptors, [None], processes=1)) == {None: ("/dev/null", *["socket"] * 3)}
 
 
-def ends_of(pipe: str) -> int:
-    """Return how often this process has a pipe open."""
-    return sum(os.readlink(f"/proc/self/fd/{each}") == pipe for each in range(64) if is_open(each))
+def kinds_of_descriptors(job: None) -> tuple[str, ...]:
+    """Return what this process has open."""
+    names = [os.readlink(f"/proc/self/fd/{each}") for each in range(64) if is_open(each)]
+    return tuple(name.partition(":")[0] for name in names)
 
 
 def is_open(descriptor: int) -> bool:
@@ -172,21 +176,35 @@ def is_open(descriptor: int) -> bool:
     return False
 
 
-def interrupts_let_through(job: None) -> tuple[bool, bool]:
-    """Whether Ctrl-C could have struck this process while it started, and whether it can now."""
-    return signal.SIGINT not in MASK_AT_IMPORT, signal.getsignal(signal.SIGINT) != signal.SIG_IGN
+def led_its_session(job: None) -> bool:
+    """Whether no Ctrl-C could have struck this process while it started."""
+    return LED_ITS_SESSION_AT_IMPORT
 
 
 def test_an_interrupt_strikes_the_caller_only() -> None:
-    assert list(run_isolated(interrupts_let_through, [None, None, None], processes=2)) == [(None, (False, False))] * 3
-    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    assert list(run_isolated(led_its_session, [None, None, None], processes=2)) == [(None, True)] * 3
 
 
 def test_a_process_that_cannot_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(process: object) -> None:
+    def refuse(*arguments: object, **options: object) -> None:
         raise BlockingIOError("Resource temporarily unavailable")
 
-    monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", refuse)
+    monkeypatch.setattr("v2v_server.system.isolate.subprocess.Popen", refuse)
     with pytest.raises(BlockingIOError):
         list(run_isolated(square_or_die, [1], processes=1))
-    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_a_process_that_ends_during_its_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(UsageError, match=r"ended during its start \(exit status 1\)"):
+        list(run_isolated(square_or_die, [1], processes=1))
+
+
+def test_modules_are_found_where_the_caller_finds_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where only the script itself says so, and not where the process was started."""
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "of_a_user.py").write_text("def twice(number: int) -> int:\n    return 2 * number\n")
+    (tmp_path / "msgpack.py").write_text("raise SystemExit('a file of the current folder')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(tmp_path / "there"), *filter(None, sys.path)])
+    assert dict(run_isolated(importlib.import_module("of_a_user").twice, [4], processes=1)) == {4: 8}

@@ -45,6 +45,8 @@ def last(job: int) -> int:
     return job
 
 if __name__ == "__main__":
+    from parent import last, report
+
     list(run_isolated(report, [1], 1, writable=[]))
     standby = WorkerProcess()
     list(run_isolated(last, [1], 1, writable=[]))

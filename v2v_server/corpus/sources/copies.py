@@ -86,11 +86,11 @@ def is_url(source: str) -> bool:
 
 class Bucket:
     """An address such as ``s3://bucket/prefix``. Credentials are found as the store's own tools find them: environment,
-    profile, role of the machine. Can be pickled.
+    profile, role of the machine.
 
     Args:
         url: the address.
-        only: the only object that is listed; "" lists all. What is unpickled lists all.
+        only: the only object that is listed; "" lists all.
 
     Raises:
         UsageError: it contains a password, which would be shown wherever the address is.
@@ -100,9 +100,6 @@ class Bucket:
         self.url, self.only = url.rstrip("/"), only
         if "@" in self.url.partition("://")[2].partition("/")[0]:
             raise UsageError("--videos: leave user and password out of the address; its store's own settings hold them")
-
-    def __reduce__(self) -> tuple[type[Bucket], tuple[str]]:
-        return Bucket, (self.url,)
 
     @cached_property
     def _store(self) -> Any:
@@ -243,7 +240,7 @@ _ROOM_SECONDS = 2.0
 
 
 class Copies(VideoSource):
-    """The videos of an address, and their copies. Can be pickled.
+    """The videos of an address, and their copies.
 
     Args:
         bucket: where the videos come from.
@@ -266,8 +263,10 @@ class Copies(VideoSource):
         self._quota = QuotaFolder(copies, most_bytes, _LOCK_SECONDS)
         self._at_hand: dict[tuple[str, str], IO[bytes]] = {}
 
-    def __reduce__(self) -> tuple[type[Copies], tuple[Bucket, Path, int], dict[str, object]]:
-        return Copies, (self.bucket, self.copies, self.most_bytes), {"kind": self.kind, "rates": self.rates}
+    @property
+    def copies_options(self) -> tuple[Path, float]:
+        """Return the folder of copies and its limit, see :attr:`VideoSource.copies_options`."""
+        return self.copies, self.most_bytes / (1 << 30)
 
     @cached_property
     def _objects(self) -> dict[str, FileState]:
@@ -319,10 +318,6 @@ class Copies(VideoSource):
             self._quota.make()
         except OSError as error:
             raise CorpusError(f"--copies {self.copies}: cannot be written to: {error.strerror or error}") from error
-
-    def worker_flags(self) -> list[str]:
-        """Return the flags that name the folder of copies and its limit."""
-        return ["--copies", str(self.copies), "--copies-gib", str(self.most_bytes / (1 << 30))]
 
     def states(self, ids: Sequence[str]) -> array[int]:
         """Return the states of many objects, from the listing."""

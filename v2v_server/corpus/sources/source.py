@@ -41,14 +41,16 @@ from functools import cached_property, lru_cache
 from importlib import import_module
 from importlib.resources.abc import Traversable
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 from zipfile import Path as ZipPath
 from zipfile import ZipFile
 
+import msgpack
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoGone, VideoUnreadable
+from v2v_protocol.persisted import reader, to_plain
 from v2v_protocol.programs import printable
 from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_server.labels import frame_of
@@ -560,8 +562,12 @@ class SourceOptions:
         return None if self.list_file is None else read_list(self.list_file, self.kind)
 
 
+_REOPENED = tuple[bytes, VideosKind, Mapping[str, float], Path | None, float]
+"""What another process opens a source by: its name, kind and rates, the folder for copies, and that folder's limit."""
+
+
 class VideoSource(ABC):
-    """Videos, by id. Can be pickled; what arrives in another process opens files, but does not list them.
+    """Videos, by id.
 
     Args:
         name: see Attributes.
@@ -582,9 +588,29 @@ class VideoSource(ABC):
         self.name, self._read_list = name, listed
         self.rates: dict[str, float] = {}
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out what only lists: it may be large."""
-        return {name: value for name, value in vars(self).items() if name not in ("_read_list", "listed", "manifest")}
+    def to_bytes(self) -> bytes:
+        """Return what another process opens it by, to open files but not to list them."""
+        plain = (os.fsencode(self.name), self.kind, self.rates, *self.copies_options)
+        return bytes(msgpack.packb(plain, default=to_plain))
+
+    @staticmethod
+    def from_bytes(data: bytes) -> VideoSource:
+        """Open the source that :meth:`to_bytes` was called of.
+
+        Raises:
+            CorpusError, UsageError: see :func:`open_source`.
+            ProtocolError, ValueError: the data is malformed.
+        """
+        name, kind, rates, copies, gib = reader(_REOPENED)(msgpack.unpackb(data))
+        # A list, which is read by listing only: without one the name of a folder can also be that of a video.
+        source = open_source(os.fsdecode(name), SourceOptions(os.devnull, copies, gib, kind=kind))
+        source.rates = rates
+        return source
+
+    @property
+    def copies_options(self) -> tuple[Path | None, float]:
+        """Return the folder for copies of its files, and that folder's limit, GiB; None without one."""
+        return None, COPIES_GIB
 
     @cached_property
     def listed(self) -> tuple[ListEntry, ...] | None:
@@ -781,10 +807,6 @@ class VideoSource(ABC):
             CorpusError: the source does not have them.
         """
         return asked or Rows()
-
-    def worker_flags(self) -> list[str]:
-        """Return the flags of ``v2v-worker`` with which another process opens this source, beside its name."""
-        return []
 
 
 def open_source(name: str | os.PathLike[str], options: SourceOptions = SourceOptions()) -> VideoSource:

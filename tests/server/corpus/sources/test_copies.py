@@ -28,7 +28,7 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources import copies as bucket_module
 from v2v_server.corpus.sources import copies as copies_module
 from v2v_server.corpus.sources.copies import Bucket, Copies, is_url
-from v2v_server.corpus.sources.source import GONE, SourceOptions, open_source
+from v2v_server.corpus.sources.source import GONE, SourceOptions, VideoSource, open_source
 from v2v_server.store.quota import PARTIAL, count_bytes, used_bytes
 from v2v_server.video.fingerprint import fingerprint
 
@@ -256,8 +256,8 @@ def test_what_is_being_read_stays(store: Path) -> None:
     assert not made.has({"a.mp4": mark})
 
 
-def _read(made: Copies, marks: dict[str, str], turns: int) -> set[tuple[str, bytes]]:
-    got = set()
+def _read(plain: bytes, marks: dict[str, str], turns: int) -> set[tuple[str, bytes]]:
+    made, got = VideoSource.from_bytes(plain), set()
     for _ in range(turns):
         for name, mark in marks.items():
             with made.open_local(name, mark) as path:
@@ -274,8 +274,8 @@ def test_many_at_once(store: Path) -> None:
     expected = {(name, bytes([number]) * SIZE) for number, name in enumerate(marks)}
     with multiprocessing.get_context("spawn").Pool(1) as processes:
         processes.apply(os.getpid)  # it is at work
-        told = processes.apply_async(_read, (made, backwards, 100))
-        assert _read(made, marks, 100) == told.get(60) == expected
+        told = processes.apply_async(_read, (made.to_bytes(), backwards, 100))
+        assert _read(made.to_bytes(), marks, 100) == told.get(60) == expected
     assert 1 <= len(files(made)) <= 2
 
 
