@@ -123,6 +123,8 @@ def _run(name: str) -> int | None:
         main = import_module(module).main
         signal.signal(signal.SIGINT, before or signal.SIG_DFL)
         status: int | None = main()
+    except KeyboardInterrupt:  # while the command line is read; the command itself answers it
+        _end_at_once(f"v2v-{name}")
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package in _OURS:

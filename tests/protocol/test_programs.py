@@ -193,8 +193,11 @@ def test_the_null_device_takes_the_place_of_a_closed_stream() -> None:
     assert (done.returncode, done.stdout) == (0, f"{os.devnull} True True\n")
 
 
-def test_ctrl_c_while_modules_are_imported_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "slow.py").write_text("print('importing', flush=True)\nimport time\ntime.sleep(60)\n")
+@pytest.mark.parametrize("before", ["", "def main():\n    "])
+def test_ctrl_c_before_a_command_runs_is_one_line(tmp_path: Path, before: str) -> None:
+    """While its modules are imported, and while its flags are built."""
+    wait = "print('importing', flush=True); import time; time.sleep(60)"
+    (tmp_path / "slow.py").write_text(f"{before}{wait}\n")
     script = "from v2v_protocol import programs; programs.COMMANDS['x'] = ('slow', 'server', ''); programs.x()"
     with subprocess.Popen(
         [sys.executable, "-c", script],
