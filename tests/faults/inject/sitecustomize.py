@@ -52,11 +52,11 @@ def _disconnect() -> None:
 
 def _install(fault: dict) -> None:
     from v2v_server.store.video_file import VideoFile
-    from v2v_server.worker import arrays
     from v2v_server.worker import process as worker
+    from v2v_server.worker import produce
 
     at = {"video": ""}
-    decode_for, simulate_clip = worker.decode_for, arrays.simulate_clip
+    decode_for, simulate_clip = worker.decode_for, produce.simulate_clip
     sample_message, confine = worker.sample_message, worker.confine
     folder = Path(fault.get("once", "/nowhere")).parent
     # A confined worker may write to no folder but its cache.
@@ -76,7 +76,7 @@ def _install(fault: dict) -> None:
 
     worker.decode_for = decoding
     VideoFile.clips = before("decode", VideoFile.clips)
-    arrays.simulate_clip = before("simulate", simulate_clip)
+    produce.simulate_clip = before("simulate", simulate_clip)
     worker.sample_message = before("send", sample_message)
 
 
