@@ -40,18 +40,24 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize(
-    "spec",
+    ("spec", "most"),
     [
-        {"recipe": {"voxels_per_clip": 20, "resize_scale": [0.5, 0.5], "crop_height_px": 64, "crop_width_px": 64}},
-        {"recipe": {"voxels_per_clip": 4, "crop_height_px": 1000, "crop_width_px": 1800}},
-        {"recipe": {"voxels_per_clip": 8, "crop_height_px": 300, "crop_width_px": 600}, "substep_px": 0.5},
+        (
+            {"recipe": {"voxels_per_clip": 20, "resize_scale": [0.5, 0.5], "crop_height_px": 64, "crop_width_px": 64}},
+            1.7,
+        ),
+        ({"recipe": {"voxels_per_clip": 4, "crop_height_px": 1000, "crop_width_px": 1800}}, 1.7),
+        # How many sub-steps there are depends on the motion, which the estimate does not know.
+        ({"recipe": {"voxels_per_clip": 8, "crop_height_px": 300, "crop_width_px": 600}, "substep_px": 0.5}, 2.5),
     ],
     ids=["resized", "large crop", "sub-steps"],
 )
-def test_a_lease_takes_at_most_what_is_estimated_and_not_much_less(tmp_path: Path, spec: dict[str, Any]) -> None:
+def test_a_lease_takes_at_most_what_is_estimated_and_not_much_less(
+    tmp_path: Path, spec: dict[str, Any], most: float
+) -> None:
     write_clip(tmp_path / "v.mp4", panned_luma(102, 1080, 1920))
     done = subprocess.run(
         [sys.executable, "-c", _PROGRAM, str(tmp_path), json.dumps(spec)], capture_output=True, text=True, check=True
     )
     estimate, peak = map(int, done.stdout.split())
-    assert peak < estimate < 1.7 * peak
+    assert peak < estimate < most * peak
