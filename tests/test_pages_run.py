@@ -21,7 +21,7 @@ from tests.clips import panned_luma, write_panned
 from tests.test_commands import MODULES, ROOT
 
 VIDEOS = ("my.mp4", "VIDEO", "bigbuckbunny.mp4")
-FOLDERS = ("smaller", "DIR", "CLIPS", "CORPUS", "webvid10k", "my-videos", "clips")
+FOLDERS = ("smaller", "DIR", "CLIPS", "CORPUS", "webvid10k", "openvid10", "my-videos", "clips")
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob("docs/guides/*.md"))]
 SMALLER = {
     "v2v-preview": ["--seeds", "1", "--set", "voxels_per_clip=4"],
