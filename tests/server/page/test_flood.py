@@ -36,7 +36,7 @@ sys.stdin.read()
 
 @pytest.fixture
 def page(tmp_path: Path) -> Iterator[Callable[[int], tuple[int, psutil.Process, Path]]]:
-    """Start a page with at most so many descriptors; return its port, process and log. Its server does not answer."""
+    """Start a page with a limit of descriptors; return its port, process and log. Its server does not answer."""
     with ExitStack() as stack:
 
         def start(descriptors: int) -> tuple[int, psutil.Process, Path]:
