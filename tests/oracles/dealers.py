@@ -27,10 +27,12 @@ class NextDealer(Dealer):
         super().__init__(address, keys, side, insecure=True)
         self._context.destroy()
         self._context = first._context
+        self._questions = self._context.socket(zmq.ROUTER)  # where no question ever arrives
 
     def close(self) -> None:
-        """Close the socket, and leave the context."""
+        """Close the sockets, and leave the context."""
         self.disconnect(linger_ms=0)
+        self._questions.close()
 
 
 class Reader:
