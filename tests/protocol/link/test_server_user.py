@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 
 import pytest
+import zmq
 
 from bench.processes import free_ports
 from tests.waiting import until
@@ -171,6 +172,7 @@ def test_the_question_of_a_connection_that_has_ended_is_not_answered_to_the_next
             first.sendall(GREETING)
             assert link._questions.poll(60_000)
         with listening.accept()[0] as second:
+            until(lambda: connections(link) == 2)  # until then the question could only be the first's
             link.has_reconnected()  # reads the question of the first
             second.sendall(GREETING)
             assert link._questions.poll(60_000)
@@ -198,6 +200,13 @@ def test_a_server_that_has_no_handshake_gets_nothing() -> None:
             peer.sendall(OLD)
             peer.settimeout(60.0)
             assert b"secret" not in received(peer)
+
+
+def connections(link: Dealer) -> int:
+    """Return how many connections a link has noticed since the last question."""
+    monitor = link._open(link._monitor)
+    link._handshakes.take(lambda: monitor.poll(0), lambda: monitor.recv_multipart(flags=zmq.NOBLOCK))
+    return link._handshakes.connections
 
 
 def received(peer: socket.socket) -> bytes:
