@@ -8,6 +8,7 @@ import re
 import shlex
 import sys
 import tomllib
+from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -15,6 +16,8 @@ from pathlib import Path
 import pytest
 
 from bench.__main__ import BENCHES, parser_for
+from v2v_protocol.command import Parser
+from v2v_protocol.errors import UsageError
 
 ROOT = Path(__file__).parents[1]
 MODULES = {
@@ -183,9 +186,12 @@ def _wrong_with_launched(words: list[str]) -> str:
 
 def _refused(parser: argparse.ArgumentParser, given: list[str]) -> str:
     try:
-        parser.parse_args(given)
+        arguments = parser.parse_args(given)
     except SystemExit as ended:
         return "" if not ended.code else f"its own parser refuses {given}"
+    with suppress(UsageError):  # a page's folders are not here
+        if isinstance(parser, Parser):
+            parser.check_outputs(arguments)
     return ""
 
 
