@@ -59,7 +59,7 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 
 FLOORS = (
-    "system", "keys", "video", "simulation", "labels", "motion", "flow", "worlds", "store", "config", "corpus",
+    "system", "keys", "video", "simulation", "labels", "motion", "flow", "worlds", "store", "kinds", "config", "corpus",
     "schedule",
     "quarantine", "sharing",
     "broker",
@@ -224,7 +224,7 @@ def test_no_two_classes_constants_or_aliases_have_one_name() -> None:
             for name, definition in (constants(nodes[0]) | classes).items():
                 if name[0].isupper():
                     found.setdefault(name, {})[str(path.relative_to(ROOT))] = definition
-    del found["LOOKED_FOR"]  # of each kind of pixels
+    del found["KIND"]  # of each kind of videos
     assert {
         name: list(used)
         for name, used in found.items()

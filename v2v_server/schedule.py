@@ -44,13 +44,13 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.programs import counted
 from v2v_protocol.recipe import LARGEST_SCALE, MOST_STEPS_PER_GRID, Recipe
 from v2v_protocol.sample import Refusal, RefusalKind
-from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
+from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.scene import MOST_ANALYSED_FRAMES, NO_BARS, Flag, Pieces, Sides, sides_of
 from v2v_server.corpus.videos import SplitVideos, VideoEntry
 from v2v_server.corpus.videos import Videos as CatalogueVideos
+from v2v_server.kinds.registry import VIDEOS, kind_of
 from v2v_server.simulation.draw import admits, smallest_scale
-from v2v_server.store.pixels import kind_of
 from v2v_server.video.rows import Rows
 
 _SKIPPED = {
@@ -317,7 +317,8 @@ class SequenceTable:
 
     def __init__(self, videos: _Videos, rows: Rows, spec: StreamSpec, columns: Columns | None = None) -> None:
         self._all, self._rows, self._spec, self._columns = videos, rows, spec, columns or Columns(videos)
-        _check_kind(spec, kind_of(videos[0].id) if len(videos) else "videos")
+        if why := (kind_of(videos[0].id) if len(videos) else VIDEOS).refuses(spec):
+            raise UsageError(why)
         if spec.scene != "off" and self._columns.split is None:
             raise UsageError(
                 f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '
@@ -411,20 +412,6 @@ class SequenceTable:
         sequences = SplitSequences(split, counts[at], of_split, spec, columns.size[split.numbers], suits)
         counts[at] = sequences.counts
         return counts, sequences
-
-
-def _check_kind(spec: StreamSpec, kind: str) -> None:
-    """Check that the spec suits what the videos are.
-
-    Raises:
-        UsageError: it does not.
-    """
-    if spec.recipe.is_world and kind != "photographs":
-        raise UsageError(
-            f"the recipe's world fields are for photographs, these are {kind}: add --videos-kind photographs"
-        )
-    if kind == "photographs" and not spec.recipe.is_world:
-        raise UsageError("photographs stand still under this recipe: set world fields, as --preset worlds does")
 
 
 class Refusals(Sequence[Refusal]):
@@ -532,7 +519,7 @@ def _frame_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec) -> tuple[int, 
     """
     recipe, samples = spec.recipe, spec.samples_per_decode
     window, crop, depth = _sizes_of(video, rows, spec)
-    read = window if recipe.resize_scale != (1.0, 1.0) and kind_of(video.id) != "photographs" else crop
+    read = window if recipe.resize_scale != (1.0, 1.0) else crop
     held = samples + (1 if spec.scene == "off" else samples)
     seen = 2 * depth + np.dtype(spec.voxel_dtype).itemsize + _level_bytes(spec)
     return read * samples, depth * window * held + seen * crop
@@ -544,15 +531,9 @@ def _level_bytes(spec: StreamSpec) -> int:
 
 def _sizes_of(video: VideoEntry, rows: Rows, spec: StreamSpec) -> tuple[int, int, int]:
     """Return the pixels of each frame that are decoded for a sample, those of its crop, and the bytes of a level."""
-    recipe = spec.recipe
     top, bottom = rows.bounds(video.height_px)
-    whole, crop = (bottom - top) * video.width_px, recipe.crop_height_px * recipe.crop_width_px
-    if kind_of(video.id) == "photographs":
-        return crop, crop, 2
-    sides = 2 * max(spec.flow_margin_px, MARGIN_PX if spec.substep_px else 0)
-    window = min(whole, (recipe.crop_height_px + sides) * (recipe.crop_width_px + sides))
-    is_whole = recipe.resize_scale != (1.0, 1.0) or spec.flow_margin_px < 0
-    return whole if is_whole else window, crop, 1 if recipe.light == "sdr" else 2
+    window, depth = kind_of(video.id).reads(spec, bottom - top, video.width_px)
+    return window, spec.recipe.crop_height_px * spec.recipe.crop_width_px, depth
 
 
 def lease_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec, array_bytes: int) -> int:

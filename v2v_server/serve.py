@@ -47,7 +47,6 @@ from v2v_server.schedule import SequenceTable, corpus_summary
 from v2v_server.status.snapshot import StatusPublisher
 from v2v_server.status.terminal import StatusView, format_shutdown_summary
 from v2v_server.store.cache import make_cache
-from v2v_server.store.pixels import VideosKind
 from v2v_server.supervise.local_host import WorkerProcess
 from v2v_server.supervise.pool import Pool, Scaling, make_pool, question_workers
 from v2v_server.system.log import GIB, Level, Log
@@ -88,7 +87,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
             cache_dir=config.cache_dir or None,
             copies=config.copies or None,
             copies_gib=config.copies_gib,
-            kind=VideosKind(config.videos_kind, config.rate, config.photograph_seconds, config.picture_bits),
+            kind=config.kind,
             scene=config.spec.scene != "off",
             # Without local workers all cores are free for probing.
             processes=min(config.most_workers or cores, cores),

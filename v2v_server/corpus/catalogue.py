@@ -62,10 +62,10 @@ from v2v_server.corpus.videos import (
     VideoTable,
     joined,
     missing_arrays,
-    unknown_arrays,
 )
+from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.registry import VIDEOS, kind_of
 from v2v_server.store.format import PIECE_FRAMES
-from v2v_server.store.pixels import VIDEOS, VideosKind, kind_of
 from v2v_server.store.store_file import STORE_FORMAT
 from v2v_server.system.log import gauge, text
 from v2v_server.system.process import cache_folder, without_collections
@@ -126,7 +126,7 @@ def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice) -> Corpu
     note = left_out_note(left_out)
     if not ids:
         raise CorpusError(
-            f"{source}: no video found; looked for {source.kind.form.LOOKED_FOR}"
+            f"{source}: no video found; looked for {source.kind.looked_for}"
             f"{format_problems(refused)}{note and '. '}{note}"
         )
     return Corpus(source, rows, tuple(ids), refused, note)
@@ -440,12 +440,12 @@ class Catalogue:
     def facts(self) -> CorpusFacts:
         """What is known in memory: all that a server's dispatcher needs."""
         ids = self.videos.ids if not self._absent else [id for id in self.videos.ids if id not in self._absent]
-        missing = unknown_arrays(self.kind) | ({} if self.prepared is None else missing_arrays(self.source, ids))
+        missing = {**self.kind.cannot()} | ({} if self.prepared is None else missing_arrays(self.source, ids))
         return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars, missing)
 
     @property
-    def kind(self) -> str:
-        """Return what its videos are, one of :data:`v2v_server.store.pixels.PIXEL_KINDS`."""
+    def kind(self) -> Kind:
+        """Return what its videos are, with all flags at their defaults; prepared ones are what their sources were."""
         return kind_of(self.videos.ids[0])
 
     def part(self) -> CorpusPart:
@@ -521,7 +521,7 @@ def open_catalogue(
     cache_dir: str | os.PathLike[str] | None = None,
     copies: str | os.PathLike[str] | None = None,
     copies_gib: float = COPIES_GIB,
-    kind: VideosKind = VIDEOS,
+    kind: Kind = VIDEOS,
     scene: bool = False,
     processes: int = 1,
     progress: VideoProgress = silent,
@@ -548,10 +548,10 @@ def open_catalogue(
     Raises:
         CorpusError: the folder or list is missing, unreadable or malformed, or has no usable video.
         IndexUnreadable: the index cannot be read any more after the probes.
-        UsageError: ``scene``, and the videos are photographs.
+        UsageError: ``scene``, and the videos are of a kind without scenes.
     """
-    if scene and kind.is_rendered:
-        raise UsageError("--scene auto leaves out defects of videos, which photographs do not have: set it to off")
+    if scene and not kind.has_scenes:
+        raise UsageError(f"--scene auto leaves out defects of videos, which {kind.name} do not have: set it to off")
     opened = open_source(source, SourceOptions(list_file, copies, copies_gib, cache_dir, kind))
     corpus = list_corpus(opened, rows, notice)
     scenes = SceneCollection(corpus.rows) if scene else None
@@ -639,7 +639,7 @@ def _snapshot(
                 *notes,
                 f"{counted(len(died), 'video crashes', 'videos crash')} the decoder that analyses scenes: {died[0]}",
             ]
-    marks = {} if source.kind.is_rendered else dict(zip(videos.ids, videos.fingerprints, strict=True))
+    marks = dict(zip(videos.ids, videos.fingerprints, strict=True)) if source.kind.has_sidecars else {}
     endings = sidecar_endings(tuple(ARRAYS))
     sidecars, said = collect_sidecars(source, store, marks, videos.shape, endings, processes, notice)
     notes = [*notes, *said]

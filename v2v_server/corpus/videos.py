@@ -25,7 +25,7 @@ from v2v_protocol.sample import ARRAYS, sidecar_endings
 from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import PIECE, Pieces, clip_pieces, firsts_of, sides_of
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.pixels import kind_of
+from v2v_server.kinds.registry import kind_of
 from v2v_server.store.planes import PLANES
 from v2v_server.store.store_file import StoreFile
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
@@ -411,7 +411,7 @@ class Videos(Sequence[VideoEntry]):
 
         Fingerprints cover the track and its orientation.
         """
-        of_kind = "".join(f"{kind}\n" for kind in {kind_of(id) for id in self.ids[:1]} if kind != "videos")
+        of_kind = "".join(kind_of(id).in_digest for id in self.ids[:1])
         sha = hashlib.sha256(f"v2v catalogue 2\n{rows}\n{of_kind}".encode())
         pos, neg = NO_THRESHOLDS
         none, limits = f"{pos}\0{neg}", {number: f"{pos}\0{neg}" for number, (pos, neg) in self._thresholds.items()}
@@ -478,17 +478,6 @@ def missing_arrays(source: VideoSource, ids: Sequence[str]) -> dict[str, str]:
         "that they were prepared from"
         for name, plane in PLANES.items()
         if plane.serves in ARRAYS and not (source.is_local and all(_has_plane(source, id, name) for id in some))
-    }
-
-
-def unknown_arrays(kind: str) -> dict[str, str]:
-    """Return the arrays that cannot be made from any video of a kind, with the remedy."""
-    if kind != "photographs":
-        return {"tracks": "--videos-kind photographs, where all motion is known: ask for flow, which is estimated"}
-    labels = {name for name, form in ARRAYS.items() if form.needs.sidecars and name != "masks"}
-    return {
-        "frames_rgb": "the colour of a video, and photographs are rendered in grey: ask for frames",
-        **dict.fromkeys(labels, "labels beside a video, and photographs move: ask for masks and tracks"),
     }
 
 

@@ -22,9 +22,9 @@ from v2v_protocol.spec_flags import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import look_at_pictures, name_all
 from v2v_server.corpus.sources.source import open_sidecar, sidecar_id
+from v2v_server.kinds.kind import Kind
 from v2v_server.labels import READERS
 from v2v_server.schedule import SequenceTable, lease_bytes
-from v2v_server.store.pixels import VideosKind
 from v2v_server.system.process import memory_limit
 from v2v_server.video.rows import Rows
 from v2v_tools.doctor.motion import look_at_motion
@@ -38,7 +38,7 @@ _VIDEOS_OPENED = 10_000
 """Most videos of which more is read than their line of the index."""
 
 
-def check_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, kind: VideosKind) -> Iterator[Line]:
+def check_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, kind: Kind) -> Iterator[Line]:
     """Check a corpus and yield lines of the report.
 
     Args:
@@ -85,7 +85,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
     yield from _labels(catalogue)
     frames_needed = int(np.median(spec.recipe.sequence_at(found.frames_per_second))) + 1
     defects = yield from look_at_pictures(catalogue, frames_needed)
-    if not catalogue.source.kind.is_rendered:  # as it stands, a photograph does not move
+    if catalogue.kind.has_motion:
         yield from look_at_motion(catalogue, defects)
     yield from _rates(found.frames_per_second, spec.recipe)
     table = SequenceTable(found, catalogue.rows, spec)
@@ -153,7 +153,7 @@ def _rates(rates: npt.NDArray[np.float64], recipe: Recipe) -> Iterator[Line]:
 
 
 def _how_videos_are_stored(catalogue: Catalogue) -> Iterator[Line]:
-    if catalogue.prepared is not None or catalogue.source.kind.has_parts:
+    if catalogue.prepared is not None or not catalogue.kind.seeks_by_time:
         return
     ids = [video.id for video in islice(catalogue.videos, _VIDEOS_OPENED)]
     unnamed = [id for id in ids if not catalogue.frame_index(id).seekable]

@@ -57,7 +57,7 @@ from v2v_server.corpus.sources.source import (
     sidecar_fingerprint,
     state_text,
 )
-from v2v_server.store.pixels import PIXEL_KINDS, VideosKind, kind_of, open_pixels
+from v2v_server.kinds.registry import KINDS, kind_of
 from v2v_server.store.quota import MOST_GIB, PARTIAL, QuotaFolder
 from v2v_server.store.verified import content_of
 from v2v_server.system.process import cache_folder, locked, make_private
@@ -297,7 +297,7 @@ class Copies(VideoSource):
             parts = name.split("/")
             if any(part.startswith(".") for part in parts):
                 continue
-            if not (id := self.kind.form.id_of(name)) and self.kind.form.id_of(name.partition("?")[0]):
+            if not (id := self.kind.id_of(name)) and self.kind.id_of(name.partition("?")[0]):
                 refused[printable(name)] = "is a link with a query, which is not followed: link to the file itself"
             elif not id:
                 count_left_out(parts[-1], left_out)
@@ -555,7 +555,7 @@ class Copies(VideoSource):
         named.unlink(missing_ok=True)
         named.symlink_to(slot.name)
         try:
-            with open_pixels(named, kind_of(id)) as pixels:
+            with kind_of(id).open_pixels(named) as pixels:
                 check_content(named, content_of(pixels), fingerprint)
         finally:
             named.unlink()
@@ -588,7 +588,7 @@ def open_source(name: str, options: SourceOptions) -> Copies | None:
         raise UsageError(f"--copies-gib {options.copies_gib:g}: give more than 0, at most {MOST_GIB:g}")
     folder = Path(options.copies or cache_folder(options.cache_dir) / "copies").absolute()
     bucket, listed, (above, _, file) = Bucket(name), options.listed, name.rpartition("/")
-    if options.list_file is None and any(VideosKind(kind).form.id_of(file) == file != "" for kind in PIXEL_KINDS):
+    if options.list_file is None and any(kind.id_of(file) == file != "" for kind in KINDS.values()):
         bucket, listed = Bucket(above, file), lambda: (ListEntry(file),)
     return Copies(bucket, folder, int(options.copies_gib * (1 << 30)), listed)
 

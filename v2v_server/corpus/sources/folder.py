@@ -32,7 +32,9 @@ from v2v_server.corpus.sources.source import (
     read_list,
     sidecar_id,
 )
-from v2v_server.store.pixels import VIDEOS, Pixels, VideosKind
+from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.registry import VIDEOS
+from v2v_server.store.pixels import Pixels
 from v2v_server.store.verified import KnownState, Verified
 from v2v_server.video.fingerprint import check_fingerprint, files_in, unreadable
 
@@ -253,7 +255,7 @@ def locate(name: str, options: SourceOptions) -> tuple[Path, Callable[[], tuple[
     path = Path(name)
     if path.is_dir():
         root = path.resolve()
-        is_video = options.kind.has_parts and "/" in map(options.kind.form.id_of, os.listdir(root))
+        is_video = options.kind.has_parts and "/" in map(options.kind.id_of, os.listdir(root))
         if options.list_file is None and is_video:
             return root.parent, lambda: (ListEntry(f"{root.name}/"),)
         return root, options.listed
@@ -268,9 +270,7 @@ def locate(name: str, options: SourceOptions) -> tuple[Path, Callable[[], tuple[
     return path.parent.resolve(), lambda: (ListEntry(path.name),)
 
 
-def video_files(
-    root: Path, refused: dict[str, str], left_out: Counter[str], kind: VideosKind = VIDEOS
-) -> Iterator[str]:
+def video_files(root: Path, refused: dict[str, str], left_out: Counter[str], kind: Kind = VIDEOS) -> Iterator[str]:
     """Return relative POSIX paths of the video files below ``root``, known by their suffixes.
 
     Links are followed; a link to a folder that it lies in is not. A folder that several links lead to has its videos
@@ -285,7 +285,7 @@ def video_files(
         left_out: counts, by suffix, files that may be videos of other endings; and, by path, folders of outputs.
         kind: what a video is; the id of a folder of pictures ends with a slash.
     """
-    id_of, pseudo, paths_of = kind.form.id_of, pseudo_devices(), Counter[tuple[int, int]]()
+    id_of, pseudo, paths_of = kind.id_of, pseudo_devices(), Counter[tuple[int, int]]()
 
     def below(folder: Path, prefix: str, above: frozenset[tuple[int, int]], links: int) -> Iterator[list[str]]:
         """Yield the videos below a folder, some at a time.

@@ -29,7 +29,6 @@ import math
 import os
 import re
 import stat
-import zlib
 from abc import ABC, abstractmethod
 from array import array
 from collections import Counter, deque
@@ -41,7 +40,7 @@ from functools import cached_property, lru_cache
 from importlib import import_module
 from importlib.resources.abc import Traversable
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 from zipfile import Path as ZipPath
 from zipfile import ZipFile
 
@@ -53,8 +52,10 @@ from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoGone
 from v2v_protocol.persisted import reader, to_plain
 from v2v_protocol.programs import printable
 from v2v_protocol.sample import ARRAYS, sidecar_endings
+from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.registry import VIDEOS, kind_from, kind_of
 from v2v_server.labels import frame_of
-from v2v_server.store.pixels import VIDEOS, Pixels, VideosKind, kind_of, open_pixels
+from v2v_server.store.pixels import Pixels
 from v2v_server.video.fingerprint import unreadable
 from v2v_server.video.rows import Rows
 
@@ -280,7 +281,6 @@ MANIFEST_NAME = "v2v-prepared.jsonl"
 """Name of the file that makes a folder a prepared one."""
 LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
-_SUFFIX = re.compile(r"\.(?=.*[a-z]|26[45]$)[a-z0-9]+", re.IGNORECASE)
 _COLUMNS = "path", "frames", "c+", "c-", "rate"
 
 
@@ -334,7 +334,7 @@ class ListEntry:
     rate: float | None = None
 
 
-def read_list(path: str | os.PathLike[str], kind: VideosKind = VIDEOS) -> tuple[ListEntry, ...]:
+def read_list(path: str | os.PathLike[str], kind: Kind = VIDEOS) -> tuple[ListEntry, ...]:
     """Read the entries of a list file like the paper's, in its order: one video a line, ``path frames c+ c- rate``.
 
     The columns after the path may be left out from the right. A single threshold holds for both polarities. The rate is
@@ -355,7 +355,7 @@ def read_list(path: str | os.PathLike[str], kind: VideosKind = VIDEOS) -> tuple[
         raise CorpusError(f"list {path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise CorpusError(f"list {path} is not UTF-8 text ({error.reason} at byte {error.start})") from error
-    is_csv, most = Path(path).suffix.lower() == ".csv", len(_COLUMNS) - (not kind.has_parts)
+    is_csv, most = Path(path).suffix.lower() == ".csv", len(_COLUMNS) - (not kind.has_listed_rates)
     entries: dict[str, int] = {}
     found: list[ListEntry] = []
     webvid: list[int] = []
@@ -406,7 +406,7 @@ def _webvid_entry(fields: list[str], folder: int, video: int) -> ListEntry:
     return ListEntry(_relative(f"{fields[folder]}/{fields[video]}.mp4"))
 
 
-def _entry(fields: list[str], kind: VideosKind, most: int) -> ListEntry:
+def _entry(fields: list[str], kind: Kind, most: int) -> ListEntry:
     if len(fields) > most:
         raise ValueError(f"{len(fields)} columns; there are at most {most}: {' '.join(_COLUMNS[:most])}")
     fields += [""] * (len(_COLUMNS) - len(fields))
@@ -426,18 +426,17 @@ def _number(field: str) -> float:
     return float(field)
 
 
-def _relative(text: str, kind: VideosKind = VIDEOS) -> str:
+def _relative(text: str, kind: Kind = VIDEOS) -> str:
     path = PurePosixPath(text.replace("\\", "/"))
     if path.is_absolute() or re.match(r"[A-Za-z]:/", str(path)):
         raise ValueError(f"{text} is absolute; give paths relative to the folder of the videos")
     if ".." in path.parts:
         raise ValueError(f"{text} leaves the folder of the videos")
-    is_folder = kind.has_parts and path.suffix.lower() != ".zip"
-    if not (is_folder or _SUFFIX.fullmatch(path.suffix)):
+    if not (id := kind.listed_id(path)):
         raise ValueError(f"{text!r} does not name a video file")
     if printable(text) != text:
         raise ValueError(f"{printable(text)} holds control characters")
-    return f"{path}/" if is_folder else str(path)
+    return id
 
 
 Q = TypeVar("Q")
@@ -466,8 +465,6 @@ FileState = tuple[int, int, int]
 or a mark of an object's ETag and 0."""
 NO_STATE: FileState = (-1, 0, 0)
 """The state cannot be told now."""
-_SEQUENCE_READER = 2
-"""Raise it with every change of what probing a sequence finds: they are probed again."""
 GONE: FileState = (-2, 0, 0)
 """There is no such file."""
 
@@ -551,7 +548,7 @@ class SourceOptions:
     copies: str | os.PathLike[str] | None = None
     copies_gib: float = COPIES_GIB
     cache_dir: str | os.PathLike[str] | None = None
-    kind: VideosKind = VIDEOS
+    kind: Kind = VIDEOS
 
     def listed(self) -> tuple[ListEntry, ...] | None:
         """Return the entries of the list; None without one.
@@ -562,8 +559,9 @@ class SourceOptions:
         return None if self.list_file is None else read_list(self.list_file, self.kind)
 
 
-_REOPENED = tuple[bytes, VideosKind, Mapping[str, float], Path | None, float]
-"""What another process opens a source by: its name, kind and rates, the folder for copies, and that folder's limit."""
+_REOPENED = tuple[bytes, Mapping[str, Any], Mapping[str, float], Path | None, float]
+"""What another process opens a source by: its name, the flags of its kind, its rates, the folder for copies, and that
+folder's limit."""
 
 
 class VideoSource(ABC):
@@ -581,7 +579,7 @@ class VideoSource(ABC):
     """
 
     is_local = True
-    kind = VIDEOS
+    kind: Kind = VIDEOS
     _expected: tuple[str, tuple[int, ...]] = "", ()
 
     def __init__(self, name: str, listed: Callable[[], tuple[ListEntry, ...] | None] = lambda: None) -> None:
@@ -590,7 +588,7 @@ class VideoSource(ABC):
 
     def to_bytes(self) -> bytes:
         """Return what another process opens it by, to open files but not to list them."""
-        plain = (os.fsencode(self.name), self.kind, self.rates, *self.copies_options)
+        plain = (os.fsencode(self.name), self.kind.flags, self.rates, *self.copies_options)
         return bytes(msgpack.packb(plain, default=to_plain))
 
     @staticmethod
@@ -601,9 +599,9 @@ class VideoSource(ABC):
             CorpusError, UsageError: see :func:`open_source`.
             ProtocolError, ValueError: the data is malformed.
         """
-        name, kind, rates, copies, gib = reader(_REOPENED)(msgpack.unpackb(data))
+        name, flags, rates, copies, gib = reader(_REOPENED)(msgpack.unpackb(data))
         # A list, which is read by listing only: without one the name of a folder can also be that of a video.
-        source = open_source(os.fsdecode(name), SourceOptions(os.devnull, copies, gib, kind=kind))
+        source = open_source(os.fsdecode(name), SourceOptions(os.devnull, copies, gib, kind=kind_from(flags)))
         source.rates = rates
         return source
 
@@ -700,7 +698,7 @@ class VideoSource(ABC):
             VideoUnreadable, VideoChanged: see :meth:`open_local`.
             VideoError: the video is damaged.
         """
-        with self.open_local(id, fingerprint) as path, open_pixels(path, kind_of(id)) as pixels:
+        with self.open_local(id, fingerprint) as path, kind_of(id).open_pixels(path) as pixels:
             yield pixels
 
     def unmarked(self, id: str, state: FileState) -> FileState:
@@ -722,15 +720,11 @@ class VideoSource(ABC):
 
     def rate(self, id: str) -> float:
         """Return the rate of a video that does not state one, Hz; 0 if it is unknown."""
-        return self.kind.rendered_hz if self.kind.is_rendered else self.rates.get(id, self.kind.rate)
+        return self.kind.rate_of(self.rates.get(id))
 
     def mark(self, id: str) -> int:
         """Return a number for the state of a video, which changes with what the user states of it."""
-        if self.kind.is_rendered:
-            return 1 + zlib.crc32(f"{self.kind.rendered_hz} {self.kind.frames}".encode())
-        return (
-            _SEQUENCE_READER + int(1e6 * self.rate(id)) + (self.kind.picture_bits << 44) if self.kind.has_parts else 0
-        )
+        return self.kind.mark(self.rate(id))
 
     def state_of_parts(self, id: str, files: Sequence[tuple[str, FileState]]) -> FileState:
         """Return the state of a folder of pictures from those of its files.

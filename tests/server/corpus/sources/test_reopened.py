@@ -10,9 +10,9 @@ from v2v_server.corpus.sources.copies import Bucket, Copies
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.prepared import Prepared
 from v2v_server.corpus.sources.source import MANIFEST_NAME, SourceOptions, VideoSource, open_source
-from v2v_server.store.pixels import VideosKind
+from v2v_server.kinds.sequences import SequenceKind
 
-KIND = VideosKind("sequences", 25.0, picture_bits=12)
+KIND = SequenceKind(25.0, picture_bits=12)
 
 
 @pytest.mark.parametrize("kind", [Folder, Prepared, Copies])
