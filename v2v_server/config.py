@@ -15,7 +15,7 @@ from v2v_protocol.recipe import STREAM_PRESETS
 from v2v_protocol.settings import bounds, check_settings, number, require_known, settings_of, switch, text, whole, word
 from v2v_protocol.spec import SPEC_KEYS, StreamSpec
 from v2v_protocol.spec_flags import read_recipe, read_yaml_mapping, recipe_setting
-from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS, KindFlags, kind_from
 from v2v_server.system.log import LOG_FORMATS
 from v2v_server.video.rows import Rows
@@ -127,7 +127,7 @@ class ServeConfig:
         "text", LOG_FORMATS, "format of standard error: text for people, or json, one object per line"
     )  # fmt: skip
     parent_pid: int = whole(0, 0, 1 << 31, "stop when this process is no longer the parent; 0: never", is_hidden=True)
-    kind: Kind = VIDEOS
+    kind: VideosKind = VIDEOS
     spec: StreamSpec = field(default_factory=StreamSpec)
 
     def __post_init__(self) -> None:

@@ -34,7 +34,7 @@ from v2v_protocol.write_aside import check_output, write_file
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import defects_of_video
-from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS, KindFlags, kind_from
 from v2v_server.motion.measure import MeasuredMotion, together
 from v2v_server.schedule import SequenceTable, VideoSequence
@@ -90,7 +90,7 @@ def preview(
     with_flow: bool = True,
     moments: int = 1,
     cache_dir: str | None = None,
-    kind: Kind = VIDEOS,
+    kind: VideosKind = VIDEOS,
     say: Callable[[str], None] = print,
 ) -> None:
     """Make the cameras' clips, draw them, and write the file.

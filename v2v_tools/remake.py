@@ -15,7 +15,7 @@ from v2v_server.broker import dispatcher
 from v2v_server.broker.dispatcher import next_candidate
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
-from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.quarantine import Quarantine
 from v2v_server.schedule import MOST_CANDIDATES, Schedule, SequenceTable, VideoSequence
 from v2v_server.system.process import usable_cores
@@ -120,7 +120,7 @@ class Remaker:
 
 
 def open_shown(
-    source: str, *, list_file: str | None, rows: str, cache_dir: str | None, kind: Kind, scene: bool = False
+    source: str, *, list_file: str | None, rows: str, cache_dir: str | None, kind: VideosKind, scene: bool = False
 ) -> Catalogue:
     """Call :func:`open_catalogue` on all cores, with progress on stderr."""
     with Progress("probing videos") as progress:
@@ -136,7 +136,7 @@ def open_remaker(
     rows: str,
     list_file: str | None,
     cache_dir: str | None,
-    kind: Kind,
+    kind: VideosKind,
     spec: StreamSpec,
     arrays: tuple[str, ...],
 ) -> Remaker:

@@ -63,7 +63,7 @@ from v2v_server.corpus.videos import (
     joined,
     missing_arrays,
 )
-from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS, kind_of
 from v2v_server.store.format import PIECE_FRAMES
 from v2v_server.store.store_file import STORE_FORMAT
@@ -444,7 +444,7 @@ class Catalogue:
         return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars, missing)
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> VideosKind:
         """Return what its videos are, with all flags at their defaults; prepared ones are what their sources were."""
         return kind_of(self.videos.ids[0])
 
@@ -521,7 +521,7 @@ def open_catalogue(
     cache_dir: str | os.PathLike[str] | None = None,
     copies: str | os.PathLike[str] | None = None,
     copies_gib: float = COPIES_GIB,
-    kind: Kind = VIDEOS,
+    kind: VideosKind = VIDEOS,
     scene: bool = False,
     processes: int = 1,
     progress: VideoProgress = silent,

@@ -42,7 +42,7 @@ from v2v_server.corpus.sources.source import (
     sidecar_id,
 )
 from v2v_server.corpus.videos import Sidecars, SplitVideos, VideoTable, encoded_pieces, joined
-from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS, kind_of
 from v2v_server.labels import check_labels
 from v2v_server.system.compile_cache import compile_cache
@@ -111,13 +111,13 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
     )
 
 
-def facts_of(path: Path, kind: Kind = VIDEOS) -> VideoFacts:
+def facts_of(path: Path, kind: VideosKind = VIDEOS) -> VideoFacts:
     """Return what is known of the video in a file. Errors: :class:`v2v_server.store.pixels.Pixels`."""
     with kind.open_pixels(path) as pixels:
         return pixels.facts()
 
 
-def _facts(path: Path, kind: Kind) -> VideoFacts:
+def _facts(path: Path, kind: VideosKind) -> VideoFacts:
     """Return what is known of the video; retry once after an error of the system rather than of the decoder.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What a video of a corpus is: one file for each kind, named in ``registry.FILES``.
+"""What a video of a corpus is: one file for each kind, named in ``registry.KIND_FILES``.
 
 kind          what every kind has and what its callers ask; its own flags are its fields
 registry      all kinds: which one owns an id, which one a user asks for, and the flags of all of them

@@ -1,7 +1,7 @@
 """What a video of a corpus is, as far as callers ask.
 
-A kind is a file beside this one, named in :data:`v2v_server.kinds.registry.FILES`: a frozen dataclass that is a
-:class:`Kind`, whose fields are its flags, and ``KIND``, an instance with their defaults. These files load no decoder:
+A kind is a file beside this one, named in :data:`v2v_server.kinds.registry.KIND_FILES`: a frozen dataclass that is a
+:class:`VideosKind`, whose fields are its flags, and ``KIND``, an instance with their defaults. These files load no decoder:
 the command lines import them.
 """
 
@@ -35,7 +35,7 @@ def rate_flag() -> Any:
 
 
 @dataclass(frozen=True)
-class Kind:
+class VideosKind:
     """What a video of a corpus is, and what a user states of it: each field is a flag, declared as a setting.
 
     Kinds may have a flag in common: one declaration, with one meaning. A worker has the id of a video only, and so the

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.settings import number
-from v2v_server.kinds.kind import Kind, at_rate, rate_flag
+from v2v_server.kinds.kind import VideosKind, at_rate, rate_flag
 from v2v_server.store.pixels import IMAGE_SUFFIXES
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ LONGEST_PHOTOGRAPH_FRAMES = 2**17
 
 
 @dataclass(frozen=True)
-class PhotographKind(Kind):
+class PhotographKind(VideosKind):
     """A photograph, whose frames are rendered for each sample.
 
     Raises:

@@ -10,17 +10,19 @@ from typing import Any
 from v2v_protocol.command import flag_of
 from v2v_protocol.errors import UsageError
 from v2v_protocol.settings import check_settings, settings_of, word
-from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.kind import VideosKind
 
-FILES = (
+KIND_FILES = (
     "videos",
     "sequences",
     "photographs",
 )
 """Files of the kinds. The first is the default, and owns the ids that no other kind does."""
-KINDS: dict[str, Kind] = {kind.name: kind for kind in (import_module(f"{__package__}.{file}").KIND for file in FILES)}
+KINDS: dict[str, VideosKind] = {
+    kind.name: kind for kind in (import_module(f"{__package__}.{file}").KIND for file in KIND_FILES)
+}
 """Each kind by its name, with all flags at their defaults."""
-VIDEOS = KINDS[FILES[0]]
+VIDEOS = KINDS[KIND_FILES[0]]
 _OWN = {item.name: item for kind in KINDS.values() for item in fields(kind)}
 KindFlags: Any = make_dataclass(
     "KindFlags",
@@ -28,7 +30,7 @@ KindFlags: Any = make_dataclass(
         (
             "videos_kind", str,
             word(
-                FILES[0], KINDS,
+                KIND_FILES[0], KINDS,
                 f"what a video is: {'; '.join(f'{kind.name} is {kind.help}' for kind in KINDS.values())}",
                 group="Kind of videos",
             ),
@@ -41,12 +43,12 @@ KindFlags: Any = make_dataclass(
 """The flags of all kinds as one dataclass of settings: for command lines, files of settings and their page."""
 
 
-def kind_of(id: str) -> Kind:
+def kind_of(id: str) -> VideosKind:
     """Return the kind that owns the id of a catalogued video, with all flags at their defaults."""
     return next(kind for kind in reversed(KINDS.values()) if kind.owns(id))
 
 
-def kind_from(given: Mapping[str, Any]) -> Kind:
+def kind_from(given: Mapping[str, Any]) -> VideosKind:
     """Return the kind that flags state.
 
     Args:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from v2v_protocol.errors import VideoError
 from v2v_protocol.settings import whole
-from v2v_server.kinds.kind import Kind, at_rate, rate_flag
+from v2v_server.kinds.kind import VideosKind, at_rate, rate_flag
 from v2v_server.store.pixels import IMAGE_SUFFIXES
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ _QUESTIONED_BITS = 14
 
 
 @dataclass(frozen=True)
-class SequenceKind(Kind):
+class SequenceKind(VideosKind):
     """A folder, whose id ends with a slash, or a ZIP archive."""
 
     name = "sequences"

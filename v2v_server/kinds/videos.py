@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.kind import VideosKind
 
 VIDEO_SUFFIXES = frozenset({
     ".3gp", ".avi", ".flv", ".h264", ".h265", ".hevc", ".ivf", ".m2ts", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov",
@@ -13,7 +13,7 @@ VIDEO_SUFFIXES = frozenset({
 
 
 @dataclass(frozen=True)
-class VideoKind(Kind):
+class VideoKind(VideosKind):
     """A video in a file."""
 
     name = "videos"

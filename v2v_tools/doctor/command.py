@@ -27,7 +27,7 @@ from packaging.requirements import Requirement
 from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show, version_of
-from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.system.process import control_group_memory, usable_cores
 from v2v_server.system.sandbox import can_confine
@@ -67,7 +67,7 @@ class Finding:
 
 
 def run_checks(
-    port: int, videos: str | None, recipe: str, rows: str, cache_dir: str | None, kind: Kind
+    port: int, videos: str | None, recipe: str, rows: str, cache_dir: str | None, kind: VideosKind
 ) -> Iterator[Finding]:
     """Run all checks and yield each finding at once; arguments as of the command.
 

@@ -22,7 +22,7 @@ from v2v_protocol.spec_flags import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import look_at_pictures, name_all
 from v2v_server.corpus.sources.source import open_sidecar, sidecar_id
-from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.labels import READERS
 from v2v_server.schedule import SequenceTable, lease_bytes
 from v2v_server.system.process import memory_limit
@@ -38,7 +38,7 @@ _VIDEOS_OPENED = 10_000
 """Most videos of which more is read than their line of the index."""
 
 
-def check_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, kind: Kind) -> Iterator[Line]:
+def check_corpus(videos: str, recipe: str, rows: str, cache_dir: str | None, kind: VideosKind) -> Iterator[Line]:
     """Check a corpus and yield lines of the report.
 
     Args:

@@ -23,7 +23,7 @@ from v2v_protocol.messages import Denied, Hello, Welcome
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.photographs import LONGEST_PHOTOGRAPH_FRAMES, PhotographKind
 from v2v_server.kinds.registry import kind_from, kind_of
 from v2v_server.prepare import prepare
@@ -61,7 +61,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, picture: Grey) -> Path:
     return photos
 
 
-def opened(folder: Path, kind: Kind = PHOTOGRAPHS, **options: Any) -> closing[Catalogue]:
+def opened(folder: Path, kind: VideosKind = PHOTOGRAPHS, **options: Any) -> closing[Catalogue]:
     return closing(open_catalogue(folder, cache_dir=folder.parent / "index", kind=kind, processes=0, **options))
 
 

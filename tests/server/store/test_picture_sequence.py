@@ -28,7 +28,7 @@ from tests.digests.rows import Row, samples_of
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources.source import SourceOptions, open_source
-from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import kind_from
 from v2v_server.kinds.sequences import SequenceKind
 from v2v_server.kinds.videos import VideoKind
@@ -83,7 +83,7 @@ def write_pictures(folder: Path, luma: npt.NDArray[np.uint8], name: str = "{:04}
         Image.fromarray(picture).save(folder / name.format(number))
 
 
-def opened(folder: Path, kind: Kind = SEQUENCES, **options: Any) -> closing[Catalogue]:
+def opened(folder: Path, kind: VideosKind = SEQUENCES, **options: Any) -> closing[Catalogue]:
     return closing(open_catalogue(folder, cache_dir=folder.parent / "index", kind=kind, processes=0, **options))
 
 
@@ -92,7 +92,7 @@ def arrays(catalogue: Catalogue, row: Row = ROW, cache: Cache | None = None) -> 
     return [{name: array.tobytes() for name, array in sample.arrays.items()} for sample in samples]
 
 
-def refusal(folder: Path, kind: Kind = SEQUENCES) -> str:
+def refusal(folder: Path, kind: VideosKind = SEQUENCES) -> str:
     """Return why the only sequence of a folder cannot be used."""
     with pytest.raises(CorpusError) as caught, opened(folder, kind):
         pass

@@ -32,7 +32,7 @@ from v2v_server.corpus.sources.source import (
     read_list,
     sidecar_id,
 )
-from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS
 from v2v_server.store.pixels import Pixels
 from v2v_server.store.verified import KnownState, Verified
@@ -270,7 +270,9 @@ def locate(name: str, options: SourceOptions) -> tuple[Path, Callable[[], tuple[
     return path.parent.resolve(), lambda: (ListEntry(path.name),)
 
 
-def video_files(root: Path, refused: dict[str, str], left_out: Counter[str], kind: Kind = VIDEOS) -> Iterator[str]:
+def video_files(
+    root: Path, refused: dict[str, str], left_out: Counter[str], kind: VideosKind = VIDEOS
+) -> Iterator[str]:
     """Return relative POSIX paths of the video files below ``root``, known by their suffixes.
 
     Links are followed; a link to a folder that it lies in is not. A folder that several links lead to has its videos

@@ -52,7 +52,7 @@ from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoGone
 from v2v_protocol.persisted import reader, to_plain
 from v2v_protocol.programs import printable
 from v2v_protocol.sample import ARRAYS, sidecar_endings
-from v2v_server.kinds.kind import Kind
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS, kind_from, kind_of
 from v2v_server.labels import frame_of
 from v2v_server.store.pixels import Pixels
@@ -334,7 +334,7 @@ class ListEntry:
     rate: float | None = None
 
 
-def read_list(path: str | os.PathLike[str], kind: Kind = VIDEOS) -> tuple[ListEntry, ...]:
+def read_list(path: str | os.PathLike[str], kind: VideosKind = VIDEOS) -> tuple[ListEntry, ...]:
     """Read the entries of a list file like the paper's, in its order: one video a line, ``path frames c+ c- rate``.
 
     The columns after the path may be left out from the right. A single threshold holds for both polarities. The rate is
@@ -406,7 +406,7 @@ def _webvid_entry(fields: list[str], folder: int, video: int) -> ListEntry:
     return ListEntry(_relative(f"{fields[folder]}/{fields[video]}.mp4"))
 
 
-def _entry(fields: list[str], kind: Kind, most: int) -> ListEntry:
+def _entry(fields: list[str], kind: VideosKind, most: int) -> ListEntry:
     if len(fields) > most:
         raise ValueError(f"{len(fields)} columns; there are at most {most}: {' '.join(_COLUMNS[:most])}")
     fields += [""] * (len(_COLUMNS) - len(fields))
@@ -426,7 +426,7 @@ def _number(field: str) -> float:
     return float(field)
 
 
-def _relative(text: str, kind: Kind = VIDEOS) -> str:
+def _relative(text: str, kind: VideosKind = VIDEOS) -> str:
     path = PurePosixPath(text.replace("\\", "/"))
     if path.is_absolute() or re.match(r"[A-Za-z]:/", str(path)):
         raise ValueError(f"{text} is absolute; give paths relative to the folder of the videos")
@@ -548,7 +548,7 @@ class SourceOptions:
     copies: str | os.PathLike[str] | None = None
     copies_gib: float = COPIES_GIB
     cache_dir: str | os.PathLike[str] | None = None
-    kind: Kind = VIDEOS
+    kind: VideosKind = VIDEOS
 
     def listed(self) -> tuple[ListEntry, ...] | None:
         """Return the entries of the list; None without one.
@@ -579,7 +579,7 @@ class VideoSource(ABC):
     """
 
     is_local = True
-    kind: Kind = VIDEOS
+    kind: VideosKind = VIDEOS
     _expected: tuple[str, tuple[int, ...]] = "", ()
 
     def __init__(self, name: str, listed: Callable[[], tuple[ListEntry, ...] | None] = lambda: None) -> None:
