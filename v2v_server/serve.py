@@ -167,8 +167,8 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
         if config.cache:
             worker_flags += ["--cache", str(Path(config.cache).absolute()), "--cache-gib", str(config.cache_gib)]
         worker_flags += ["--debug"] * debug + ["--insecure"] * config.insecure
-        copies, gib = catalogue.source.copies_options
-        worker_flags += ["--copies", str(copies), "--copies-gib", str(gib)] if copies else []
+        if copies := catalogue.source.copies:
+            worker_flags += ["--copies", str(copies.folder), "--copies-gib", str(copies.most_bytes / GIB)]
         stop = threading.Event()
         sockets.has_session = dispatcher.has_session
         signals = opened.enter_context(stop_on_signals(stop))

@@ -26,7 +26,7 @@ from v2v_protocol.programs import counted
 from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
 from v2v_recordings.time_stamps import PLAUSIBLE_HZ
-from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
+from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, IndexRow, Shard, Store
 from v2v_server.corpus.probe import (
     SceneCollection,
     VideoProgress,
@@ -37,21 +37,18 @@ from v2v_server.corpus.probe import (
     sidecar_kind,
 )
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sources.prepared import ABSENT, Header
+from v2v_server.corpus.sources.lists import ListEntry, left_out_note
+from v2v_server.corpus.sources.prepared import ABSENT, Header, Manifest, manifest_of, prepared_name, rows_of
+from v2v_server.corpus.sources.questions import Notice, by_parts, is_said, silent
+from v2v_server.corpus.sources.sidecars import sidecar_id
 from v2v_server.corpus.sources.source import (
     COPIES_GIB,
     GONE,
     FileState,
-    ListEntry,
-    Notice,
     SourceOptions,
     VideoSource,
-    by_parts,
-    is_said,
-    left_out_note,
     open_source,
-    sidecar_id,
-    silent,
+    unmarked,
 )
 from v2v_server.corpus.videos import (
     NO_THRESHOLDS,
@@ -112,9 +109,10 @@ def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice) -> Corpu
         CorpusError: the source cannot be listed, makes no sense, or has no video; or its folder of copies cannot be
             written to.
     """
-    source.make()
-    rows = source.rows(rows)
-    source.rates = {entry.id: entry.rate for entry in source.listed or () if entry.rate is not None}
+    if source.copies is not None:
+        source.copies.make()
+    rows = rows_of(source, rows)
+    source.rates = {entry.id: entry.rate for entry in source.listed() or () if entry.rate is not None}
     refused: dict[str, str] = {}
     left_out = Counter[str]()
     ids = list[str]()
@@ -305,7 +303,13 @@ class Catalogue:
 
     @property
     def folder(self) -> Path:
-        """Return the folder that ids are relative to, see :attr:`VideoSource.folder`."""
+        """Return the folder that ids are relative to.
+
+        Raises:
+            CorpusError: there is no such folder on this host.
+        """
+        if self.source.folder is None:
+            raise CorpusError(f"{self.source}: not a folder of this host; copy the videos to one first")
         return self.source.folder
 
     def path(self, id: str) -> Path:
@@ -315,7 +319,7 @@ class Catalogue:
             CorpusError: there is no such id in this catalogue, or no such folder on this host.
         """
         self._fingerprint(id)
-        return self.folder / self.source.file_of(id)
+        return self.folder / (id if self.prepared is None else prepared_name(id))
 
     def check(self, id: str, fingerprint: str, sidecar: str = "") -> None:
         """Check that the video is as catalogued, or its sidecar of that ending, see :meth:`VideoSource.verify`.
@@ -467,7 +471,8 @@ class Catalogue:
     def close(self) -> None:
         """Close the index; ``frame_index`` and ``scene`` fail afterwards."""
         self._store.close()
-        self.source.release()
+        if self.source.copies is not None:
+            self.source.copies.release()
 
     def _fingerprint(self, id: str) -> str:
         number = self.videos.find(id)
@@ -508,7 +513,7 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
     frames = catalogue.frame_index_bytes(video, start, count)
     state = catalogue.state(video)
     # A message has no number below 0, such as a time before 1970.
-    known = catalogue.source.unmarked(video, state) if state is not None and min(state) >= 0 else ()
+    known = unmarked(catalogue.source, video, state) if state is not None and min(state) >= 0 else ()
     notes = replace(lease.notes, state=known)
     return replace(lease, frame_index=frames, scene=part, sidecars=sidecars, notes=notes)
 
@@ -576,10 +581,10 @@ def _snapshot(
     processes: int,
     notice: Notice,
 ) -> Catalogue:
-    source, manifest, table = corpus.source, corpus.source.manifest, on_disk
+    source, manifest, table = corpus.source, manifest_of(corpus.source), on_disk
     problems, absent = dict(corpus.refused), frozenset[str]()
     if manifest is not None:
-        rows = ((*manifest.as_source(on_disk.row(at)).columns, None) for at in range(len(on_disk)))
+        rows = ((*_as_source(manifest, on_disk.row(at)).columns, None) for at in range(len(on_disk)))
         table = replace(VideoTable.read(rows, len(on_disk))[0], summaries=on_disk.summaries)
         absent = frozenset(table.ids[at] for at in np.flatnonzero(table.codec == ABSENT).tolist())
     else:
@@ -587,7 +592,7 @@ def _snapshot(
     usable = table.problem == np.array(None)
     problems.update((table.ids[at], table.problem[at]) for at in np.flatnonzero(~usable).tolist())
     table = table.where(usable)
-    thresholds, shorter = _listed(source.listed or (), Videos(table, {}))
+    thresholds, shorter = _listed(source.listed() or (), Videos(table, {}))
     videos = Videos(table, thresholds)
     if not videos:
         raise CorpusError(f"{source}: none of {len(problems)} videos can be used{format_problems(problems)}")
@@ -657,6 +662,28 @@ def _snapshot(
         _absent=absent,
         _scenes=scenes,
         _unknown=frozenset(unknown),
+    )
+
+
+def _as_source(manifest: Manifest, record: IndexRow) -> IndexRow:
+    """Return the record of a prepared file with the facts that have to agree with its source.
+
+    This includes videos without a usable file, whose codec is ABSENT: the sequences of the others keep their places
+    only if the source's frames are counted. A usable file may be damaged: each of its blocks is checked when it is
+    read. The source itself will do in its place.
+    """
+    video = manifest.videos[record.id]
+    is_there = record.problem is None and record.fingerprint == video.source_fingerprint
+    return replace(
+        record,
+        fingerprint=video.source_fingerprint,
+        frames=video.frames,
+        height_px=video.height_px,
+        width_px=video.width_px,
+        frames_per_second=video.frames_per_second,
+        codec=record.codec if is_there else ABSENT,
+        remark=video.remark,
+        problem=None,
     )
 
 

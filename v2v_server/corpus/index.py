@@ -26,7 +26,7 @@ import xxhash
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.persisted import Int64, Persisted
 from v2v_protocol.write_aside import write_aside_and_rename
-from v2v_server.corpus.sources.source import Notice, silent
+from v2v_server.corpus.sources.questions import Notice, silent
 from v2v_server.system.process import make_private
 
 SCHEMA_VERSION = 7

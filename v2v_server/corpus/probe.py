@@ -31,16 +31,10 @@ from v2v_protocol.persisted import Persisted
 from v2v_protocol.programs import counted, printable
 from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Store
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_ANALYSED_FRAMES, PIECE, Scene
-from v2v_server.corpus.sources.prepared import Manifest
-from v2v_server.corpus.sources.source import (
-    Notice,
-    VideoSource,
-    by_parts,
-    files_between,
-    open_sidecar,
-    read_files,
-    sidecar_id,
-)
+from v2v_server.corpus.sources.prepared import Manifest, manifest_of
+from v2v_server.corpus.sources.questions import Notice, by_parts
+from v2v_server.corpus.sources.sidecars import files_between, open_sidecar, read_files, sidecar_id
+from v2v_server.corpus.sources.source import VideoSource, rate_of
 from v2v_server.corpus.videos import Sidecars, SplitVideos, VideoTable, encoded_pieces, joined
 from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS, kind_of
@@ -82,11 +76,12 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
         before = source.state(id)
         with source.open_local(id, "") as path:
             mark = fingerprint(path)
-            facts = kind.with_flags(_facts(path, kind), source.rate(id))
+            facts = kind.with_flags(_facts(path, kind), rate_of(source, id))
         name = facts.made_of or (f"{mark}-{facts.content}" if facts.content else mark)
         if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
-        source.keep_as(id, mark, name)
+        if source.copies is not None:
+            source.copies.keep_as(id, mark, name)
     except OSError as error:
         return IndexRow(id, -1, problem=f"cannot be read: {error.strerror or error}")
     except VideoUnreadable as error:
@@ -286,10 +281,10 @@ class SceneCollection:
     def _found(
         self, store: Store, source: VideoSource, table: VideoTable, missing: list[int], processes: int
     ) -> Generator[tuple[IndexRow | _SceneJob, Scene], None, None]:
-        left = []
+        left, manifest = [], manifest_of(source)
         for place in missing:
             record = table.row(place)
-            if (data := self._stated(source.manifest, record)) is None:
+            if (data := self._stated(manifest, record)) is None:
                 left.append(place)
             else:
                 yield record, Scene.from_bytes(data)

@@ -1,8 +1,8 @@
 """What a video of a corpus is, as far as callers ask.
 
 A kind is a file beside this one, named in :data:`v2v_server.kinds.registry.KIND_FILES`: a frozen dataclass that is a
-:class:`VideosKind`, whose fields are its flags, and ``KIND``, an instance with their defaults. These files load no decoder:
-the command lines import them.
+:class:`VideosKind`, whose fields are its flags, and ``KIND``, an instance with their defaults. These files load no
+decoder: the command lines import them.
 """
 
 from __future__ import annotations

@@ -476,7 +476,7 @@ class Worker:
         if self._clips.has(lease):
             return True
         files = _files(lease)
-        self._source.expect(lease.video, lease.notes.state)
+        self._source.expected = lease.video, lease.notes.state
         return (self._unfetched is not None and self._unfetched[0] == files) or self._source.has(files)
 
     def _fetch(self, lease: Lease) -> None:

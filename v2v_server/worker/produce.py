@@ -46,7 +46,8 @@ from v2v_protocol.sample import (
 )
 from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sources.source import VideoSource, open_sidecar, sidecar_id
+from v2v_server.corpus.sources.sidecars import open_sidecar, sidecar_id
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
 from v2v_server.kinds.registry import kind_of
 from v2v_server.motion import cells_of, levels_of
@@ -208,7 +209,7 @@ def decode_for(
             tuple((lease.seed, lease.epoch, index) for index in indices),
             tuple(SampleView(plan.spec, plan.params, lease.arrays) for plan in plans),
         )  # fmt: skip
-        source.expect(lease.video, lease.notes.state)
+        source.expected = lease.video, lease.notes.state
         with source.open_pixels(lease.video, lease.fingerprint) as pixels:
             if cache is not None and not pixels.is_stored:
                 pixels = Cached(pixels, cache, lease.video, lease.fingerprint)

@@ -21,7 +21,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import look_at_pictures, name_all
-from v2v_server.corpus.sources.source import open_sidecar, sidecar_id
+from v2v_server.corpus.sources.sidecars import open_sidecar, sidecar_id
 from v2v_server.kinds.kind import VideosKind
 from v2v_server.labels import READERS
 from v2v_server.schedule import SequenceTable, lease_bytes

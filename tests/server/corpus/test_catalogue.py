@@ -24,7 +24,8 @@ from v2v_server.corpus import probe as probe_module
 from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
 from v2v_server.corpus.probe import probe_files
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.corpus.sources.source import MANIFEST_NAME, silent
+from v2v_server.corpus.sources.questions import silent
+from v2v_server.corpus.sources.source import MANIFEST_NAME
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint, is_same_file
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows

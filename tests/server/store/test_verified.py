@@ -266,7 +266,7 @@ def test_a_copy_on_another_host_is_read_whole_once(corpus: Corpus, read_whole: l
         read_whole.clear()
         source = Folder(other)
         files = {leases[0].video: leases[0].fingerprint}
-        source.expect(leases[0].video, leases[0].notes.state)
+        source.expected = leases[0].video, leases[0].notes.state
         assert not source.has(files), "this happens before a lease begins, so that no deadline runs"
         source.fetch(files)
         assert source.has(files)
