@@ -60,7 +60,7 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 FLOORS = (
     "system", "keys", "video", "simulation", "labels", "motion", "flow", "worlds", "store", "kinds", "config", "corpus",
-    "schedule",
+    "lease_memory", "corpus_words", "schedule",
     "quarantine", "sharing",
     "broker",
     "worker", "supervise", "status", "prepare", "page",
@@ -168,6 +168,8 @@ def test_server_folders_import_only_lower_folders() -> None:
                 "prepare",
                 "quarantine",
                 "schedule",
+                "corpus_words",
+                "lease_memory",
                 "sharing",
                 "keys",
                 "serve",
@@ -193,6 +195,9 @@ def test_every_folder_documents_its_files(room: str) -> None:
         ("v2v_server.simulation.draw", ("torch", "zmq", "av", "numba", "cv2")),
         ("v2v_server.broker.dispatcher", ("torch", "zmq", "numba", "cv2")),
         ("v2v_server.serve", ("torch", "numba", "cv2")),
+        ("v2v_server.worker.process", ("torch", "v2v_server.corpus.index", "v2v_server.schedule")),
+        ("v2v_server.schedule", ("torch", "zmq", "numba", "cv2", "sqlite3")),
+        ("v2v_server.kinds.registry", ("torch", "zmq", "av", "numba", "cv2", "numpy")),
     ],
 )
 def test_what_a_fresh_interpreter_loads(module: str, without: tuple[str, ...]) -> None:

@@ -40,10 +40,11 @@ from v2v_server.broker.state import (
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.corpus.scenes.picture_check import check_in_background
+from v2v_server.corpus_words import corpus_summary, notes_of
 from v2v_server.keys import KeyFolder
 from v2v_server.page.child import PageProcess
 from v2v_server.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
-from v2v_server.schedule import SequenceTable, corpus_summary
+from v2v_server.schedule import SequenceTable
 from v2v_server.status.snapshot import StatusPublisher
 from v2v_server.status.terminal import StatusView, format_shutdown_summary
 from v2v_server.store.cache import make_cache
@@ -141,7 +142,7 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
         catalogue = load_catalogue(config)
         table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
         summary = corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused)
-        for line in (*catalogue.notes, *summary):
+        for line in (*notes_of(catalogue), *summary):
             log.say(line)
         config.spec.recipe.warn(log.say)
         catalogue.fail_fast()

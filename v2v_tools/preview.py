@@ -34,6 +34,7 @@ from v2v_protocol.write_aside import check_output, write_file
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import defects_of_video
+from v2v_server.corpus_words import notes_of
 from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS, KindFlags, kind_from
 from v2v_server.motion.measure import MeasuredMotion, together
@@ -118,7 +119,7 @@ def preview(
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir, kind=kind)
     cameras: list[Camera] = []
     moving, started, notes = list[MeasuredMotion](), np.zeros(2), dict[str, list[str]]()
-    for note in catalogue.notes:
+    for note in notes_of(catalogue):
         say(note)
     try:
         first = _fitted_stream(catalogue, spec, wanted[0].recipe)

@@ -20,6 +20,7 @@ from v2v_server.corpus.catalogue import Catalogue, index_path, list_corpus, open
 from v2v_server.corpus.index import Shard, make_folder, merge_parts, parts_in, write_part
 from v2v_server.corpus.probe import SceneCollection
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
+from v2v_server.corpus_words import notes_of
 from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
@@ -151,7 +152,7 @@ class _Probed:
 
 def _of_all(catalogue: Catalogue) -> list[str]:
     with closing(catalogue):
-        lines = [*catalogue.notes, f"{catalogue.source}: {counted(len(catalogue.videos), 'video')} can be used"]
+        lines = [*notes_of(catalogue), f"{catalogue.source}: {counted(len(catalogue.videos), 'video')} can be used"]
         if catalogue.refusals:
             lines.append(f"{counted(len(catalogue.refusals), 'file')} cannot be used:")
             lines += [f"  {refusal}" for refusal in catalogue.refusals[:_SHOWN]]

@@ -25,8 +25,7 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.programs import counted
 from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
-from v2v_recordings.time_stamps import PLAUSIBLE_HZ
-from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, IndexRow, Shard, Store
+from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
 from v2v_server.corpus.probe import (
     SceneCollection,
     VideoProgress,
@@ -37,7 +36,7 @@ from v2v_server.corpus.probe import (
     sidecar_kind,
 )
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sources.lists import ListEntry, left_out_note
+from v2v_server.corpus.sources.lists import ListEntry, format_problems, left_out_note
 from v2v_server.corpus.sources.prepared import ABSENT, Header, Manifest, manifest_of, prepared_name, rows_of
 from v2v_server.corpus.sources.questions import Notice, by_parts, is_said, silent
 from v2v_server.corpus.sources.sidecars import sidecar_id
@@ -53,6 +52,7 @@ from v2v_server.corpus.sources.source import (
 from v2v_server.corpus.videos import (
     NO_THRESHOLDS,
     CorpusFacts,
+    IndexRow,
     Sidecars,
     Thresholds,
     Videos,
@@ -70,6 +70,7 @@ from v2v_server.video.fingerprint import CHANGED
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
 
+_NO_FILE = "its file is missing or changed"
 _KEPT_SLICES = 64
 _KEPT_LONG_FRAMES = 1 << 22
 """Frames of the opened indexes that are kept, 32 MiB: two days at 25 a second; one index at least."""
@@ -128,15 +129,6 @@ def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice) -> Corpu
             f"{format_problems(refused)}{note and '. '}{note}"
         )
     return Corpus(source, rows, tuple(ids), refused, note)
-
-
-def format_problems(problems: Mapping[str, str]) -> str:
-    """Return the first few reasons, for an error message; "" without one."""
-    if not problems:
-        return ""
-    shown = "; ".join(f"{id}: {problems[id]}" for id in sorted(problems)[:3])
-    more = f"; and {len(problems) - 3} more" if len(problems) > 3 else ""
-    return f" ({shown}{more})"
 
 
 def index_path(
@@ -276,13 +268,15 @@ class Catalogue:
         rows: which rows of the pictures may be used.
         videos: the videos that can be used, by id.
         refusals: files, folders and lines of the list that give no video, by id.
-        notes: what the user ought to be told: an index that cannot be kept, counts that contradict the list.
+        notes: what the user ought to be told of opening it: an index that cannot be kept, counts that contradict the
+            list. What is wrong with the videos is worded in :mod:`v2v_server.corpus_words`.
         digest: 32 hexadecimal digits that name this snapshot: equal digests, equal videos.
         prepared: how the folder was made if it is a prepared one (see :mod:`v2v_server.prepare`). Its videos
             are those of its source in number, order, id and frames, so that every position means the same frames;
             one without a sound prepared file is refused when it is opened, like a damaged one.
         scene_digest: names this snapshot together with the statistics of its videos; None without them.
         sidecars: the files beside the videos that arrays can be made from, by ending.
+        lacking: why videos of a prepared folder have no file, by id.
     """
 
     source: VideoSource
@@ -294,8 +288,8 @@ class Catalogue:
     prepared: Header | None
     scene_digest: str | None
     sidecars: Mapping[str, Sidecars]
+    lacking: Mapping[str, str]
     _store: Store = field(repr=False, compare=False)
-    _absent: frozenset[str] = field(repr=False, compare=False)  # without a prepared file
     _scenes: SceneCollection | None = field(repr=False, compare=False)
     _unknown: frozenset[str] = field(repr=False, compare=False)
     _slices: dict[tuple[str, int, int], bytes] = field(repr=False, compare=False, default_factory=dict)
@@ -398,7 +392,7 @@ class Catalogue:
         return index
 
     def _stored_index(self, id: str) -> bytes:
-        if id in self._absent:
+        if id in self.lacking:
             frames, height_px, width_px = self.videos.shape(id)
             return unseekable(frames, (1, 1), height_px, width_px).to_bytes()
         return self._stored(id, partial(self._store.frame_index, id))
@@ -443,7 +437,7 @@ class Catalogue:
     @property
     def facts(self) -> CorpusFacts:
         """What is known in memory: all that a server's dispatcher needs."""
-        ids = self.videos.ids if not self._absent else [id for id in self.videos.ids if id not in self._absent]
+        ids = self.videos.ids if not self.lacking else [id for id in self.videos.ids if id not in self.lacking]
         missing = {**self.kind.cannot()} | ({} if self.prepared is None else missing_arrays(self.source, ids))
         return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars, missing)
 
@@ -596,37 +590,9 @@ def _snapshot(
     videos = Videos(table, thresholds)
     if not videos:
         raise CorpusError(f"{source}: none of {len(problems)} videos can be used{format_problems(problems)}")
-    if manifest is not None and absent:
-        if len(absent) == len(videos):
-            raise CorpusError(f"{source}: none of {len(absent)} prepared files is there as its manifest says")
-        reasons = {id: manifest.videos[id].problem or "its file is missing or changed" for id in absent}
-        notes = [
-            *notes,
-            f"{counted(len(absent), 'video has', 'videos have')} no prepared file, so others stand in for them"
-            f"{format_problems(reasons)}",
-        ]
-    if len(woven := np.flatnonzero(videos.interlaced)):
-        first = videos[int(woven[0])].id
-        notes = [
-            *notes,
-            f"{counted(len(woven), 'video is', 'videos are')} interlaced ({first}): the frames are served as they are "
-            "stored, two fields taken at different times woven together, so that what moves is combed and makes "
-            "false events. Deinterlace such videos once (ffmpeg -i IN -vf bwdif=send_field OUT), or leave them out",
-        ]
-    if remarks := {videos.ids[at]: videos.remark[at] for at in np.flatnonzero(videos.remark).tolist()}:
-        notes = [
-            *notes,
-            f"{counted(len(remarks), 'video is', 'videos are')} served in part, or with wrong grey levels or times"
-            f"{format_problems(remarks)}",
-        ]
-    rates, (low, high) = videos.frames_per_second, PLAUSIBLE_HZ
-    is_odd = (rates > 0) & ((rates < low) | (rates > high))
-    if odd := {videos.ids[at]: f"{rates[at]:.3g}" for at in np.flatnonzero(is_odd).tolist()}:
-        notes = [
-            *notes,
-            f"{counted(len(odd), 'video has a rate', 'videos have rates')} outside of {low:g} to {high:g} frames a "
-            f"second{format_problems(odd)}: check the unit of their time stamps, or --rate",
-        ]
+    lacking = {} if manifest is None else {id: manifest.videos[id].problem or _NO_FILE for id in sorted(absent)}
+    if lacking and len(lacking) == len(videos):
+        raise CorpusError(f"{source}: none of {len(absent)} prepared files is there as its manifest says")
     if corpus.left_out:
         notes = [*notes, corpus.left_out]
     if shorter:
@@ -658,8 +624,8 @@ def _snapshot(
         prepared=None if manifest is None else manifest.header,
         scene_digest=scene_digest,
         sidecars=sidecars,
+        lacking=lacking,
         _store=store,
-        _absent=absent,
         _scenes=scenes,
         _unknown=frozenset(unknown),
     )

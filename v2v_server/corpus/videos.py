@@ -20,9 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_protocol.persisted import FloatOrNaN, Persisted
+from v2v_protocol.persisted import FloatOrNaN, Int64, Persisted
 from v2v_protocol.sample import ARRAYS, sidecar_endings
-from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import PIECE, Pieces, clip_pieces, firsts_of, sides_of
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.kinds.registry import kind_of
@@ -103,6 +102,42 @@ class StringColumn(Sequence[str]):
 
 
 NO_STRINGS = StringColumn(b"", np.zeros(0, np.int64))
+
+
+@dataclass(frozen=True, slots=True)
+class IndexRow(Persisted):
+    """What is known of one file.
+
+    Attributes:
+        id: relative POSIX path.
+        size_bytes, mtime_ns, ctime_ns: of the file when it was probed; a size of -1, which no file has, lets it be
+            probed again at the next start.
+        fingerprint: see :mod:`v2v_server.video.fingerprint`.
+        frames, width_px, height_px, frames_per_second, codec, interlaced, remark: see
+            :class:`v2v_server.video.probe.VideoFacts`; frames_per_second is None where unknown.
+        problem: why the file cannot be used; None if it can.
+        frame_index: ``FrameIndex.to_bytes()``; None with a problem, and where only the other columns were read.
+    """
+
+    id: str
+    size_bytes: Int64
+    mtime_ns: Int64 = 0
+    ctime_ns: Int64 = 0
+    fingerprint: str = ""
+    frames: Int64 = 0
+    width_px: Int64 = 0
+    height_px: Int64 = 0
+    frames_per_second: float | None = None
+    codec: str = ""
+    interlaced: bool = False
+    problem: str | None = None
+    remark: str = ""
+    frame_index: bytes | None = None
+
+    @property
+    def columns(self) -> tuple[Any, ...]:
+        """Return the attributes without the frame index."""
+        return tuple(getattr(self, name) for name in self.__slots__[:-1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,9 +22,11 @@ from v2v_protocol.spec_flags import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import look_at_pictures, name_all
 from v2v_server.corpus.sources.sidecars import open_sidecar, sidecar_id
+from v2v_server.corpus_words import notes_of
 from v2v_server.kinds.kind import VideosKind
 from v2v_server.labels import READERS
-from v2v_server.schedule import SequenceTable, lease_bytes
+from v2v_server.lease_memory import lease_bytes
+from v2v_server.schedule import SequenceTable
 from v2v_server.system.process import memory_limit
 from v2v_server.video.rows import Rows
 from v2v_tools.doctor.motion import look_at_motion
@@ -72,7 +74,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
         if any(os.strerror(errno.EACCES) in refusal.reason for refusal in catalogue.refusals):
             change += "; where permission is denied, let this user read the file and its folders (chmod, chown)"
         yield "note", "corpus", text, change
-    for note in catalogue.notes:
+    for note in notes_of(catalogue):
         yield "note", "corpus", note, ""
     for what, values in (
         ("interlaced", found.interlaced),

@@ -28,6 +28,7 @@ from tests.digests.rows import Row, samples_of
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources.source import SourceOptions, open_source
+from v2v_server.corpus_words import notes_of
 from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import kind_from
 from v2v_server.kinds.sequences import SequenceKind
@@ -247,16 +248,16 @@ def test_what_is_assumed_of_times_is_said(tmp_path: Path) -> None:
     with opened(tmp_path / "seqs") as catalogue:
         assert catalogue.videos.frames_per_second.tolist() == pytest.approx([28], abs=0.01)
         assert catalogue.videos[0].remark == "its times are taken for us, 28 pictures a second"
-        assert any("s/: its times are taken for us" in note for note in catalogue.notes)
+        assert any("s/: its times are taken for us" in note for note in notes_of(catalogue))
     write_times(tmp_path / "seqs/s/timestamps.txt", ["0", "10", "20", "30"])
     with opened(tmp_path / "seqs") as catalogue:
         assert catalogue.videos.frames_per_second.tolist() == [0.1]
-        (note,) = catalogue.notes
+        (note,) = notes_of(catalogue)
         assert "1 video has a rate outside of 0.5 to 20000 frames a second (s/: 0.1)" in note
     (tmp_path / "seqs/s/timestamps.txt").unlink()
     for rate, is_odd in ((0.4, True), (0.5, False), (20000.0, False), (20001.0, True), (0.0, False)):
         with opened(tmp_path / "seqs", SequenceKind(rate)) as catalogue:
-            assert any("outside of" in note for note in catalogue.notes) == is_odd, rate
+            assert any("outside of" in note for note in notes_of(catalogue)) == is_odd, rate
 
 
 def test_rates_come_from_the_flag_or_a_list(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -61,6 +61,15 @@ def left_out_note(left_out: Counter[str]) -> str:
 def _shown(names: Sequence[str]) -> str:
     more = len(names) - _MOST_SUFFIXES_SHOWN
     return ", ".join(names[:_MOST_SUFFIXES_SHOWN]) + (f" and {more} others" if more > 0 else "")
+
+
+def format_problems(problems: Mapping[str, str]) -> str:
+    """Return the first few reasons, for an error message; "" without one."""
+    if not problems:
+        return ""
+    shown = "; ".join(f"{id}: {problems[id]}" for id in sorted(problems)[:3])
+    more = f"; and {len(problems) - 3} more" if len(problems) > 3 else ""
+    return f" ({shown}{more})"
 
 
 @dataclass(frozen=True, slots=True)
