@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -168,29 +168,12 @@ def too_small(video: VideoEntry, rows: Rows, recipe: Recipe, sides: Sides = NO_B
     return _unsuited(video, reason, larger)
 
 
-class SequencesOf(Protocol):
-    """What is said of the sequences of a corpus, see :class:`v2v_server.schedule.SequenceTable`."""
-
-    count: int
-    videos: int
-
-    @property
-    def spoilt(self) -> int: ...
-
-    @property
-    def refusals(self) -> Sequence[Refusal]: ...
-
-    @property
-    def longest_clips(self) -> tuple[int, ...]: ...
-
-
-def corpus_summary(
-    catalogue: Catalogue, spec: StreamSpec, table: SequencesOf, *, list_refused: bool = False
-) -> list[str]:
+def corpus_summary(catalogue: Catalogue, spec: StreamSpec, table: Any, *, list_refused: bool = False) -> list[str]:
     """Return lines that say how many sequences there are, which videos give none, and which setting would admit them.
 
     Args:
-        catalogue, spec, table: of the server.
+        catalogue, spec: of the server.
+        table: its :class:`v2v_server.schedule.SequenceTable`.
         list_refused: whether to name all of those videos, not only the first few.
     """
     span, lines = sequence_span(catalogue, spec.recipe)
@@ -248,7 +231,7 @@ def _listed(refused: Sequence[Refusal], all_of_them: bool) -> list[str]:
     return [f"  {line}" for line in shown] + ([f"  ... and {rest} more: --list-refused names all"] if rest else [])
 
 
-def _shorter_clips(table: SequencesOf) -> list[str]:
+def _shorter_clips(table: Any) -> list[str]:
     """Say how many of the videos that are too short a shorter clip would admit: half of them, and all."""
     longest = sorted(table.longest_clips, reverse=True)
     if not longest:

@@ -71,7 +71,7 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
     """
     kind, owner = source.kind, kind_of(id)
     if owner.unprepared and owner.name != kind.name:  # what can be prepared may be a store, which needs no flag
-        return IndexRow(id, -1, problem=f"is {owner.title}: add --videos-kind {owner.name}")
+        return IndexRow(id, -1, problem=f"is {owner.help}: add --videos-kind {owner.name}")
     try:
         before = source.state(id)
         with source.open_local(id, "") as path:

@@ -15,37 +15,33 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
+
 from v2v_protocol.command import flag_of
-from v2v_protocol.settings import Setting, check_settings, number, settings_of
+from v2v_protocol.settings import Setting, check_settings, settings_of
+from v2v_protocol.spec import MARGIN_PX, StreamSpec
 from v2v_server.store.pixels import Pixels, open_pixels
 
 if TYPE_CHECKING:  # a command line starts without the decoder
-    from v2v_protocol.spec import StreamSpec
     from v2v_server.simulation.precision import Variant
     from v2v_server.video.probe import VideoFacts
 
-HIGHEST_RATE_HZ = 1e6
+RATE = 0.0, 0.0, 1e6, "rate of picture sequences without time stamps, 0: unknown; of photographs, 0: 60"
+"""What kinds of pictures without times of their own state of their flag ``rate``, in Hz."""
 _SUFFIX = re.compile(r"\.(?=.*[a-z]|26[45]$)[a-z0-9]+", re.IGNORECASE)
-
-
-def rate_flag() -> Any:
-    """Return the field of a flag that kinds of pictures without times of their own have in common."""
-    what = "rate of picture sequences without time stamps, 0: unknown; of photographs, 0: 60"
-    return number(0.0, 0.0, HIGHEST_RATE_HZ, what, unit="Hz", metavar="N")
 
 
 @dataclass(frozen=True)
 class VideosKind:
     """What a video of a corpus is, and what a user states of it: each field is a flag, declared as a setting.
 
-    Kinds may have a flag in common: one declaration, with one meaning. A worker has the id of a video only, and so the
+    Kinds may have a flag in common: with one meaning, limits and help. A worker has the id of a video only, and so the
     kind that owns it with all flags at their defaults. What a flag changes reaches it in the frame index
     (:meth:`with_flags`).
 
     Attributes:
         name: its ``--videos-kind``.
-        title: of one video, for messages: "a picture".
-        help: what a video is, for ``--help``.
+        help: what a video is, after "is".
         forms: files of ``v2v_server/store/`` that read a video, in the order in which they are asked.
         looked_for: which files are videos, for messages.
         has_parts: whether a video may be a folder of files, whose id ends with a slash.
@@ -64,7 +60,6 @@ class VideosKind:
     """
 
     name: ClassVar[str]
-    title: ClassVar[str]
     help: ClassVar[str]
     forms: ClassVar[Sequence[str]]
     looked_for: ClassVar[str]
@@ -147,8 +142,6 @@ class VideosKind:
 
     def reads(self, spec: StreamSpec, height_px: int, width_px: int) -> tuple[int, int]:
         """Return how much a sample reads of each frame of this size: pixels, and the bytes of a level."""
-        from v2v_protocol.spec import MARGIN_PX  # lazily: it loads NumPy
-
         recipe, whole = spec.recipe, height_px * width_px
         sides = 2 * max(spec.flow_margin_px, MARGIN_PX if spec.substep_px else 0)
         window = min(whole, (recipe.crop_height_px + sides) * (recipe.crop_width_px + sides))
@@ -164,8 +157,6 @@ def at_rate(facts: VideoFacts, rate: float, frames: int) -> VideoFacts:
     """Return the facts of ``frames`` pictures that follow each other at a stated rate, Hz, if their file states no
     times.
     """
-    import numpy as np
-
     if not rate or facts.index.seekable:
         return facts
     index = facts.index.timed(np.rint(np.arange(frames) * 1e9 / rate).astype(np.int64))

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.sample import ARRAYS
 from v2v_protocol.settings import number
-from v2v_server.kinds.kind import VideosKind, at_rate, rate_flag
+from v2v_protocol.spec import StreamSpec
+from v2v_server.kinds.kind import RATE, VideosKind, at_rate
 from v2v_server.store.pixels import IMAGE_SUFFIXES
 
 if TYPE_CHECKING:
-    from v2v_protocol.spec import StreamSpec
     from v2v_server.simulation.precision import Variant
     from v2v_server.video.probe import VideoFacts
 
@@ -30,7 +31,7 @@ class PhotographKind(VideosKind):
     """
 
     name = "photographs"
-    title, help = "a picture", "a picture that the camera moves over"
+    help = "a picture that the camera moves over"
     forms = ("photograph",)
     looked_for = " ".join(sorted(IMAGE_SUFFIXES))
     has_sidecars = has_scenes = has_motion = False
@@ -38,7 +39,7 @@ class PhotographKind(VideosKind):
     shown_arrays = "masks", "tracks"
     unprepared = "photographs are rendered for each sample, so there is nothing to prepare: serve them"
 
-    rate: float = rate_flag()
+    rate: float = number(*RATE, unit="Hz", metavar="N")
     photograph_seconds: float = number(
         0.0, 0.0, 1e6, "time for which each photograph is shown; 0: 10", unit="s", metavar="S"
     )
@@ -80,8 +81,6 @@ class PhotographKind(VideosKind):
 
     def cannot(self) -> Mapping[str, str]:
         """Return colour, and the labels of files."""
-        from v2v_protocol.sample import ARRAYS  # lazily: it loads NumPy
-
         labels = {name for name, form in ARRAYS.items() if form.needs.sidecars and name != "masks"}
         return {
             "frames_rgb": "the colour of a video, and photographs are rendered in grey: ask for frames",

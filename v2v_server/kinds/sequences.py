@@ -8,8 +8,8 @@ from pathlib import PurePosixPath
 from typing import TYPE_CHECKING
 
 from v2v_protocol.errors import VideoError
-from v2v_protocol.settings import whole
-from v2v_server.kinds.kind import VideosKind, at_rate, rate_flag
+from v2v_protocol.settings import number, whole
+from v2v_server.kinds.kind import RATE, VideosKind, at_rate
 from v2v_server.store.pixels import IMAGE_SUFFIXES
 
 if TYPE_CHECKING:
@@ -26,12 +26,12 @@ class SequenceKind(VideosKind):
     """A folder, whose id ends with a slash, or a ZIP archive."""
 
     name = "sequences"
-    title, help = "a picture sequence", "a folder, or a zip archive, of numbered pictures"
+    help = "a folder, or a zip archive, of numbered pictures"
     forms = "store_file", "picture_sequence"
     looked_for = f"folders and .zip archives of numbered {' '.join(sorted(IMAGE_SUFFIXES))}"
     has_parts = has_listed_rates = True
 
-    rate: float = rate_flag()
+    rate: float = number(*RATE, unit="Hz", metavar="N")
     picture_bits: int = whole(
         0, 8, 15,
         "bits, 8 to 15, that the levels of picture sequences of 16 bits hold, such as 12 for 0 to 4095; 0: all 16",

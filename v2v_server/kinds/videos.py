@@ -17,7 +17,7 @@ class VideoKind(VideosKind):
     """A video in a file."""
 
     name = "videos"
-    title = help = "a file"
+    help = "a file"
     forms = "store_file", "video_file"
     looked_for = (
         f"{' '.join(sorted(VIDEO_SUFFIXES))}; with --videos-kind sequences, folders of numbered pictures are videos, "

@@ -313,7 +313,7 @@ def test_a_large_photograph_takes_the_memory_of_its_crops() -> None:
 
 
 def test_a_picture_is_no_video(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(CorpusError, match="is a picture: add --videos-kind photographs"):
+    with pytest.raises(CorpusError, match="is a picture that the camera moves over: add --videos-kind photographs"):
         open_catalogue(folder / "b.jpg", cache_dir=tmp_path, processes=0)
     with closing(open_catalogue(folder / "b.jpg", cache_dir=tmp_path, kind=PHOTOGRAPHS, processes=0)) as one:
         assert list(one.videos.ids) == ["b.jpg"]

@@ -108,7 +108,12 @@ class CopyFolder:
             yield Path(held.name)
 
     def keep_as(self, id: str, found: str, fingerprint: str) -> None:
-        """See :meth:`v2v_server.corpus.sources.source.CopiedFiles.keep_as`."""
+        """Let the copy that was made for probing be found under the video's full fingerprint.
+
+        Args:
+            found: fingerprint of the file, its size, head and tail.
+            fingerprint: the full one.
+        """
         # A link, because another process may be reading the copy under its first name, which then stays.
         with contextlib.suppress(OSError), self._locked_slot(_slot_number(id)) as slot:
             slot.unlink(missing_ok=True)

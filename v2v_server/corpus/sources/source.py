@@ -19,12 +19,13 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import msgpack
 
 from v2v_protocol.errors import CorpusError, VideoGone, VideoUnreadable
 from v2v_protocol.persisted import reader, to_plain
+from v2v_server.corpus.sources.copy_folder import CopyFolder
 from v2v_server.corpus.sources.lists import ListEntry, read_list
 from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS, kind_from, kind_of
@@ -78,35 +79,6 @@ _REOPENED = tuple[bytes, Mapping[str, Any], Mapping[str, float], Path | None, fl
 folder's limit."""
 
 
-class CopiedFiles(Protocol):
-    """What a source needs whose files are fetched to a folder of this host.
-
-    Attributes:
-        folder, most_bytes: that folder, and its limit.
-    """
-
-    folder: Path
-    most_bytes: int
-
-    def make(self) -> None:
-        """Create the folder. Listing and opening files come after it.
-
-        Raises:
-            CorpusError: it cannot be created or written to.
-        """
-
-    def keep_as(self, id: str, found: str, fingerprint: str) -> None:
-        """Let the copy that was made for probing be found under the video's full fingerprint.
-
-        Args:
-            found: fingerprint of the file, its size, head and tail.
-            fingerprint: the full one.
-        """
-
-    def release(self) -> None:
-        """Release the files that :meth:`VideoSource.has` or :meth:`VideoSource.fetch` keeps."""
-
-
 class VideoSource(ABC):
     """Videos, by id.
 
@@ -130,7 +102,7 @@ class VideoSource(ABC):
 
     is_local = True
     kind: VideosKind = VIDEOS
-    copies: CopiedFiles | None = None
+    copies: CopyFolder | None = None
     expected: tuple[str, Sequence[int]] = "", ()
 
     def __init__(
