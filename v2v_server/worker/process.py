@@ -49,7 +49,7 @@ from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Buffer, Frames, Lease, Notes, Result, WorkerHello, encode_sample
 from v2v_protocol.sample import Form, Layout, new_arrays
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.schedule import LARGEST_MEMORY_BYTES
+from v2v_server.lease_memory import LARGEST_MEMORY_BYTES
 from v2v_server.simulation.precision import USUAL
 from v2v_server.store.cache import Cache
 from v2v_server.system.compile_cache import compile_cache
@@ -476,7 +476,7 @@ class Worker:
         if self._clips.has(lease):
             return True
         files = _files(lease)
-        self._source.expect(lease.video, lease.notes.state)
+        self._source.expected = lease.video, lease.notes.state
         return (self._unfetched is not None and self._unfetched[0] == files) or self._source.has(files)
 
     def _fetch(self, lease: Lease) -> None:

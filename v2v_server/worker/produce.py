@@ -46,8 +46,10 @@ from v2v_protocol.sample import (
 )
 from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sources.source import VideoSource, open_sidecar, sidecar_id
+from v2v_server.corpus.sources.sidecars import open_sidecar, sidecar_id
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import FlowSettings, flow_for
+from v2v_server.kinds.registry import kind_of
 from v2v_server.motion import cells_of, levels_of
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.draw import choose_crop, draw
@@ -58,7 +60,6 @@ from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.view import apply_view, source_window, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.store.cache import Cache, Cached
-from v2v_server.store.pixels import kind_of
 from v2v_server.store.verified import read_unchanged
 from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, SampleView
 from v2v_server.video.picture import MIXED, MOST_BITS, SDR, ChromaCut
@@ -168,13 +169,13 @@ def plan_sample(lease: Lease, index: int) -> SamplePlan:
     flow: FlowSettings | None = None
     still_px: int | None = 0
     flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture, place)
-    is_rendered, needs = kind_of(lease.video) == "photographs", needs_of(lease.arrays)
-    if not is_rendered and needs.flow:
+    is_view, needs = kind_of(lease.video).is_view, needs_of(lease.arrays)
+    if not is_view and needs.flow:
         flow = FlowSettings.of(spec)
         if flow_plan is not None and flow_plan.still:
             flow = replace(flow, margin_px=0)
         still_px = flow.margin_px
-    has_motion = spec.substep_px > 0 and not is_rendered
+    has_motion = spec.substep_px > 0 and not is_view
     margin_px = max(still_px, MARGIN_PX) if has_motion and still_px is not None else still_px
     window, still = (source_window(params, recipe, picture, margin) for margin in (margin_px, still_px))
     chroma = chroma_cut(lease, params, spec, frames, source) if needs.colour else None
@@ -208,7 +209,7 @@ def decode_for(
             tuple((lease.seed, lease.epoch, index) for index in indices),
             tuple(SampleView(plan.spec, plan.params, lease.arrays) for plan in plans),
         )  # fmt: skip
-        source.expect(lease.video, lease.notes.state)
+        source.expected = lease.video, lease.notes.state
         with source.open_pixels(lease.video, lease.fingerprint) as pixels:
             if cache is not None and not pixels.is_stored:
                 pixels = Cached(pixels, cache, lease.video, lease.fingerprint)
@@ -434,21 +435,18 @@ def kernels_of(lease: Lease) -> frozenset[Variant]:
     others = [name for name in lease.arrays if name not in NAMES and needs_of([name]).events]
     found = frozenset[Variant]()
     for arrays in filter(None, (made, _LISTED if others else ())):
-        found |= _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds, arrays, kind_of(lease.video))
-    return found
+        found |= _variants(lease.spec, lease.frames_per_second or 1.0, lease.thresholds, arrays)
+    return kind_of(lease.video).variants(found)
 
 
 @lru_cache(maxsize=64)
 def _variants(
-    canonical: bytes, frames_per_second: float, thresholds: tuple[float, ...], arrays: tuple[str, ...], kind: str
+    canonical: bytes, frames_per_second: float, thresholds: tuple[float, ...], arrays: tuple[str, ...]
 ) -> frozenset[Variant]:
     spec = _spec(canonical)
     step_seconds = spec.recipe.frame_stride / frames_per_second
     levels_per_step = MOST_SUBSTEPS - 1 if spec.substep_px else 0
-    found = variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds), arrays, levels_per_step)
-    if kind == "photographs":
-        found = frozenset(variant._replace(is_divided=False, bits=MOST_BITS, is_rendered=True) for variant in found)
-    return found
+    return variants(spec.recipe, spec.voxel_dtype, step_seconds, _pair(thresholds), arrays, levels_per_step)
 
 
 @lru_cache(maxsize=16)
