@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.arena import give_back_freed_memory
-from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoGone
+from v2v_protocol.errors import CorpusError, IndexUnreadable, V2VError, VideoChanged, VideoError, VideoGone
 from v2v_protocol.link.router import ConsumerGone, FromConsumer, FromWorker, InFlight, Sockets
 from v2v_protocol.link.user import OwnUser
 from v2v_protocol.progress import Progress
@@ -32,6 +32,7 @@ from v2v_server.broker.state import (
     CheckVideo,
     Disconnect,
     GiveUp,
+    Grant,
     ReportRefusal,
     SendStatus,
     ToConsumer,
@@ -155,7 +156,6 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
         dispatcher = Dispatcher(
             catalogue.facts,
             config.spec,
-            complete=lambda lease, spec: complete_lease(lease, catalogue, spec),
             quarantine=quarantine,
             wall_clock=utc_now,
             lease_deadline_seconds=config.lease_deadline_seconds,
@@ -309,6 +309,17 @@ class Server:
                     is_sent = self._sockets.send(identity, frames, to_worker=True)
                     if not is_sent and not self._pool.watches(self._name(identity)):
                         todo.extend(dispatcher.worker_unreachable(identity, now()))
+                case Grant() as grant:
+                    try:
+                        completed = complete_lease(grant.leases[0], self._catalogue, grant.spec)
+                        todo.extend(grant.messages(completed))
+                    except IndexUnreadable as error:
+                        # None of the others could be completed either.
+                        grants = [grant, *(each for each in todo if isinstance(each, Grant))]
+                        todo = deque(each for each in todo if not isinstance(each, Grant))
+                        todo.extend(dispatcher.not_granted(grants, str(error), now(), is_blocked=True))
+                    except V2VError as error:
+                        todo.extend(dispatcher.not_granted([grant], str(error), now(), is_blocked=False))
                 case Disconnect(identity):
                     self._sockets.cut(identity)
                 case GiveUp() as hopeless:

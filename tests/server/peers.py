@@ -12,6 +12,7 @@ from typing import Any
 from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import NO_SLOT
+from v2v_protocol.errors import IndexUnreadable, V2VError
 from v2v_protocol.messages import (
     Begun,
     Buffer,
@@ -40,6 +41,7 @@ from v2v_server.broker.state import (
     AddToQuarantine,
     CheckVideo,
     GiveUp,
+    Grant,
     ReportRefusal,
     ToConsumer,
     ToWorker,
@@ -164,6 +166,15 @@ class Peers:
                         self.owners[message.lease] = b"" if asked is None else asked.session
                     else:
                         self.told.setdefault(identity, []).append(message)
+                case Grant() as grant:
+                    try:
+                        todo.extend(grant.messages(complete_lease(grant.leases[0], self.catalogue, grant.spec)))
+                    except IndexUnreadable as error:
+                        grants = [grant, *(each for each in todo if isinstance(each, Grant))]
+                        todo = deque(each for each in todo if not isinstance(each, Grant))
+                        todo.extend(self.dispatcher.not_granted(grants, str(error), self.now, is_blocked=True))
+                    except V2VError as error:
+                        todo.extend(self.dispatcher.not_granted([grant], str(error), self.now, is_blocked=False))
                 case GiveUp(identity, reason):
                     self.given_up.append(identity)
                     cause = Cause.UNEXPLAINED if identity in self.remote else Cause.HUNG
@@ -303,7 +314,6 @@ def peers(
     dispatcher = Dispatcher(
         videos.facts,
         spec,
-        complete=lambda lease, spec: complete_lease(lease, videos, spec),
         lease_deadline_seconds=DEADLINE,
         session_idle_seconds=IDLE,
         max_credit_bytes=max_credit_bytes,

@@ -37,7 +37,6 @@ from v2v_protocol.messages import (
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause
 from v2v_server.config import ServeConfig
-from v2v_server.corpus.catalogue import complete_lease
 from v2v_server.quarantine import read_quarantine
 from v2v_server.serve import Server
 from v2v_server.worker.conversation import (
@@ -168,7 +167,6 @@ class World:
         self.dispatcher = Dispatcher(
             videos.facts,
             SMALL_SPEC,
-            complete=lambda lease, spec: complete_lease(lease, videos, spec),
             lease_deadline_seconds=DEADLINE,
             session_idle_seconds=600.0,
             max_credit_bytes=2 << 30,

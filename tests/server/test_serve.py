@@ -11,12 +11,14 @@ from typing import Any, cast
 
 import pytest
 
+from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import peers
 from tests.server.queues import Queues, ToyPool
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.errors import VideoChanged
-from v2v_protocol.messages import Pong, Stop, WorkerHello, encode
+from v2v_protocol.errors import IndexUnreadable, ProtocolError, VideoChanged
+from v2v_protocol.messages import Lease, Pong, Stop, WorkerHello, encode
 from v2v_protocol.sample import Refusal
+from v2v_protocol.spec import StreamSpec
 from v2v_server import serve as serve_module
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause, Loss, Request
@@ -26,6 +28,7 @@ from v2v_server.broker.state import (
     CheckVideo,
     Counters,
     GiveUp,
+    Grant,
     ReportRefusal,
     ToConsumer,
     ToWorker,
@@ -72,6 +75,10 @@ class Scripted:
 
     def video_checked(self, missing: CheckVideo, found: bool, now: float) -> list[Action]:
         self.told.append(("looked for", missing, found))
+        return []
+
+    def not_granted(self, grants: Sequence[Grant], reason: str, now: float, *, is_blocked: bool) -> list[Action]:
+        self.told.append(("not granted", [grant.identity for grant in grants], reason, is_blocked))
         return []
 
     def worker_lost(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
@@ -159,6 +166,33 @@ def test_a_record_waits_for_another_writer_and_the_server_does_not(is_freed: boo
     times[0] = 3.0
     server.turn(0.0)
     assert dispatcher.told == [("recorded", RECORD, [replace(VERDICT, snapshot=1)] if is_freed else [])]
+
+
+GRANTS = [Grant(name, (), SMALL_SPEC, True) for name in (b"1", b"2", b"3")]
+
+
+@pytest.mark.parametrize("is_locked", [True, False])
+def test_leases_that_cannot_be_completed_are_reported(
+    is_locked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the index is locked only one is tried: each attempt may wait for a disk."""
+    tried: list[StreamSpec] = []
+
+    def refuse(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Lease:
+        tried.append(spec)
+        raise IndexUnreadable("locked") if is_locked else ProtocolError("damaged")
+
+    monkeypatch.setattr(serve_module, "complete_lease", refuse)
+    leases = [replace(grant, leases=(cast(Lease, number),)) for number, grant in enumerate(GRANTS)]
+    dispatcher = Scripted([*leases[:1], ToConsumer(b"gone", encode(Pong())), *leases[1:]])
+    served(dispatcher, tmp_path)
+    assert len(tried) == (1 if is_locked else 3)
+    assert [told for told in dispatcher.told if told[0] == "not granted"] == (
+        [("not granted", [b"1", b"2", b"3"], "locked", True)]
+        if is_locked
+        else [("not granted", [name], "damaged", False) for name in (b"1", b"2", b"3")]
+    )
+    assert ("consumer lost", b"gone") in dispatcher.told  # all else is still carried out
 
 
 @pytest.mark.parametrize("found", [True, False])

@@ -24,7 +24,7 @@ from typing import Any
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
-from v2v_protocol.errors import CorpusError, IndexUnreadable, LimitExceeded, ProtocolError, UsageError, V2VError
+from v2v_protocol.errors import CorpusError, LimitExceeded, ProtocolError, UsageError
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import (
     LARGEST_ARRAY_BYTES,
@@ -40,7 +40,6 @@ from v2v_protocol.messages import (
     Lease,
     LeaseFailed,
     Message,
-    Notes,
     Ping,
     Pong,
     Result,
@@ -77,6 +76,7 @@ from v2v_server.broker.state import (
     CheckVideo,
     Disconnect,
     GiveUp,
+    Grant,
     ParkedClip,
     RefusalPart,
     ReportRefusal,
@@ -428,6 +428,31 @@ class Dispatcher(Broker):
                 each.quarantine = self.quarantine.latest
         return [*_refuse_quarantined(self, record.request, record.entry.reason), *_assign(self, now)]
 
+    def not_granted(self, grants: Sequence[Grant], reason: str, now: float, *, is_blocked: bool) -> list[Action]:
+        """Continue after :class:`Grant`\\ s whose leases were not completed, and so not sent.
+
+        Args:
+            grants: in their order. The requests go back in reverse order, so that siblings keep theirs.
+            reason: why the first of them could not be completed.
+            now: monotonic time, seconds.
+            is_blocked: whether the index cannot be read at the moment: the requests wait, and no lease is granted until
+                the next tick. Else it has nothing for the clip, whose candidate is refused.
+        """
+        if is_blocked:
+            self.blocked_reason = f"{reason}; retried ten times a second"
+        actions: list[Action] = []
+        for lease in reversed([lease for grant in grants for lease in grant.leases]):
+            request = self.leases.recall(lease.lease)
+            if request is None:
+                continue
+            if request.sample in self.leases.out:  # the first worker still makes it
+                self.counters.second_leases -= 1
+            elif is_blocked:
+                self.sessions.put_back(request)
+            else:
+                actions += _refuse(self, request, None, reason)
+        return [*actions, *_assign(self, now)]
+
     def video_checked(self, missing: CheckVideo, found: bool, now: float) -> list[Action]:
         """Continue after a :class:`CheckVideo`: blame the video, or the worker's host.
 
@@ -457,9 +482,7 @@ class Dispatcher(Broker):
         for identity in self.registry.vanished(now):
             actions.append(GiveUp(identity, f"was silent for {SILENCE_SECONDS:g} s"))
         actions += _check_parked(self, now)
-        second = _assign_slow(self, now)
-        self.counters.second_leases += len(second)
-        actions += second
+        actions += _assign_slow(self, now)
         # A consumer that left may have freed a worker that was reserved for its requests.
         return actions + _assign(self, now)
 
@@ -787,79 +810,58 @@ def _assign_slow(broker: Broker, now: float) -> list[Action]:
         session = broker.sessions.get(request.session)
         if session is not None and second is not None and not runs_alone(request):
             slotless = replace(request, slot=None)  # the first worker may still write to the slot
-            granted = _grant(broker, session, slotless, second, now)
-            if granted is None:
-                broker.sessions.put_back(slotless)
-                break
-            actions += granted
+            actions.append(_grant(broker, session, [slotless], second, now))
+    broker.counters.second_leases += len(actions)
     return actions
 
 
 def _give(broker: Broker, requests: list[Request], worker: bytes, now: float) -> list[Action]:
-    """Give a worker the requests of one clip, except those whose candidate is in quarantine."""
+    """Give a worker the requests of one clip, unless its candidate is in quarantine."""
     session = broker.sessions.get(requests[0].session)
     if session is None:
         return []
+    requests = [session.current(request) for request in requests]
+    reason = _quarantined(broker, session, requests[0], session.quarantine)
     actions: list[Action] = []
-    good: list[Request] = []
+    if reason is not None:
+        for request in reversed(requests):  # siblings keep their order
+            actions += _refuse(broker, request, None, reason, RefusalKind.QUARANTINED)
+        return actions
+    alone: list[Request] = []
     for request in requests:
-        current = session.current(request)
-        reason = _quarantined(broker, session, current, session.quarantine)
-        if reason is not None:
-            actions += _refuse(broker, current, None, reason, RefusalKind.QUARANTINED)
-        elif (answer := _share(broker, session, current)) is not None:
-            actions += answer
+        if (answer := _share(broker, session, request)) is None:
+            alone.append(request)
         else:
-            good.append(current)
-    for place, request in enumerate(good):
-        granted = _grant(broker, session, request, worker, now, tuple(other.index for other in good[place + 1 :]))
-        if granted is None:
-            for each in reversed(good[place:]):
-                broker.sessions.put_back(each)
-            break
-        actions += granted
-    return actions
+            actions += answer
+    return [*actions, _grant(broker, session, alone, worker, now)] if alone else actions
 
 
-def _grant(
-    broker: Broker, session: Session, request: Request, worker: bytes, now: float, siblings: tuple[int, ...] = ()
-) -> list[Action] | None:
-    """Lease a request to a worker, or refuse its candidate if the index of its video is damaged, belongs to another
-    file, or is too large.
-
-    Returns:
-        None if the index cannot be read at the moment. No lease is granted until it is tried again.
-    """
-    sequence = session.sequence(request)
+def _grant(broker: Broker, session: Session, requests: list[Request], worker: bytes, now: float) -> Grant:
+    """Lease the requests of one clip to a worker."""
+    sequence = session.sequence(requests[0])
     seconds = work_seconds(session.spec, session.arrays, sequence.video)
-    number = broker.leases.grant(request, worker, now, seconds)
-    if broker.ring is not None:
-        broker.makers[sharing_key(session, request)] = request.sample
-        # A consumer without a slot is on another host, as far as is known, and gets a message.
-        if request.slot is not None and not session.packed:
-            broker.ring.lend(number, session.form.sizes)
-    lease = lease_for(
-        _as_leased(broker, request, number),
-        number=number,
-        sequence=sequence,
-        facts=broker.facts,
-        spec=session.spec,
-        seed=session.seed,
-        arrays=session.arrays,
-        siblings=siblings,
-        packed=session.packed,
-    )
-    try:
-        lease = broker.complete(lease, session.spec)
-        if not broker.registry.members[worker].takes_notes:
-            lease = replace(lease, notes=Notes())
-        return [ToWorker(worker, encode(lease), lease.arena)]
-    except V2VError as error:
-        broker.leases.finished(number, worker, now)
-        if not isinstance(error, IndexUnreadable):
-            return _refuse(broker, request, None, str(error))
-        broker.blocked_reason = f"{error}; retried ten times a second"
-        return None
+    indices = tuple(request.index for request in requests)
+    leases: list[Lease] = []
+    for request in requests:
+        number = broker.leases.grant(request, worker, now, seconds)
+        if broker.ring is not None:
+            broker.makers[sharing_key(session, request)] = request.sample
+            # A consumer without a slot is on another host, as far as is known, and gets a message.
+            if request.slot is not None and not session.packed:
+                broker.ring.lend(number, session.form.sizes)
+        lease = lease_for(
+            _as_leased(broker, request, number),
+            number=number,
+            sequence=sequence,
+            facts=broker.facts,
+            spec=session.spec,
+            seed=session.seed,
+            arrays=session.arrays,
+            siblings=indices[len(leases) + 1 :],
+            packed=session.packed,
+        )
+        leases.append(lease)
+    return Grant(worker, tuple(leases), session.spec, broker.registry.members[worker].takes_notes)
 
 
 # --- memory of workers ------------------------------------------------------------------------------------------------
@@ -1009,7 +1011,8 @@ def _release_followers(broker: Broker) -> None:
     if broker.ring is None:
         return
     broker.ring.release(broker.leases)
-    for key in [key for key, maker in broker.makers.items() if maker not in broker.leases.out]:
+    ended = [key for key, maker in broker.makers.items() if maker not in broker.leases.out]
+    for key in reversed(ended):  # a consumer's followers keep their order
         del broker.makers[key]
         for request in reversed(broker.followers.pop(key, [])):
             broker.sessions.put_back(request)

@@ -343,12 +343,21 @@ class LeaseBook:
         """
         returned = []
         for number in list(self.held.get(worker, ())):
-            lease = self._leases[number]
-            self._drop(number)
-            if lease.request is not None and lease.request.sample not in self.out:
-                begun = lease.begun_at is not None if at is None else number == at
-                returned.append((replace(lease.request, slot=None), begun))
+            begun = self._leases[number].begun_at is not None if at is None else number == at
+            request = self.recall(number)
+            if request is not None and request.sample not in self.out:
+                returned.append((replace(request, slot=None), begun))
         return returned
+
+    def recall(self, number: int) -> Request | None:
+        """Drop a lease, and return its request, which a second worker may still hold; None if it is not wanted or the
+        lease has ended.
+        """
+        lease = self._leases.get(number)
+        if lease is None:
+            return None
+        self._drop(number)
+        return lease.request
 
     def overdue(self, now: float) -> set[bytes]:
         """Return the workers with a lease past its deadline. Their leases stay out until the workers are given up

@@ -436,7 +436,9 @@ class Sessions:
         session = self._sessions.get(request.session)
         if session is None or session.spec.samples_per_decode == 1:
             return []
-        siblings = [other for other in session.waiting if other.clip == request.clip and not runs_alone(other)]
+        # Under another snapshot a request returns to its first candidate, and so to another clip.
+        clip, waiting = session.current(request).clip, session.waiting
+        siblings = [other for other in waiting if session.current(other).clip == clip and not runs_alone(other)]
         for sibling in siblings:
             session.waiting.remove(sibling)
         self._requeue(session)
