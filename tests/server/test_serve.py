@@ -15,7 +15,7 @@ from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import peers
 from tests.server.queues import Queues, ToyPool
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.errors import IndexUnreadable, ProtocolError, VideoChanged
+from v2v_protocol.errors import IndexUnreadable, ProtocolError, V2VError, VideoChanged
 from v2v_protocol.messages import Lease, Pong, Stop, WorkerHello, encode
 from v2v_protocol.sample import Refusal
 from v2v_protocol.spec import StreamSpec
@@ -46,7 +46,8 @@ RECORD = AddToQuarantine(VERDICT, Request(b"c", 0, 0))
 
 
 class Scripted:
-    """A dispatcher whose first tick says what the test says, and which writes down what it is told."""
+    """A dispatcher whose first tick says what the test says, and which writes down what it is told. It is its own
+    broker."""
 
     def __init__(
         self, first: Sequence[Action] = (), after_record: Sequence[Action] = (), workers: Sequence[bytes] = ()
@@ -57,7 +58,7 @@ class Scripted:
         self.times: list[float] = []
         self.blocked_reason = ""
         self.counters = Counters()
-        self._there = peers().dispatcher
+        self._there, self.broker = peers().broker, self
         for worker in workers:
             self._there.registry.add(worker, WorkerHello(worker.decode(), NUMERICS_VERSION, 2), 0.0)
 
@@ -77,15 +78,15 @@ class Scripted:
         self.told.append(("looked for", missing, found))
         return []
 
-    def not_granted(self, grants: Sequence[Grant], reason: str, now: float, *, is_blocked: bool) -> list[Action]:
-        self.told.append(("not granted", [grant.identity for grant in grants], reason, is_blocked))
+    def not_granted(self, grants: Sequence[Grant], error: V2VError, now: float) -> list[Action]:
+        self.told.append(("not granted", [grant.identity for grant in grants], str(error)))
         return []
 
     def worker_lost(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
         self.told.append(("lost", identity, loss))
         return []
 
-    def worker_unreachable(self, identity: bytes, now: float) -> list[Action]:
+    def worker_gone(self, identity: bytes, now: float) -> list[Action]:
         self.told.append(("unreachable", identity))
         return []
 
@@ -188,9 +189,9 @@ def test_leases_that_cannot_be_completed_are_reported(
     served(dispatcher, tmp_path)
     assert len(tried) == (1 if is_locked else 3)
     assert [told for told in dispatcher.told if told[0] == "not granted"] == (
-        [("not granted", [b"1", b"2", b"3"], "locked", True)]
+        [("not granted", [b"1", b"2", b"3"], "locked")]
         if is_locked
-        else [("not granted", [name], "damaged", False) for name in (b"1", b"2", b"3")]
+        else [("not granted", [name], "damaged") for name in (b"1", b"2", b"3")]
     )
     assert ("consumer lost", b"gone") in dispatcher.told  # all else is still carried out
 
@@ -312,13 +313,13 @@ def test_with_json_every_line_is_an_object_and_one_on_a_sample_has_its_identity(
     at.hello(b"c", seed=5)
     request = Request(b"c", 2, 7)
     dispatcher = Scripted([ReportRefusal(Refusal("a.mp4", 7, "cut short"), request), AddToQuarantine(VERDICT, request)])
-    dispatcher._there = at.dispatcher
+    dispatcher._there = at.broker
     server = served(dispatcher, tmp_path, log_format="json")
     server.close()
     lines: list[dict[str, Any]] = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     assert all({"time", "level", "text"} <= line.keys() for line in lines)
     passed_over, condemned = (next(line for line in lines if word in line["text"]) for word in ("passed", "quarantine"))
-    session = at.dispatcher.sessions.get(b"c")
+    session = at.broker.sessions.get(b"c")
     assert session is not None
     assert passed_over["sample"] == {
         "spec_digest": session.spec.digest, "catalogue_digest": "c" * 32, "numerics_version": NUMERICS_VERSION,

@@ -507,6 +507,7 @@ class Workers:
 
     Attributes:
         members: all of them by routing id.
+        resting: time at which the rest of those ends that get no work for a while.
         least_memory, most_memory: smallest and largest limit of a worker's memory, bytes; 0 without workers.
     """
 
@@ -516,17 +517,11 @@ class Workers:
         self.members: dict[bytes, Member] = {}
         self._names: dict[str, bytes] = {}
         self._unfit = ""  # why the last worker left that cannot work for this server, until a worker makes a sample
-        self._resting: dict[bytes, float] = {}  # time at which their rest ends
+        self.resting: dict[bytes, float] = {}
         # With a thousand workers, only those whose load has changed are examined.
         self._changed: set[bytes] = set()
         self._held: dict[bytes, int] = {}  # leases of each worker with free credit
         self._room: list[tuple[int, bytes]] = []  # the same, sorted
-
-    def __len__(self) -> int:
-        return len(self.members)
-
-    def __contains__(self, identity: bytes) -> bool:
-        return identity in self.members
 
     def name_of(self, identity: bytes) -> str:
         """Return the name of a worker; empty if it has not said hello."""
@@ -536,10 +531,6 @@ class Workers:
     def named(self, name: str) -> bytes | None:
         """Return the routing id of the worker of that name; None if there is none."""
         return self._names.get(name)
-
-    def is_resting(self, identity: bytes) -> bool:
-        """Return whether a worker gets no work for a while."""
-        return identity in self._resting
 
     def add(self, identity: bytes, hello: WorkerHello, now: float, user: str = "", owner: bytes = b"") -> None:
         """Add a worker that said hello; none of that routing id or name is there."""
@@ -564,7 +555,7 @@ class Workers:
         if worker is not None:
             del self._names[worker.name]
             self._weigh()
-        self._resting.pop(identity, None)
+        self.resting.pop(identity, None)
         self._changed.add(identity)
 
     def mark_heard(self, identity: bytes, now: float) -> bool:
@@ -610,14 +601,14 @@ class Workers:
         """Give a worker no work for a while, because its host could not read a video."""
         if identity in self.members:
             self.members[identity].unreadable = unreadable
-            self._resting[identity] = now + REST_SECONDS
+            self.resting[identity] = now + REST_SECONDS
             self._changed.add(identity)
 
     def wake(self, now: float) -> None:
         """Give work again to workers whose rest is over."""
-        rested = [identity for identity, until in self._resting.items() if now >= until]
+        rested = [identity for identity, until in self.resting.items() if now >= until]
         for identity in rested:
-            del self._resting[identity]
+            del self.resting[identity]
         self._changed.update(rested)
 
     def hanging(self, now: float) -> list[bytes]:
@@ -677,7 +668,7 @@ class Workers:
             if (before := self._held.pop(identity, None)) is not None:
                 del self._room[bisect_left(self._room, (before, identity))]
             worker, held = self.members.get(identity), self._leases.held_by(identity)
-            if worker is None or worker.given_up or identity in self._resting:
+            if worker is None or worker.given_up or identity in self.resting:
                 continue
             if held < worker.credit and not self._is_alone(identity):
                 self._held[identity] = held

@@ -1,6 +1,6 @@
 """What the broker knows, as one value, and the actions that it wants done. No I/O: the loop (:mod:`v2v_server.serve`)
-has the sockets, the processes and the disk, and does them. :mod:`v2v_server.broker.dispatcher` changes the value; all
-other parts only read.
+has the sockets, the processes and the disk, and does them. The modules of this folder change the value; all others only
+read it.
 """
 
 from __future__ import annotations
@@ -167,11 +167,6 @@ def denial(code: ErrorCode, text: str) -> Frames:
     return encode(Denied(code, text if len(text) <= _LONGEST_TEXT else text[:_LONGEST_TEXT] + " ..."))
 
 
-def malformed(error: ProtocolError) -> Frames:
-    """Build the reply to a message that cannot be used."""
-    return denial(ErrorCode.VERSION if isinstance(error, VersionMismatch) else ErrorCode.MALFORMED, str(error))
-
-
 @dataclass(slots=True)
 class Counters(WorkDone):
     """Totals since the start. The status leaves out fields without a meaning text."""
@@ -309,7 +304,7 @@ class Broker:
         makers: the request that has the lease of each sample that others may follow, by sharing key.
         followers: requests that wait for the sample of a maker.
         parked: clips that the free workers do not suit, oldest first.
-        outgrown: memory that was not enough for a clip under a spec, bytes, by :func:`dispatcher.clip_key`. It lasts as
+        outgrown: memory that was not enough for a clip under a spec, bytes, by :func:`assignment.clip_key`. It lasts as
             long as the server: the next one may have larger workers.
         refusals: the last few, oldest first.
         blocked_reason: why no lease can be granted at the moment; empty if leases can be granted.
@@ -354,7 +349,7 @@ class Broker:
     @property
     def workers(self) -> int:
         """Return the number of workers that said hello and are alive as far as is known."""
-        return len(self.registry)
+        return len(self.registry.members)
 
     @property
     def waiting(self) -> int:
@@ -375,7 +370,7 @@ class Broker:
 
     def has_session(self, identity: bytes) -> bool:
         """Return whether a peer is a consumer with a session, or a worker that said hello."""
-        return self.sessions.get(identity) is not None or identity in self.registry
+        return self.sessions.get(identity) is not None or identity in self.registry.members
 
     def identity_of(self, request: Request) -> SampleId | None:
         """Return the identity of the sample that a request asks for; None if its consumer is gone."""
@@ -396,4 +391,12 @@ class Broker:
     @property
     def idle_share(self) -> float:
         """Share of the workers that hold no lease: 0 to 1."""
-        return max(0.0, 1.0 - len(self.leases.held) / max(len(self.registry), 1)) if self.registry else 0.0
+        return (
+            max(0.0, 1.0 - len(self.leases.held) / max(len(self.registry.members), 1)) if self.registry.members else 0.0
+        )
+
+
+def malformed(broker: Broker, error: ProtocolError) -> Frames:
+    """Count a message that cannot be used, and build the reply."""
+    broker.counters.malformed += 1
+    return denial(ErrorCode.VERSION if isinstance(error, VersionMismatch) else ErrorCode.MALFORMED, str(error))

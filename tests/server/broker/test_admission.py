@@ -16,7 +16,8 @@ from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.messages import Hello
 from v2v_protocol.spec import StreamSpec
 from v2v_server import schedule as sequences
-from v2v_server.broker.dispatcher import Dispatcher, admit
+from v2v_server.broker.admission import admit
+from v2v_server.broker.state import Broker
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.scene import Flag
 from v2v_server.corpus.videos import CorpusFacts, encoded_pieces
@@ -27,8 +28,8 @@ SAMPLE_BYTES = 2 * 2 * 8 * 8
 VERDICTS = [QuarantineEntry(number, "v0.mp4", "f", 0, "crash", "t") for number in (1, 2, 3)]
 
 
-def admission(max_credit_bytes: int = 2**30, quarantine: Quarantine | None = None) -> Dispatcher:
-    return peers(None, SMALL_SPEC, max_credit_bytes, quarantine).dispatcher
+def admission(max_credit_bytes: int = 2**30, quarantine: Quarantine | None = None) -> Broker:
+    return peers(None, SMALL_SPEC, max_credit_bytes, quarantine).broker
 
 
 def hello(batch_size: int = 4, seed: int = 0, quarantine: int | None = None, **spec: Any) -> Hello:
@@ -115,7 +116,7 @@ def test_the_sequences_of_a_spec_do_not_depend_on_who_came_before(asked: dict[st
     default, other = ({"scene": "auto", "max_sequences_per_video": 1000} | changed for changed in ({}, asked))
 
     def count(*specs: dict[str, Any]) -> int:
-        at = peers(cast(Catalogue, SimpleNamespace(facts=facts))).dispatcher
+        at = peers(cast(Catalogue, SimpleNamespace(facts=facts))).broker
         return [admit(at, b"c", hello(**spec), 1, 0.0)[1].sequences for spec in specs][-1]
 
     assert count(default, other) == count(other) != count(default)

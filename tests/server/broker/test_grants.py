@@ -42,7 +42,7 @@ def test_all_clips_that_wait_for_a_locked_index_keep_their_order(ticks: int) -> 
     at.want(*range(12))
     for _ in range(ticks):
         at.tick(0.1)
-    broker = at.dispatcher
+    broker = at.broker
     assert not at.leases[b"w1"]
     assert not at.leases[b"w2"]
     assert (len(broker.leases), broker.waiting, broker.leases.held, broker.leases.out) == (0, 12, {}, {})
@@ -80,7 +80,7 @@ def test_the_siblings_of_a_damaged_clip_move_on_together() -> None:
         assert len(first.indices) == 1 or first.indices[1:] == second.indices  # each follows its sibling
     refused = [lease.refusals["refusals"] for lease in leases if lease.candidate]
     assert all("is damaged" in each["reason"] for refusals in refused for each in refusals)
-    assert [lease.lease for lease in leases] == at.dispatcher.leases.held[b"w"]
+    assert [lease.lease for lease in leases] == at.broker.leases.held[b"w"]
     at.work_off()
     assert len(at.samples()) == 12
 
@@ -94,7 +94,7 @@ def test_memory_of_a_lease_that_was_not_sent_is_free_and_its_followers_wait_agai
         at.hello(identity)
         at.want(0, 1, 2, identity=identity, arena=ARENA, slots=[1, 2, 3])
     at.join(credit=8)
-    broker = at.dispatcher
+    broker = at.broker
     assert broker.ring is not None
     assert (broker.makers, broker.followers, broker.ring.being_made) == ({}, {}, {})
     if is_damaged:
@@ -115,7 +115,7 @@ def test_a_second_lease_that_was_not_sent_leaves_the_first_alone() -> None:
     for _ in range(3):
         at.tick(1.6)
     assert not at.leases[b"fast"]
-    assert at.dispatcher.counters.second_leases == 0
+    assert at.broker.counters.second_leases == 0
     before = at.samples()
     at.finish(b"slow")
     assert at.samples() == [*before, (0, 20)]

@@ -27,7 +27,7 @@ from v2v_protocol.messages import (
     Unavailable,
     decode_map,
 )
-from v2v_server.broker.dispatcher import TOO_LARGE_SECONDS
+from v2v_server.broker.assignment import TOO_LARGE_SECONDS
 from v2v_server.broker.leases import Cause, runs_alone
 
 _HALF_WRITTEN = (-1, -1, -1)
@@ -244,12 +244,12 @@ class Interleaving(RuleBasedStateMachine):
         if how == "goodbye":
             self.at.worker_says(identity, Goodbye())
         elif how == "unreachable" or not held:
-            self.at.carry_out(self.at.dispatcher.worker_unreachable(identity, self.at.now))
+            self.at.carry_out(self.at.dispatcher.worker_gone(identity, self.at.now))
         else:
             self.at.worker_says(identity, Result(held[0].lease), b"nonsense")
-            if self.at.dispatcher.sessions.get(self.at.asked_by(held[0])) is not None:
-                self.at.carry_out(self.at.dispatcher.worker_unreachable(identity, self.at.now))
-        self.at.carry_out(self.at.dispatcher.worker_unreachable(identity, self.at.now))
+            if self.at.broker.sessions.get(self.at.asked_by(held[0])) is not None:
+                self.at.carry_out(self.at.dispatcher.worker_gone(identity, self.at.now))
+        self.at.carry_out(self.at.dispatcher.worker_gone(identity, self.at.now))
         self.late += [(identity, lease) for lease in held]
         self._listen()
 
@@ -294,13 +294,13 @@ class Interleaving(RuleBasedStateMachine):
         at = getattr(self, "at", None)
         if at is None:
             return
-        for identity in at.dispatcher.registry.members:
+        for identity in at.broker.registry.members:
             held = at.leases.get(identity, ())
-            assert at.dispatcher.leases.held.get(identity, []) == sorted(lease.lease for lease in held)
+            assert at.broker.leases.held.get(identity, []) == sorted(lease.lease for lease in held)
             for lease in held:
-                request = at.dispatcher.leases.request(lease.lease, identity)
+                request = at.broker.leases.request(lease.lease, identity)
                 if request is not None:
-                    assert at.dispatcher.clip_of(request) == (lease.video, lease.start_frame)
+                    assert at.broker.clip_of(request) == (lease.video, lease.start_frame)
 
     @invariant()
     def bounded(self) -> None:
@@ -309,20 +309,20 @@ class Interleaving(RuleBasedStateMachine):
             return
         for held in at.leases.values():
             assert len(held) <= CREDIT * self.spec.get("samples_per_decode", 1)
-        assert {session.identity for session in at.dispatcher.sessions} == set(self.owed)
-        for session in at.dispatcher.sessions:
+        assert {session.identity for session in at.broker.sessions} == set(self.owed)
+        for session in at.broker.sessions:
             assert session.unanswered == self.owed[session.identity]
             assert len(session.unanswered) <= session.credit
             assert 0 <= session.quarantine <= at.quarantine.latest
-        assert at.dispatcher.waiting <= sum(map(len, self.owed.values()))
+        assert at.broker.waiting <= sum(map(len, self.owed.values()))
 
     @invariant()
     def a_lone_request_is_alone(self) -> None:
         at = getattr(self, "at", None)
         if at is None:
             return
-        book = at.dispatcher.leases
-        for identity in list(at.dispatcher.registry.members):
+        book = at.broker.leases
+        for identity in list(at.broker.registry.members):
             lonely = any(runs_alone(request) for request in book.requests_of(identity))
             assert not lonely or book.held_by(identity) == 1
 
@@ -351,12 +351,12 @@ class Interleaving(RuleBasedStateMachine):
             self.at.tick(TOO_LARGE_SECONDS)
             self._listen()
         assert not any(self.owed.values())
-        assert self.at.dispatcher.waiting == 0
-        assert not self.at.dispatcher.parked
-        assert len(self.at.dispatcher.leases) == 0
-        assert not self.at.dispatcher.leases.held
-        assert not self.at.dispatcher.leases.out
-        assert set(self.at.dispatcher.leases.durations) <= set(self.owed)
+        assert self.at.broker.waiting == 0
+        assert not self.at.broker.parked
+        assert len(self.at.broker.leases) == 0
+        assert not self.at.broker.leases.held
+        assert not self.at.broker.leases.out
+        assert set(self.at.broker.leases.durations) <= set(self.owed)
 
 
 class OfSiblings(Interleaving):
@@ -395,7 +395,7 @@ class WithSlots(Interleaving):
 
     def want(self, identity: bytes, epoch: int, indices: list[int]) -> None:
         slots = self.slots.setdefault(identity, Slots())
-        session = self.at.dispatcher.sessions.get(identity)
+        session = self.at.broker.sessions.get(identity)
         keys = {epoch * 1000 + index: index for index in indices}
         fresh = {key: index for key, index in keys.items() if key not in slots._named}
         if session is None or len(session.unanswered | {(epoch, index) for index in indices}) > session.credit:
@@ -513,13 +513,13 @@ def walk(seed: int, steps: int, kind: type[Interleaving] = Interleaving) -> Coun
         model.bounded()
         model.every_lease_is_sent()
         model.a_lone_request_is_alone()
-        book = model.at.dispatcher.leases
-        seen["blocked"] += bool(model.at.dispatcher.blocked_reason)
+        book = model.at.broker.leases
+        seen["blocked"] += bool(model.at.broker.blocked_reason)
         seen["lone at work"] += any(map(runs_alone, (request for name in names for request in book.requests_of(name))))
-        seen["lone waiting"] += any(runs_alone(clip.requests[0]) for clip in model.at.dispatcher.parked)
-    seen["twins"] = model.at.dispatcher.counters.second_leases
+        seen["lone waiting"] += any(runs_alone(clip.requests[0]) for clip in model.at.broker.parked)
+    seen["twins"] = model.at.broker.counters.second_leases
     seen["verdicts"] = len(model.at.recorded)
-    seen["samples"] = model.at.dispatcher.counters.samples
+    seen["samples"] = model.at.broker.counters.samples
     if isinstance(model, WithSlots):
         seen["read in slots"] = model.read_there
         seen["abandoned slots"] = model.abandoned
