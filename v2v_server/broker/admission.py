@@ -51,13 +51,12 @@ def suggested_credit(batch_size: int, workers: int, samples_per_decode: int) -> 
     return under_way + -(-under_way // 7)
 
 
-def admit(broker: Broker, identity: bytes, hello: Hello, workers: int, now: float) -> tuple[Session, Welcome]:
+def admit(broker: Broker, identity: bytes, hello: Hello, now: float) -> tuple[Session, Welcome]:
     """Open the session that a consumer asks for, and return it with the reply.
 
     Args:
         identity: the consumer's routing id.
         hello: its message.
-        workers: number of workers, present or expected; the credit keeps all of them busy, within its bounds.
         now: monotonic time, seconds.
 
     Raises:
@@ -87,6 +86,8 @@ def admit(broker: Broker, identity: bytes, hello: Hello, workers: int, now: floa
             f"{table.count} sequences do not fill a block of sibling_spacing = {spec.sibling_spacing}: use a "
             "smaller batch size, fewer ranks or loader workers, samples_per_decode = 1, or more videos"
         )
+    # It keeps all workers busy, present or expected, within its bounds.
+    workers = max(len(broker.registry.members), broker.expected_workers)
     suggested = suggested_credit(hello.batch_size, workers, spec.samples_per_decode)
     session = Session(
         identity=identity,

@@ -42,13 +42,16 @@ def quarantine_candidate(broker: Broker, request: Request, reason: str, *, for_a
     if quarantine_reason(broker, session, request, broker.quarantine.latest) is not None:
         return refusequarantine_reason(broker, request, reason)
     sequence = session.sequence(request)
-    video, text = sequence.video, reason[:LONGEST_REASON]
-    spec, time = "" if for_all else session.spec.digest, broker.wall_clock()
-    return [
-        AddToQuarantine(
-            QuarantineEntry(0, video.id, video.fingerprint, sequence.start_frame, text, time, spec), request
-        )
-    ]
+    entry = QuarantineEntry(
+        snapshot=0,
+        path=sequence.video.id,
+        fingerprint=sequence.video.fingerprint,
+        frame=sequence.start_frame,
+        reason=reason[:LONGEST_REASON],
+        time=broker.wall_clock(),
+        spec="" if for_all else session.spec.digest,
+    )
+    return [AddToQuarantine(entry, request)]
 
 
 def extend_quarantine(broker: Broker, record: AddToQuarantine, written: Sequence[QuarantineEntry]) -> list[Action]:

@@ -33,8 +33,7 @@ def open_session(broker: Broker, identity: bytes, hello: Hello, now: float, user
     if present is None and len(broker.sessions) >= MOST_SESSIONS:
         return ToConsumer(identity, denial(ErrorCode.BUSY, f"this server has {MOST_SESSIONS} consumers, its limit"))
     try:
-        workers = max(len(broker.registry.members), broker.expected_workers)
-        session, welcome = admit(broker, identity, hello, workers, now)
+        session, welcome = admit(broker, identity, hello, now)
         session.user, session.owner = user, owner
     except (UsageError, CorpusError) as error:
         return answer_fault(broker, identity, denial(ErrorCode.SPEC, str(error)))
@@ -48,14 +47,13 @@ def queue_requests(broker: Broker, session: Session, want: Want) -> list[Action]
     """Queue the requests of a Want, and answer those whose samples are there, or deny all of them."""
     try:
         slots = _slots(want)
-    except ProtocolError as error:
-        return [answer_fault(broker, session.identity, malformed(broker, error))]
-    try:
         for index in want.indices[:1]:
             SampleId(session.spec.digest, broker.facts.digest, NUMERICS_VERSION, session.seed, want.epoch, index)
         broker.sessions.want(session, want.epoch, want.indices, slots)
     except LimitExceeded as error:
         return [ToConsumer(session.identity, denial(ErrorCode.CREDIT, str(error)))]
+    except ProtocolError as error:
+        return [answer_fault(broker, session.identity, malformed(broker, error))]
     except (IndexError, UsageError) as error:
         return [ToConsumer(session.identity, denial(ErrorCode.RANGE, str(error)))]
     return answer_shared(broker, session)

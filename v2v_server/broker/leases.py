@@ -140,7 +140,7 @@ class Request:
 
 
 @dataclass(slots=True)
-class _Grant:
+class _Lease:
     request: Request | None  # None: answered, or its consumer is gone; the worker still works on it
     worker: bytes
     since: float  # when it was granted, or its worker last began something
@@ -179,7 +179,7 @@ class LeaseBook:
 
     def __init__(self, deadline_seconds: float) -> None:
         self.deadline_seconds = deadline_seconds
-        self._leases: dict[int, _Grant] = {}
+        self._leases: dict[int, _Lease] = {}
         self.held: dict[bytes, list[int]] = {}
         self.out: dict[tuple[bytes, int, int], list[int]] = {}
         self.durations: dict[bytes, deque[float]] = {}
@@ -250,7 +250,7 @@ class LeaseBook:
         limit = max(
             [self.deadline_seconds + work_seconds, *(self._leases[n].limit_seconds for n in self.held.get(worker, ()))]
         )
-        self._leases[number] = _Grant(request, worker, now, limit)
+        self._leases[number] = _Lease(request, worker, now, limit)
         self.held.setdefault(worker, []).append(number)
         self.out.setdefault(request.sample, []).append(number)
         self._changed.add(worker)
@@ -374,7 +374,7 @@ class LeaseBook:
 
         The time counts from when its worker last began something, so a request queued behind a hanging one is slow too.
         """
-        oldest: dict[bytes, _Grant] = {}
+        oldest: dict[bytes, _Lease] = {}
         for lease in self._leases.values():
             if lease.request is not None:
                 oldest.setdefault(lease.request.session, lease)

@@ -42,8 +42,7 @@ def register(broker: Broker, identity: bytes, hello: WorkerHello, now: float, us
         before = _replaced_by(broker, identity, hello.name, owner, user)
     except LimitExceeded as error:
         return [ToWorker(identity, malformed(broker, error))]
-    again = Loss(Cause.KILLED, "started again")
-    actions = [action for each in before for action in remove(broker, each, again)]
+    actions = [action for each in before for action in remove(broker, each, Loss(Cause.KILLED, "started again"))]
     if hello.numerics_version != NUMERICS_VERSION:
         text = f"worker numerics version {hello.numerics_version}, the server's is {NUMERICS_VERSION}"
         return [ToWorker(identity, encode(Denied(ErrorCode.VERSION, text))), *actions]
