@@ -188,6 +188,44 @@ def test_every_folder_documents_its_files(room: str) -> None:
     assert on_the_map == {path.stem for path in folder.glob("*.py")} - {"__init__"} | rooms
 
 
+BROKER = ROOT / "v2v_server" / "broker"
+PURE = {
+    "__future__", "bisect", "collections", "collections.abc", "dataclasses", "enum", "hashlib", "itertools", "math",
+    "statistics", "typing",
+    "v2v_protocol", "v2v_protocol.arena", "v2v_protocol.errors", "v2v_protocol.liveness", "v2v_protocol.messages",
+    "v2v_protocol.recipe", "v2v_protocol.sample", "v2v_protocol.spec",
+    "v2v_server.corpus.videos", "v2v_server.schedule", "v2v_server.sharing", "v2v_server.system.log",
+}  # fmt: skip
+"""What the broker may import: nothing here reads a file, but for the quarantine, of which it uses the values."""
+
+
+def broker_files() -> list[str]:
+    """Return the names of the broker's files in the order of its page: each imports only those above it."""
+    return [line.split()[0] for line in (BROKER / "__init__.py").read_text("utf-8").splitlines()[2:-1]]
+
+
+@pytest.mark.parametrize("file", broker_files())
+def test_the_broker_reads_no_file_and_imports_in_one_direction(file: str) -> None:
+    source = (BROKER / f"{file}.py").read_text("utf-8")
+    nodes = nodes_of(source, expressions=True)
+    above = {f"v2v_server.broker.{name}" for name in broker_files()[: broker_files().index(file)]}
+    from_quarantine: set[str] = set()
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom) and node.module == "v2v_server.quarantine":
+            from_quarantine |= {alias.name for alias in node.names}
+    assert from_quarantine <= {"Quarantine", "QuarantineEntry"}
+    modules = modules_of(BROKER / f"{file}.py") - {"v2v_server.quarantine", "v2v_server.broker"}
+    assert modules - PURE - above == set()
+    packages = {
+        f"v2v_server.broker.{alias.name}"
+        for node in nodes
+        if isinstance(node, ast.ImportFrom) and node.module == "v2v_server.broker"
+        for alias in node.names
+    }
+    assert packages - above == set()
+    assert "open" not in {node.id for node in nodes if isinstance(node, ast.Name)}
+
+
 @pytest.mark.parametrize(
     ("module", "without"),
     [

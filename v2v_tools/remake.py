@@ -11,8 +11,8 @@ from v2v_protocol.programs import counted
 from v2v_protocol.progress import Progress
 from v2v_protocol.sample import DEFAULT_ARRAYS, Refusal, RefusalKind, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker import dispatcher
-from v2v_server.broker.dispatcher import next_candidate
+from v2v_server.broker import assignment
+from v2v_server.broker.candidates import next_candidate
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.kinds.kind import VideosKind
@@ -177,12 +177,12 @@ def lease_for(
     number: int = 1,
     siblings: tuple[int, ...] = (),
 ) -> Lease:
-    """Build the lease that a server sends for a request; see :func:`v2v_server.broker.dispatcher.lease_for`.
+    """Build the lease that a server sends for a request; see :func:`v2v_server.broker.assignment.lease_for`.
 
     Raises:
         IndexUnreadable, V2VError: as of :func:`v2v_server.corpus.catalogue.complete_lease`.
     """
-    lease = dispatcher.lease_for(
+    lease = assignment.lease_for(
         request,
         sequence=sequence,
         facts=catalogue.facts,

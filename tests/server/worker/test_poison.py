@@ -78,7 +78,7 @@ def test_a_crash_or_a_hang_refuses_the_begun_candidate_at_once(cause: Cause) -> 
     assert at.samples() == [(0, 0), (0, 1)]
     # The operator reads the verdict; what the quarantine refuses from then on is no news.
     assert at.passed_over == []
-    assert at.dispatcher.counters.refused_candidates == 1
+    assert at.broker.counters.refused_candidates == 1
 
 
 @pytest.mark.parametrize("answered", [True, False])
@@ -138,7 +138,7 @@ def test_unexplained_deaths_make_it_run_alone_and_one_more_refuses_it() -> None:
     at.join()
     # Alone on its worker, though that has room and others wait.
     assert [lease.indices for lease in at.leases[b"w"]] == [(0,)]
-    assert at.dispatcher.waiting == 3
+    assert at.broker.waiting == 3
     at.join(b"other")
     assert [lease.indices for lease in at.leases[b"other"]] == [(1,), (2,)]
     at.begin()
@@ -187,13 +187,13 @@ def test_a_consumer_that_leaves_takes_its_lone_task_along_and_frees_the_worker_k
     at.join(b"w2", credit=3)
     at.die(b"w1", Cause.KILLED)
     at.finish(b"w2")
-    assert (at.dispatcher.waiting, len(at.leases[b"w2"])) == (6, 2)
+    assert (at.broker.waiting, len(at.leases[b"w2"])) == (6, 2)
     at.dispatcher.consumer_lost(b"c")
-    assert at.dispatcher.waiting == 5
+    assert at.broker.waiting == 5
     at.tick(0.1)
     assert len(at.leases[b"w2"]) == 3
     at.work_off(b"w2")
-    assert (at.dispatcher.waiting, len(at.samples(b"other"))) == (0, 8)
+    assert (at.broker.waiting, len(at.samples(b"other"))) == (0, 8)
 
 
 # --- the verdict ------------------------------------------------------------------------------------------------------
